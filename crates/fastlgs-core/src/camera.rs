@@ -1,0 +1,146 @@
+//! Pinhole cameras.
+
+use crate::{Error, Result, fs};
+use glam::{Mat4, Vec2, Vec3};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// An undistorted pinhole camera; x right, y down, looking along +z (OpenCV).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Name of the view: the photo's file name.
+    pub name: String,
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Focal length in pixels along x.
+    pub fx: f32,
+    /// Focal length in pixels along y.
+    pub fy: f32,
+    /// Principal point in pixels, x.
+    pub cx: f32,
+    /// Principal point in pixels, y.
+    pub cy: f32,
+    /// World to camera, column-major as glam stores it.
+    pub world_to_camera: Mat4,
+}
+
+impl Camera {
+    /// The same view at another resolution; field of view is kept along each axis.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let (sx, sy) = (width as f32 / self.width as f32, height as f32 / self.height as f32);
+        Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..self.clone() }
+    }
+
+    /// The same view with its longer side at most `max_side` pixels; never enlarged.
+    pub fn shrunk_to(&self, max_side: u32) -> Self {
+        let scale = max_side as f32 / self.width.max(self.height) as f32;
+        if scale >= 1.0 {
+            return self.clone();
+        }
+        let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
+        self.resized(size(self.width), size(self.height))
+    }
+
+    /// Position of the camera in the world.
+    pub fn centre(&self) -> Vec3 {
+        self.world_to_camera.inverse().w_axis.truncate()
+    }
+
+    /// Unit viewing direction in the world.
+    pub fn forward(&self) -> Vec3 {
+        self.world_to_camera.transpose().z_axis.truncate().normalize()
+    }
+
+    /// A point of camera space on the image plane, in pixels.
+    pub fn to_pixel(&self, p: Vec3) -> Vec2 {
+        Vec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy)
+    }
+
+    /// Direction of a pixel's ray in camera space, with z = 1.
+    pub fn ray(&self, pixel: Vec2) -> Vec3 {
+        Vec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
+    }
+
+    /// A camera at `eye` that looks at `target`, with `up` pointing to the top of the image.
+    pub fn look_at(name: &str, eye: Vec3, target: Vec3, up: Vec3, width: u32, height: u32, fov_y: f32) -> Self {
+        let z = (target - eye).normalize();
+        let x = z.cross(up).normalize();
+        let y = z.cross(x);
+        let camera_to_world = Mat4::from_cols(x.extend(0.0), y.extend(0.0), z.extend(0.0), eye.extend(1.0));
+        let f = height as f32 / (2.0 * (fov_y / 2.0).tan());
+        Self {
+            name: name.to_owned(),
+            width,
+            height,
+            fx: f,
+            fy: f,
+            cx: width as f32 / 2.0,
+            cy: height as f32 / 2.0,
+            world_to_camera: camera_to_world.inverse(),
+        }
+    }
+
+    /// Checks that every number is finite and the size is not zero.
+    ///
+    /// # Errors
+    /// A sentence that names the view and the field.
+    pub fn check(&self) -> Result<(), String> {
+        let name = &self.name;
+        if self.width == 0 || self.height == 0 {
+            return Err(format!("camera '{name}' has size {}x{}", self.width, self.height));
+        }
+        if ![self.fx, self.fy].iter().all(|f| f.is_finite() && *f > 0.0) || !(self.cx + self.cy).is_finite() {
+            return Err(format!("camera '{name}' has a focal length or principal point that is not a positive number"));
+        }
+        if !self.world_to_camera.is_finite() {
+            return Err(format!("the pose of '{name}' has a NaN or infinite entry; remove or mend that pose"));
+        }
+        let determinant = self.world_to_camera.determinant();
+        if (determinant - 1.0).abs() > 0.05 {
+            return Err(format!("the pose of '{name}' is not a rotation and a translation (determinant {determinant:.3})"));
+        }
+        Ok(())
+    }
+
+    /// Reads a camera from JSON (the fields of this struct).
+    ///
+    /// # Errors
+    /// [`Error::Io`] or [`Error::Format`], also for numbers that are not finite.
+    pub fn load(path: &Path) -> Result<Self> {
+        let camera: Self = fs::read_json(path)?;
+        camera.check().map_err(|reason| Error::format(path, reason))?;
+        Ok(camera)
+    }
+}
+
+/// Half the diagonal of the box around the camera centres: the scale of learning rates ("scene extent" of 3DGS).
+pub fn scene_extent(cameras: &[Camera]) -> f32 {
+    let mean = cameras.iter().map(Camera::centre).sum::<Vec3>() / cameras.len().max(1) as f32;
+    let radius = cameras.iter().map(|c| c.centre().distance(mean)).fold(0.0, f32::max);
+    (radius * 1.1).max(1e-3)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn look_at_puts_the_target_in_the_middle() {
+        let camera = Camera::look_at("a", Vec3::new(1.0, 2.0, 3.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let p = camera.world_to_camera.transform_point3(Vec3::ZERO);
+        assert!((camera.to_pixel(p) - Vec2::new(32.0, 24.0)).length() < 1e-3);
+        let above = camera.world_to_camera.transform_point3(Vec3::Y * 0.1);
+        assert!(camera.to_pixel(above).y < 24.0, "world up must be image up");
+        assert!((camera.centre() - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-4);
+        assert!(camera.check().is_ok());
+    }
+
+    #[test]
+    fn bad_poses_are_named() {
+        let mut camera = Camera::look_at("view7", Vec3::ONE, Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        camera.world_to_camera.x_axis.x = f32::NAN;
+        assert!(camera.check().unwrap_err().contains("view7"));
+    }
+}

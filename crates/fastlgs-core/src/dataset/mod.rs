@@ -1,0 +1,101 @@
+//! Posed photos from other programs' folders.
+
+pub mod colmap;
+pub mod transforms;
+
+use crate::undistort::Distortion;
+use crate::{Camera, Error, Result};
+use glam::Vec3;
+use std::path::{Path, PathBuf};
+
+/// One photo with the camera that took it, still distorted.
+#[derive(Clone, Debug)]
+pub struct PosedPhoto {
+    /// File of the photo.
+    pub path: PathBuf,
+    /// Pinhole part of the camera, at the resolution that the poses' file states.
+    pub camera: Camera,
+    /// Lens distortion to be removed.
+    pub distortion: Distortion,
+}
+
+/// A reconstructed 3-D point (structure from motion).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SfmPoint {
+    /// Position in the world.
+    pub position: Vec3,
+    /// Colour, 0 to 255.
+    pub color: [u8; 3],
+}
+
+/// Posed photos, sorted by name, and what else their folder offered.
+#[derive(Clone, Debug, Default)]
+pub struct Dataset {
+    /// Photos with poses, sorted by name.
+    pub photos: Vec<PosedPhoto>,
+    /// Structure-from-motion points; empty where the folder has none.
+    pub points: Vec<SfmPoint>,
+    /// What was wrong but survivable, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// Loads PHOTOS: `sparse/0` or `sparse` (COLMAP, binary or text) or `transforms.json` (nerfstudio, instant-ngp).
+///
+/// # Errors
+/// When no poses are found, a file is damaged, a pose is not finite, or no posed photo is left.
+pub fn load(photos: &Path) -> Result<Dataset> {
+    if !photos.is_dir() {
+        return Err(Error::Invalid(format!("{}: no such folder of photos", photos.display())));
+    }
+    let sparse = ["sparse/0", "sparse"].iter().map(|s| photos.join(s));
+    let mut dataset = if let Some(folder) = sparse.into_iter().find(|s| colmap::is_model(s)) {
+        colmap::load(photos, &folder)?
+    } else if photos.join("transforms.json").is_file() {
+        transforms::load(photos)?
+    } else {
+        return Err(Error::Invalid(format!(
+            "{}: no poses found; expected sparse/0/cameras.bin (or .txt) of COLMAP, or transforms.json, beside images/",
+            photos.display()
+        )));
+    };
+    if dataset.photos.is_empty() {
+        return Err(Error::Invalid(format!("{}: no photo has a pose", photos.display())));
+    }
+    for photo in &dataset.photos {
+        photo.camera.check().map_err(|reason| Error::format(photos, reason))?;
+    }
+    dataset.photos.sort_by(|a, b| a.camera.name.cmp(&b.camera.name));
+    if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
+        return Err(Error::format(photos, format!("two poses for the photo '{}'", pair[0].camera.name)));
+    }
+    warn_of_photos_without_pose(photos, &mut dataset);
+    Ok(dataset)
+}
+
+/// Photos that no pose names are left out; the user hears of it once.
+fn warn_of_photos_without_pose(photos: &Path, dataset: &mut Dataset) {
+    let Ok(entries) = std::fs::read_dir(photos.join("images")) else { return };
+    let posed: std::collections::HashSet<_> = dataset.photos.iter().filter_map(|p| p.path.file_name()).collect();
+    let mut extra: Vec<String> = entries
+        .flatten()
+        .map(|e| e.path())
+        .filter(|p| is_photo(p) && p.file_name().is_some_and(|n| !posed.contains(n)))
+        .filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned()))
+        .collect();
+    extra.sort();
+    if !extra.is_empty() {
+        dataset.warnings.push(format!("{} photos have no pose and are left out: {}", extra.len(), first_few(&extra)));
+    }
+}
+
+/// Whether the file's ending is that of a photo this project reads.
+pub fn is_photo(path: &Path) -> bool {
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    matches!(ending.as_str(), "jpg" | "jpeg" | "png")
+}
+
+/// The first names of a list, for a message.
+fn first_few(names: &[String]) -> String {
+    let shown = names.iter().take(5).cloned().collect::<Vec<_>>().join(", ");
+    if names.len() > 5 { format!("{shown}, ...") } else { shown }
+}

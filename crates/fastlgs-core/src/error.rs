@@ -1,0 +1,43 @@
+//! Errors of the data layer. Every message names the file and, where one is known, the mend.
+
+use std::path::{Path, PathBuf};
+
+/// What can go wrong while reading or writing data.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder concerned.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file was read but its content is not what its format promises.
+    #[error("{}: {reason}", path.display())]
+    Format {
+        /// The file concerned.
+        path: PathBuf,
+        /// What is wrong and what to do.
+        reason: String,
+    },
+    /// A request that does not fit the data (unknown view, empty folder, ...).
+    #[error("{0}")]
+    Invalid(String),
+}
+
+/// Result of the data layer.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+impl Error {
+    /// An [`Error::Format`] for `path`.
+    pub fn format(path: impl AsRef<Path>, reason: impl Into<String>) -> Self {
+        Self::Format { path: path.as_ref().to_owned(), reason: reason.into() }
+    }
+
+    /// Wraps an I/O error with the path it happened on; for `map_err`.
+    pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.as_ref().to_owned();
+        move |source| Self::Io { path, source }
+    }
+}

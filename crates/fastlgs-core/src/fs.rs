@@ -1,0 +1,138 @@
+//! Files that are either the old or the new version, never half of one.
+
+use crate::{Error, Result};
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Writes `path` through a temporary neighbour that is renamed into place when `write` succeeded.
+///
+/// # Errors
+/// Whatever `write` returns, or the system's refusal; the earlier file then stays as it was.
+pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
+    if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    }
+    let partial = partial_name(path);
+    let result = (|| {
+        let mut file = BufWriter::new(File::create(&partial)?);
+        write(&mut file)?;
+        file.flush()?;
+        file.get_ref().sync_all()
+    })();
+    if let Err(source) = result.and_then(|()| std::fs::rename(&partial, path)) {
+        let _ = std::fs::remove_file(&partial);
+        return Err(Error::Io { path: path.to_owned(), source });
+    }
+    Ok(())
+}
+
+/// The temporary name beside `path`; the process id keeps concurrent writers apart.
+fn partial_name(path: &Path) -> PathBuf {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(format!(".{}.partial", std::process::id()));
+    path.with_file_name(name)
+}
+
+/// Reads a whole file.
+///
+/// # Errors
+/// [`Error::Io`] with the path.
+pub fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(Error::io(path))
+}
+
+/// Writes a value as indented JSON, atomically.
+///
+/// # Errors
+/// [`Error::Io`] with the path.
+pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
+    write_atomic(path, |file| {
+        serde_json::to_writer_pretty(&mut *file, value)?;
+        file.write_all(b"\n")
+    })
+}
+
+/// Reads a JSON file.
+///
+/// # Errors
+/// [`Error::Io`], or [`Error::Format`] with the line and column.
+pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
+    serde_json::from_slice(&read(path)?).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))
+}
+
+/// Little-endian reader over a byte slice that says where a file ended too early.
+pub struct Bytes<'a> {
+    path: &'a Path,
+    data: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Bytes<'a> {
+    /// Starts at the first byte of `data`, which came from `path`.
+    pub fn new(path: &'a Path, data: &'a [u8]) -> Self {
+        Self { path, data, at: 0 }
+    }
+
+    /// The next `n` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Format`] when fewer are left.
+    pub fn take(&mut self, n: usize) -> Result<&'a [u8]> {
+        let rest = &self.data[self.at..];
+        if n > rest.len() {
+            return Err(Error::format(
+                self.path,
+                format!("truncated: {n} bytes wanted at offset {}, {} left; copy the file again", self.at, rest.len()),
+            ));
+        }
+        self.at += n;
+        Ok(&rest[..n])
+    }
+
+    /// Bytes not yet read.
+    pub fn left(&self) -> usize {
+        self.data.len() - self.at
+    }
+
+    /// An unsigned 8-byte count that must fit what is left when each item takes at least `item` bytes.
+    ///
+    /// # Errors
+    /// [`Error::Format`] when the file cannot hold that many.
+    pub fn count(&mut self, item: usize) -> Result<usize> {
+        let n = self.u64()?;
+        if n > (self.left() / item.max(1)) as u64 {
+            return Err(Error::format(self.path, format!("truncated: it announces {n} entries but ends before them")));
+        }
+        Ok(n as usize)
+    }
+
+    /// Bytes up to the next NUL, which is consumed.
+    ///
+    /// # Errors
+    /// [`Error::Format`] when there is none or the text is not UTF-8.
+    pub fn c_string(&mut self) -> Result<&'a str> {
+        let rest = &self.data[self.at..];
+        let end = rest.iter().position(|&b| b == 0).ok_or_else(|| Error::format(self.path, "truncated inside a name"))?;
+        self.at += end + 1;
+        std::str::from_utf8(&rest[..end]).map_err(|_| Error::format(self.path, "a name is not UTF-8"))
+    }
+}
+
+macro_rules! number {
+    ($($name:ident $type:ty),*) => {
+        impl Bytes<'_> {$(
+            /// The next little-endian number.
+            ///
+            /// # Errors
+            /// [`Error::Format`] when the file ends before it.
+            pub fn $name(&mut self) -> Result<$type> {
+                const SIZE: usize = std::mem::size_of::<$type>();
+                let mut raw = [0; SIZE];
+                raw.copy_from_slice(self.take(SIZE)?);
+                Ok(<$type>::from_le_bytes(raw))
+            }
+        )*}
+    };
+}
+number!(u32 u32, i32 i32, u64 u64, f64 f64);

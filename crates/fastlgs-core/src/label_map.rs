@@ -1,0 +1,112 @@
+//! Label maps: one 16-bit label a pixel, 0 for "no mask".
+
+use crate::{Error, Result, fs, image_io};
+use image::{DynamicImage, ImageBuffer, ImageReader, Luma};
+use std::io::Cursor;
+use std::path::Path;
+
+/// Non-overlapping masks of one view and level; label 0 is unlabelled.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LabelMap {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Row-major labels.
+    pub labels: Vec<u16>,
+}
+
+impl LabelMap {
+    /// An unlabelled map.
+    pub fn new(width: u32, height: u32) -> Self {
+        Self { width, height, labels: vec![0; (width * height) as usize] }
+    }
+
+    /// Label at a pixel.
+    pub fn at(&self, x: u32, y: u32) -> u16 {
+        self.labels[(y * self.width + x) as usize]
+    }
+
+    /// Largest label.
+    pub fn max(&self) -> u16 {
+        self.labels.iter().copied().max().unwrap_or(0)
+    }
+
+    /// Pixels of each label, indexed by label.
+    pub fn areas(&self) -> Vec<usize> {
+        let mut areas = vec![0; usize::from(self.max()) + 1];
+        for &l in &self.labels {
+            areas[usize::from(l)] += 1;
+        }
+        areas
+    }
+
+    /// Boxes (x0, y0, x1, y1), ends excluded, indexed by label; `None` for labels that do not occur.
+    pub fn boxes(&self) -> Vec<Option<[u32; 4]>> {
+        let mut boxes: Vec<Option<[u32; 4]>> = vec![None; usize::from(self.max()) + 1];
+        for y in 0..self.height {
+            for x in 0..self.width {
+                let b = boxes[usize::from(self.at(x, y))].get_or_insert([x, y, x + 1, y + 1]);
+                *b = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
+            }
+        }
+        boxes
+    }
+
+    /// Pixels that carry `label`.
+    pub fn mask(&self, label: u16) -> Vec<bool> {
+        self.labels.iter().map(|&l| l == label).collect()
+    }
+
+    /// The same map at another size, nearest neighbour.
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let pick = |n: u32, from: u32, to: u32| ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32;
+        let labels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        let labels = labels.map(|(x, y)| self.at(pick(x, self.width, width), pick(y, self.height, height))).collect();
+        Self { width, height, labels }
+    }
+
+    /// Writes a 16-bit grey PNG, atomically.
+    ///
+    /// # Errors
+    /// [`Error::Io`] with the path.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let picture: ImageBuffer<Luma<u16>, _> =
+            ImageBuffer::from_raw(self.width, self.height, self.labels.clone()).expect("the label map has its own size");
+        image_io::save_png(path, DynamicImage::ImageLuma16(picture))
+    }
+
+    /// Reads a grey PNG of 8 or 16 bits.
+    ///
+    /// # Errors
+    /// [`Error::Io`], or [`Error::Format`] when it is not a grey picture.
+    pub fn load(path: &Path) -> Result<Self> {
+        let reader = ImageReader::new(Cursor::new(fs::read(path)?)).with_guessed_format().map_err(Error::io(path))?;
+        let decoded = reader.decode().map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")))?;
+        let (width, height) = (decoded.width(), decoded.height());
+        let labels = match decoded {
+            DynamicImage::ImageLuma16(map) => map.into_raw(),
+            DynamicImage::ImageLuma8(map) => map.into_raw().into_iter().map(u16::from).collect(),
+            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits")),
+        };
+        Ok(Self { width, height, labels })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn png_keeps_all_16_bits() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut map = LabelMap::new(3, 2);
+        map.labels = vec![0, 1, 300, 65535, 2, 2];
+        map.save(&dir.path().join("a.png")).unwrap();
+        assert_eq!(LabelMap::load(&dir.path().join("a.png")).unwrap(), map);
+        assert_eq!(map.boxes()[2], Some([1, 1, 3, 2]));
+        assert_eq!(map.areas()[2], 2);
+        let double = map.resized(6, 4);
+        assert_eq!((double.at(4, 1), double.at(0, 2), double.at(2, 3)), (300, 65535, 2));
+    }
+}

@@ -1,0 +1,29 @@
+//! Data of FastLGS that knows neither GPU, neural network nor text: cameras and posed photos, the Gaussian scene and
+//! its PLY, label maps, evaluation labels, metrics, and the scene folder that ties the stages together.
+//!
+//! Conventions, everywhere in the project:
+//! * world units are those of the input poses; cameras look along +z with x right and y down (OpenCV);
+//! * pixel (0, 0) covers [0, 1) x [0, 1): its centre is at (0.5, 0.5);
+//! * images are row-major; planar float images are `[channel][row][column]`.
+
+pub mod camera;
+pub mod dataset;
+pub mod error;
+pub mod exr_image;
+pub mod fs;
+pub mod gaussians;
+pub mod image_io;
+pub mod label_map;
+pub mod labels;
+pub mod metrics;
+pub mod ply;
+pub mod rng;
+pub mod scene_folder;
+pub mod turbo;
+pub mod undistort;
+
+pub use camera::Camera;
+pub use error::{Error, Result};
+pub use gaussians::Gaussians;
+pub use label_map::LabelMap;
+pub use scene_folder::SceneFolder;

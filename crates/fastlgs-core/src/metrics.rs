@@ -1,0 +1,190 @@
+//! Measures of masks and pictures. Rules: DESIGN of the evaluation in `docs/evaluation.md`.
+
+/// Intersection over union; two empty masks agree perfectly.
+pub fn iou(a: &[bool], b: &[bool]) -> f64 {
+    let (mut both, mut either) = (0usize, 0usize);
+    for (&a, &b) in a.iter().zip(b) {
+        both += usize::from(a && b);
+        either += usize::from(a || b);
+    }
+    if either == 0 { 1.0 } else { both as f64 / either as f64 }
+}
+
+/// Share of the true pixels that were found; 1 where there are none.
+pub fn recall(found: &[bool], truth: &[bool]) -> f64 {
+    let total = truth.iter().filter(|t| **t).count();
+    let hit = found.iter().zip(truth).filter(|(f, t)| **f && **t).count();
+    if total == 0 { 1.0 } else { hit as f64 / total as f64 }
+}
+
+/// Pixel accuracy: share of all pixels on which two masks agree.
+pub fn accuracy(found: &[bool], truth: &[bool]) -> f64 {
+    let same = found.iter().zip(truth).filter(|(f, t)| f == t).count();
+    same as f64 / truth.len().max(1) as f64
+}
+
+/// Boundary IoU (Cheng et al. 2021): IoU of the bands within `distance` pixels inside each mask's border.
+pub fn boundary_iou(a: &[bool], b: &[bool], width: u32, height: u32, distance: u32) -> f64 {
+    iou(&inner_band(a, width, height, distance), &inner_band(b, width, height, distance))
+}
+
+fn inner_band(mask: &[bool], width: u32, height: u32, distance: u32) -> Vec<bool> {
+    let inside = erode(mask, width, height, distance);
+    mask.iter().zip(inside).map(|(&m, i)| m && !i).collect()
+}
+
+/// Pixels whose whole square neighbourhood of radius `r` lies in the mask; outside the picture counts as outside.
+pub fn erode(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
+    let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
+    dilate_with(&outside, width, height, r, true).into_iter().map(|m| !m).collect()
+}
+
+/// Pixels with a mask pixel in their square neighbourhood of radius `r`.
+pub fn dilate(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
+    dilate_with(mask, width, height, r, false)
+}
+
+fn dilate_with(mask: &[bool], width: u32, height: u32, r: u32, outside: bool) -> Vec<bool> {
+    let (w, h, r) = (width as i64, height as i64, i64::from(r));
+    let line = |n: i64, len: i64, get: &dyn Fn(i64) -> bool| (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { outside });
+    let mut rows = vec![false; mask.len()];
+    for y in 0..h {
+        for x in 0..w {
+            rows[(y * w + x) as usize] = line(x, w, &|k| mask[(y * w + k) as usize]);
+        }
+    }
+    let mut out = vec![false; mask.len()];
+    for y in 0..h {
+        for x in 0..w {
+            out[(y * w + x) as usize] = line(y, h, &|k| rows[(k * w + x) as usize]);
+        }
+    }
+    out
+}
+
+/// Peak signal-to-noise ratio of values in [0, 1], in dB.
+pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
+    let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+    let mse = sum / a.len().max(1) as f64;
+    if mse == 0.0 { f64::INFINITY } else { -10.0 * mse.log10() }
+}
+
+/// Half width of the SSIM window.
+pub const SSIM_RADIUS: usize = 5;
+
+/// The 11 weights of the Gaussian window (sigma 1.5) of SSIM.
+pub fn ssim_window() -> [f32; 2 * SSIM_RADIUS + 1] {
+    let raw: [f64; 11] = std::array::from_fn(|i| (-((i as f64 - 5.0).powi(2)) / (2.0 * 1.5 * 1.5)).exp());
+    let sum: f64 = raw.iter().sum();
+    raw.map(|w| (w / sum) as f32)
+}
+
+/// Mean structural similarity of planar pictures `[channels][h][w]` in [0, 1], with zeros outside, as 3DGS measures it.
+pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
+    let n = width * height;
+    let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
+    let mut total = 0.0;
+    for (a, b) in a.chunks_exact(n).zip(b.chunks_exact(n)) {
+        let product = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(x, y)| x * y).collect::<Vec<_>>();
+        let blur = |x: &[f32]| blur(x, width, height);
+        let (ma, mb) = (blur(a), blur(b));
+        let (aa, bb, ab) = (blur(&product(a, a)), blur(&product(b, b)), blur(&product(a, b)));
+        for i in 0..n {
+            let (ma, mb) = (f64::from(ma[i]), f64::from(mb[i]));
+            let (va, vb, cov) = (f64::from(aa[i]) - ma * ma, f64::from(bb[i]) - mb * mb, f64::from(ab[i]) - ma * mb);
+            total += (2.0 * ma * mb + c1) * (2.0 * cov + c2) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
+        }
+    }
+    total / a.len().max(1) as f64
+}
+
+/// Separable blur with the SSIM window, zeros outside.
+pub fn blur(x: &[f32], width: usize, height: usize) -> Vec<f32> {
+    let window = ssim_window();
+    let mut rows = vec![0.0; x.len()];
+    for j in 0..height {
+        for i in 0..width {
+            let (from, to) = (i.saturating_sub(SSIM_RADIUS), (i + SSIM_RADIUS).min(width - 1));
+            rows[j * width + i] = (from..=to).map(|k| window[k + SSIM_RADIUS - i] * x[j * width + k]).sum();
+        }
+    }
+    let mut out = vec![0.0; x.len()];
+    for j in 0..height {
+        let (from, to) = (j.saturating_sub(SSIM_RADIUS), (j + SSIM_RADIUS).min(height - 1));
+        for i in 0..width {
+            out[j * width + i] = (from..=to).map(|k| window[k + SSIM_RADIUS - j] * rows[k * width + i]).sum();
+        }
+    }
+    out
+}
+
+/// Localisation by LERF's rule: does the peak of the 29x29 box-filtered relevancy lie inside a box? Ties all count.
+pub fn localised(relevancy: &[f32], width: u32, height: u32, boxes: &[[f64; 4]]) -> bool {
+    let (w, h) = (width as usize, height as usize);
+    // Borders are mirrored without repeating the edge, as OpenCV's filter2D does by default.
+    let mirrored = |k: isize, n: usize| {
+        let period = 2 * (n as isize - 1).max(1);
+        let k = k.rem_euclid(period);
+        k.min(period - k) as usize
+    };
+    let mut rows = vec![0.0f64; w * h];
+    for p in 0..w * h {
+        rows[p] = (-14..=14).map(|d| f64::from(relevancy[p / w * w + mirrored((p % w) as isize + d, w)])).sum();
+    }
+    let values: Vec<f64> = (0..w * h).map(|p| (-14..=14).map(|d| rows[mirrored((p / w) as isize + d, h) * w + p % w]).sum()).collect();
+    let peak = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    (0..w * h).filter(|&p| values[p] >= peak - 1e-9).any(|p| {
+        let (x, y) = ((p % w) as f64 + 0.5, (p / w) as f64 + 0.5);
+        boxes.iter().any(|b| b[0] <= x && x <= b[2] && b[1] <= y && y <= b[3])
+    })
+}
+
+/// Area under the ROC curve: the chance that a present score exceeds an absent one; ties count half.
+pub fn auroc(present: &[f64], absent: &[f64]) -> f64 {
+    if present.is_empty() || absent.is_empty() {
+        return f64::NAN;
+    }
+    let wins: f64 = present.iter().flat_map(|p| absent.iter().map(move |a| if p > a { 1.0 } else if p == a { 0.5 } else { 0.0 })).sum();
+    wins / (present.len() * absent.len()) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_masks_by_hand() {
+        let a = [true, true, false, false];
+        let b = [true, false, true, false];
+        assert!((iou(&a, &b) - 1.0 / 3.0).abs() < 1e-12);
+        assert!((recall(&a, &b) - 0.5).abs() < 1e-12);
+        assert!((accuracy(&a, &b) - 0.5).abs() < 1e-12);
+        assert_eq!(iou(&[false; 3], &[false; 3]), 1.0);
+        assert!((auroc(&[0.9, 0.4], &[0.1, 0.4]) - 0.875).abs() < 1e-12);
+    }
+
+    #[test]
+    fn boundary_band_of_a_square() {
+        let square = |from: usize, to: usize| -> Vec<bool> { (0..400).map(|p| (from..to).contains(&(p % 20)) && (from..to).contains(&(p / 20))).collect() };
+        // Bands one pixel wide: the ring of an 8x8 square has 28 pixels, that of a 6x6 square 20; disjoint.
+        assert_eq!(inner_band(&square(4, 12), 20, 20, 1).iter().filter(|b| **b).count(), 28);
+        assert_eq!(boundary_iou(&square(4, 12), &square(4, 12), 20, 20, 1), 1.0);
+        assert_eq!(boundary_iou(&square(4, 12), &square(5, 11), 20, 20, 1), 0.0);
+    }
+
+    #[test]
+    fn ssim_and_psnr_of_known_pictures() {
+        let a: Vec<f32> = (0..32 * 24).map(|i| ((i * 37) % 101) as f32 / 100.0).collect();
+        assert!((ssim(&a, &a, 32, 24) - 1.0).abs() < 1e-6);
+        assert!(ssim(&a, &a.iter().map(|v| 1.0 - v).collect::<Vec<_>>(), 32, 24) < 0.2);
+        assert!((psnr(&[0.5, 0.5], &[0.6, 0.4]) - 20.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn localisation_follows_the_peak() {
+        let mut map = vec![0.0; 64 * 64];
+        map[20 * 64 + 40] = 1.0;
+        assert!(localised(&map, 64, 64, &[[30.0, 10.0, 50.0, 30.0]]));
+        assert!(!localised(&map, 64, 64, &[[0.0, 45.0, 10.0, 60.0]]));
+    }
+}

@@ -1,0 +1,252 @@
+//! The PLY that 3DGS programs exchange: binary little-endian (or ASCII on reading), one `vertex` element of floats.
+//!
+//! Written columns: `x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, then `feature_0..2` (float) and
+//! `object_id` (ushort), which other viewers skip. On reading, unknown columns are skipped and missing features are 0.
+
+use crate::{Error, Gaussians, Result, fs};
+use glam::Vec3;
+use std::io::Write;
+use std::path::Path;
+
+const FLOATS: [&str; 20] = [
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
+    "rot_1", "rot_2", "rot_3", "feature_0", "feature_1", "feature_2",
+];
+
+/// Writes the scene atomically.
+///
+/// # Errors
+/// [`Error::Io`] with the path.
+pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
+    fs::write_atomic(path, |file| {
+        writeln!(file, "ply\nformat binary_little_endian 1.0\ncomment FastLGS\nelement vertex {}", scene.len())?;
+        for name in FLOATS {
+            writeln!(file, "property float {name}")?;
+        }
+        writeln!(file, "property ushort object_id\nend_header")?;
+        for i in 0..scene.len() {
+            let (m, c, s, r) = (scene.means[i], scene.sh_dc[i], scene.log_scales[i], scene.rotations[i]);
+            let (o, f) = (scene.opacity_logits[i], scene.features[i]);
+            let row = [
+                m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z, o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z,
+            ];
+            for value in row {
+                file.write_all(&value.to_le_bytes())?;
+            }
+            file.write_all(&scene.object_ids[i].to_le_bytes())?;
+        }
+        Ok(())
+    })
+}
+
+#[derive(Clone, Copy, PartialEq, Debug)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    /// Value of the first bytes of `b` (little-endian), which must be long enough.
+    fn read(self, b: &[u8]) -> f64 {
+        match self {
+            Self::I8 => f64::from(b[0] as i8),
+            Self::U8 => f64::from(b[0]),
+            Self::I16 => f64::from(i16::from_le_bytes([b[0], b[1]])),
+            Self::U16 => f64::from(u16::from_le_bytes([b[0], b[1]])),
+            Self::I32 => f64::from(i32::from_le_bytes([b[0], b[1], b[2], b[3]])),
+            Self::U32 => f64::from(u32::from_le_bytes([b[0], b[1], b[2], b[3]])),
+            Self::F32 => f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]])),
+            Self::F64 => f64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]),
+        }
+    }
+}
+
+struct Header {
+    ascii: bool,
+    big_endian: bool,
+    count: usize,
+    columns: Vec<(String, Scalar)>,
+    /// Offset of the first row.
+    body: usize,
+}
+
+fn header(path: &Path, data: &[u8]) -> Result<Header> {
+    let bad = |reason: String| Error::format(path, reason);
+    let marker = b"end_header";
+    let limit = data.len().min(1 << 16);
+    let end = data[..limit].windows(marker.len()).position(|w| w == marker).filter(|_| data.starts_with(b"ply"));
+    let end = end.ok_or_else(|| bad("not a PLY file, or its header is cut off".into()))?;
+    let body = end + marker.len() + data[end + marker.len()..].iter().take_while(|b| **b == b'\r').count() + 1;
+    let text = std::str::from_utf8(&data[..end]).map_err(|_| bad("its header is not text".into()))?;
+    let mut header = Header { ascii: false, big_endian: false, count: 0, columns: Vec::new(), body };
+    let mut in_vertex = false;
+    for line in text.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words.as_slice() {
+            ["format", format, _] => {
+                header.ascii = *format == "ascii";
+                header.big_endian = *format == "binary_big_endian";
+            }
+            ["element", "vertex", n] => {
+                header.count = n.parse().map_err(|_| bad(format!("bad vertex count '{n}'")))?;
+                in_vertex = true;
+            }
+            ["element", name, _] if header.columns.is_empty() => {
+                return Err(bad(format!("element '{name}' stands before the vertices; that layout is not supported")));
+            }
+            ["element", ..] => in_vertex = false,
+            ["property", "list", ..] if in_vertex => return Err(bad("a list property in the vertices is not supported".into())),
+            ["property", kind, name] if in_vertex => {
+                let scalar = Scalar::parse(kind).ok_or_else(|| bad(format!("unknown property type '{kind}'")))?;
+                header.columns.push(((*name).to_owned(), scalar));
+            }
+            _ => {}
+        }
+    }
+    Ok(header)
+}
+
+/// The vertex rows as columns of f64.
+fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
+    let mut table = vec![Vec::new(); header.columns.len()];
+    let short = |i: usize| Error::format(path, format!("truncated: it announces {} Gaussians and ends in number {}; copy it again", header.count, i + 1));
+    if header.ascii {
+        let text = std::str::from_utf8(&data[header.body.min(data.len())..]).map_err(|_| Error::format(path, "not text"))?;
+        let mut words = text.split_whitespace();
+        for i in 0..header.count {
+            for column in &mut table {
+                column.push(words.next().and_then(|w| w.parse().ok()).ok_or_else(|| short(i))?);
+            }
+        }
+        return Ok(table);
+    }
+    let row: usize = header.columns.iter().map(|c| c.1.size()).sum();
+    let body = &data[header.body.min(data.len())..];
+    if row == 0 || body.len() / row < header.count {
+        return Err(short(body.len() / row.max(1)));
+    }
+    for chunk in body.chunks_exact(row).take(header.count) {
+        let mut at = 0;
+        for (column, (_, scalar)) in table.iter_mut().zip(&header.columns) {
+            let mut raw = [0; 8];
+            raw[..scalar.size()].copy_from_slice(&chunk[at..at + scalar.size()]);
+            if header.big_endian {
+                raw[..scalar.size()].reverse();
+            }
+            column.push(scalar.read(&raw));
+            at += scalar.size();
+        }
+    }
+    Ok(table)
+}
+
+/// Reads a 3DGS PLY of this or another program.
+///
+/// # Errors
+/// Truncation, missing columns and values that are not finite are [`Error::Format`].
+pub fn read(path: &Path) -> Result<Gaussians> {
+    let data = fs::read(path)?;
+    let header = header(path, &data)?;
+    let table = columns(path, &data, &header)?;
+    let find = |name: &str| header.columns.iter().position(|c| c.0 == name).map(|i| table[i].as_slice());
+    let need = |name: &str| find(name).ok_or_else(|| Error::format(path, format!("no column '{name}': this is not a Gaussian scene")));
+    let vec3 = |a: &[f64], b: &[f64], c: &[f64]| -> Vec<Vec3> {
+        a.iter().zip(b).zip(c).map(|((a, b), c)| Vec3::new(*a as f32, *b as f32, *c as f32)).collect()
+    };
+    let n = header.count;
+    let zeros = vec![0.0; n];
+    let rot = [need("rot_0")?, need("rot_1")?, need("rot_2")?, need("rot_3")?];
+    let feature = |k: usize| find(&format!("feature_{k}")).unwrap_or(&zeros);
+    let scene = Gaussians {
+        means: vec3(need("x")?, need("y")?, need("z")?),
+        log_scales: vec3(need("scale_0")?, need("scale_1")?, need("scale_2")?),
+        rotations: (0..n).map(|i| rot.map(|r| r[i] as f32)).collect(),
+        opacity_logits: need("opacity")?.iter().map(|&v| v as f32).collect(),
+        sh_dc: vec3(need("f_dc_0")?, need("f_dc_1")?, need("f_dc_2")?),
+        features: vec3(feature(0), feature(1), feature(2)),
+        object_ids: find("object_id").unwrap_or(&zeros).iter().map(|&v| v as u16).collect(),
+    };
+    match scene.first_not_finite() {
+        Some(i) => Err(Error::format(path, format!("Gaussian {i} holds a value that is not a finite number"))),
+        None => Ok(scene),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn sample() -> Gaussians {
+        let mut g = Gaussians::default();
+        for i in 0..5 {
+            g.push_sphere(Vec3::splat(i as f32), 0.1 + i as f32, 0.5, [0.1 * i as f32; 3]);
+        }
+        g.features[2] = Vec3::new(0.1, 0.2, 0.3);
+        g.object_ids[4] = 513;
+        g
+    }
+
+    #[test]
+    fn round_trip_is_lossless_and_truncation_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.ply");
+        write(&path, &sample()).unwrap();
+        assert_eq!(read(&path).unwrap(), sample());
+        let data = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &data[..data.len() - 7]).unwrap();
+        let message = read(&path).unwrap_err().to_string();
+        assert!(message.contains("scene.ply") && message.contains("truncated"), "{message}");
+    }
+
+    /// The same two Gaussians in both byte orders and in text.
+    #[test]
+    fn both_byte_orders_and_text() {
+        let dir = tempfile::tempdir().unwrap();
+        let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "extra"];
+        let rows: Vec<Vec<f32>> = (0..2).map(|i| (0..names.len()).map(|c| c as f32 * 0.25 + i as f32).collect()).collect();
+        let read_as = |format: &str, body: Vec<u8>| {
+            let properties: String = names.iter().map(|n| format!("property float {n}\n")).collect();
+            let mut data = format!("ply\nformat {format} 1.0\nelement vertex 2\n{properties}end_header\n").into_bytes();
+            data.extend(body);
+            let path = dir.path().join(format);
+            std::fs::write(&path, data).unwrap();
+            read(&path).unwrap()
+        };
+        let flat = || rows.iter().flatten();
+        let little = read_as("binary_little_endian", flat().flat_map(|v| v.to_le_bytes()).collect());
+        let big = read_as("binary_big_endian", flat().flat_map(|v| v.to_be_bytes()).collect());
+        let text = read_as("ascii", flat().map(|v| format!("{v} ")).collect::<String>().into_bytes());
+        assert_eq!(little, big);
+        assert_eq!(little, text);
+        assert_eq!(little.rotations[1], [3.5, 3.75, 4.0, 4.25]);
+    }
+}

@@ -1,0 +1,251 @@
+//! The scene folder: one place for everything a stage leaves for the next.
+
+use crate::dataset::SfmPoint;
+use crate::{Camera, Error, Gaussians, LabelMap, Result, fs, image_io, ply};
+use image::RgbImage;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What made a scene folder; `scene.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Manifest {
+    /// Version of the program that wrote it.
+    pub version: String,
+    /// The folder of photos.
+    pub photos: PathBuf,
+    /// Every n-th view (by sorted name) is held out; 0 for none.
+    pub holdout: usize,
+    /// Segmenter that made the masks.
+    pub segmenter: String,
+    /// Encoder that made the embeddings; queries must use the same.
+    pub encoder: String,
+    /// Seed of all randomness.
+    pub seed: u64,
+    /// What was survivable but wrong in the input.
+    pub warnings: Vec<String>,
+    /// Seconds a stage took, by name.
+    #[serde(default)]
+    pub seconds: BTreeMap<String, f64>,
+    /// Notes of later stages (training preset, adapter, figures).
+    #[serde(default)]
+    pub notes: BTreeMap<String, serde_json::Value>,
+}
+
+/// A scene folder on disk. Paths are given by the methods; nothing is cached.
+#[derive(Clone, Debug)]
+pub struct SceneFolder {
+    /// Root of the folder.
+    pub root: PathBuf,
+}
+
+impl SceneFolder {
+    /// A folder that may not exist yet.
+    pub fn new(root: impl Into<PathBuf>) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// A folder that `preprocess` has finished.
+    ///
+    /// # Errors
+    /// When there is no `scene.json`.
+    pub fn open(root: &Path) -> Result<Self> {
+        let folder = Self::new(root);
+        if !folder.manifest_path().is_file() {
+            return Err(Error::Invalid(format!(
+                "{}: not a scene (no scene.json); run 'fastlgs preprocess PHOTOS -o {}' first",
+                root.display(),
+                root.display()
+            )));
+        }
+        Ok(folder)
+    }
+
+    fn manifest_path(&self) -> PathBuf {
+        self.root.join("scene.json")
+    }
+
+    /// The trained scene.
+    pub fn ply_path(&self) -> PathBuf {
+        self.root.join("scene.ply")
+    }
+
+    /// Reads `scene.json`.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn manifest(&self) -> Result<Manifest> {
+        fs::read_json(&self.manifest_path())
+    }
+
+    /// Writes `scene.json`; the last act of a stage.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save_manifest(&self, manifest: &Manifest) -> Result<()> {
+        fs::write_json(&self.manifest_path(), manifest)
+    }
+
+    /// The trained Gaussians.
+    ///
+    /// # Errors
+    /// When the scene was never trained or the PLY is damaged.
+    pub fn gaussians(&self) -> Result<Gaussians> {
+        let path = self.ply_path();
+        if !path.is_file() {
+            let root = self.root.display();
+            return Err(Error::Invalid(format!("{root}: this scene was never trained (no scene.ply); run 'fastlgs train {root}' first")));
+        }
+        ply::read(&path)
+    }
+
+    /// Writes the cameras, sorted by name.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save_cameras(&self, cameras: &[Camera]) -> Result<()> {
+        fs::write_json(&self.root.join("cameras/cameras.json"), &cameras)
+    }
+
+    /// All cameras, sorted by name.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn cameras(&self) -> Result<Vec<Camera>> {
+        fs::read_json(&self.root.join("cameras/cameras.json"))
+    }
+
+    /// Index of a view by exact file name, or by name without ending where that is unique.
+    ///
+    /// # Errors
+    /// An unknown name; the message lists what there is.
+    pub fn view_index(&self, cameras: &[Camera], name: &str) -> Result<usize> {
+        let stem = |c: &Camera| Path::new(&c.name).file_stem().is_some_and(|s| s == name);
+        if let Some(i) = cameras.iter().position(|c| c.name == name) {
+            return Ok(i);
+        }
+        let mut hits = cameras.iter().enumerate().filter(|(_, c)| stem(c)).map(|(i, _)| i);
+        match (hits.next(), hits.next()) {
+            (Some(i), None) => Ok(i),
+            _ => {
+                let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
+                Err(Error::Invalid(format!("no view '{name}' in {}; it has {} views: {}, ...", self.root.display(), cameras.len(), names.join(", "))))
+            }
+        }
+    }
+
+    /// Undistorted, scaled photo of a view.
+    pub fn photo_path(&self, view: &str) -> PathBuf {
+        self.root.join("photos").join(format!("{view}.png"))
+    }
+
+    /// Reads a view's photo.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn photo(&self, view: &str) -> Result<RgbImage> {
+        image_io::load_rgb(&self.photo_path(view))
+    }
+
+    /// Label map of a view and level, of raw segmenter masks.
+    pub fn masks_path(&self, level: &str, view: &str) -> PathBuf {
+        self.root.join("masks").join(level).join(format!("{view}.png"))
+    }
+
+    /// Label map of a view after mapping: values are object ids.
+    pub fn objects_path(&self, view: &str) -> PathBuf {
+        self.root.join("masks/objects").join(format!("{view}.png"))
+    }
+
+    /// Reads the object ids of a view.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn objects(&self, view: &str) -> Result<LabelMap> {
+        LabelMap::load(&self.objects_path(view))
+    }
+
+    /// Writes the initial points (x y z r g b a line).
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save_points(&self, points: &[SfmPoint]) -> Result<()> {
+        let position: Vec<f32> = points.iter().flat_map(|p| p.position.to_array()).collect();
+        let color: Vec<f32> = points.iter().flat_map(|p| p.color.map(f32::from)).collect();
+        let shape = vec![points.len(), 3];
+        save_tensors(&self.root.join("points.safetensors"), &[("position", shape.clone(), &position), ("color", shape, &color)])
+    }
+
+    /// Reads the initial points.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn points(&self) -> Result<Vec<SfmPoint>> {
+        let tensors = load_tensors(&self.root.join("points.safetensors"))?;
+        let get = |name: &str| tensors.get(name).map(|t| t.1.as_slice()).unwrap_or_default();
+        let rows = get("position").chunks_exact(3).zip(get("color").chunks_exact(3));
+        Ok(rows.map(|(p, c)| SfmPoint { position: glam::Vec3::from_slice(p), color: [c[0] as u8, c[1] as u8, c[2] as u8] }).collect())
+    }
+}
+
+/// Whether the view at `index` (sorted by name) is held out.
+pub fn is_held_out(index: usize, holdout: usize) -> bool {
+    holdout > 0 && index.is_multiple_of(holdout)
+}
+
+/// Named float tensors: shape and row-major values.
+pub type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+/// Writes f32 tensors as safetensors, atomically.
+///
+/// # Errors
+/// The system's refusal, or a shape that does not fit its values.
+pub fn save_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])]) -> Result<()> {
+    let views = tensors.iter().map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?)));
+    let views: Result<Vec<_>, safetensors::SafeTensorError> = views.collect();
+    let data = views.and_then(|v| safetensors::serialize(v, None)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
+    fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
+}
+
+/// Reads the f32 tensors of a safetensors file.
+///
+/// # Errors
+/// Truncated or damaged files, and tensors of another type.
+pub fn load_tensors(path: &Path) -> Result<Tensors> {
+    let data = fs::read(path)?;
+    let file = SafeTensors::deserialize(&data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
+    file.tensors()
+        .into_iter()
+        .map(|(name, view)| {
+            if view.dtype() != Dtype::F32 {
+                return Err(Error::format(path, format!("tensor '{name}' is {:?}; 32-bit floats were expected", view.dtype())));
+            }
+            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            Ok((name, (view.shape().to_vec(), values)))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tensors_round_trip_and_truncation_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("t.safetensors");
+        save_tensors(&path, &[("a", vec![2, 2], &[1.0, 2.0, 3.0, 4.0])]).unwrap();
+        assert_eq!(load_tensors(&path).unwrap()["a"], (vec![2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+        let data = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &data[..data.len() - 3]).unwrap();
+        assert!(load_tensors(&path).unwrap_err().to_string().contains("t.safetensors"));
+    }
+
+    #[test]
+    fn every_eighth_view_is_held_out() {
+        let held: Vec<usize> = (0..20).filter(|&i| is_held_out(i, 8)).collect();
+        assert_eq!(held, [0, 8, 16]);
+        assert!(!is_held_out(0, 0));
+    }
+}

@@ -1,0 +1,15 @@
+use crate::View;
+
+/// Twin of `shaders/tile_ranges.wgsl`.
+pub fn tile_ranges(view: &View, sorted_tiles: &[u32], ranges: &mut [u32]) {
+    let pairs = view.pairs as usize;
+    for i in 0..pairs {
+        let tile = sorted_tiles[i] as usize;
+        if i == 0 || sorted_tiles[i - 1] as usize != tile {
+            ranges[2 * tile] = i as u32;
+        }
+        if i + 1 == pairs || sorted_tiles[i + 1] as usize != tile {
+            ranges[2 * tile + 1] = i as u32 + 1;
+        }
+    }
+}

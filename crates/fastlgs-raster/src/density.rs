@@ -1,0 +1,190 @@
+//! Density control of 3DGS (section 5) as small named operations on the training state.
+
+use fastlgs_core::gaussians::{CHANNELS, logit, sigmoid};
+use fastlgs_core::rng::Rng;
+use glam::{Quat, Vec3};
+
+/// Trained values and both Adam moments, each `[CHANNELS][n]`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct State {
+    /// Trained values.
+    pub params: Vec<f32>,
+    /// First moment.
+    pub moment1: Vec<f32>,
+    /// Second moment.
+    pub moment2: Vec<f32>,
+}
+
+/// Thresholds of 3DGS.
+#[derive(Clone, Copy, Debug)]
+pub struct Config {
+    /// Mean gradient of the projected centre (half-image units) from which a Gaussian is too coarse.
+    pub gradient: f32,
+    /// Share of the scene extent that separates cloning from splitting.
+    pub split_scale: f32,
+    /// Opacity below which a Gaussian is removed.
+    pub min_opacity: f32,
+    /// No more Gaussians than this.
+    pub budget: usize,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { gradient: 2e-4, split_scale: 0.01, min_opacity: 0.005, budget: 60_000 }
+    }
+}
+
+/// What one round did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Copied in place.
+    pub cloned: usize,
+    /// Replaced by two smaller ones.
+    pub split: usize,
+    /// Removed.
+    pub pruned: usize,
+}
+
+impl State {
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.params.len() / CHANNELS
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.params.is_empty()
+    }
+
+    fn vec3(&self, channel: usize, i: usize) -> Vec3 {
+        let n = self.len();
+        Vec3::new(self.params[channel * n + i], self.params[(channel + 1) * n + i], self.params[(channel + 2) * n + i])
+    }
+
+    fn opacity(&self, i: usize) -> f32 {
+        sigmoid(self.params[10 * self.len() + i])
+    }
+
+    fn largest_scale(&self, i: usize) -> f32 {
+        self.vec3(3, i).max_element().exp()
+    }
+
+    /// The state whose Gaussian k is a copy of `sources[k]`; moments of those marked fresh start at zero.
+    fn gathered(&self, sources: &[(usize, bool)]) -> Self {
+        let n = self.len();
+        let pick = |values: &[f32], keep_fresh: bool| {
+            (0..CHANNELS)
+                .flat_map(|c| sources.iter().map(move |&(i, fresh)| (c, i, fresh)))
+                .map(|(c, i, fresh)| if fresh && !keep_fresh { 0.0 } else { values[c * n + i] })
+                .collect()
+        };
+        Self { params: pick(&self.params, true), moment1: pick(&self.moment1, false), moment2: pick(&self.moment2, false) }
+    }
+
+    /// Moves Gaussian `i` to a sample of its own distribution and shrinks it by 1.6.
+    fn resample(&mut self, i: usize, rng: &mut Rng) {
+        let n = self.len();
+        let scale = self.vec3(3, i).map(f32::exp);
+        let q = [6, 7, 8, 9].map(|c| self.params[c * n + i]);
+        let rotation = Quat::from_xyzw(q[1], q[2], q[3], q[0]).normalize();
+        let offset = rotation * (scale * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+        for k in 0..3 {
+            self.params[k * n + i] += offset[k];
+            self.params[(3 + k) * n + i] -= 1.6f32.ln();
+        }
+    }
+}
+
+/// Gaussians whose mean gradient exceeds the threshold, steepest first, at most `room` of them.
+fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
+    let n = stats.len() / 2;
+    let mean = |i: usize| stats[i] / stats[n + i].max(1.0);
+    let mut found: Vec<usize> = (0..n).filter(|&i| mean(i) > threshold).collect();
+    found.sort_by(|&a, &b| mean(b).total_cmp(&mean(a)).then(a.cmp(&b)));
+    found.truncate(room);
+    found
+}
+
+/// One round: prune the faint, clone small and split large coarse Gaussians within the budget.
+pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rng: &mut Rng) -> Counts {
+    let n = state.len();
+    let keep: Vec<bool> = (0..n).map(|i| state.opacity(i) >= config.min_opacity && state.largest_scale(i) < extent * 10.0).collect();
+    let kept = keep.iter().filter(|k| **k).count();
+    let mut counts = Counts { pruned: n - kept, ..Counts::default() };
+    let mut coarse = vec![false; n];
+    for i in too_coarse(stats, config.gradient, config.budget.saturating_sub(kept)) {
+        coarse[i] = keep[i];
+    }
+    let (mut sources, mut moved) = (Vec::with_capacity(n), Vec::new());
+    for i in (0..n).filter(|&i| keep[i]) {
+        if !coarse[i] {
+            sources.push((i, false));
+        } else if state.largest_scale(i) <= config.split_scale * extent {
+            sources.extend([(i, false), (i, true)]);
+            counts.cloned += 1;
+        } else {
+            moved.extend([sources.len(), sources.len() + 1]);
+            sources.extend([(i, true), (i, true)]);
+            counts.split += 1;
+        }
+    }
+    *state = state.gathered(&sources);
+    for i in moved {
+        state.resample(i, rng);
+    }
+    counts
+}
+
+/// Lowers every opacity to at most `ceiling` and forgets its momentum (3DGS: floaters must earn their place again).
+pub fn reset_opacity(state: &mut State, ceiling: f32) {
+    let n = state.len();
+    for k in 10 * n..11 * n {
+        state.params[k] = state.params[k].min(logit(ceiling));
+        state.moment1[k] = 0.0;
+        state.moment2[k] = 0.0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::Gaussians;
+
+    fn state(scene: &Gaussians) -> State {
+        let params = scene.to_channels();
+        let zeros = vec![1.0; params.len()];
+        State { params, moment1: zeros.clone(), moment2: zeros }
+    }
+
+    #[test]
+    fn faint_go_small_are_cloned_large_are_split() {
+        let mut scene = Gaussians::default();
+        scene.push_sphere(Vec3::ZERO, 0.001, 0.5, [0.5; 3]);
+        scene.push_sphere(Vec3::X, 0.5, 0.5, [0.5; 3]);
+        scene.push_sphere(Vec3::Y, 0.1, 0.001, [0.5; 3]);
+        scene.push_sphere(Vec3::Z, 0.1, 0.5, [0.5; 3]);
+        let mut s = state(&scene);
+        // Gradient sums, then how often each was drawn.
+        let stats = [1.0, 1.0, 1.0, 0.0, 10.0, 10.0, 10.0, 10.0];
+        let counts = refine(&mut s, &stats, 1.0, &Config::default(), &mut Rng::new(1, "test"));
+        assert_eq!(counts, Counts { cloned: 1, split: 1, pruned: 1 });
+        let after = Gaussians::from_channels(&s.params, None);
+        assert_eq!(after.len(), 5);
+        assert_eq!(after.means[0], after.means[1]);
+        assert!((after.log_scales[2].x - (0.5f32 / 1.6).ln()).abs() < 1e-5);
+        assert_ne!(after.means[2], after.means[3]);
+        assert_eq!((s.moment1[0], s.moment1[1]), (1.0, 0.0), "a clone starts without momentum");
+        reset_opacity(&mut s, 0.01);
+        assert!((s.opacity(0) - 0.01).abs() < 1e-4);
+    }
+
+    #[test]
+    fn the_budget_is_hard() {
+        let mut scene = Gaussians::default();
+        (0..10).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
+        let mut s = state(&scene);
+        let config = Config { budget: 13, ..Config::default() };
+        refine(&mut s, &[1.0; 20], 1.0, &config, &mut Rng::new(1, "test"));
+        assert_eq!(s.len(), 13);
+    }
+}

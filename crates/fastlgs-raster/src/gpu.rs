@@ -1,0 +1,164 @@
+//! Adapters, the device, and buffers.
+
+use crate::{Error, Result};
+use std::sync::{Arc, Mutex};
+
+/// An opened device.
+pub struct Gpu {
+    /// The logical device.
+    pub device: wgpu::Device,
+    /// Its queue.
+    pub queue: wgpu::Queue,
+    /// Name of the adapter.
+    pub name: String,
+    /// Whether kernels may use subgroup operations over 8 lanes.
+    pub subgroups: bool,
+    /// Largest storage binding in bytes.
+    pub max_binding: u64,
+    /// First error that no one caught (out of memory, lost device).
+    failure: Arc<Mutex<Option<String>>>,
+}
+
+fn instance() -> wgpu::Instance {
+    wgpu::Instance::new(wgpu::InstanceDescriptor { backends: wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12, ..wgpu::InstanceDescriptor::new_without_display_handle() })
+}
+
+/// Names of the adapters, in the order of their indices.
+pub fn adapters() -> Vec<String> {
+    let list = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()));
+    list.iter().map(|a| a.get_info().name).collect()
+}
+
+impl Gpu {
+    /// Opens `auto` (the first hardware adapter, else any), an adapter by index, or by a part of its name.
+    ///
+    /// # Errors
+    /// When there is no such adapter; the message lists those there are.
+    pub fn open(which: &str) -> Result<Self> {
+        let mut list = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()));
+        let names: Vec<String> = list.iter().map(|a| a.get_info().name).collect();
+        let wanted = which.to_lowercase();
+        let found = if which == "auto" {
+            let hardware = |a: &wgpu::Adapter| a.get_info().device_type != wgpu::DeviceType::Cpu;
+            list.iter().position(hardware).or(if list.is_empty() { None } else { Some(0) })
+        } else {
+            which.parse().ok().filter(|i| *i < list.len()).or_else(|| names.iter().position(|n| n.to_lowercase().contains(&wanted)))
+        };
+        let index = found.ok_or_else(|| {
+            Error::Adapter(if names.is_empty() {
+                "no Vulkan device found; install a driver (on Debian: mesa-vulkan-drivers) or use --device cpu".to_owned()
+            } else {
+                format!("no device '{which}'; there are: {}, and cpu", names.join(", "))
+            })
+        })?;
+        Self::from_adapter(&list.swap_remove(index))
+    }
+
+    fn from_adapter(adapter: &wgpu::Adapter) -> Result<Self> {
+        let info = adapter.get_info();
+        let limits = adapter.limits();
+        let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && info.subgroup_min_size >= 8;
+        let features = if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("fastlgs"),
+            required_features: features,
+            required_limits: wgpu::Limits {
+                max_storage_buffer_binding_size: limits.max_storage_buffer_binding_size,
+                max_buffer_size: limits.max_buffer_size,
+                max_storage_buffers_per_shader_stage: 8,
+                ..wgpu::Limits::default()
+            },
+            ..Default::default()
+        };
+        let failed = |reason: String| Error::Device { device: info.name.clone(), reason };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|e| failed(e.to_string()))?;
+        let failure = Arc::new(Mutex::new(None));
+        let slot = failure.clone();
+        device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
+            slot.lock().expect("no panic while holding the lock").get_or_insert_with(|| e.to_string());
+        }));
+        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size.into(), failure })
+    }
+
+    /// An uninitialised storage buffer of `bytes` (at least 16).
+    ///
+    /// # Errors
+    /// When it exceeds the adapter's binding limit; `what` names it.
+    pub fn storage(&self, what: &str, bytes: u64) -> Result<wgpu::Buffer> {
+        let size = bytes.max(16).next_multiple_of(16);
+        if size > self.max_binding {
+            let mib = |b: u64| b.div_ceil(1 << 20);
+            return Err(Error::TooLarge(format!(
+                "{what} needs {} MiB, but '{}' binds at most {} MiB at once; lower --size or --budget",
+                mib(size),
+                self.name,
+                mib(self.max_binding)
+            )));
+        }
+        Ok(self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some(what),
+            size,
+            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        }))
+    }
+
+    /// A storage buffer with the given content.
+    ///
+    /// # Errors
+    /// As [`Self::storage`].
+    pub fn storage_with<T: bytemuck::Pod>(&self, what: &str, data: &[T]) -> Result<wgpu::Buffer> {
+        let bytes: &[u8] = bytemuck::cast_slice(data);
+        let buffer = self.storage(what, bytes.len() as u64)?;
+        self.queue.write_buffer(&buffer, 0, bytes);
+        Ok(buffer)
+    }
+
+    /// A uniform buffer with the given content.
+    pub fn uniform<T: bytemuck::Pod>(&self, value: &T) -> wgpu::Buffer {
+        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("uniform"),
+            size: size_of::<T>() as u64,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(value));
+        buffer
+    }
+
+    /// Starts recording.
+    pub fn encoder(&self) -> wgpu::CommandEncoder {
+        self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
+    }
+
+    /// Submits what was recorded.
+    pub fn submit(&self, encoder: wgpu::CommandEncoder) {
+        self.queue.submit([encoder.finish()]);
+    }
+
+    /// Reads `count` values from the start of a buffer, after all submitted work.
+    ///
+    /// # Errors
+    /// When the device failed since the last call.
+    pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, count: usize) -> Result<Vec<T>> {
+        let bytes = ((count * size_of::<T>()) as u64).next_multiple_of(4);
+        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("read"),
+            size: bytes.max(4),
+            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        let mut encoder = self.encoder();
+        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
+        self.submit(encoder);
+        staging.map_async(wgpu::MapMode::Read, .., |_| {});
+        let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
+        let failed = |reason: String| Error::Device { device: self.name.clone(), reason };
+        waited.map_err(|e| failed(e.to_string()))?;
+        if let Some(reason) = self.failure.lock().expect("no panic while holding the lock").take() {
+            return Err(failed(reason));
+        }
+        let view = staging.get_mapped_range(..).map_err(|e| failed(e.to_string()))?;
+        Ok(view[..count * size_of::<T>()].chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect())
+    }
+}

@@ -1,0 +1,65 @@
+//! First Gaussians: from points, or at worst at random in what the cameras see together.
+
+use fastlgs_core::dataset::SfmPoint;
+use fastlgs_core::rng::Rng;
+use fastlgs_core::{Camera, Gaussians};
+use glam::Vec3;
+use kiddo::{KdTree, SquaredEuclidean};
+
+/// One isotropic Gaussian a point, as wide as the mean distance to its three nearest neighbours (3DGS).
+pub fn from_points(points: &[SfmPoint]) -> Gaussians {
+    let mut tree: KdTree<f64, 3> = KdTree::new();
+    for (i, p) in points.iter().enumerate() {
+        tree.add(&p.position.as_dvec3().to_array(), i as u64);
+    }
+    let mut scene = Gaussians::default();
+    for p in points {
+        let near = tree.nearest_n::<SquaredEuclidean>(&p.position.as_dvec3().to_array(), 4);
+        let others = near.iter().skip(1).map(|n| n.distance);
+        let mean_square = others.sum::<f64>() / near.len().saturating_sub(1).max(1) as f64;
+        let radius = (mean_square.sqrt() as f32).clamp(1e-6, 1e3);
+        scene.push_sphere(p.position, radius, 0.1, p.color.map(|c| f32::from(c) / 255.0));
+    }
+    scene
+}
+
+/// `count` grey points in front of random cameras, at depths around their distance to the cameras' common focus.
+pub fn random_points(cameras: &[Camera], count: usize, rng: &mut Rng) -> Vec<SfmPoint> {
+    let focus = common_focus(cameras);
+    (0..count)
+        .map(|_| {
+            let camera = &cameras[rng.below(cameras.len())];
+            let pixel = glam::Vec2::new(rng.uniform() * camera.width as f32, rng.uniform() * camera.height as f32);
+            let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
+            let position = camera.world_to_camera.inverse().transform_point3(camera.ray(pixel) * depth);
+            SfmPoint { position, color: [128; 3] }
+        })
+        .collect()
+}
+
+/// The point nearest to all viewing axes (least squares).
+pub fn common_focus(cameras: &[Camera]) -> Vec3 {
+    let (mut a, mut b) = (glam::Mat3::ZERO, Vec3::ZERO);
+    for camera in cameras {
+        let d = camera.forward();
+        let across = glam::Mat3::IDENTITY - glam::Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+        a += across;
+        b += across * camera.centre();
+    }
+    let mean = cameras.iter().map(Camera::centre).sum::<Vec3>() / cameras.len().max(1) as f32;
+    // Parallel axes have no nearest point.
+    if a.determinant().abs() > 1e-4 { a.inverse() * b } else { mean + cameras[0].forward() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn focus_is_where_the_cameras_look() {
+        let target = Vec3::new(0.5, -1.0, 2.0);
+        let eyes = [Vec3::new(4.0, 0.0, 0.0), Vec3::new(0.0, 1.0, -5.0), Vec3::new(-3.0, 0.5, 3.0)];
+        let cameras = eyes.map(|e| Camera::look_at("c", e, target, Vec3::Y, 64, 48, 0.8));
+        assert!((common_focus(&cameras) - target).length() < 1e-3);
+    }
+}

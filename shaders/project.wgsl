@@ -1,0 +1,84 @@
+// Projects every Gaussian: splat (what blending reads), depth key, and how many tiles it touches.
+//
+// params  [CHANNELS][n]     trained values
+// splats  [n][3] vec4       (mean.xy, q.xy) (q.z, opacity, r, g) (b, f0, f1, f2);
+//                           q: the exponent in base 2, q.x dx^2 + q.y dx dy + q.z dy^2
+// depths  [n]               24-bit key, ascending with depth
+// rects   [n][2]            first tile (x | y << 16), end tile (x | y << 16), end excluded
+// touched [n]               number of tiles; 0 for Gaussians that are not drawn
+#import view
+#import channels
+#import covariance
+#import flat
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> params: array<f32>;
+@group(0) @binding(2) var<storage, read_write> splats: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> depths: array<u32>;
+@group(0) @binding(4) var<storage, read_write> rects: array<vec2<u32>>;
+@group(0) @binding(5) var<storage, read_write> touched: array<u32>;
+
+fn param3(channel: u32, i: u32) -> vec3<f32> {
+    let n = view.gaussians;
+    return vec3<f32>(params[channel * n + i], params[(channel + 1u) * n + i], params[(channel + 2u) * n + i]);
+}
+
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let i = flat_group(group, groups) * 64u + lane;
+    let n = view.gaussians;
+    if i >= n {
+        return;
+    }
+    depths[i] = 0xffffffu;
+    touched[i] = 0u;
+    let t = (view.world_to_camera * vec4<f32>(param3(MEAN, i), 1.0)).xyz;
+    // Written so that a NaN is not drawn either.
+    if !(t.z > NEAR) {
+        return;
+    }
+    let opacity = 1.0 / (1.0 + exp(-params[OPACITY * n + i]));
+    if !(opacity >= ALPHA_MIN) {
+        return;
+    }
+    let q = vec4<f32>(params[ROTATION * n + i], params[(ROTATION + 1u) * n + i], params[(ROTATION + 2u) * n + i], params[(ROTATION + 3u) * n + i]);
+    let r = rotation_matrix(q / max(length(q), 1e-12));
+    let s = exp(param3(LOG_SCALE, i));
+    let jw = affine(t, view);
+    // A = J W R S, so that the covariance is A A^T.
+    let ax = (jw.x * r) * s;
+    let ay = (jw.y * r) * s;
+    let cxx = dot(ax, ax) + DILATION;
+    let cxy = dot(ax, ay);
+    let cyy = dot(ay, ay) + DILATION;
+    let det = cxx * cyy - cxy * cxy;
+    let mean = view.focal * t.xy / t.z + view.centre;
+    // Half extents of the ellipse on which alpha falls to ALPHA_MIN.
+    let reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
+    let extent = reach * sqrt(vec2<f32>(cxx, cyy));
+    let finite = det > 0.0 && det < 1e30 && abs(mean.x) < 1e9 && abs(mean.y) < 1e9 && extent.x < 1e9 && extent.y < 1e9;
+    if !finite {
+        return;
+    }
+    let limit = vec2<f32>(view.tiles);
+    let first = vec2<u32>(clamp(floor((mean - extent) / f32(TILE)), vec2<f32>(0.0), limit));
+    let end = vec2<u32>(clamp(floor((mean + extent) / f32(TILE)) + 1.0, vec2<f32>(0.0), limit));
+    let count = (max(end.x, first.x) - first.x) * (max(end.y, first.y) - first.y);
+    if count == 0u {
+        return;
+    }
+    let color = max(vec3<f32>(0.5) + SH_C0 * param3(COLOR, i), vec3<f32>(0.0));
+    var feature = param3(FEATURE, i);
+    if view.depth_as_feature == 1u {
+        feature = vec3<f32>(t.z, 0.0, 0.0);
+    }
+    let log2e = 1.4426950408889634;
+    let conic = vec3<f32>(cyy, -cxy, cxx) / det;
+    splats[3u * i] = vec4<f32>(mean, -0.5 * log2e * conic.x, -log2e * conic.y);
+    splats[3u * i + 1u] = vec4<f32>(-0.5 * log2e * conic.z, opacity, color.r, color.g);
+    splats[3u * i + 2u] = vec4<f32>(color.b, feature);
+    // Positive floats ascend with their bits; sign and the last 7 bits are dropped.
+    depths[i] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);
+    rects[i] = vec2<u32>(first.x | (first.y << 16u), end.x | (end.y << 16u));
+    touched[i] = count;
+}

@@ -1,0 +1,17 @@
+// Serial chunks: invocation t of CHUNKS owns a contiguous part of n items. Stable, free of atomics and barriers,
+// and what eight-lane software devices do best.
+const CHUNKS: u32 = 256u;
+
+struct Job {
+    // Number of items.
+    n: u32,
+    // Bits that a radix digit is shifted by.
+    shift: u32,
+    // 1: values are made up as 0, 1, 2, ... instead of read.
+    first: u32,
+    unused: u32,
+}
+
+fn chunk_length(n: u32) -> u32 {
+    return (n + CHUNKS - 1u) / CHUNKS;
+}
