@@ -1,1 +1,21 @@
-//! stub
+//! The semantic feature grid of FastLGS: masks become objects ([`mapping`]), objects get low-dimensional codes
+//! ([`codes`]) and keep all their embeddings ([`grid`]), and a text finds its object ([`relevancy`], [`query`]).
+
+pub mod codes;
+pub mod grid;
+pub mod mapping;
+pub mod query;
+pub mod relevancy;
+
+pub use grid::{Grid, Object};
+
+/// Errors of the grid.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Files.
+    #[error(transparent)]
+    Core(#[from] fastlgs_core::Error),
+}
+
+/// Result of the grid crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;

@@ -108,7 +108,7 @@ fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
 /// One round: prune the faint, clone small and split large coarse Gaussians within the budget.
 pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rng: &mut Rng) -> Counts {
     let n = state.len();
-    let keep: Vec<bool> = (0..n).map(|i| state.opacity(i) >= config.min_opacity && state.largest_scale(i) < extent * 10.0).collect();
+    let keep: Vec<bool> = (0..n).map(|i| state.opacity(i) >= config.min_opacity).collect();
     let kept = keep.iter().filter(|k| **k).count();
     let mut counts = Counts { pruned: n - kept, ..Counts::default() };
     let mut coarse = vec![false; n];

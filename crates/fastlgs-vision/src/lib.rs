@@ -1,1 +1,46 @@
-//! stub
+//! Eyes of FastLGS: segmenters, image and text encoders (ONNX Runtime), and key points (SIFT).
+//!
+//! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
+
+pub mod conse;
+pub mod crops;
+pub mod edges;
+pub mod encoder;
+pub mod histogram;
+pub mod keypoints;
+pub mod models;
+pub mod regions;
+mod runtime;
+pub mod segmenter;
+pub mod text;
+pub mod triangulate;
+
+pub use conse::Conse;
+pub use encoder::{Encoder, TextEncoder};
+pub use segmenter::{OfflineSegmenter, Segmentation, Segmenter};
+pub use text::MiniLm;
+
+/// Errors of the vision crate.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Weights or the ONNX Runtime library are not installed.
+    #[error("{0}")]
+    Missing(String),
+    /// ONNX Runtime refused a model or an input.
+    #[error("{model}: {reason}")]
+    Inference {
+        /// File of the model.
+        model: String,
+        /// What ONNX Runtime said.
+        reason: String,
+    },
+    /// Data that does not fit.
+    #[error("{0}")]
+    Invalid(String),
+    /// Files.
+    #[error(transparent)]
+    Core(#[from] fastlgs_core::Error),
+}
+
+/// Result of the vision crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;

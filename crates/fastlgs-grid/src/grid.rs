@@ -1,0 +1,116 @@
+//! The object table: for each object its code and the embeddings of all its views.
+
+use crate::mapping::Mask;
+use crate::{Result, codes};
+use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use fastlgs_core::{Error, SceneFolder, fs};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+
+/// One object.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Object {
+    /// Number, 1..=K.
+    pub id: u16,
+    /// Code in (0, 1)^3.
+    pub code: Vec3,
+    /// Embeddings of its masks, each L2-normalised.
+    pub embeddings: Vec<Vec<f32>>,
+    /// Share of its photo that each of those masks covered.
+    pub areas: Vec<f32>,
+    /// Photos that show it.
+    pub views: usize,
+}
+
+/// All objects of a scene.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Grid {
+    /// In order of id.
+    pub objects: Vec<Object>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Row {
+    id: u16,
+    code: [f32; 3],
+    views: usize,
+    /// Rows of the embedding table: first and number.
+    first: usize,
+    count: usize,
+}
+
+impl Grid {
+    /// Gathers the masks of each object.
+    pub fn build(masks: &[Mask], object_of: &[u16], count: u16, seed: u64) -> Self {
+        let codes = codes::lattice(usize::from(count), seed);
+        let objects = (1..=count)
+            .map(|id| {
+                let own: Vec<&Mask> = masks.iter().zip(object_of).filter(|(_, o)| **o == id).map(|(m, _)| m).collect();
+                let views = own.iter().map(|m| m.view).collect::<std::collections::BTreeSet<_>>().len();
+                let seen: Vec<&Mask> = own.into_iter().filter(|m| m.embedding.iter().any(|v| *v != 0.0)).collect();
+                Object {
+                    id,
+                    code: codes[usize::from(id) - 1],
+                    embeddings: seen.iter().map(|m| m.embedding.clone()).collect(),
+                    areas: seen.iter().map(|m| m.area).collect(),
+                    views,
+                }
+            })
+            .collect();
+        Self { objects }
+    }
+
+    /// The object whose code is nearest to a rendered feature, with the distance on the 0..255 scale.
+    pub fn nearest(&self, feature: Vec3) -> Option<(u16, f32)> {
+        let distances = self.objects.iter().map(|o| (o.id, codes::distance(feature, o.code)));
+        distances.min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// Writes `grid.safetensors` and then `grid.json`.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save(&self, folder: &SceneFolder) -> Result<()> {
+        let dimension = self.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next().unwrap_or(0);
+        let (mut embeddings, mut areas, mut rows) = (Vec::new(), Vec::new(), Vec::new());
+        for o in &self.objects {
+            rows.push(Row { id: o.id, code: o.code.to_array(), views: o.views, first: areas.len(), count: o.areas.len() });
+            embeddings.extend(o.embeddings.iter().flatten().copied());
+            areas.extend(&o.areas);
+        }
+        let n = areas.len();
+        save_tensors(&folder.root.join("grid.safetensors"), &[("embeddings", vec![n, dimension], &embeddings), ("areas", vec![n], &areas)])?;
+        Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
+    }
+
+    /// Reads what [`Self::save`] wrote.
+    ///
+    /// # Errors
+    /// Missing or damaged files.
+    pub fn load(folder: &SceneFolder) -> Result<Self> {
+        let rows: Vec<Row> = fs::read_json(&folder.root.join("grid.json"))?;
+        let path = folder.root.join("grid.safetensors");
+        let tensors = load_tensors(&path)?;
+        let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing")));
+        let (embeddings, areas) = (get("embeddings")?, get("areas")?);
+        let dimension = embeddings.0.get(1).copied().unwrap_or(0);
+        let objects = rows
+            .into_iter()
+            .map(|r| {
+                let range = r.first..r.first + r.count;
+                if range.end > areas.1.len() || range.end * dimension > embeddings.1.len() {
+                    return Err(Error::format(&path, "it does not fit grid.json; run 'fastlgs preprocess' again"));
+                }
+                let own = &embeddings.1[range.start * dimension..range.end * dimension];
+                Ok(Object {
+                    id: r.id,
+                    code: Vec3::from(r.code),
+                    embeddings: own.chunks_exact(dimension.max(1)).map(<[f32]>::to_vec).collect(),
+                    areas: areas.1[range].to_vec(),
+                    views: r.views,
+                })
+            })
+            .collect::<Result<Vec<_>, Error>>()?;
+        Ok(Self { objects })
+    }
+}

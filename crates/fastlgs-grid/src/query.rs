@@ -1,0 +1,119 @@
+//! From a text to objects and from objects to a mask (paper, querying features).
+
+use crate::codes;
+use crate::grid::{Grid, Object};
+use crate::relevancy::TextQuery;
+use glam::Vec3;
+use serde::Serialize;
+
+/// How objects are chosen.
+#[derive(Clone, Copy, Debug)]
+pub struct QueryConfig {
+    /// Score from which an object counts as found.
+    pub min_score: f32,
+    /// At most this many objects.
+    pub top_k: usize,
+    /// Further objects must score within this of the best.
+    pub margin: f32,
+}
+
+/// Calibrated on the offline encoder: see `docs/evaluation.md`.
+pub const MIN_SCORE: f32 = 0.95;
+
+impl Default for QueryConfig {
+    fn default() -> Self {
+        Self { min_score: MIN_SCORE, top_k: 8, margin: 0.02 }
+    }
+}
+
+/// An object with its score.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Hit {
+    /// Object id.
+    pub id: u16,
+    /// Relevancy, 0 to 1.
+    pub score: f32,
+}
+
+/// Score of an object: area-weighted mean relevancy of the better half of its views, so that one good view is enough
+/// company for a second one, and a single outlier is not.
+pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
+    let mut scores: Vec<(f32, f32)> = object.embeddings.iter().map(|e| query.relevancy(e)).zip(object.areas.iter().copied()).collect();
+    scores.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let total: f32 = object.areas.iter().sum();
+    let (mut sum, mut weight) = (0.0, 0.0);
+    for (score, area) in scores {
+        sum += score * area;
+        weight += area;
+        if weight >= 0.5 * total {
+            break;
+        }
+    }
+    if weight > 0.0 { sum / weight } else { 0.0 }
+}
+
+/// All objects, best first.
+pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
+    let mut hits: Vec<Hit> = grid.objects.iter().map(|o| Hit { id: o.id, score: object_score(o, query) }).collect();
+    hits.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.id.cmp(&b.id)));
+    hits
+}
+
+/// The target objects; empty means "not found".
+pub fn select(ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
+    let Some(best) = ranked.first() else { return Vec::new() };
+    let floor = config.min_score.max(best.score - config.margin);
+    ranked.iter().take(config.top_k).filter(|h| h.score >= floor).copied().collect()
+}
+
+/// Object of each pixel from rendered features `[3][h][w]`: the nearest code within `tau_ac`, else 0.
+pub fn restore_objects(grid: &Grid, features: &[f32], tau_ac: f32) -> Vec<u16> {
+    let n = features.len() / 3;
+    (0..n)
+        .map(|p| {
+            let feature = Vec3::new(features[p], features[n + p], features[2 * n + p]);
+            grid.nearest(feature).filter(|(_, d)| *d < tau_ac).map_or(0, |(id, _)| id)
+        })
+        .collect()
+}
+
+/// The paper's target mask: pixels whose feature lies within `tau_ac` of a target's code.
+pub fn mask(grid: &Grid, targets: &[Hit], features: &[f32], tau_ac: f32) -> Vec<bool> {
+    let n = features.len() / 3;
+    let codes: Vec<Vec3> = grid.objects.iter().filter(|o| targets.iter().any(|t| t.id == o.id)).map(|o| o.code).collect();
+    (0..n)
+        .map(|p| {
+            let feature = Vec3::new(features[p], features[n + p], features[2 * n + p]);
+            codes.iter().any(|c| codes::distance(feature, *c) < tau_ac)
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid() -> Grid {
+        let object = |id: u16, e: [f32; 2]| Object { id, code: Vec3::splat(0.25 * f32::from(id)), embeddings: vec![e.to_vec()], areas: vec![0.1], views: 1 };
+        Grid { objects: vec![object(1, [1.0, 0.0]), object(2, [0.0, 1.0])] }
+    }
+
+    #[test]
+    fn the_right_object_is_found_and_absence_is_said() {
+        let query = TextQuery { text: vec![1.0, 0.0], canonical: vec![vec![0.1, 0.1]] };
+        let hits = select(&rank(&grid(), &query), &QueryConfig::default());
+        assert_eq!(hits.iter().map(|h| h.id).collect::<Vec<_>>(), [1]);
+        let absent = TextQuery { text: vec![-1.0, 0.0], canonical: vec![vec![0.1, 0.1]] };
+        assert!(select(&rank(&grid(), &absent), &QueryConfig::default()).is_empty());
+    }
+
+    #[test]
+    fn masks_follow_tau_ac() {
+        // Features: on code 1, within 5/255 of it, midway between both codes, on code 2.
+        let x = [0.25, 0.26, 0.375, 0.5];
+        let features: Vec<f32> = x.iter().chain(&x).chain(&x).copied().collect();
+        let targets = [Hit { id: 1, score: 1.0 }];
+        assert_eq!(mask(&grid(), &targets, &features, codes::TAU_AC), [true, true, false, false]);
+        assert_eq!(restore_objects(&grid(), &features, codes::TAU_AC), [1, 1, 0, 2]);
+    }
+}

@@ -1,0 +1,108 @@
+//! The offline joint space: ConSE (Norouzi et al. 2014). An image's embedding is the probability-weighted mean of the
+//! text embeddings of its ten most likely ImageNet class names. A zero-shot encoder with the limits of 1,000 concepts.
+
+use crate::crops::{self, Surround};
+use crate::encoder::{Encoder, TextEncoder, normalise};
+use crate::runtime::{Input, Model};
+use crate::{MiniLm, Result, models};
+use fastlgs_core::{LabelMap, fs};
+use image::RgbImage;
+
+/// Classes that take part in an embedding.
+const TOP: usize = 10;
+/// Input size of EfficientNet-Lite2.
+const SIZE: usize = 260;
+/// Crops in one inference.
+const BATCH: usize = 8;
+
+/// EfficientNet-Lite2 + MiniLM.
+pub struct Conse {
+    classifier: Model,
+    /// `[1000][384]`, L2-normalised.
+    class_embeddings: Vec<Vec<f32>>,
+    names: Vec<String>,
+}
+
+impl Conse {
+    /// Loads both towers from the cache folder.
+    ///
+    /// # Errors
+    /// When they are not installed.
+    pub fn load() -> Result<Self> {
+        let folder = models::offline_dir();
+        let classifier = Model::load(&folder.join("classifier.onnx"))?;
+        let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
+        let names: Vec<String> = lists.into_iter().map(|n| n.into_iter().next().unwrap_or_default()).collect();
+        let texts: Vec<&str> = names.iter().map(String::as_str).collect();
+        let class_embeddings = MiniLm::load()?.embed(&texts)?;
+        Ok(Self { classifier, class_embeddings, names })
+    }
+
+    /// Class probabilities `[n][1000]` of crops.
+    fn classify(&self, crops: &[crops::Crop]) -> Result<Vec<Vec<f32>>> {
+        let mut out = Vec::with_capacity(crops.len());
+        for batch in crops.chunks(BATCH) {
+            let data = batch.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
+            let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![batch.len(), 3, SIZE, SIZE], data))], "logits")?;
+            out.extend(logits.chunks_exact(shape[1]).map(softmax));
+        }
+        Ok(out)
+    }
+
+    /// The ConSE embedding of class probabilities.
+    fn embedding(&self, probabilities: &[f32]) -> Vec<f32> {
+        let mut order: Vec<usize> = (0..probabilities.len()).collect();
+        order.sort_by(|&a, &b| probabilities[b].total_cmp(&probabilities[a]).then(a.cmp(&b)));
+        let mut sum = vec![0.0; self.class_embeddings[0].len()];
+        for &class in order.iter().take(TOP) {
+            for (s, e) in sum.iter_mut().zip(&self.class_embeddings[class]) {
+                *s += probabilities[class] * e;
+            }
+        }
+        normalise(&mut sum);
+        sum
+    }
+
+    /// The most likely class name of each mask with its probability, for reports.
+    ///
+    /// # Errors
+    /// When inference fails.
+    pub fn describe(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<(String, f32)>> {
+        let best = |p: &Vec<f32>| (0..p.len()).max_by(|&a, &b| p[a].total_cmp(&p[b])).map_or((String::new(), 0.0), |i| (self.names[i].clone(), p[i]));
+        Ok(self.mask_probabilities(photo, masks)?.iter().map(best).collect())
+    }
+
+    /// Mean class probabilities over the two crops of each label 1..=max; empty for labels that do not occur.
+    fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+        let boxes = masks.boxes();
+        let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
+        let views = [Surround::Neutral, Surround::Context];
+        let cut = |&(label, bounds): &(u16, [u32; 4])| views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s));
+        let crops: Vec<_> = present.iter().flat_map(cut).collect();
+        let probabilities = self.classify(&crops)?;
+        let mut out = vec![Vec::new(); usize::from(masks.max())];
+        for ((label, _), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {
+            out[usize::from(*label) - 1] = pair[0].iter().zip(&pair[1]).map(|(a, b)| 0.5 * (a + b)).collect();
+        }
+        Ok(out)
+    }
+}
+
+impl Encoder for Conse {
+    fn name(&self) -> &'static str {
+        "offline"
+    }
+
+    fn embed_masks(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+        let dimension = self.class_embeddings[0].len();
+        let embed = |p: &Vec<f32>| if p.is_empty() { vec![0.0; dimension] } else { self.embedding(p) };
+        Ok(self.mask_probabilities(photo, masks)?.iter().map(embed).collect())
+    }
+}
+
+fn softmax(logits: &[f32]) -> Vec<f32> {
+    let most = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let raw: Vec<f32> = logits.iter().map(|l| (l - most).exp()).collect();
+    let sum: f32 = raw.iter().sum();
+    raw.into_iter().map(|v| v / sum).collect()
+}

@@ -1,0 +1,33 @@
+//! What embeds masks and texts into one space.
+
+use crate::Result;
+use fastlgs_core::LabelMap;
+use image::RgbImage;
+
+/// Embeds the masks of a photo.
+pub trait Encoder {
+    /// Name recorded in the scene; a query must use the text tower of the same encoder.
+    fn name(&self) -> &'static str;
+    /// One L2-normalised embedding for each label 1..=max of the map, in order; zeros for labels that do not occur.
+    ///
+    /// # Errors
+    /// When inference fails.
+    fn embed_masks(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>>;
+}
+
+/// Embeds texts.
+pub trait TextEncoder {
+    /// One L2-normalised embedding a text.
+    ///
+    /// # Errors
+    /// When inference fails.
+    fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>>;
+}
+
+/// Scales a vector to length 1; a zero vector stays.
+pub fn normalise(vector: &mut [f32]) {
+    let length = vector.iter().map(|v| v * v).sum::<f32>().sqrt();
+    if length > 0.0 {
+        vector.iter_mut().for_each(|v| *v /= length);
+    }
+}

