@@ -1,0 +1,208 @@
+//! `fastlgs eval`: accuracy on held-out views. The rules are in `docs/evaluation.md`.
+
+use crate::scene::Scene;
+use crate::{Outcome, report, ui};
+use anyhow::{Context, Result, bail};
+use fastlgs_core::labels::{Label, LabelledView};
+use fastlgs_core::scene_folder::is_held_out;
+use fastlgs_core::{image_io, labels, metrics};
+use fastlgs_grid::query::{self, QueryConfig};
+use fastlgs_grid::{Grid, codes};
+use fastlgs_raster::Frame;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs eval scenes/fox --labels photos/fox/labels --json -")]
+pub struct Args {
+    /// Trained scene folder.
+    scene: PathBuf,
+    /// Folder of LERF-OVS label files (one JSON a view); without it only colour is measured.
+    #[arg(long)]
+    labels: Option<PathBuf>,
+    /// Texts that must not be found, one a line; a list of everyday things is built in.
+    #[arg(long, value_name = "FILE")]
+    absent: Option<PathBuf>,
+}
+
+/// Things that are in neither of the project's scenes; those that a label names are left out.
+const ABSENT: [&str; 40] = [
+    "elephant", "airplane", "pizza", "submarine", "toothbrush", "volcano", "guitar", "penguin", "traffic light", "banana", "helicopter",
+    "snowman", "tractor", "sushi", "lighthouse", "giraffe", "microwave oven", "jellyfish", "castle", "sailboat", "hamburger", "parachute",
+    "cactus", "ice cream", "fire engine", "octopus", "washing machine", "canoe", "trombone", "strawberry", "tank", "rocket", "goldfish",
+    "bulldozer", "sunglasses", "stethoscope", "ambulance", "zebra", "broccoli", "umbrella",
+];
+
+#[derive(Default)]
+struct Sums {
+    iou: Vec<f64>,
+    oracle: Vec<f64>,
+    recall: Vec<f64>,
+    boundary: Vec<f64>,
+    localised: Vec<f64>,
+    top1: Vec<f64>,
+    present: Vec<f64>,
+    by_label: BTreeMap<String, Vec<f64>>,
+    first_ms: Vec<f64>,
+    next_ms: Vec<f64>,
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let mut scene = Scene::open(&args.scene, &common.device)?;
+    let grid = scene.grid()?;
+    let (psnr, ssim) = color_quality(&mut scene)?;
+    let views = args.labels.as_deref().map(labels::load).transpose()?.unwrap_or_default();
+    let total: usize = views.iter().map(|v| v.labels.len()).sum();
+    let mut sums = Sums::default();
+    let mut encoder = None;
+    for view in &views {
+        let index = scene.cameras.iter().position(|c| c.name == view.name);
+        let index = index.with_context(|| format!("the label file of '{}' names no view of {}", view.name, args.scene.display()))?;
+        if !is_held_out(index, scene.manifest.holdout) {
+            bail!("'{}' is labelled but was trained on; preprocess with --holdout so that it is held out", view.name);
+        }
+        let camera = scene.cameras[index].clone();
+        scene.render(&camera)?; // compiles the kernels
+        let started = Instant::now();
+        let frame = scene.render(&camera)?;
+        let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        let ids = query::restore_objects(&grid, frame.channels(3, 6), codes::TAU_AC);
+        for (k, label) in view.labels.iter().enumerate() {
+            let ms = score_label(&scene, &grid, &mut encoder, view, label, &frame, &ids, &mut sums)?;
+            if k == 0 { sums.first_ms.push(render_ms + ms) } else { sums.next_ms.push(ms) }
+        }
+    }
+    let absent = absent_scores(args, &scene, &grid, &mut encoder, &views)?;
+    let rejected = absent.iter().filter(|s| **s < f64::from(query::MIN_SCORE)).count();
+    let by_label: BTreeMap<&String, Option<f64>> = sums.by_label.iter().map(|(k, v)| (k, mean(v))).collect();
+    let auroc = metrics::auroc(&sums.present, &absent);
+    let camera = &scene.cameras[0];
+    let value = json!({
+        "scene": args.scene,
+        "views_scored": views.len(),
+        "labels_scored": sums.iou.len(),
+        "labels_total": total,
+        "miou": mean(&sums.iou),
+        "miou_by_label": by_label,
+        "macc": mean(&sums.recall),
+        "boundary_iou": mean(&sums.boundary),
+        "loc_acc": mean(&sums.localised),
+        "oracle_miou": mean(&sums.oracle),
+        "text_top1": mean(&sums.top1),
+        "absent_auroc": if auroc.is_nan() { Value::Null } else { json!(auroc) },
+        "absent_texts": absent.len(),
+        "absent_rejected": rejected,
+        "psnr": psnr,
+        "ssim": ssim,
+        "gaussians": scene.gaussians.len(),
+        "objects": grid.objects.len(),
+        "scene_bytes": scene_bytes(&args.scene),
+        "query_ms_first": mean(&sums.first_ms),
+        "query_ms_next": mean(&sums.next_ms),
+        "size": format!("{}x{}", camera.width, camera.height),
+        "adapter": scene.engine.name(),
+    });
+    report::give(common, &value)?;
+    Ok(Outcome::Done)
+}
+
+/// Mean PSNR and SSIM over the held-out views.
+fn color_quality(scene: &mut Scene) -> Result<(Option<f64>, Option<f64>)> {
+    let (mut psnr, mut ssim) = (Vec::new(), Vec::new());
+    let held_out: Vec<_> = (0..scene.cameras.len()).filter(|&i| is_held_out(i, scene.manifest.holdout)).collect();
+    for i in held_out {
+        let camera = scene.cameras[i].clone();
+        let frame = scene.render(&camera)?;
+        let photo = image_io::to_planar(&scene.folder.photo(&camera.name)?);
+        psnr.push(metrics::psnr(frame.channels(0, 3), &photo));
+        ssim.push(metrics::ssim(frame.channels(0, 3), &photo, camera.width as usize, camera.height as usize));
+    }
+    Ok((mean(&psnr), mean(&ssim)))
+}
+
+/// Scores one label; returns the milliseconds of the query beyond rendering.
+fn score_label(
+    scene: &Scene,
+    grid: &Grid,
+    encoder: &mut Option<fastlgs_vision::MiniLm>,
+    view: &LabelledView,
+    label: &Label,
+    frame: &Frame,
+    ids: &[u16],
+    sums: &mut Sums,
+) -> Result<f64> {
+    let (w, h) = (frame.width, frame.height);
+    let truth = view.mask(label, w, h);
+    if !truth.contains(&true) {
+        bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
+    }
+    if encoder.is_none() {
+        scene.text_query(encoder, "warm up")?;
+    }
+    let started = Instant::now();
+    let text_query = scene.text_query(encoder, &label.category)?;
+    let ranked = query::rank(grid, &text_query);
+    let targets = query::select(&ranked, &QueryConfig::default());
+    let mask = query::mask(grid, &targets, frame.channels(3, 6), codes::TAU_AC);
+    let ms = started.elapsed().as_secs_f64() * 1e3;
+    let iou = metrics::iou(&mask, &truth);
+    sums.iou.push(iou);
+    sums.by_label.entry(label.category.clone()).or_default().push(iou);
+    sums.recall.push(metrics::recall(&mask, &truth));
+    // 2 % of the diagonal, as Cheng et al. propose.
+    let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
+    sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
+    let mut score = vec![0.0; grid.objects.len() + 1];
+    ranked.iter().for_each(|r| score[usize::from(r.id)] = r.score);
+    let nearest = query::restore_objects(grid, frame.channels(3, 6), f32::INFINITY);
+    let relevancy: Vec<f32> = nearest.iter().map(|id| score[usize::from(*id)]).collect();
+    let (sx, sy) = (f64::from(w) / f64::from(view.width), f64::from(h) / f64::from(view.height));
+    let boxes: Vec<[f64; 4]> = label.polygons.iter().map(|p| polygon_box(p, sx, sy)).collect();
+    sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &boxes))));
+    sums.present.push(f64::from(ranked.first().map_or(0.0, |r| r.score)));
+    // Oracle: the best single object. Text top-1: is the first-ranked object one that mostly lies in the label?
+    let present: std::collections::BTreeSet<u16> = ids.iter().copied().filter(|id| *id > 0).collect();
+    let object_iou = |id: u16| metrics::iou(&ids.iter().map(|i| *i == id).collect::<Vec<_>>(), &truth);
+    sums.oracle.push(present.iter().map(|id| object_iou(*id)).fold(0.0, f64::max));
+    let inside = |id: u16| {
+        let (hit, all) = ids.iter().zip(&truth).filter(|(i, _)| **i == id).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+        all > 0 && 2 * hit > all
+    };
+    sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(r.id)))));
+    Ok(ms)
+}
+
+fn polygon_box(polygon: &[[f64; 2]], sx: f64, sy: f64) -> [f64; 4] {
+    polygon.iter().fold([f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY], |b, p| {
+        [b[0].min(p[0] * sx), b[1].min(p[1] * sy), b[2].max(p[0] * sx), b[3].max(p[1] * sy)]
+    })
+}
+
+/// Best scores of texts that name nothing in the scene.
+fn absent_scores(args: &Args, scene: &Scene, grid: &Grid, encoder: &mut Option<fastlgs_vision::MiniLm>, views: &[LabelledView]) -> Result<Vec<f64>> {
+    let texts: Vec<String> = match &args.absent {
+        Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
+        None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
+    };
+    let named = |text: &String| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(text.as_str()));
+    if views.is_empty() {
+        return Ok(Vec::new());
+    }
+    texts
+        .iter()
+        .filter(|t| !t.trim().is_empty() && !named(t))
+        .map(|text| Ok(f64::from(query::rank(grid, &scene.text_query(encoder, text)?).first().map_or(0.0, |h| h.score))))
+        .collect()
+}
+
+/// Bytes of everything that a query needs.
+fn scene_bytes(root: &Path) -> u64 {
+    let files = ["scene.ply", "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"];
+    files.iter().filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
+}

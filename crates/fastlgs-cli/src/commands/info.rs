@@ -1,0 +1,44 @@
+//! `fastlgs info`: devices, or what is in a scene.
+
+use crate::{Outcome, report, ui};
+use anyhow::Result;
+use fastlgs_core::SceneFolder;
+use fastlgs_core::scene_folder::is_held_out;
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs info scenes/fox")]
+pub struct Args {
+    /// Scene folder; without it the machine's devices are listed.
+    scene: Option<PathBuf>,
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let value = match &args.scene {
+        None => serde_json::json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "adapters": fastlgs_raster::adapters(),
+            "cores": std::thread::available_parallelism().map_or(1, usize::from),
+            "sift": fastlgs_vision::keypoints::backend(),
+            "offline_models": fastlgs_vision::models::offline_installed(),
+        }),
+        Some(root) => {
+            let folder = SceneFolder::open(root)?;
+            let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
+            let grid = fastlgs_grid::Grid::load(&folder)?;
+            let held_out = (0..cameras.len()).filter(|&i| is_held_out(i, manifest.holdout)).count();
+            let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
+            serde_json::json!({
+                "scene": root,
+                "views": cameras.len(),
+                "held_out": held_out,
+                "objects": grid.objects.len(),
+                "gaussians": folder.gaussians().map(|g| g.len()).ok(),
+                "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
+                "made_by": manifest,
+            })
+        }
+    };
+    report::give(common, &value)?;
+    Ok(Outcome::Done)
+}

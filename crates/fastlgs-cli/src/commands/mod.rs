@@ -1,0 +1,10 @@
+//! One module a command.
+
+pub mod eval;
+pub mod info;
+pub mod models;
+pub mod preprocess;
+pub mod query;
+pub mod render;
+pub mod synth;
+pub mod train;

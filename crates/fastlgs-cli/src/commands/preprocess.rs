@@ -1,0 +1,290 @@
+//! `fastlgs preprocess`: everything that is done once, before training.
+
+use crate::{Outcome, report, ui};
+use anyhow::{Context, Result, bail};
+use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
+use fastlgs_core::scene_folder::{Manifest, is_held_out, save_tensors};
+use fastlgs_core::undistort::undistort;
+use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
+use fastlgs_grid::Grid;
+use fastlgs_grid::mapping::{self, Correspondences, Mask, PaperConfig};
+use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::triangulate::{self, PairMatches};
+use fastlgs_vision::{Conse, Encoder, OfflineSegmenter, Segmenter, histogram};
+use image::RgbImage;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
+pub struct Args {
+    /// Folder with images/ and poses: sparse/0 (COLMAP) or transforms.json.
+    photos: PathBuf,
+    /// Scene folder to write.
+    #[arg(short, long)]
+    output: PathBuf,
+    /// Longer side of the working photos in pixels.
+    #[arg(long, default_value_t = 960)]
+    max_side: u32,
+    /// Every N-th photo (by sorted name) is kept out of training and mapping; 0 for none.
+    #[arg(long, default_value_t = 8)]
+    holdout: usize,
+    /// What finds masks: `offline` (learned edges) or `import` (PHOTOS/masks/NAME.png, 16-bit labels).
+    #[arg(long, default_value = "offline", value_parser = ["offline", "import"])]
+    segmenter: String,
+    /// What embeds masks.
+    #[arg(long, default_value = "offline", value_parser = ["offline"])]
+    encoder: String,
+    /// Photos that each photo's key points are matched with.
+    #[arg(long, default_value_t = 10)]
+    neighbours: usize,
+    /// Fewest key-point pairs that make two masks one object.
+    #[arg(long, default_value_t = PaperConfig::default().tau)]
+    tau: u32,
+    /// Least similarity that makes two masks one object.
+    #[arg(long, default_value_t = PaperConfig::default().theta)]
+    theta: f32,
+    /// Weight of colour in the similarity.
+    #[arg(long, default_value_t = PaperConfig::default().alpha)]
+    alpha: f32,
+}
+
+/// A working photo: undistorted and scaled.
+struct Photo {
+    camera: Camera,
+    pixels: RgbImage,
+}
+
+/// Masks of one training view.
+struct ViewMasks {
+    /// Index into the training photos.
+    view: usize,
+    labels: LabelMap,
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let started = Instant::now();
+    let mut seconds = BTreeMap::new();
+    let mut clock = Instant::now();
+    let mut lap = |stage: &str| {
+        seconds.insert(format!("preprocess.{stage}"), clock.elapsed().as_secs_f64());
+        clock = Instant::now();
+    };
+    if args.max_side < 64 {
+        bail!("--max-side {} is too small: 64 pixels are the least", args.max_side);
+    }
+    let dataset = dataset::load(&args.photos)?;
+    for warning in &dataset.warnings {
+        tracing::warn!("{warning}");
+    }
+    let folder = SceneFolder::new(&args.output);
+    let photos = load_photos(&dataset, args.max_side, &folder, common)?;
+    let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
+    folder.save_cameras(&cameras)?;
+    let training: Vec<Photo> = photos.into_iter().enumerate().filter(|(i, _)| !is_held_out(*i, args.holdout)).map(|p| p.1).collect();
+    if training.len() < 2 {
+        bail!("{}: only {} photos are left for training; at least 2 are needed", args.photos.display(), training.len());
+    }
+    lap("photos");
+
+    let segmented = segment(args, &training, &folder, common)?;
+    lap("masks");
+    let masks = describe(&training, &segmented, common)?;
+    lap("embeddings");
+    let (keypoints, matches) = match_photos(&training, args.neighbours, common)?;
+    lap("key_points");
+
+    let points = if dataset.points.is_empty() { triangulated(&training, &keypoints, &matches) } else { dataset.points.clone() };
+    folder.save_points(&points)?;
+    let pairs = correspondences(&masks, &segmented, &keypoints, &matches);
+    let config = PaperConfig { tau: args.tau, theta: args.theta, alpha: args.alpha };
+    let (object_of, count) = mapping::paper(&masks, &pairs, &config);
+    let grid = Grid::build(&masks, &object_of, count, common.seed);
+    save_objects(&folder, &training, &segmented, &masks, &object_of)?;
+    save_embeddings(&folder, &masks)?;
+    grid.save(&folder)?;
+    lap("mapping");
+
+    let matched: usize = matches.iter().map(|m| m.pairs.len()).sum();
+    let manifest = Manifest {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        photos: args.photos.clone(),
+        holdout: args.holdout,
+        segmenter: args.segmenter.clone(),
+        encoder: args.encoder.clone(),
+        seed: common.seed,
+        warnings: dataset.warnings.clone(),
+        seconds: seconds.clone(),
+        notes: BTreeMap::new(),
+    };
+    folder.save_manifest(&manifest)?;
+    let value = serde_json::json!({
+        "scene": args.output,
+        "photos": cameras.len(),
+        "training_photos": training.len(),
+        "held_out": cameras.len() - training.len(),
+        "size": format!("{}x{}", cameras[0].width, cameras[0].height),
+        "masks": masks.len(),
+        "objects": count,
+        "key_point_matches": matched,
+        "points": points.len(),
+        "sift": keypoints::backend(),
+        "warnings": dataset.warnings,
+        "seconds": seconds,
+        "seconds_total": started.elapsed().as_secs_f64(),
+    });
+    report::give(common, &value)?;
+    Ok(Outcome::Done)
+}
+
+fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &ui::Common) -> Result<Vec<Photo>> {
+    let bar = ui::bar(common, dataset.photos.len() as u64, "photos");
+    let mut photos = Vec::new();
+    for posed in &dataset.photos {
+        let photo = load_photo(posed, max_side)?;
+        image_io::save_png(&folder.photo_path(&photo.camera.name), photo.pixels.clone())?;
+        photos.push(photo);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(photos)
+}
+
+/// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
+fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
+    let raw = image_io::load_rgb(&posed.path)?;
+    // The file decides the true size; some tools scale photos and leave the poses' file as it was.
+    let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
+    let aspect = f64::from(posed.camera.width) / f64::from(posed.camera.height) * f64::from(raw.height()) / f64::from(raw.width());
+    if (aspect - 1.0).abs() > 0.02 {
+        bail!(
+            "{}: the photo is {}x{}, but its camera is {}x{}; was it rotated or cropped after the poses were made?",
+            posed.path.display(), raw.width(), raw.height(), posed.camera.width, posed.camera.height
+        );
+    }
+    let small = image_io::resize(&raw, camera.width, camera.height);
+    let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
+    Ok(Photo { camera, pixels })
+}
+
+fn segment(args: &Args, training: &[Photo], folder: &SceneFolder, common: &ui::Common) -> Result<Vec<ViewMasks>> {
+    let bar = ui::bar(common, training.len() as u64, "masks");
+    let segmenter = if args.segmenter == "offline" { Some(OfflineSegmenter::load()?) } else { None };
+    let mut out = Vec::new();
+    for (view, photo) in training.iter().enumerate() {
+        let name = &photo.camera.name;
+        let labels = match &segmenter {
+            Some(segmenter) => {
+                let found = segmenter.segment(&photo.pixels).with_context(|| format!("segmenting {name}"))?;
+                found.part.save(&folder.masks_path("part", name))?;
+                found.whole
+            }
+            None => import_masks(args, photo)?,
+        };
+        labels.save(&folder.masks_path("whole", name))?;
+        out.push(ViewMasks { view, labels });
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(out)
+}
+
+/// `PHOTOS/masks/NAME.png`: labels made elsewhere, at any size with the photo's proportions.
+fn import_masks(args: &Args, photo: &Photo) -> Result<LabelMap> {
+    let path = args.photos.join("masks").join(format!("{}.png", photo.camera.name));
+    let map = LabelMap::load(&path)?;
+    if map.max() == 0 {
+        tracing::warn!("{}: the label map is empty", path.display());
+    }
+    Ok(map.resized(photo.camera.width, photo.camera.height))
+}
+
+/// Embedding and colour distribution of every mask, sorted by view and label.
+fn describe(training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) -> Result<Vec<Mask>> {
+    let encoder = Conse::load()?;
+    let bar = ui::bar(common, training.len() as u64, "embeddings");
+    let mut masks = Vec::new();
+    for ViewMasks { view, labels } in segmented {
+        let photo = &training[*view].pixels;
+        let embeddings = encoder.embed_masks(photo, labels)?;
+        let histograms = histogram::histograms(photo, labels);
+        let areas = labels.areas();
+        for (k, (embedding, histogram)) in embeddings.into_iter().zip(histograms).enumerate() {
+            let area = areas[k + 1] as f32 / labels.labels.len() as f32;
+            if area > 0.0 {
+                masks.push(Mask { view: *view, label: k as u16 + 1, area, embedding, histogram });
+            }
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(masks)
+}
+
+fn match_photos(training: &[Photo], neighbours: usize, common: &ui::Common) -> Result<(Vec<Keypoints>, Vec<PairMatches>)> {
+    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let chosen = triangulate::overlapping_pairs(&cameras, neighbours);
+    let bar = ui::bar(common, (training.len() + chosen.len()) as u64, "key points");
+    let mut points = Vec::new();
+    for photo in training {
+        points.push(keypoints::detect(&image::imageops::grayscale(&photo.pixels))?);
+        bar.inc(1);
+    }
+    let mut matches = Vec::new();
+    for (a, b) in chosen {
+        let pairs = keypoints::matches(&points[a], &points[b]);
+        let pairs = triangulate::epipolar_filter((&cameras[a], &points[a]), (&cameras[b], &points[b]), &pairs);
+        matches.push(PairMatches { a, b, pairs });
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok((points, matches))
+}
+
+fn triangulated(training: &[Photo], points: &[Keypoints], matches: &[PairMatches]) -> Vec<dataset::SfmPoint> {
+    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let photos: Vec<RgbImage> = training.iter().map(|p| p.pixels.clone()).collect();
+    triangulate::triangulate(&cameras, points, &photos, matches)
+}
+
+/// Counts the key-point pairs between the masks of matched photos.
+fn correspondences(masks: &[Mask], segmented: &[ViewMasks], points: &[Keypoints], matches: &[PairMatches]) -> Correspondences {
+    let index: BTreeMap<(usize, u16), usize> = masks.iter().enumerate().map(|(i, m)| ((m.view, m.label), i)).collect();
+    let mask_at = |view: usize, point: usize| {
+        let map = &segmented[view].labels;
+        let p = points[view].positions[point];
+        let label = map.at((p.x as u32).min(map.width - 1), (p.y as u32).min(map.height - 1));
+        index.get(&(view, label)).copied()
+    };
+    let mut out = Correspondences::new();
+    for m in matches {
+        for &(i, j) in &m.pairs {
+            if let (Some(a), Some(b)) = (mask_at(m.a, i), mask_at(m.b, j)) {
+                *out.entry((b, a)).or_default() += 1;
+            }
+        }
+    }
+    out
+}
+
+fn save_objects(folder: &SceneFolder, training: &[Photo], segmented: &[ViewMasks], masks: &[Mask], object_of: &[u16]) -> Result<()> {
+    for ViewMasks { view, labels } in segmented {
+        let mut table = vec![0u16; usize::from(labels.max()) + 1];
+        for (mask, object) in masks.iter().zip(object_of).filter(|(m, _)| m.view == *view) {
+            table[usize::from(mask.label)] = *object;
+        }
+        let map = LabelMap { labels: labels.labels.iter().map(|l| table[usize::from(*l)]).collect(), ..*labels };
+        map.save(&folder.objects_path(&training[*view].camera.name))?;
+    }
+    Ok(())
+}
+
+fn save_embeddings(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
+    let dimension = masks.first().map_or(0, |m| m.embedding.len());
+    let embeddings: Vec<f32> = masks.iter().flat_map(|m| m.embedding.iter().copied()).collect();
+    let places: Vec<f32> = masks.iter().flat_map(|m| [m.view as f32, f32::from(m.label)]).collect();
+    let tensors = [("embeddings", vec![masks.len(), dimension], embeddings.as_slice()), ("view_label", vec![masks.len(), 2], &places)];
+    Ok(save_tensors(&folder.root.join("embeddings.safetensors"), &tensors)?)
+}

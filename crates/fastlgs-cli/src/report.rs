@@ -1,0 +1,33 @@
+//! Reports: a table for people, JSON for programs.
+
+use crate::ui::Common;
+use anyhow::{Context, Result};
+use serde_json::Value;
+use std::path::Path;
+
+/// Writes `value` where `--json` says, else as `name value` lines to standard output.
+pub fn give(common: &Common, value: &Value) -> Result<()> {
+    match common.json.as_deref() {
+        Some(path) if path == Path::new("-") => println!("{}", serde_json::to_string_pretty(value)?),
+        Some(path) => fastlgs_core::fs::write_json(path, value).context("writing the report")?,
+        None if common.quiet => {}
+        None => print_table(value, 0),
+    }
+    Ok(())
+}
+
+fn print_table(value: &Value, indent: usize) {
+    let Value::Object(map) = value else { return println!("{value}") };
+    let width = map.keys().map(String::len).max().unwrap_or(0);
+    for (name, value) in map {
+        match value {
+            Value::Object(_) => {
+                println!("{:indent$}{name}", "");
+                print_table(value, indent + 2);
+            }
+            Value::String(text) => println!("{:indent$}{name:width$}  {text}", ""),
+            Value::Number(n) if n.is_f64() => println!("{:indent$}{name:width$}  {:.4}", "", n.as_f64().unwrap_or(f64::NAN)),
+            other => println!("{:indent$}{name:width$}  {other}", ""),
+        }
+    }
+}

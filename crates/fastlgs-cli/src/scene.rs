@@ -1,0 +1,113 @@
+//! An opened, trained scene: what `render`, `query` and `eval` share.
+
+use anyhow::{Context, Result, bail};
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_grid::Grid;
+use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
+use fastlgs_raster::{Engine, Frame, View};
+use fastlgs_vision::{MiniLm, TextEncoder};
+use std::path::{Path, PathBuf};
+
+/// A trained scene on a device.
+pub struct Scene {
+    /// Its folder.
+    pub folder: SceneFolder,
+    /// What made it.
+    pub manifest: Manifest,
+    /// All views, sorted by name.
+    pub cameras: Vec<Camera>,
+    /// The Gaussians.
+    pub gaussians: Gaussians,
+    /// The device, holding the Gaussians.
+    pub engine: Box<dyn Engine>,
+}
+
+impl Scene {
+    /// Loads SCENE and puts it on the device.
+    pub fn open(root: &Path, device: &str) -> Result<Self> {
+        let folder = SceneFolder::open(root)?;
+        let gaussians = folder.gaussians()?;
+        let mut engine = fastlgs_raster::open_engine(device)?;
+        let params = gaussians.to_channels();
+        let zeros = vec![0.0; params.len()];
+        engine.set_state(&params, &zeros, &zeros)?;
+        Ok(Self { manifest: folder.manifest()?, cameras: folder.cameras()?, folder, gaussians, engine })
+    }
+
+    /// The object table.
+    pub fn grid(&self) -> Result<Grid> {
+        Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs preprocess' again")
+    }
+
+    /// Renders colour, feature and transmittance.
+    pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
+        Ok(self.engine.render(View::new(camera, self.gaussians.len()))?)
+    }
+
+    /// Renders the expected depth (sum of w z / sum of w), infinite where nothing is.
+    pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
+        let mut view = View::new(camera, self.gaussians.len());
+        view.depth_as_feature = 1;
+        let frame = self.engine.render(view)?;
+        let solid = |(z, t): (&f32, &f32)| if *t < 0.999 { z / (1.0 - t) } else { f32::INFINITY };
+        Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
+    }
+
+    /// Prepares a text with the encoder that made the scene's embeddings.
+    pub fn text_query(&self, encoder: &mut Option<MiniLm>, text: &str) -> Result<TextQuery> {
+        if self.manifest.encoder != "offline" {
+            bail!("the scene's embeddings were made by the encoder '{}', which this program cannot load", self.manifest.encoder);
+        }
+        if encoder.is_none() {
+            *encoder = Some(MiniLm::load()?);
+        }
+        let mut texts = vec![text];
+        texts.extend(CANONICAL);
+        let mut embeddings = encoder.as_ref().expect("loaded above").embed(&texts)?;
+        let canonical = embeddings.split_off(1);
+        Ok(TextQuery { text: embeddings.remove(0), canonical })
+    }
+}
+
+/// Which cameras a command works on.
+#[derive(clap::Args, Clone)]
+pub struct ViewChoice {
+    /// A view of the scene by its photo's name.
+    #[arg(long, value_name = "NAME")]
+    pub view: Option<String>,
+    /// All views of the scene.
+    #[arg(long, conflicts_with = "view")]
+    pub all_views: bool,
+    /// A camera file: JSON with name, width, height, fx, fy, cx, cy and world_to_camera (16 numbers, column-major).
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["view", "all_views"])]
+    pub camera: Option<PathBuf>,
+    /// Size of the pictures, as WIDTHxHEIGHT.
+    #[arg(long, value_name = "WxH", value_parser = parse_size)]
+    pub size: Option<(u32, u32)>,
+}
+
+impl ViewChoice {
+    /// The cameras; the first view where nothing was chosen.
+    pub fn cameras(&self, scene: &Scene) -> Result<Vec<Camera>> {
+        let chosen = if let Some(path) = &self.camera {
+            vec![Camera::load(path)?]
+        } else if self.all_views {
+            scene.cameras.clone()
+        } else if let Some(name) = &self.view {
+            vec![scene.cameras[scene.folder.view_index(&scene.cameras, name)?].clone()]
+        } else {
+            scene.cameras.first().cloned().into_iter().collect()
+        };
+        if chosen.is_empty() {
+            bail!("{}: the scene has no views", scene.folder.root.display());
+        }
+        Ok(chosen.into_iter().map(|c| self.size.map_or(c.clone(), |(w, h)| c.resized(w, h))).collect())
+    }
+}
+
+/// Parses `640x480`.
+pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
+    let sizes = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
+    sizes.filter(|(w, h)| (1..=16384).contains(w) && (1..=16384).contains(h)).ok_or_else(|| format!("'{text}' is not a size like 640x480"))
+}

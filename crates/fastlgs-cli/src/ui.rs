@@ -1,0 +1,49 @@
+//! Options that every command has, progress bars, and logging.
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use tracing_subscriber::EnvFilter;
+
+/// Options that every command has.
+#[derive(clap::Args, Clone)]
+pub struct Common {
+    /// Tell more (twice: everything).
+    #[arg(short, long, action = clap::ArgAction::Count, global = true)]
+    pub verbose: u8,
+    /// Tell only errors.
+    #[arg(short, long, global = true)]
+    pub quiet: bool,
+    /// Write the report as JSON to FILE, or to standard output with `-`.
+    #[arg(long, value_name = "FILE", global = true)]
+    pub json: Option<PathBuf>,
+    /// Seed of all randomness.
+    #[arg(long, default_value_t = 0, global = true)]
+    pub seed: u64,
+    /// `auto`, `cpu`, or an adapter's name or index (`fastlgs info` lists them).
+    #[arg(long, default_value = "auto", global = true)]
+    pub device: String,
+}
+
+/// Logs go to stderr; `FASTLGS_LOG` overrides the flags.
+pub fn start_logging(common: &Common) {
+    let level = match (common.quiet, common.verbose) {
+        (true, _) => "error",
+        (_, 0) => "warn",
+        (_, 1) => "info,wgpu_core=warn,wgpu_hal=error,ort=warn",
+        _ => "debug,wgpu_core=info,wgpu_hal=warn,naga=info",
+    };
+    let level = if common.verbose == 0 { format!("{level},wgpu_hal=error,ort=error") } else { level.to_owned() };
+    let filter = EnvFilter::try_from_env("FASTLGS_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).without_time().init();
+}
+
+/// A bar on a terminal; nothing elsewhere or with `--quiet`.
+pub fn bar(common: &Common, length: u64, what: &str) -> ProgressBar {
+    let bar = ProgressBar::new(length).with_message(what.to_owned());
+    if common.quiet || !std::io::stderr().is_terminal() {
+        bar.set_draw_target(ProgressDrawTarget::hidden());
+    }
+    bar.set_style(ProgressStyle::with_template("{msg:32!} {bar:30} {pos}/{len} {elapsed} (eta {eta})").expect("a fixed template"));
+    bar
+}
