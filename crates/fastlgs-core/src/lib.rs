@@ -19,6 +19,7 @@ pub mod metrics;
 pub mod ply;
 pub mod rng;
 pub mod scene_folder;
+pub mod synth;
 pub mod turbo;
 pub mod undistort;
 

