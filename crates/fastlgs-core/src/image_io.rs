@@ -12,7 +12,8 @@ use std::path::Path;
 pub fn load_rgb(path: &Path) -> Result<RgbImage> {
     let data = fs::read(path)?;
     let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
-    let decoded = reader.decode().map_err(|e| Error::format(path, format!("the photo cannot be read ({e}); export it again or remove it")))?;
+    let decoded =
+        reader.decode().map_err(|e| Error::format(path, format!("the photo cannot be read ({e}); export it again or remove it")))?;
     Ok(decoded.into_rgb8())
 }
 

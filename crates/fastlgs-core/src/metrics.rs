@@ -144,7 +144,20 @@ pub fn auroc(present: &[f64], absent: &[f64]) -> f64 {
     if present.is_empty() || absent.is_empty() {
         return f64::NAN;
     }
-    let wins: f64 = present.iter().flat_map(|p| absent.iter().map(move |a| if p > a { 1.0 } else if p == a { 0.5 } else { 0.0 })).sum();
+    let wins: f64 = present
+        .iter()
+        .flat_map(|p| {
+            absent.iter().map(move |a| {
+                if p > a {
+                    1.0
+                } else if p == a {
+                    0.5
+                } else {
+                    0.0
+                }
+            })
+        })
+        .sum();
     wins / (present.len() * absent.len()) as f64
 }
 
@@ -165,7 +178,9 @@ mod tests {
 
     #[test]
     fn boundary_band_of_a_square() {
-        let square = |from: usize, to: usize| -> Vec<bool> { (0..400).map(|p| (from..to).contains(&(p % 20)) && (from..to).contains(&(p / 20))).collect() };
+        let square = |from: usize, to: usize| -> Vec<bool> {
+            (0..400).map(|p| (from..to).contains(&(p % 20)) && (from..to).contains(&(p / 20))).collect()
+        };
         // Bands one pixel wide: the ring of an 8x8 square has 28 pixels, that of a 6x6 square 20; disjoint.
         assert_eq!(inner_band(&square(4, 12), 20, 20, 1).iter().filter(|b| **b).count(), 28);
         assert_eq!(boundary_iou(&square(4, 12), &square(4, 12), 20, 20, 1), 1.0);

@@ -9,8 +9,26 @@ use std::io::Write;
 use std::path::Path;
 
 const FLOATS: [&str; 20] = [
-    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0",
-    "rot_1", "rot_2", "rot_3", "feature_0", "feature_1", "feature_2",
+    "x",
+    "y",
+    "z",
+    "nx",
+    "ny",
+    "nz",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+    "feature_0",
+    "feature_1",
+    "feature_2",
 ];
 
 /// Writes the scene atomically.
@@ -27,9 +45,7 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
         for i in 0..scene.len() {
             let (m, c, s, r) = (scene.means[i], scene.sh_dc[i], scene.log_scales[i], scene.rotations[i]);
             let (o, f) = (scene.opacity_logits[i], scene.features[i]);
-            let row = [
-                m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z, o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z,
-            ];
+            let row = [m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z, o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z];
             for value in row {
                 file.write_all(&value.to_le_bytes())?;
             }
@@ -138,7 +154,9 @@ fn header(path: &Path, data: &[u8]) -> Result<Header> {
 /// The vertex rows as columns of f64.
 fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
     let mut table = vec![Vec::new(); header.columns.len()];
-    let short = |i: usize| Error::format(path, format!("truncated: it announces {} Gaussians and ends in number {}; copy it again", header.count, i + 1));
+    let short = |i: usize| {
+        Error::format(path, format!("truncated: it announces {} Gaussians and ends in number {}; copy it again", header.count, i + 1))
+    };
     if header.ascii {
         let text = std::str::from_utf8(&data[header.body.min(data.len())..]).map_err(|_| Error::format(path, "not text"))?;
         let mut words = text.split_whitespace();
@@ -231,7 +249,10 @@ mod tests {
     #[test]
     fn both_byte_orders_and_text() {
         let dir = tempfile::tempdir().unwrap();
-        let names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "extra"];
+        let names = [
+            "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
+            "extra",
+        ];
         let rows: Vec<Vec<f32>> = (0..2).map(|i| (0..names.len()).map(|c| c as f32 * 0.25 + i as f32).collect()).collect();
         let read_as = |format: &str, body: Vec<u8>| {
             let properties: String = names.iter().map(|n| format!("property float {n}\n")).collect();

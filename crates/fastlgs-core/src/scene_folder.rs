@@ -130,7 +130,12 @@ impl SceneFolder {
             (Some(i), None) => Ok(i),
             _ => {
                 let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
-                Err(Error::Invalid(format!("no view '{name}' in {}; it has {} views: {}, ...", self.root.display(), cameras.len(), names.join(", "))))
+                Err(Error::Invalid(format!(
+                    "no view '{name}' in {}; it has {} views: {}, ...",
+                    self.root.display(),
+                    cameras.len(),
+                    names.join(", ")
+                )))
             }
         }
     }
@@ -202,9 +207,11 @@ pub type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 /// # Errors
 /// The system's refusal, or a shape that does not fit its values.
 pub fn save_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])]) -> Result<()> {
-    let views = tensors.iter().map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?)));
+    let views =
+        tensors.iter().map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?)));
     let views: Result<Vec<_>, safetensors::SafeTensorError> = views.collect();
-    let data = views.and_then(|v| safetensors::serialize(v, None)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
+    let data =
+        views.and_then(|v| safetensors::serialize(v, None)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 

@@ -29,7 +29,8 @@ pub struct Room {
 const ROOM: Vec3 = Vec3::new(5.0, 2.0, 5.0);
 
 /// Pictures that the room needs, by file name: all of them ship with scikit-image.
-pub const PICTURES: [(&str, &str); 4] = [("cat", "chelsea.png"), ("coffee", "coffee.png"), ("rocket", "rocket.jpg"), ("astronaut", "astronaut.png")];
+pub const PICTURES: [(&str, &str); 4] =
+    [("cat", "chelsea.png"), ("coffee", "coffee.png"), ("rocket", "rocket.jpg"), ("astronaut", "astronaut.png")];
 /// Textures of floor and walls.
 pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
 

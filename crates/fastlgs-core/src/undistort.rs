@@ -80,8 +80,9 @@ mod tests {
             }
         }
         let ideal = undistort(&photo, &camera, &lens);
-        let columns: Vec<u32> =
-            (20..180).filter_map(|j| (0..200).max_by_key(|&i| ideal.get_pixel(i, j)[0]).filter(|&i| ideal.get_pixel(i, j)[0] > 60)).collect();
+        let columns: Vec<u32> = (20..180)
+            .filter_map(|j| (0..200).max_by_key(|&i| ideal.get_pixel(i, j)[0]).filter(|&i| ideal.get_pixel(i, j)[0] > 60))
+            .collect();
         assert!(columns.len() > 100, "the line is seen in most rows");
         let (low, high) = (columns.iter().min().unwrap(), columns.iter().max().unwrap());
         assert!(high - low <= 2, "columns {low} to {high}");

@@ -79,7 +79,10 @@ impl Grid {
             areas.extend(&o.areas);
         }
         let n = areas.len();
-        save_tensors(&folder.root.join("grid.safetensors"), &[("embeddings", vec![n, dimension], &embeddings), ("areas", vec![n], &areas)])?;
+        save_tensors(
+            &folder.root.join("grid.safetensors"),
+            &[("embeddings", vec![n, dimension], &embeddings), ("areas", vec![n], &areas)],
+        )?;
         Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
     }
 

@@ -94,7 +94,13 @@ mod tests {
     use super::*;
 
     fn grid() -> Grid {
-        let object = |id: u16, e: [f32; 2]| Object { id, code: Vec3::splat(0.25 * f32::from(id)), embeddings: vec![e.to_vec()], areas: vec![0.1], views: 1 };
+        let object = |id: u16, e: [f32; 2]| Object {
+            id,
+            code: Vec3::splat(0.25 * f32::from(id)),
+            embeddings: vec![e.to_vec()],
+            areas: vec![0.1],
+            views: 1,
+        };
         Grid { objects: vec![object(1, [1.0, 0.0]), object(2, [0.0, 1.0])] }
     }
 

@@ -83,7 +83,8 @@ fn floats(data: &[u8]) -> Vec<f32> {
 fn assert_close(what: &str, a: &[f32], b: &[f32], tolerance: f32, flips: f64) {
     assert_eq!(a.len(), b.len(), "{what}: lengths");
     let scale = b.iter().filter(|v| v.is_finite()).fold(0.0f32, |m, v| m.max(v.abs())).max(1e-6);
-    let off = a.iter().zip(b).filter(|(a, b)| !((*a - *b).abs() <= tolerance * (scale * 0.01 + b.abs()) || (a.is_nan() && b.is_nan()))).count();
+    let off =
+        a.iter().zip(b).filter(|(a, b)| !((*a - *b).abs() <= tolerance * (scale * 0.01 + b.abs()) || (a.is_nan() && b.is_nan()))).count();
     let share = off as f64 / a.len().max(1) as f64;
     let worst = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);
     assert!(share <= flips, "{what}: {off} of {} values differ (worst {worst}, scale {scale})", a.len());
@@ -114,7 +115,13 @@ fn project_matches_its_twin() {
         let view = View::new(&camera(w, h), n);
         let twin = projected(&view, &params);
         let zeros = vec![0u8; 48 * n];
-        let out = run_pass(&gpu, &shaders::PROJECT, &view, &[bytes(&params), &zeros, &zeros[..4 * n], &zeros[..8 * n], &zeros[..4 * n]], (n as u32).div_ceil(64));
+        let out = run_pass(
+            &gpu,
+            &shaders::PROJECT,
+            &view,
+            &[bytes(&params), &zeros, &zeros[..4 * n], &zeros[..8 * n], &zeros[..4 * n]],
+            (n as u32).div_ceil(64),
+        );
         let touched = words(&out[4]);
         let flips = touched.iter().zip(&twin.touched).filter(|(a, b)| a != b).count();
         assert!(flips as f64 <= 0.002 * n as f64, "{flips} of {n} tile counts differ");
@@ -211,7 +218,13 @@ fn listing_passes_match_their_twins() {
         let inputs = [bytes(&l.order), bytes(&l.offsets), bytes(&l.p.rects), bytes(&l.p.touched), &zeros[..p4], &zeros[..p4], &zeros[..g4]];
         let out = run_pass(&gpu, &shaders::EMIT, &l.view, &inputs, groups);
         assert_eq!((words(&out[4]), words(&out[5]), words(&out[6])), (l.pair_tiles, l.pair_gaussians, l.first_pair));
-        let out = run_pass(&gpu, &shaders::TILE_RANGES, &l.view, &[bytes(&l.sorted_tiles), &zeros[..8 * l.view.tile_count() as usize]], l.view.pairs.div_ceil(64));
+        let out = run_pass(
+            &gpu,
+            &shaders::TILE_RANGES,
+            &l.view,
+            &[bytes(&l.sorted_tiles), &zeros[..8 * l.view.tile_count() as usize]],
+            l.view.pairs.div_ceil(64),
+        );
         assert_eq!(words(&out[1]), l.ranges);
     }
 }
@@ -226,7 +239,13 @@ fn blending_passes_match_their_twins() {
         view.feature_moves_geometry = 1;
         let l = lists(view, &params);
         let mut frame = vec![0.0; 8 * l.view.pixels()];
-        let out = run_pass(&gpu, &shaders::BLEND, &l.view, &[bytes(&l.ranges), bytes(&l.sorted_pairs), bytes(&l.pair_gaussians), bytes(&l.p.splats), bytes(&frame)], l.view.tile_count());
+        let out = run_pass(
+            &gpu,
+            &shaders::BLEND,
+            &l.view,
+            &[bytes(&l.ranges), bytes(&l.sorted_pairs), bytes(&l.pair_gaussians), bytes(&l.p.splats), bytes(&frame)],
+            l.view.tile_count(),
+        );
         cpu::blend(&l.view, &l.ranges, &l.sorted_pairs, &l.pair_gaussians, &l.p.splats, &mut frame);
         let visible = 7 * l.view.pixels();
         assert_close("frame", &floats(&out[4])[..visible], &frame[..visible], 1e-3, 0.001);
@@ -234,14 +253,30 @@ fn blending_passes_match_their_twins() {
         let mut rng = Rng::new(2, "gradient");
         let gradient: Vec<f32> = (0..6 * l.view.pixels()).map(|_| rng.normal()).collect();
         let mut slots: Vec<Splat> = vec![[[9.0; 4]; 3]; l.view.pairs as usize];
-        let inputs = [bytes(&l.ranges), bytes(&l.sorted_pairs), bytes(&l.pair_gaussians), bytes(&l.p.splats), bytes(&frame), bytes(&gradient), bytes(&slots)];
+        let inputs = [
+            bytes(&l.ranges),
+            bytes(&l.sorted_pairs),
+            bytes(&l.pair_gaussians),
+            bytes(&l.p.splats),
+            bytes(&frame),
+            bytes(&gradient),
+            bytes(&slots),
+        ];
         let out = run_pass(&gpu, &shaders::BLEND_BACKWARD, &l.view, &inputs, l.view.tile_count());
         cpu::blend_backward(&l.view, &l.ranges, &l.sorted_pairs, &l.pair_gaussians, &l.p.splats, &frame, &gradient, &mut slots);
         assert_close("slots", &floats(&out[6]), bytemuck::cast_slice(&slots), 0.02, 0.005);
 
         let count = view.gaussians as usize;
         let (mut gradients, mut stats) = (vec![0.0; CHANNELS * count], vec![0.0; 2 * count]);
-        let inputs = [bytes(&params), bytes(&l.p.splats), bytes(&l.p.touched), bytes(&l.first_pair), bytes(&slots), bytes(&gradients), bytes(&stats)];
+        let inputs = [
+            bytes(&params),
+            bytes(&l.p.splats),
+            bytes(&l.p.touched),
+            bytes(&l.first_pair),
+            bytes(&slots),
+            bytes(&gradients),
+            bytes(&stats),
+        ];
         let out = run_pass(&gpu, &shaders::PROJECT_BACKWARD, &l.view, &inputs, view.gaussians.div_ceil(64));
         cpu::project_backward(&l.view, &params, &l.p.splats, &l.p.touched, &l.first_pair, &slots, &mut gradients, &mut stats);
         for c in 0..CHANNELS {
@@ -274,7 +309,13 @@ fn loss_passes_and_adam_match_their_twins() {
         let out = run_pass(&gpu, &shaders::SSIM_BACKWARD_ROWS, &plane, &[bytes(&partials), bytes(&rows)], row_groups);
         cpu::ssim_backward_rows(&plane, &partials, &mut rows);
         assert_close("ssim_backward_rows", &floats(&out[1]), &rows, 1e-3, 0.0);
-        let out = run_pass(&gpu, &shaders::LOSS_GRADIENT, &plane, &[bytes(&frame), bytes(&target), bytes(&rows), bytes(&gradient), bytes(&sums)], column_groups);
+        let out = run_pass(
+            &gpu,
+            &shaders::LOSS_GRADIENT,
+            &plane,
+            &[bytes(&frame), bytes(&target), bytes(&rows), bytes(&gradient), bytes(&sums)],
+            column_groups,
+        );
         cpu::loss_gradient(&plane, &frame, &target, &rows, &mut gradient, &mut sums);
         assert_close("loss_gradient", &floats(&out[3]), &gradient, 1e-2, 0.0);
         assert_close("l1 sums", &floats(&out[4]), &sums, 1e-3, 0.0);

@@ -289,7 +289,10 @@ impl Trainer {
         }
         let header: CheckpointHeader = fs::read_json(&header_path)?;
         if header.config != self.config {
-            return Err(Error::Invalid(format!("{}: the checkpoint was made with other options; leave out --resume", header_path.display())));
+            return Err(Error::Invalid(format!(
+                "{}: the checkpoint was made with other options; leave out --resume",
+                header_path.display()
+            )));
         }
         let tensors_path = path.with_extension(format!("{}.safetensors", header.iteration));
         let tensors = load_tensors(&tensors_path)?;

@@ -14,7 +14,7 @@ const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2.
 const SIZE: usize = 260;
 /// Dimensions of the dense embedding.
-pub const DENSE: usize = 24;
+pub const DENSE: usize = 32;
 /// Crops in one inference.
 const BATCH: usize = 8;
 
@@ -23,8 +23,8 @@ pub struct Conse {
     classifier: Model,
     /// `[1000][384]`, L2-normalised.
     class_embeddings: Vec<Vec<f32>>,
-    /// `[1000][DENSE]`: class embeddings under the random projection.
-    projected: Vec<[f32; DENSE]>,
+    /// `[1000][DENSE]`: random projection of logits.
+    projection: Vec<[f32; DENSE]>,
     names: Vec<String>,
 }
 
@@ -41,11 +41,8 @@ impl Conse {
         let texts: Vec<&str> = names.iter().map(String::as_str).collect();
         let class_embeddings = MiniLm::load()?.embed(&texts)?;
         let mut rng = Rng::new(0, "dense projection");
-        let scale = (DENSE as f32).sqrt().recip();
-        let axes: Vec<Vec<f32>> = (0..DENSE).map(|_| (0..class_embeddings[0].len()).map(|_| scale * rng.normal()).collect()).collect();
-        let project = |e: &Vec<f32>| std::array::from_fn(|k| axes[k].iter().zip(e).map(|(a, v)| a * v).sum());
-        let projected = class_embeddings.iter().map(project).collect();
-        Ok(Self { classifier, class_embeddings, projected, names })
+        let projection = names.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
+        Ok(Self { classifier, class_embeddings, projection, names })
     }
 
     /// Class probabilities `[n][1000]` of crops.
@@ -73,9 +70,9 @@ impl Conse {
         sum
     }
 
-    /// What every part of a photo looks like: embeddings on a grid of cells of 32 pixels, projected to
-    /// [`DENSE`] dimensions (a seeded random projection keeps distances). Returns columns, rows and
-    /// `[rows][columns][DENSE]`, each cell of length about 1.
+    /// What every part of a photo looks like: the class logits of cells of 32 pixels, without their mean over the
+    /// photo, projected to [`DENSE`] dimensions (a seeded random projection keeps distances). Returns columns, rows
+    /// and `[rows][columns][DENSE]`.
     ///
     /// # Errors
     /// When inference fails.
@@ -85,14 +82,17 @@ impl Conse {
         for (i, pixel) in photo.pixels().enumerate() {
             (0..3).for_each(|k| data[k * w * h + i] = (f32::from(pixel[k]) - 127.0) / 128.0);
         }
-        let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
-        let (classes, rows, columns) = (shape[1], shape[2], shape[3]);
-        let mut out = Vec::with_capacity(rows * columns * DENSE);
-        for cell in 0..rows * columns {
-            let own: Vec<f32> = (0..classes).map(|c| logits[c * rows * columns + cell]).collect();
-            let probabilities = softmax(&own);
-            for k in 0..DENSE {
-                out.push(probabilities.iter().zip(&self.projected).map(|(p, e)| p * e[k]).sum());
+        let (shape, mut logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
+        let (rows, columns) = (shape[2], shape[3]);
+        let cells = rows * columns;
+        for class in logits.chunks_exact_mut(cells) {
+            let mean = class.iter().sum::<f32>() / cells as f32;
+            class.iter_mut().for_each(|v| *v -= mean);
+        }
+        let mut out = vec![0.0; cells * DENSE];
+        for (class, axes) in logits.chunks_exact(cells).zip(&self.projection) {
+            for (cell, value) in class.iter().enumerate() {
+                out[cell * DENSE..][..DENSE].iter_mut().zip(axes).for_each(|(o, a)| *o += value * a);
             }
         }
         Ok((columns, rows, out))
@@ -103,7 +103,9 @@ impl Conse {
     /// # Errors
     /// When inference fails.
     pub fn describe(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<(String, f32)>> {
-        let best = |p: &Vec<f32>| (0..p.len()).max_by(|&a, &b| p[a].total_cmp(&p[b])).map_or((String::new(), 0.0), |i| (self.names[i].clone(), p[i]));
+        let best = |p: &Vec<f32>| {
+            (0..p.len()).max_by(|&a, &b| p[a].total_cmp(&p[b])).map_or((String::new(), 0.0), |i| (self.names[i].clone(), p[i]))
+        };
         Ok(self.mask_probabilities(photo, masks)?.iter().map(best).collect())
     }
 

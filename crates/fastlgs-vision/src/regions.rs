@@ -1,7 +1,7 @@
 //! A region hierarchy from an edge map: watershed basins merged in the order of their dissimilarity.
 
 use std::cmp::Reverse;
-use std::collections::{BinaryHeap, BTreeMap};
+use std::collections::{BTreeMap, BinaryHeap};
 
 /// Grows basins from the minima of `edges` (row-major, 0..1); returns basin numbers 0.. and how many there are.
 pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize) {
@@ -9,7 +9,9 @@ pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize
     let level: Vec<u32> = edges.iter().map(|e| (e.clamp(0.0, 1.0) * 255.0) as u32).collect();
     let near = |p: usize| {
         let (x, y) = (p % width, p / width);
-        [(x > 0).then(|| p - 1), (x + 1 < width).then(|| p + 1), (y > 0).then(|| p - width), (y + 1 < height).then(|| p + width)].into_iter().flatten()
+        [(x > 0).then(|| p - 1), (x + 1 < width).then(|| p + 1), (y > 0).then(|| p - width), (y + 1 < height).then(|| p + width)]
+            .into_iter()
+            .flatten()
     };
     let mut basin = vec![NONE; level.len()];
     let mut count = 0;
@@ -118,7 +120,8 @@ impl Hierarchy {
                 }
             }
         }
-        let cost = |nodes: &[Node], border: Border, a: usize, b: usize| dissimilarity(border.strength / border.length, &nodes[a], &nodes[b]);
+        let cost =
+            |nodes: &[Node], border: Border, a: usize, b: usize| dissimilarity(border.strength / border.length, &nodes[a], &nodes[b]);
         // Positive floats order like their bits.
         let mut queue = BinaryHeap::new();
         for a in 0..count {
@@ -203,7 +206,13 @@ mod tests {
     fn three_rooms_merge_by_their_walls() {
         // Rooms divided by a weak wall at x = 10 and a strong one at x = 20.
         let (w, h) = (30, 12);
-        let edges: Vec<f32> = (0..w * h).map(|p| match p % w { 10 => 0.3, 20 => 0.9, _ => 0.0 }).collect();
+        let edges: Vec<f32> = (0..w * h)
+            .map(|p| match p % w {
+                10 => 0.3,
+                20 => 0.9,
+                _ => 0.0,
+            })
+            .collect();
         let (basins, count) = watershed(&edges, w, h);
         assert_eq!(count, 3);
         let tree = Hierarchy::build(&basins, count, w, &edges, &vec![0.0; w * h], 1, |edge, _, _| edge);

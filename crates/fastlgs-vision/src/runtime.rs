@@ -37,10 +37,7 @@ impl Model {
         let failed = |e: &dyn std::fmt::Display| Error::Inference { model: name.clone(), reason: e.to_string() };
         let environment = environment()?;
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let mut builder = Session::builder(&environment)
-            .map_err(|e| failed(&e))?
-            .with_intra_threads(threads)
-            .map_err(|e| failed(&e))?;
+        let mut builder = Session::builder(&environment).map_err(|e| failed(&e))?.with_intra_threads(threads).map_err(|e| failed(&e))?;
         let session = builder.commit_from_file(path).map_err(|e| failed(&e))?;
         Ok(Self { name, session: Mutex::new(session) })
     }
@@ -58,7 +55,9 @@ impl Model {
         }
         let mut session = self.session.lock().expect("no panic while holding the lock");
         let outputs = session.run(values).map_err(failed)?;
-        let value = outputs.get(output).ok_or_else(|| Error::Inference { model: self.name.clone(), reason: format!("it has no output '{output}'") })?;
+        let value = outputs
+            .get(output)
+            .ok_or_else(|| Error::Inference { model: self.name.clone(), reason: format!("it has no output '{output}'") })?;
         let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
         Ok((shape.iter().map(|d| *d as usize).collect(), data.to_vec()))
     }

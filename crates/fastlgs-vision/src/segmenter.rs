@@ -1,9 +1,9 @@
 //! Object masks of photos.
 
+use crate::Result;
 use crate::conse::{Conse, DENSE};
 use crate::edges::Hed;
 use crate::regions::{Hierarchy, Node, watershed};
-use crate::Result;
 use fastlgs_core::{LabelMap, image_io};
 use image::RgbImage;
 
@@ -35,14 +35,14 @@ pub struct OfflineSegmenter {
 
 /// Longer side at which edges are found: HED was trained near this size.
 const WORK_SIDE: u32 = 480;
-/// Longer side at which the classifier looks: cells of 32 pixels, so about 28 cells along it.
-const DENSE_SIDE: u32 = 896;
+/// Longer sides at which the classifier looks: cells of 32 pixels, so 15 and 26 cells along it.
+const DENSE_SIDES: [u32; 2] = [480, 832];
 /// Smallest mask as a share of the photo.
 const MIN_AREA: f32 = 0.003;
 /// Features of a pixel: L, a, b, then the dense embedding.
-const FEATURES: usize = 3 + DENSE;
+const FEATURES: usize = 3 + DENSE_SIDES.len() * DENSE;
 /// Between these dissimilarities a region may stand as an object: below, pieces are always joined; above, never.
-const WHOLE_HEIGHTS: [f32; 2] = [0.16, 0.40];
+const WHOLE_HEIGHTS: [f32; 2] = [0.25, 0.45];
 /// The same for parts.
 const PART_HEIGHTS: [f32; 2] = [0.08, 0.20];
 
@@ -57,20 +57,23 @@ impl OfflineSegmenter {
 
     /// Colour and meaning of each pixel of `small`.
     fn features(&self, photo: &RgbImage, small: &RgbImage) -> Result<Vec<f32>> {
-        let large = shrunk(photo, DENSE_SIDE, true);
-        let (columns, rows, dense) = self.classifier.dense(&large)?;
         let (w, h) = (small.width() as usize, small.height() as usize);
+        let scales = DENSE_SIDES.map(|side| self.classifier.dense(&shrunk(photo, side, true)));
+        let scales = scales.into_iter().collect::<Result<Vec<_>>>()?;
         let mut out = Vec::with_capacity(w * h * FEATURES);
         for (p, pixel) in small.pixels().enumerate() {
             out.extend(lab(pixel.0));
-            let at = |x: usize, n: usize, cells: usize| ((x as f32 + 0.5) / n as f32 * cells as f32 - 0.5).clamp(0.0, (cells - 1) as f32);
-            let (u, v) = (at(p % w, w, columns), at(p / w, h, rows));
-            let (i, j) = (u as usize, v as usize);
-            let (i1, j1) = ((i + 1).min(columns - 1), (j + 1).min(rows - 1));
-            let (fu, fv) = (u.fract(), v.fract());
-            for k in 0..DENSE {
-                let cell = |i: usize, j: usize| dense[(j * columns + i) * DENSE + k];
-                out.push((cell(i, j) * (1.0 - fu) + cell(i1, j) * fu) * (1.0 - fv) + (cell(i, j1) * (1.0 - fu) + cell(i1, j1) * fu) * fv);
+            for (columns, rows, dense) in &scales {
+                let at =
+                    |x: usize, n: usize, cells: usize| ((x as f32 + 0.5) / n as f32 * cells as f32 - 0.5).clamp(0.0, (cells - 1) as f32);
+                let (u, v) = (at(p % w, w, *columns), at(p / w, h, *rows));
+                let (i, j, fu, fv) = (u as usize, v as usize, u.fract(), v.fract());
+                let (i1, j1) = ((i + 1).min(columns - 1), (j + 1).min(rows - 1));
+                for k in 0..DENSE {
+                    let cell = |i: usize, j: usize| dense[(j * columns + i) * DENSE + k];
+                    let (upper, lower) = (cell(i, j) * (1.0 - fu) + cell(i1, j) * fu, cell(i, j1) * (1.0 - fu) + cell(i1, j1) * fu);
+                    out.push(upper * (1.0 - fv) + lower * fv);
+                }
             }
         }
         Ok(out)
@@ -116,10 +119,10 @@ fn dissimilarity(edge: f32, a: &Node, b: &Node) -> f32 {
         aa += x * x;
         bb += y * y;
     }
-    let meaning = 1.0 - (dot / (aa * bb).sqrt()).clamp(0.0, 1.0);
+    let meaning = 0.5 - 0.5 * dot / (aa * bb).sqrt();
     let small = a.area.min(b.area);
     let crumbs = small / (small + 300.0);
-    (0.5 * edge + 0.2 * (color / 40.0).min(1.0) + 0.3 * meaning) * crumbs
+    (0.4 * edge + 0.2 * (color / 40.0).min(1.0) + 0.4 * meaning) * crumbs
 }
 
 /// How much a region speaks for being an object: its area times the span of dissimilarity, between `low` and `high`,

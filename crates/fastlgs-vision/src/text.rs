@@ -35,7 +35,10 @@ impl TextEncoder for MiniLm {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
         let mut out = Vec::with_capacity(texts.len());
         for batch in texts.chunks(64) {
-            let encoded = self.tokenizer.encode_batch(batch.to_vec(), true).map_err(|e| Error::Invalid(format!("a text cannot be tokenised: {e}")))?;
+            let encoded = self
+                .tokenizer
+                .encode_batch(batch.to_vec(), true)
+                .map_err(|e| Error::Invalid(format!("a text cannot be tokenised: {e}")))?;
             let length = encoded.iter().map(|e| e.get_ids().len()).max().unwrap_or(1);
             let (mut ids, mut mask) = (Vec::new(), Vec::new());
             for e in &encoded {
@@ -44,7 +47,8 @@ impl TextEncoder for MiniLm {
                 mask.extend((0..length).map(|k| i64::from(k < row.len())));
             }
             let shape = vec![batch.len(), length];
-            let (shape, values) = self.model.run(vec![("ids", Input::Int(shape.clone(), ids)), ("mask", Input::Int(shape, mask))], "embedding")?;
+            let (shape, values) =
+                self.model.run(vec![("ids", Input::Int(shape.clone(), ids)), ("mask", Input::Int(shape, mask))], "embedding")?;
             out.extend(values.chunks_exact(shape[1]).map(<[f32]>::to_vec));
         }
         Ok(out)

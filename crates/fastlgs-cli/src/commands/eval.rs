@@ -29,10 +29,46 @@ pub struct Args {
 
 /// Things that are in neither of the project's scenes; those that a label names are left out.
 const ABSENT: [&str; 40] = [
-    "elephant", "airplane", "pizza", "submarine", "toothbrush", "volcano", "guitar", "penguin", "traffic light", "banana", "helicopter",
-    "snowman", "tractor", "sushi", "lighthouse", "giraffe", "microwave oven", "jellyfish", "castle", "sailboat", "hamburger", "parachute",
-    "cactus", "ice cream", "fire engine", "octopus", "washing machine", "canoe", "trombone", "strawberry", "tank", "rocket", "goldfish",
-    "bulldozer", "sunglasses", "stethoscope", "ambulance", "zebra", "broccoli", "umbrella",
+    "elephant",
+    "airplane",
+    "pizza",
+    "submarine",
+    "toothbrush",
+    "volcano",
+    "guitar",
+    "penguin",
+    "traffic light",
+    "banana",
+    "helicopter",
+    "snowman",
+    "tractor",
+    "sushi",
+    "lighthouse",
+    "giraffe",
+    "microwave oven",
+    "jellyfish",
+    "castle",
+    "sailboat",
+    "hamburger",
+    "parachute",
+    "cactus",
+    "ice cream",
+    "fire engine",
+    "octopus",
+    "washing machine",
+    "canoe",
+    "trombone",
+    "strawberry",
+    "tank",
+    "rocket",
+    "goldfish",
+    "bulldozer",
+    "sunglasses",
+    "stethoscope",
+    "ambulance",
+    "zebra",
+    "broccoli",
+    "umbrella",
 ];
 
 #[derive(Default)]
@@ -185,7 +221,13 @@ fn polygon_box(polygon: &[[f64; 2]], sx: f64, sy: f64) -> [f64; 4] {
 }
 
 /// Best scores of texts that name nothing in the scene.
-fn absent_scores(args: &Args, scene: &Scene, grid: &Grid, encoder: &mut Option<fastlgs_vision::MiniLm>, views: &[LabelledView]) -> Result<Vec<f64>> {
+fn absent_scores(
+    args: &Args,
+    scene: &Scene,
+    grid: &Grid,
+    encoder: &mut Option<fastlgs_vision::MiniLm>,
+    views: &[LabelledView],
+) -> Result<Vec<f64>> {
     let texts: Vec<String> = match &args.absent {
         Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
         None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),

@@ -161,7 +161,11 @@ fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     if (aspect - 1.0).abs() > 0.02 {
         bail!(
             "{}: the photo is {}x{}, but its camera is {}x{}; was it rotated or cropped after the poses were made?",
-            posed.path.display(), raw.width(), raw.height(), posed.camera.width, posed.camera.height
+            posed.path.display(),
+            raw.width(),
+            raw.height(),
+            posed.camera.width,
+            posed.camera.height
         );
     }
     let small = image_io::resize(&raw, camera.width, camera.height);

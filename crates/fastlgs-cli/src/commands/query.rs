@@ -13,7 +13,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n\nExit code 3 means that nothing in the scene matches the text.")]
+#[command(
+    after_help = "Example: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n\nExit code 3 means that nothing in the scene matches the text."
+)]
 pub struct Args {
     /// Trained scene folder.
     scene: PathBuf,

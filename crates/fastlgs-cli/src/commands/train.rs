@@ -45,7 +45,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut manifest = folder.manifest()?;
     let cameras = folder.cameras()?;
     let grid = Grid::load(&folder)?;
-    let training: Vec<Camera> = cameras.iter().enumerate().filter(|(i, _)| !is_held_out(*i, manifest.holdout)).map(|c| c.1.clone()).collect();
+    let training: Vec<Camera> =
+        cameras.iter().enumerate().filter(|(i, _)| !is_held_out(*i, manifest.holdout)).map(|c| c.1.clone()).collect();
     let targets = training.iter().map(|c| target(&folder, c, &grid)).collect::<Result<Vec<_>>>()?;
     let first = first_gaussians(args, &folder, &training, common.seed)?;
     let preset = match args.preset.as_str() {
@@ -117,7 +118,10 @@ fn target(folder: &SceneFolder, camera: &Camera, grid: &Grid) -> Result<Target> 
     let objects = folder.objects(&camera.name)?;
     let n = (camera.width * camera.height) as usize;
     if image.len() != 3 * n || objects.labels.len() != n {
-        anyhow::bail!("{}: photo, masks and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
+        anyhow::bail!(
+            "{}: photo, masks and camera differ in size; run 'fastlgs preprocess' again",
+            folder.photo_path(&camera.name).display()
+        );
     }
     for k in 0..3 {
         image.extend(objects.labels.iter().map(|&id| grid.objects.get(usize::from(id).wrapping_sub(1)).map_or(-1.0, |o| o.code[k])));

@@ -128,9 +128,7 @@ fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     for _ in 0..count {
         let (id, model) = (bytes.u32()?, bytes.u32()?);
         let (width, height) = (bytes.u64()?, bytes.u64()?);
-        let &(name, n) = MODELS
-            .get(model as usize)
-            .ok_or_else(|| Error::format(path, format!("unknown camera model number {model}")))?;
+        let &(name, n) = MODELS.get(model as usize).ok_or_else(|| Error::format(path, format!("unknown camera model number {model}")))?;
         let parameters = (0..n).map(|_| bytes.f64()).collect::<Result<Vec<_>>>()?;
         lenses.insert(id, lens(path, name, width, height, &parameters)?);
     }
@@ -216,9 +214,11 @@ fn images_txt(path: &Path) -> Result<Vec<Registered>> {
             rotation: [number(1)?, number(2)?, number(3)?, number(4)?],
             translation: [number(5)?, number(6)?, number(7)?],
             lens: parse(path, *line, f, 8)?,
-            name: f.get(9..).map(|n| n.join(" ")).filter(|n| !n.is_empty()).ok_or_else(|| {
-                Error::format(path, format!("line {line}: the image's name is missing"))
-            })?,
+            name: f
+                .get(9..)
+                .map(|n| n.join(" "))
+                .filter(|n| !n.is_empty())
+                .ok_or_else(|| Error::format(path, format!("line {line}: the image's name is missing")))?,
         });
     }
     Ok(images)
@@ -230,10 +230,7 @@ fn points_txt(path: &Path) -> Result<Vec<SfmPoint>> {
         .map(|(line, f)| {
             let number = |i| parse::<f32>(path, line, &f, i);
             let byte = |i| parse::<u8>(path, line, &f, i);
-            Ok(SfmPoint {
-                position: Vec3::new(number(1)?, number(2)?, number(3)?),
-                color: [byte(4)?, byte(5)?, byte(6)?],
-            })
+            Ok(SfmPoint { position: Vec3::new(number(1)?, number(2)?, number(3)?), color: [byte(4)?, byte(5)?, byte(6)?] })
         })
         .collect()
 }

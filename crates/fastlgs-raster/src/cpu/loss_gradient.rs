@@ -16,7 +16,13 @@ pub fn loss_gradient(plane: &Plane, frame: &[f32], target: &[f32], rows: &[f32],
             let (x, t) = (frame[at], target[at]);
             let y = if t < 0.0 { x } else { t };
             sums[base + (j / RUN) * w + i] += (x - y).abs();
-            let sign = if x > y { 1.0 } else if x < y { -1.0 } else { 0.0 };
+            let sign = if x > y {
+                1.0
+            } else if x < y {
+                -1.0
+            } else {
+                0.0
+            };
             let d_ssim = by_mean + 2.0 * x * by_square + y * by_product;
             gradient[at] = if t < 0.0 { 0.0 } else { plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim) };
         }

@@ -41,11 +41,8 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
         let f = if view.depth_as_feature == 1 { Vec3::new(t.z, 0.0, 0.0) } else { param3(14) };
         let log2e = std::f32::consts::LOG2_E;
         let (qa, qb, qc) = (cyy / det, -cxy / det, cxx / det);
-        splats[i] = [
-            [mean.x, mean.y, -0.5 * log2e * qa, -log2e * qb],
-            [-0.5 * log2e * qc, opacity, color.x, color.y],
-            [color.z, f.x, f.y, f.z],
-        ];
+        splats[i] =
+            [[mean.x, mean.y, -0.5 * log2e * qa, -log2e * qb], [-0.5 * log2e * qc, opacity, color.x, color.y], [color.z, f.x, f.y, f.z]];
         depths[i] = (t.z.to_bits() >> 7).min(0xff_fffe);
         rects[i] = [first.x | (first.y << 16), end.x | (end.y << 16)];
         touched[i] = count;

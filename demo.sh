@@ -1,0 +1,47 @@
+#!/usr/bin/env bash
+# The main job from photos to answers. Usage: ./demo.sh [PHOTOS]
+# Without an argument it generates a small posed scene first. Pictures and reports go to scenes/NAME.
+set -euo pipefail
+start=$PWD
+cd "$(dirname "$0")"
+./setup.sh
+fastlgs=./target/release/fastlgs
+began=$(date +%s)
+
+if [ $# -gt 0 ]; then
+    photos=$(cd "$start" && realpath -- "$1")
+    name=$(basename "$photos")
+    present=("fox"); absent=("bicycle")
+    if [ "$name" = bonsai ]; then present=("piano" "bicycle" "bonsai tree"); absent=("fox"); fi
+    max_side=480
+else
+    name=room
+    photos=$PWD/scenes/photos-room
+    mkdir -p scenes
+    $fastlgs synth room -o "$photos" --views 40 --size 320x240
+    present=("cat" "coffee" "rocket"); absent=("bicycle")
+    max_side=320
+fi
+scene=scenes/$name
+mkdir -p "$scene"
+
+echo "== preprocess"; $fastlgs preprocess "$photos" -o "$scene" --max-side "$max_side"
+echo "== train";      $fastlgs train "$scene" --preset quick --budget 50000
+labelled=$(ls "$photos/labels" 2>/dev/null | sed 's/\.json$//')
+view=$(echo "$labelled" | head -n 1)
+[ -n "$view" ] && set -- --view "$view" || set --
+echo "== render";     $fastlgs render "$scene" "$@" --what color,depth,feature,objects -o "$scene/pictures"
+for text in "${present[@]}"; do
+    echo "== query \"$text\""
+    $fastlgs query "$scene" "$text" "$@" --heatmap -o "$scene/pictures" || [ $? = 3 ]
+done
+for text in "${absent[@]}"; do
+    echo "== query \"$text\" (not in the scene)"
+    $fastlgs query "$scene" "$text" "$@" || [ $? = 3 ]
+done
+if [ -n "$labelled" ]; then
+    echo "== eval"; $fastlgs eval "$scene" --labels "$photos/labels"
+else
+    echo "== eval"; $fastlgs eval "$scene"
+fi
+echo "demo: $(( $(date +%s) - began )) seconds after set-up; pictures are in $scene/pictures"

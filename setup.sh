@@ -1,0 +1,48 @@
+#!/usr/bin/env bash
+# Installs what FastLGS needs on Debian or Ubuntu and builds it. Safe to run again: it skips what is there.
+set -euo pipefail
+cd "$(dirname "$0")"
+
+say() { printf 'setup: %s\n' "$*"; }
+fail() { printf 'setup: %s\n' "$*" >&2; exit 1; }
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null; then sudo "$@"
+    else fail "root rights are needed for: $* (run this script as root, or install sudo)"; fi
+}
+
+# Vulkan on the CPU, OpenCV with its headers, libclang for its bindings, Python for the one-time weight conversion.
+packages="mesa-vulkan-drivers libvulkan1 libopencv-dev clang libclang-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
+if command -v dpkg-query >/dev/null; then
+    missing=""
+    for p in $packages; do
+        dpkg-query -W -f='${Status}' "$p" 2>/dev/null | grep -q 'install ok installed' || missing="$missing $p"
+    done
+    # A Python outside the package system serves as well.
+    if python3 -c 'import venv, ensurepip' 2>/dev/null; then missing=${missing/ python3-venv/}; missing=${missing/ python3 / }; fi
+    if [ -n "$missing" ]; then
+        say "installing$missing"
+        as_root apt-get update -qq || fail "apt-get update failed: check the network and /etc/apt/sources.list"
+        # shellcheck disable=SC2086
+        DEBIAN_FRONTEND=noninteractive as_root apt-get install -y -qq --no-install-recommends $missing >/dev/null \
+            || fail "apt-get could not install:$missing"
+    fi
+else
+    say "no dpkg here: please see that these are installed: $packages"
+fi
+
+if ! command -v cargo >/dev/null; then
+    [ -f "$HOME/.cargo/env" ] && . "$HOME/.cargo/env"
+fi
+if ! command -v cargo >/dev/null; then
+    say "installing Rust by rustup"
+    curl -sSf https://sh.rustup.rs | sh -s -- -y --profile minimal -c rustfmt -c clippy >/dev/null \
+        || fail "Rust could not be installed; get Rust 1.92 or newer from https://rustup.rs and run this again"
+    . "$HOME/.cargo/env"
+fi
+
+say "building (the first build takes some minutes)"
+cargo build --release --locked --features fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
+say "installing the offline encoders"
+./target/release/fastlgs models install-offline --quiet || fail "the offline encoders could not be installed; the message is above"
+say "ready: $(./target/release/fastlgs --version), devices: $(./target/release/fastlgs info --json - | tr -d '\n ' | sed 's/.*"adapters":\[\([^]]*\)\].*/\1/')"

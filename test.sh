@@ -1,0 +1,13 @@
+#!/usr/bin/env bash
+# Installs what is missing and runs all tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
+set -euo pipefail
+cd "$(dirname "$0")"
+./setup.sh
+export NODEVICE_SELECT=1          # Mesa's device chooser complains where there is no desktop session
+export FASTLGS_REQUIRE_GPU=1      # a missing device is a failure here, not a skip
+cargo fmt --all --check
+cargo clippy --release --locked --all-targets --features fastlgs-cli/opencv --quiet -- -D warnings
+RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps --features fastlgs-cli/opencv --quiet
+# The pure-Rust key points must keep building too.
+cargo check --release --locked --quiet
+cargo test --release --locked --features fastlgs-cli/opencv

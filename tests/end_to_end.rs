@@ -1,0 +1,184 @@
+//! The binary from photos to answers on a generated scene with exact masks, and what it says to bad input.
+//!
+//! Needs the offline models ('fastlgs models install-offline') and any Vulkan device; skips loudly without them
+//! unless FASTLGS_REQUIRE_GPU is set, which makes them a must.
+
+use fastlgs_core::label_map::LabelMap;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+fn fastlgs(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(args).output().expect("the binary starts")
+}
+
+fn json(args: &[&str]) -> Value {
+    let mut all = args.to_vec();
+    all.extend(["--json", "-"]);
+    let output = fastlgs(&all);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{args:?}: {e}"))
+}
+
+/// Fails with exit code 1 and one line that holds all `words`.
+fn fails(args: &[&str], words: &[&str]) {
+    let output = fastlgs(args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{args:?}: {said}");
+    let line = said.lines().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{args:?} gives no message: {said}"));
+    assert!(words.iter().all(|w| line.contains(w)), "{args:?}: '{line}' lacks one of {words:?}");
+    assert!(!said.contains("panicked"), "{said}");
+}
+
+struct Fixture {
+    dir: tempfile::TempDir,
+    photos: PathBuf,
+    scene: PathBuf,
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a UTF-8 path")
+}
+
+/// One small generated scene, preprocessed with its exact masks and trained, shared by the tests.
+fn fixture() -> Option<&'static Fixture> {
+    static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
+    FIXTURE
+        .get_or_init(|| {
+            let ready = json(&["info"]);
+            let complete = ready["offline_models"] == true && ready["adapters"].as_array().is_some_and(|a| !a.is_empty());
+            if !complete {
+                assert!(std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(), "models or device are missing: {ready}");
+                eprintln!("SKIPPED: needs the offline models and a Vulkan device: {ready}");
+                return None;
+            }
+            let dir = tempfile::tempdir().expect("a temporary folder");
+            let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+            json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "160x120"]);
+            let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+            assert_eq!((report["photos"].as_u64(), report["held_out"].as_u64()), (Some(32), Some(4)));
+            let report = json(&["train", text(&scene), "--iterations", "900", "--budget", "15000"]);
+            assert!(report["psnr_held_out"].as_f64().expect("a number") > 19.0, "{report}");
+            Some(Fixture { dir, photos, scene })
+        })
+        .as_ref()
+}
+
+#[test]
+fn exact_masks_give_exact_answers() {
+    let Some(f) = fixture() else { return };
+    let report = json(&["eval", text(&f.scene), "--labels", text(&f.photos.join("labels"))]);
+    assert_eq!(report["views_scored"], 4);
+    assert_eq!(report["labels_scored"], report["labels_total"]);
+    println!("generated room at 160x120: {report}");
+    assert!(report["oracle_miou"].as_f64().expect("a number") > 0.5, "{report}");
+    let answer = json(&["query", text(&f.scene), "cat", "--view", "008", "-o", text(&f.dir.path().join("out")), "--heatmap"]);
+    assert_eq!(answer["found"], true);
+    let mask = LabelMap::load(Path::new(answer["mask"].as_str().expect("a path"))).expect("the mask is a grey PNG");
+    let truth = LabelMap::load(&f.photos.join("masks/008.png.png")).expect("exact masks");
+    let both = mask.labels.iter().zip(&truth.labels).filter(|(m, t)| **m > 0 && **t == 1).count();
+    let either = mask.labels.iter().zip(&truth.labels).filter(|(m, t)| **m > 0 || **t == 1).count();
+    assert!(both as f64 / either as f64 > 0.5, "the cat's IoU is {both} / {either}");
+    assert!(Path::new(answer["heatmap"].as_str().expect("a path")).is_file());
+    let ms = &answer["ms"];
+    assert!(["encode", "render", "restore", "total"].iter().all(|k| ms[k].as_f64().is_some_and(|v| v > 0.0)), "{ms}");
+}
+
+#[test]
+fn absent_things_are_not_found() {
+    let Some(f) = fixture() else { return };
+    let output = fastlgs(&["query", text(&f.scene), "bicycle", "--json", "-"]);
+    assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stdout));
+    let answer: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(answer["found"], false);
+}
+
+#[test]
+fn renders_every_kind_of_picture_and_any_camera() {
+    let Some(f) = fixture() else { return };
+    let out = f.dir.path().join("pictures");
+    let what = ["--what", "color,depth,feature,objects", "-o", text(&out)];
+    let mut args = vec!["render", text(&f.scene), "--view", "008.png"];
+    args.extend(what);
+    json(&args);
+    let (w, h, depth) = fastlgs_core::exr_image::read(&out.join("008.png.depth.exr")).expect("depth");
+    let (_, _, truth) = fastlgs_core::exr_image::read(&f.photos.join("depth/008.png.exr")).expect("exact depth");
+    assert_eq!((w, h), (160, 120));
+    let mut errors: Vec<f32> = depth[0].1.iter().zip(&truth[0].1).map(|(a, b)| (a - b).abs() / b).collect();
+    errors.sort_by(f32::total_cmp);
+    assert!(errors[errors.len() / 2] < 0.1, "median relative depth error {}", errors[errors.len() / 2]);
+    let cameras: Value = serde_json::from_slice(&std::fs::read(f.scene.join("cameras/cameras.json")).expect("cameras")).expect("JSON");
+    let file = f.dir.path().join("camera.json");
+    std::fs::write(&file, cameras[3].to_string()).expect("a temporary file");
+    let report = json(&["render", text(&f.scene), "--camera", text(&file), "--size", "97x61", "-o", text(&out)]);
+    assert_eq!(report["size"], "97x61");
+}
+
+#[test]
+fn bad_input_is_named_and_nothing_is_damaged() {
+    let Some(f) = fixture() else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| dir.path().join(name);
+    let out = at("out");
+    std::fs::create_dir(at("empty")).expect("a folder");
+    fails(&["preprocess", text(&at("empty")), "-o", text(&out)], &["empty", "no poses"]);
+    fails(&["preprocess", text(&at("nowhere")), "-o", text(&out)], &["nowhere", "no such folder"]);
+    fails(&["train", text(&out)], &["not a scene", "preprocess"]);
+
+    // A photo that cannot be decoded, a pose without photo, a photo without pose, NaN in a pose.
+    let transforms = |edit: &dyn Fn(&mut Value)| {
+        let photos = at("photos");
+        let _ = std::fs::remove_dir_all(&photos);
+        std::fs::create_dir_all(photos.join("images")).expect("a folder");
+        let mut value: Value = serde_json::from_slice(&std::fs::read(f.photos.join("transforms.json")).expect("poses")).expect("JSON");
+        value["frames"].as_array_mut().expect("frames").truncate(3);
+        for k in 0..3 {
+            std::fs::copy(f.photos.join(format!("images/00{k}.png")), photos.join(format!("images/00{k}.png"))).expect("a copy");
+        }
+        edit(&mut value);
+        std::fs::write(photos.join("transforms.json"), value.to_string()).expect("a file");
+        photos
+    };
+    let photos = transforms(&|_| {});
+    std::fs::write(photos.join("images/001.png"), b"not a photo").expect("a file");
+    fails(&["preprocess", text(&photos), "-o", text(&out)], &["001.png", "cannot be read"]);
+    let photos = transforms(&|v| v["frames"][1]["transform_matrix"][0][0] = Value::Null);
+    fails(&["preprocess", text(&photos), "-o", text(&out)], &["001.png", "NaN"]);
+    let photos = transforms(&|v| v["frames"].as_array_mut().expect("frames").truncate(0));
+    fails(&["preprocess", text(&photos), "-o", text(&out)], &["transforms.json", "no frames"]);
+    let photos = transforms(&|v| v["frames"][1]["file_path"] = "images/lost.png".into());
+    let output = fastlgs(&["preprocess", text(&photos), "-o", text(&out), "--max-side", "64", "--holdout", "0"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success() && said.contains("lost.png") && said.contains("001.png"), "both are warned about: {said}");
+    fails(&["render", text(&out), "-o", text(&at("r"))], &["never trained"]);
+
+    // A trained scene: unknown view, truncated PLY, and a failed run that leaves the scene as it was.
+    fails(&["render", text(&f.scene), "--view", "nobody.png", "-o", text(&at("r"))], &["nobody.png", "views"]);
+    let copy = at("copy");
+    copy_folder(&f.scene, &copy);
+    let ply = std::fs::read(copy.join("scene.ply")).expect("the scene");
+    fails(&["train", text(&copy), "--init-ply", text(&at("missing.ply")), "--iterations", "1"], &["missing.ply"]);
+    assert_eq!(std::fs::read(copy.join("scene.ply")).expect("the scene"), ply, "a failed run leaves the scene alone");
+    std::fs::write(copy.join("scene.ply"), &ply[..ply.len() - 11]).expect("a file");
+    fails(&["query", text(&copy), "cat"], &["scene.ply", "truncated"]);
+    let cut = std::fs::read(copy.join("grid.safetensors")).expect("the grid");
+    std::fs::write(copy.join("scene.ply"), &ply).expect("a file");
+    std::fs::write(copy.join("grid.safetensors"), &cut[..cut.len() / 2]).expect("a file");
+    fails(&["query", text(&copy), "cat"], &["grid.safetensors"]);
+    fails(&["info", "--device", "nonsense", text(&at("nowhere"))], &["nowhere"]);
+    fails(&["render", text(&f.scene), "--device", "nonsense", "-o", text(&at("r"))], &["nonsense"]);
+    assert_eq!(fastlgs(&["query"]).status.code(), Some(2), "wrong usage");
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("a folder");
+    for entry in std::fs::read_dir(from).expect("a folder").flatten() {
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy_folder(&entry.path(), &target)
+        } else {
+            std::fs::copy(entry.path(), &target).map(|_| ()).expect("a copy")
+        }
+    }
+}
