@@ -71,9 +71,8 @@ fn load_row(x: u32, y: u32) -> Row {
     row.g1 = load(4u, x, y);
     row.g2 = load(5u, x, y);
     row.behind = load_frame(0u, x, y) * row.gr + load_frame(1u, x, y) * row.gg + load_frame(2u, x, y) * row.gb;
-    if view.feature_moves_geometry == 1u {
-        row.behind += load_frame(3u, x, y) * row.g0 + load_frame(4u, x, y) * row.g1 + load_frame(5u, x, y) * row.g2;
-    }
+    let moves = f32(view.feature_moves_geometry);
+    row.behind += moves * (load_frame(3u, x, y) * row.g0 + load_frame(4u, x, y) * row.g1 + load_frame(5u, x, y) * row.g2);
     return row;
 }
 
@@ -85,10 +84,8 @@ fn add(row: ptr<function, Row>, slot: ptr<function, Slot>, dx: vec4<f32>, dy: f3
     let t = (*row).transmittance;
     let alpha = alphas(dx, dy, vec3<f32>(s0.zw, s1.x), s1.y, t);
     let w = alpha * t;
-    var worth = s1.z * (*row).gr + s1.w * (*row).gg + s2.x * (*row).gb;
-    if view.feature_moves_geometry == 1u {
-        worth += s2.y * (*row).g0 + s2.z * (*row).g1 + s2.w * (*row).g2;
-    }
+    let moves = f32(view.feature_moves_geometry) * s2.yzw;
+    let worth = s1.z * (*row).gr + s1.w * (*row).gg + s2.x * (*row).gb + moves.x * (*row).g0 + moves.y * (*row).g1 + moves.z * (*row).g2;
     (*row).behind -= w * worth;
     (*row).transmittance = t - w;
     let unclamped = select(vec4<f32>(0.0), vec4<f32>(1.0), (alpha > vec4<f32>(0.0)) & (alpha < vec4<f32>(ALPHA_MAX)));

@@ -13,26 +13,18 @@
 @group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
 @group(0) @binding(5) var<storage, read_write> sums: array<f32>;
 
-fn blurred(map: u32, column: u32, first: i32) -> array<f32, RUN> {
-    let size = plane.width * plane.height;
-    var input: array<f32, REACH>;
-    for (var k = 0; k < 18; k++) {
-        let j = first + k - 5;
-        input[k] = 0.0;
-        if j >= 0 && j < i32(plane.height) {
-            input[k] = rows[map * size + u32(j) * plane.width + column];
-        }
-    }
-    var window = WINDOW;
-    var out: array<f32, RUN>;
-    for (var o = 0u; o < RUN; o++) {
-        var sum = 0.0;
-        for (var k = 0u; k < 11u; k++) {
-            sum += window[k] * input[o + k];
-        }
-        out[o] = sum;
-    }
-    return out;
+fn at(map: u32, column: u32, j: i32) -> f32 {
+    let row = u32(clamp(j, 0, i32(plane.height) - 1));
+    let value = rows[(map * plane.height + row) * plane.width + column];
+    return select(0.0, value, j >= 0 && j < i32(plane.height));
+}
+
+fn blurred(map: u32, column: u32, first: i32) -> array<f32, 8> {
+    return blur(array<f32, 18>(
+        at(map, column, first - 5), at(map, column, first - 4), at(map, column, first - 3), at(map, column, first - 2), at(map, column, first - 1), at(map, column, first + 0),
+        at(map, column, first + 1), at(map, column, first + 2), at(map, column, first + 3), at(map, column, first + 4), at(map, column, first + 5), at(map, column, first + 6),
+        at(map, column, first + 7), at(map, column, first + 8), at(map, column, first + 9), at(map, column, first + 10), at(map, column, first + 11), at(map, column, first + 12),
+    ));
 }
 
 @compute @workgroup_size(64)
@@ -44,10 +36,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let column = id % plane.width;
     let first = i32((id / plane.width) * RUN);
+    let size = plane.width * plane.height;
     var by_mean = blurred(0u, column, first);
     var by_square = blurred(1u, column, first);
     var by_product = blurred(2u, column, first);
-    let size = plane.width * plane.height;
     var total = 0.0;
     for (var o = 0u; o < RUN; o++) {
         let j = u32(first) + o;

@@ -10,6 +10,27 @@
 @group(0) @binding(2) var<storage, read> target_image: array<f32>;
 @group(0) @binding(3) var<storage, read_write> rows: array<f32>;
 
+// Values outside the picture are 0; loading in any case and choosing afterwards avoids branches.
+fn rendered(base: u32, i: i32) -> f32 {
+    let value = frame[base + u32(clamp(i, 0, i32(plane.width) - 1))];
+    return select(0.0, value, i >= 0 && i < i32(plane.width));
+}
+
+fn wanted(base: u32, i: i32, x: f32) -> f32 {
+    let value = target_image[base + u32(clamp(i, 0, i32(plane.width) - 1))];
+    return select(0.0, select(value, x, value < 0.0), i >= 0 && i < i32(plane.width));
+}
+
+fn store(map: u32, row: u32, first: i32, values: array<f32, 8>) {
+    var v = values;
+    let base = (map * plane.height + row) * plane.width + u32(first);
+    for (var o = 0u; o < RUN; o++) {
+        if u32(first) + o < plane.width {
+            rows[base + o] = v[o];
+        }
+    }
+}
+
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let runs = (plane.width + RUN - 1u) / RUN;
@@ -20,44 +41,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let row = id / runs;
     let first = i32((id % runs) * RUN);
     let size = plane.width * plane.height;
-    let base = row * plane.width;
-    var x: array<f32, REACH>;
-    var y: array<f32, REACH>;
-    for (var k = 0; k < 18; k++) {
-        let i = first + k - 5;
-        x[k] = 0.0;
-        y[k] = 0.0;
-        if i >= 0 && i < i32(plane.width) {
-            let at = plane.channel * size + base + u32(i);
-            x[k] = frame[at];
-            let t = target_image[at];
-            y[k] = select(t, x[k], t < 0.0);
-        }
-    }
-    var window = WINDOW;
-    for (var o = 0u; o < RUN; o++) {
-        let i = u32(first) + o;
-        var mx = 0.0;
-        var my = 0.0;
-        var xx = 0.0;
-        var yy = 0.0;
-        var xy = 0.0;
-        for (var k = 0u; k < 11u; k++) {
-            let w = window[k];
-            let a = x[o + k];
-            let b = y[o + k];
-            mx += w * a;
-            my += w * b;
-            xx += w * a * a;
-            yy += w * b * b;
-            xy += w * a * b;
-        }
-        if i < plane.width {
-            rows[base + i] = mx;
-            rows[size + base + i] = my;
-            rows[2u * size + base + i] = xx;
-            rows[3u * size + base + i] = yy;
-            rows[4u * size + base + i] = xy;
-        }
-    }
+    let base = plane.channel * size + row * plane.width;
+    let x = array<f32, 18>(
+        rendered(base, first - 5), rendered(base, first - 4), rendered(base, first - 3), rendered(base, first - 2), rendered(base, first - 1), rendered(base, first + 0),
+        rendered(base, first + 1), rendered(base, first + 2), rendered(base, first + 3), rendered(base, first + 4), rendered(base, first + 5), rendered(base, first + 6),
+        rendered(base, first + 7), rendered(base, first + 8), rendered(base, first + 9), rendered(base, first + 10), rendered(base, first + 11), rendered(base, first + 12),
+    );
+    let y = array<f32, 18>(
+        wanted(base, first - 5, x[0]), wanted(base, first - 4, x[1]), wanted(base, first - 3, x[2]),
+        wanted(base, first - 2, x[3]), wanted(base, first - 1, x[4]), wanted(base, first + 0, x[5]),
+        wanted(base, first + 1, x[6]), wanted(base, first + 2, x[7]), wanted(base, first + 3, x[8]),
+        wanted(base, first + 4, x[9]), wanted(base, first + 5, x[10]), wanted(base, first + 6, x[11]),
+        wanted(base, first + 7, x[12]), wanted(base, first + 8, x[13]), wanted(base, first + 9, x[14]),
+        wanted(base, first + 10, x[15]), wanted(base, first + 11, x[16]), wanted(base, first + 12, x[17]),
+    );
+    store(0u, row, first, blur(x));
+    store(1u, row, first, blur(y));
+    store(2u, row, first, blur(times(x, x)));
+    store(3u, row, first, blur(times(y, y)));
+    store(4u, row, first, blur(times(x, y)));
 }
