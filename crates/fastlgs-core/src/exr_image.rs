@@ -4,6 +4,9 @@ use crate::{Error, Result, fs};
 use exr::prelude::*;
 use std::path::Path;
 
+/// A named channel with its `[h][w]` values.
+pub type Channel = (String, Vec<f32>);
+
 /// Writes planar float channels, atomically. `channels` pairs each name with `[h][w]` values.
 ///
 /// # Errors
@@ -21,7 +24,7 @@ pub fn write(path: &Path, width: usize, height: usize, channels: &[(&str, &[f32]
 ///
 /// # Errors
 /// [`Error::Format`] when the file is no float EXR.
-pub fn read(path: &Path) -> Result<(usize, usize, Vec<(String, Vec<f32>)>), Error> {
+pub fn read(path: &Path) -> Result<(usize, usize, Vec<Channel>), Error> {
     let image = read_first_flat_layer_from_file(path).map_err(|e| Error::format(path, format!("the EXR cannot be read: {e}")))?;
     let size = image.layer_data.size;
     let channels = image.layer_data.channel_data.list.iter().map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect()));

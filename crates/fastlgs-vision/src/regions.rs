@@ -178,11 +178,11 @@ impl Hierarchy {
         for i in 0..self.nodes.len() {
             let own = value(i);
             best[i] = own;
-            if let Some([a, b]) = self.nodes[i].children {
-                if best[a] + best[b] > own {
-                    best[i] = best[a] + best[b];
-                    whole[i] = false;
-                }
+            if let Some([a, b]) = self.nodes[i].children
+                && best[a] + best[b] > own
+            {
+                best[i] = best[a] + best[b];
+                whole[i] = false;
             }
         }
         let mut stack: Vec<usize> = (0..self.nodes.len()).filter(|&i| self.nodes[i].parent.is_none()).collect();
