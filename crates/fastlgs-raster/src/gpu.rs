@@ -80,7 +80,7 @@ impl Gpu {
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
             slot.lock().expect("no panic while holding the lock").get_or_insert_with(|| e.to_string());
         }));
-        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size.into(), failure })
+        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size, failure })
     }
 
     /// An uninitialised storage buffer of `bytes` (at least 16).
