@@ -116,9 +116,13 @@ mod tests {
 
     #[test]
     fn a_shifted_picture_matches_itself() {
+        // Bright and dark blobs of several sizes at seeded places.
+        let mut rng = fastlgs_core::rng::Rng::new(1, "blobs");
+        let blobs: Vec<[f32; 4]> =
+            (0..150).map(|_| [rng.range(0.0, 280.0), rng.range(0.0, 220.0), rng.range(2.0, 9.0), rng.range(-90.0, 90.0)]).collect();
         let texture = |x: u32, y: u32| {
-            let (x, y) = (f64::from(x), f64::from(y));
-            (127.0 + 60.0 * (0.21 * x + 0.13 * y).sin() * (0.17 * y - 0.07 * x).cos() + 60.0 * (0.013 * x * y).sin()) as u8
+            let at = |b: &[f32; 4]| b[3] * (-((x as f32 - b[0]).powi(2) + (y as f32 - b[1]).powi(2)) / (2.0 * b[2] * b[2])).exp();
+            (127.0 + blobs.iter().map(at).sum::<f32>()).clamp(0.0, 255.0) as u8
         };
         let a = GrayImage::from_fn(240, 200, |x, y| image::Luma([texture(x + 20, y + 10)]));
         let b = GrayImage::from_fn(240, 200, |x, y| image::Luma([texture(x + 28, y + 5)]));
