@@ -2,6 +2,7 @@
 //! ([`codes`]) and keep all their embeddings ([`grid`]), and a text finds its object ([`relevancy`], [`query`]).
 
 pub mod codes;
+pub mod consensus;
 pub mod grid;
 pub mod mapping;
 pub mod query;

@@ -153,14 +153,14 @@ pub struct CpuEngine {
 }
 
 /// Everything the backward passes need of a forward run.
-struct Forward {
+pub(crate) struct Forward {
     view: View,
-    splats: Vec<Splat>,
+    pub splats: Vec<Splat>,
     touched: Vec<u32>,
     first_pair: Vec<u32>,
-    ranges: Vec<u32>,
-    sorted_pairs: Vec<u32>,
-    pair_gaussians: Vec<u32>,
+    pub ranges: Vec<u32>,
+    pub sorted_pairs: Vec<u32>,
+    pub pair_gaussians: Vec<u32>,
     frame: Vec<f32>,
 }
 
@@ -189,11 +189,19 @@ pub(crate) fn tile_bits(view: &View) -> u32 {
 }
 
 impl CpuEngine {
-    fn forward(&self, mut view: View) -> Forward {
+    fn forward(&self, view: View) -> Forward {
+        let mut f = Self::lists_of(&self.params, view);
+        f.frame = vec![0.0; 8 * view.pixels()];
+        cpu::blend(&f.view, &f.ranges, &f.sorted_pairs, &f.pair_gaussians, &f.splats, &mut f.frame);
+        f
+    }
+
+    /// Everything up to blending.
+    pub(crate) fn lists_of(params: &[f32], mut view: View) -> Forward {
         let n = view.gaussians as usize;
         let mut splats = vec![[[0.0; 4]; 3]; n];
         let (mut depths, mut rects, mut touched) = (vec![0; n], vec![[0; 2]; n], vec![0; n]);
-        cpu::project(&view, &self.params, &mut splats, &mut depths, &mut rects, &mut touched);
+        cpu::project(&view, params, &mut splats, &mut depths, &mut rects, &mut touched);
         let order = radix_sort_cpu(&mut depths, 24);
         let mut offsets = vec![0; n];
         cpu::gather_counts(&view, &order, &touched, &mut offsets);
@@ -208,9 +216,7 @@ impl CpuEngine {
         let sorted_pairs = radix_sort_cpu(&mut tiles, tile_bits(&view));
         let mut ranges = vec![0; 2 * view.tile_count() as usize];
         cpu::tile_ranges(&view, &tiles, &mut ranges);
-        let mut frame = vec![0.0; 8 * view.pixels()];
-        cpu::blend(&view, &ranges, &sorted_pairs, &pair_gaussians, &splats, &mut frame);
-        Forward { view, splats, touched, first_pair, ranges, sorted_pairs, pair_gaussians, frame }
+        Forward { view, splats, touched, first_pair, ranges, sorted_pairs, pair_gaussians, frame: Vec::new() }
     }
 }
 

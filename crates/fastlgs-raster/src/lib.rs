@@ -13,6 +13,7 @@ mod engine;
 mod gpu;
 mod gpu_engine;
 pub mod init;
+pub mod lift;
 mod pass;
 mod trainer;
 mod view;

@@ -16,6 +16,12 @@ pub(super) fn blocks(tile: u32, view: &View) -> impl Iterator<Item = (u32, u32)>
     (0..8).map(move |lane| (x + (lane & 1) * 4, y + (lane >> 1) * 2)).filter(move |(x, y)| *x < w && *y < h)
 }
 
+/// All pixels of a tile that lie in the picture.
+pub(crate) fn pixels_of(tile: u32, view: &View) -> impl Iterator<Item = (u32, u32)> + use<> {
+    let view = *view;
+    blocks(tile, &view).flat_map(move |(x, y)| block(x, y, &view))
+}
+
 /// Twin of `shaders/blend.wgsl`.
 pub fn blend(view: &View, ranges: &[u32], sorted_pairs: &[u32], pair_gaussians: &[u32], splats: &[Splat], frame: &mut [f32]) {
     let pixels = view.pixels();

@@ -21,6 +21,7 @@ mod tile_ranges;
 
 pub use adam::adam;
 pub use blend::blend;
+pub(crate) use blend::pixels_of;
 pub use blend_backward::blend_backward;
 pub use emit::emit;
 pub use gather_counts::gather_counts;

@@ -1,0 +1,111 @@
+//! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
+
+use crate::cpu;
+use crate::engine::CpuEngine;
+use crate::view::View;
+use fastlgs_core::{Camera, Gaussians, LabelMap};
+use kiddo::{KdTree, SquaredEuclidean};
+use rayon::prelude::*;
+
+/// How much one Gaussian contributes to the pixels of one label of one view: the sum of its blending weights
+/// w = alpha * transmittance, in pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Vote {
+    /// Index of the Gaussian.
+    pub gaussian: u32,
+    /// Label, never 0.
+    pub label: u16,
+    /// Sum of blending weights.
+    pub weight: f32,
+}
+
+/// Votes below this are dust that only costs memory.
+const MIN_WEIGHT: f32 = 0.02;
+
+/// Votes of all Gaussians for the labels of a view, sorted by Gaussian and label. Unlabelled pixels cast none.
+///
+/// # Panics
+/// If map and camera differ in size.
+pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote> {
+    assert_eq!((camera.width, camera.height), (labels.width, labels.height), "the label map has the view's size");
+    let view = View::new(camera, scene.len());
+    let lists = CpuEngine::lists_of(&scene.to_channels(), view);
+    let mut all: Vec<Vote> = (0..view.tile_count())
+        .into_par_iter()
+        .flat_map_iter(|tile| {
+            let range = lists.ranges[2 * tile as usize] as usize..lists.ranges[2 * tile as usize + 1] as usize;
+            let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, labels.at(x, y), 1.0f32)).collect();
+            let mut out = Vec::new();
+            for &e in &lists.sorted_pairs[range] {
+                let gaussian = lists.pair_gaussians[e as usize];
+                let splat = &lists.splats[gaussian as usize];
+                let first = out.len();
+                let mut open = false;
+                for (x, y, label, transmittance) in &mut pixels {
+                    let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
+                    let weight = cpu::alpha(splat, dx, dy, *transmittance) * *transmittance;
+                    *transmittance -= weight;
+                    open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
+                    if weight > 0.0 && *label > 0 {
+                        match out[first..].iter_mut().find(|v: &&mut Vote| v.label == *label) {
+                            Some(vote) => vote.weight += weight,
+                            None => out.push(Vote { gaussian, label: *label, weight }),
+                        }
+                    }
+                }
+                if !open {
+                    break;
+                }
+            }
+            out
+        })
+        .collect();
+    // A stable sort keeps the tiles' order, so that sums are the same in every run.
+    all.sort_by_key(|v| (v.gaussian, v.label));
+    all.dedup_by(|next, kept| {
+        let same = (next.gaussian, next.label) == (kept.gaussian, kept.label);
+        kept.weight += if same { next.weight } else { 0.0 };
+        same
+    });
+    all.retain(|v| v.weight >= MIN_WEIGHT);
+    all
+}
+
+/// Pairs of neighbouring Gaussians (a < b, sorted): each with its `k` nearest by centre.
+pub fn neighbours(scene: &Gaussians, k: usize) -> Vec<(u32, u32)> {
+    let mut tree: KdTree<f64, 3> = KdTree::new();
+    for (i, mean) in scene.means.iter().enumerate() {
+        tree.add(&mean.as_dvec3().to_array(), i as u64);
+    }
+    let mut pairs: Vec<(u32, u32)> = (0..scene.len())
+        .into_par_iter()
+        .flat_map_iter(|i| {
+            let near = tree.nearest_n::<SquaredEuclidean>(&scene.means[i].as_dvec3().to_array(), k + 1);
+            near.into_iter().map(move |n| (n.item as u32, i as u32)).filter(|(a, b)| a != b).map(|(a, b)| (a.min(b), a.max(b)))
+        })
+        .collect();
+    pairs.sort_unstable();
+    pairs.dedup();
+    pairs
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn a_gaussian_votes_for_what_it_covers() {
+        let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let mut scene = Gaussians::default();
+        scene.push_sphere(Vec3::ZERO, 0.2, 0.95, [0.5; 3]);
+        scene.push_sphere(Vec3::new(0.0, 0.0, 2.0), 0.2, 0.95, [0.5; 3]); // mostly hidden behind the first
+        let mut labels = LabelMap::new(64, 48);
+        labels.labels.iter_mut().enumerate().for_each(|(p, l)| *l = if p % 64 < 32 { 1 } else { 2 });
+        let votes = votes(&scene, &camera, &labels);
+        let of = |g: u32, l: u16| votes.iter().find(|v| (v.gaussian, v.label) == (g, l)).map_or(0.0, |v| v.weight);
+        assert!((of(0, 1) - of(0, 2)).abs() < 0.01 * of(0, 1), "the border cuts it in halves");
+        assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden one has little to say");
+        assert_eq!(neighbours(&scene, 1), [(0, 1)]);
+    }
+}
