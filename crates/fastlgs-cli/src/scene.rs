@@ -3,8 +3,9 @@
 use anyhow::{Context, Result, bail};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
-use fastlgs_grid::Grid;
+use fastlgs_grid::query::Decision;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
+use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::{Engine, Frame, View};
 use fastlgs_vision::{MiniLm, TextEncoder};
 use std::path::{Path, PathBuf};
@@ -37,7 +38,7 @@ impl Scene {
 
     /// The object table.
     pub fn grid(&self) -> Result<Grid> {
-        Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs preprocess' again")
+        Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
     }
 
     /// Renders colour, feature and transmittance.
@@ -52,6 +53,16 @@ impl Scene {
         let frame = self.engine.render(view)?;
         let solid = |(z, t): (&f32, &f32)| if *t < 0.999 { z / (1.0 - t) } else { f32::INFINITY };
         Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
+    }
+
+    /// How the scene's rendered features become objects: as it was trained, unless `tau_ac` asks for the paper's way.
+    pub fn decision(&self, tau_ac: Option<f32>) -> Decision {
+        let lifted = self.manifest.notes.get("train").is_some_and(|t| t["feature_mode"] == "lift");
+        match tau_ac {
+            Some(tau) => Decision::Within(tau),
+            None if lifted => Decision::Nearest,
+            None => Decision::Within(codes::TAU_AC),
+        }
     }
 
     /// Prepares a text with the encoder that made the scene's embeddings.

@@ -44,7 +44,11 @@ fn agreement(a: &Seen, b: &Seen) -> f32 {
     while i < a.len() && j < b.len() {
         let (va, vb) = (a[i].0.0, b[j].0.0);
         if va != vb {
-            if va < vb { i += 1 } else { j += 1 }
+            if va < vb {
+                i += 1
+            } else {
+                j += 1
+            }
             continue;
         }
         let (mut dot, mut aa, mut bb, mut wa, mut wb) = (0.0, 0.0, 0.0, 0.0f32, 0.0f32);
@@ -186,7 +190,13 @@ mod tests {
             .map(|g| {
                 let side = u16::from(g >= 6);
                 let label = |view: usize| match view {
-                    2 => if g < 3 { 7 } else { side + 1 },
+                    2 => {
+                        if g < 3 {
+                            7
+                        } else {
+                            side + 1
+                        }
+                    }
                     3 => 9,
                     _ => side + 1,
                 };

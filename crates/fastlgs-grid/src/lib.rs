@@ -3,6 +3,7 @@
 
 pub mod codes;
 pub mod consensus;
+pub mod evidence;
 pub mod grid;
 pub mod mapping;
 pub mod query;

@@ -66,19 +66,35 @@ pub fn select(ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     ranked.iter().take(config.top_k).filter(|h| h.score >= floor).copied().collect()
 }
 
-/// Object of each pixel from rendered features `[3][h][w]`: the nearest code within `tau_ac`, else 0.
-pub fn restore_objects(grid: &Grid, features: &[f32], tau_ac: f32) -> Vec<u16> {
-    let n = features.len() / 3;
-    (0..n)
-        .map(|p| {
-            let feature = Vec3::new(features[p], features[n + p], features[2 * n + p]);
-            grid.nearest(feature).filter(|(_, d)| *d < tau_ac).map_or(0, |(id, _)| id)
-        })
-        .collect()
+/// How a rendered feature becomes an object.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Decision {
+    /// The paper's: the feature lies within this distance (0..255 scale) of the code.
+    Within(f32),
+    /// The nearest code, or none where "no object" (the zero code) is nearer: the strongest share of the blend wins.
+    Nearest,
 }
 
-/// The paper's target mask: pixels whose feature lies within `tau_ac` of a target's code.
-pub fn mask(grid: &Grid, targets: &[Hit], features: &[f32], tau_ac: f32) -> Vec<bool> {
+/// Object of each pixel from rendered features `[3][h][w]`; 0 for none.
+pub fn restore_objects(grid: &Grid, features: &[f32], decision: Decision) -> Vec<u16> {
+    let n = features.len() / 3;
+    let decide = |feature: Vec3| {
+        let limit = match decision {
+            Decision::Within(tau_ac) => tau_ac,
+            Decision::Nearest => codes::SCALE * feature.length(),
+        };
+        grid.nearest(feature).filter(|(_, d)| *d < limit).map_or(0, |(id, _)| id)
+    };
+    (0..n).map(|p| decide(Vec3::new(features[p], features[n + p], features[2 * n + p]))).collect()
+}
+
+/// The target mask: pixels that belong to one of the targets.
+///
+/// With [`Decision::Within`] each target's code is compared on its own, as in the paper.
+pub fn mask(grid: &Grid, targets: &[Hit], features: &[f32], decision: Decision) -> Vec<bool> {
+    let Decision::Within(tau_ac) = decision else {
+        return restore_objects(grid, features, decision).iter().map(|id| targets.iter().any(|t| t.id == *id)).collect();
+    };
     let n = features.len() / 3;
     let codes: Vec<Vec3> = grid.objects.iter().filter(|o| targets.iter().any(|t| t.id == o.id)).map(|o| o.code).collect();
     (0..n)
@@ -119,7 +135,9 @@ mod tests {
         let x = [0.25, 0.26, 0.375, 0.5];
         let features: Vec<f32> = x.iter().chain(&x).chain(&x).copied().collect();
         let targets = [Hit { id: 1, score: 1.0 }];
-        assert_eq!(mask(&grid(), &targets, &features, codes::TAU_AC), [true, true, false, false]);
-        assert_eq!(restore_objects(&grid(), &features, codes::TAU_AC), [1, 1, 0, 2]);
+        let paper = Decision::Within(codes::TAU_AC);
+        assert_eq!(mask(&grid(), &targets, &features, paper), [true, true, false, false]);
+        assert_eq!(restore_objects(&grid(), &features, paper), [1, 1, 0, 2]);
+        assert_eq!(restore_objects(&grid(), &[0.1, 0.2, 0.1, 0.2, 0.1, 0.2], Decision::Nearest), [0, 1]);
     }
 }

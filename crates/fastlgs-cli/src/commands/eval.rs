@@ -6,8 +6,8 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{image_io, labels, metrics};
-use fastlgs_grid::query::{self, QueryConfig};
-use fastlgs_grid::{Grid, codes};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{self, Decision, QueryConfig};
 use fastlgs_raster::Frame;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -108,7 +108,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         let started = Instant::now();
         let frame = scene.render(&camera)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
-        let ids = query::restore_objects(&grid, frame.channels(3, 6), codes::TAU_AC);
+        let ids = query::restore_objects(&grid, frame.channels(3, 6), scene.decision(None));
         for (k, label) in view.labels.iter().enumerate() {
             let ms = score_label(&scene, &grid, &mut encoder, view, label, &frame, &ids, &mut sums)?;
             if k == 0 { sums.first_ms.push(render_ms + ms) } else { sums.next_ms.push(ms) }
@@ -185,7 +185,7 @@ fn score_label(
     let text_query = scene.text_query(encoder, &label.category)?;
     let ranked = query::rank(grid, &text_query);
     let targets = query::select(&ranked, &QueryConfig::default());
-    let mask = query::mask(grid, &targets, frame.channels(3, 6), codes::TAU_AC);
+    let mask = query::mask(grid, &targets, frame.channels(3, 6), scene.decision(None));
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
     sums.iou.push(iou);
@@ -196,7 +196,7 @@ fn score_label(
     sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
     let mut score = vec![0.0; grid.objects.len() + 1];
     ranked.iter().for_each(|r| score[usize::from(r.id)] = r.score);
-    let nearest = query::restore_objects(grid, frame.channels(3, 6), f32::INFINITY);
+    let nearest = query::restore_objects(grid, frame.channels(3, 6), Decision::Nearest);
     let relevancy: Vec<f32> = nearest.iter().map(|id| score[usize::from(*id)]).collect();
     let (sx, sy) = (f64::from(w) / f64::from(view.width), f64::from(h) / f64::from(view.height));
     let boxes: Vec<[f64; 4]> = label.polygons.iter().map(|p| polygon_box(p, sx, sy)).collect();

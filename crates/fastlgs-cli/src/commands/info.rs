@@ -25,14 +25,14 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         Some(root) => {
             let folder = SceneFolder::open(root)?;
             let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
-            let grid = fastlgs_grid::Grid::load(&folder)?;
+            let objects = fastlgs_grid::Grid::load(&folder).map(|g| g.objects.len()).ok();
             let held_out = (0..cameras.len()).filter(|&i| is_held_out(i, manifest.holdout)).count();
             let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
             serde_json::json!({
                 "scene": root,
                 "views": cameras.len(),
                 "held_out": held_out,
-                "objects": grid.objects.len(),
+                "objects": objects,
                 "gaussians": folder.gaussians().map(|g| g.len()).ok(),
                 "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
                 "made_by": manifest,

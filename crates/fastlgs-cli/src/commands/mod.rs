@@ -3,6 +3,7 @@
 pub mod eval;
 pub mod info;
 pub mod models;
+mod objects;
 pub mod preprocess;
 pub mod query;
 pub mod render;

@@ -3,11 +3,11 @@
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
-use fastlgs_core::scene_folder::{Manifest, is_held_out, save_tensors};
+use fastlgs_core::scene_folder::{Manifest, is_held_out};
 use fastlgs_core::undistort::undistort;
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
-use fastlgs_grid::Grid;
-use fastlgs_grid::mapping::{self, Correspondences, Mask, PaperConfig};
+use fastlgs_grid::evidence;
+use fastlgs_grid::mapping::{Correspondences, Mask};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Conse, Encoder, OfflineSegmenter, Segmenter, histogram};
@@ -40,15 +40,6 @@ pub struct Args {
     /// Photos that each photo's key points are matched with.
     #[arg(long, default_value_t = 10)]
     neighbours: usize,
-    /// Fewest key-point pairs that make two masks one object.
-    #[arg(long, default_value_t = PaperConfig::default().tau)]
-    tau: u32,
-    /// Least similarity that makes two masks one object.
-    #[arg(long, default_value_t = PaperConfig::default().theta)]
-    theta: f32,
-    /// Weight of colour in the similarity.
-    #[arg(long, default_value_t = PaperConfig::default().alpha)]
-    alpha: f32,
 }
 
 /// A working photo: undistorted and scaled.
@@ -99,13 +90,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let points = if dataset.points.is_empty() { triangulated(&training, &keypoints, &matches) } else { dataset.points.clone() };
     folder.save_points(&points)?;
     let pairs = correspondences(&masks, &segmented, &keypoints, &matches);
-    let config = PaperConfig { tau: args.tau, theta: args.theta, alpha: args.alpha };
-    let (object_of, count) = mapping::paper(&masks, &pairs, &config);
-    let grid = Grid::build(&masks, &object_of, count, common.seed);
-    save_objects(&folder, &training, &segmented, &masks, &object_of)?;
-    save_embeddings(&folder, &masks)?;
-    grid.save(&folder)?;
-    lap("mapping");
+    evidence::save(&folder, &masks, &pairs)?;
+    lap("points");
 
     let matched: usize = matches.iter().map(|m| m.pairs.len()).sum();
     let manifest = Manifest {
@@ -127,7 +113,6 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "held_out": cameras.len() - training.len(),
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
         "masks": masks.len(),
-        "objects": count,
         "key_point_matches": matched,
         "points": points.len(),
         "sift": keypoints::backend(),
@@ -271,24 +256,4 @@ fn correspondences(masks: &[Mask], segmented: &[ViewMasks], points: &[Keypoints]
         }
     }
     out
-}
-
-fn save_objects(folder: &SceneFolder, training: &[Photo], segmented: &[ViewMasks], masks: &[Mask], object_of: &[u16]) -> Result<()> {
-    for ViewMasks { view, labels } in segmented {
-        let mut table = vec![0u16; usize::from(labels.max()) + 1];
-        for (mask, object) in masks.iter().zip(object_of).filter(|(m, _)| m.view == *view) {
-            table[usize::from(mask.label)] = *object;
-        }
-        let map = LabelMap { labels: labels.labels.iter().map(|l| table[usize::from(*l)]).collect(), ..*labels };
-        map.save(&folder.objects_path(&training[*view].camera.name))?;
-    }
-    Ok(())
-}
-
-fn save_embeddings(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
-    let dimension = masks.first().map_or(0, |m| m.embedding.len());
-    let embeddings: Vec<f32> = masks.iter().flat_map(|m| m.embedding.iter().copied()).collect();
-    let places: Vec<f32> = masks.iter().flat_map(|m| [m.view as f32, f32::from(m.label)]).collect();
-    let tensors = [("embeddings", vec![masks.len(), dimension], embeddings.as_slice()), ("view_label", vec![masks.len(), 2], &places)];
-    Ok(save_tensors(&folder.root.join("embeddings.safetensors"), &tensors)?)
 }

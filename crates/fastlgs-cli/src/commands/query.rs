@@ -4,8 +4,8 @@ use crate::scene::{Scene, ViewChoice};
 use crate::{Outcome, report, ui};
 use anyhow::Result;
 use fastlgs_core::{Camera, image_io, turbo};
-use fastlgs_grid::query::{self, Hit, QueryConfig};
-use fastlgs_grid::{Grid, codes};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{self, Decision, Hit, QueryConfig};
 use fastlgs_raster::Frame;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::{Value, json};
@@ -36,9 +36,10 @@ pub struct Args {
     /// Further objects must score within this of the best.
     #[arg(long, default_value_t = QueryConfig::default().margin)]
     margin: f32,
-    /// Largest distance of a rendered feature to its code, on the 0..255 scale.
-    #[arg(long, default_value_t = codes::TAU_AC)]
-    tau_ac: f32,
+    /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
+    /// Without it, lifted scenes take the nearest code.
+    #[arg(long)]
+    tau_ac: Option<f32>,
     /// Also write the relevancy of every pixel in turbo colours.
     #[arg(long)]
     heatmap: bool,
@@ -64,7 +65,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             let started = Instant::now();
             let ranked = query::rank(&grid, &text_query);
             let targets = query::select(&ranked, &QueryConfig { min_score: args.min_score, top_k: args.top_k, margin: args.margin });
-            let answer = Answer { grid: &grid, frame: &frame, ranked: &ranked, targets: &targets, tau_ac: args.tau_ac };
+            let answer = Answer { grid: &grid, frame: &frame, ranked: &ranked, targets: &targets, decision: scene.decision(args.tau_ac) };
             let mask = answer.mask();
             let restore_ms = started.elapsed().as_secs_f64() * 1e3;
             found_any |= !targets.is_empty();
@@ -98,16 +99,16 @@ struct Answer<'a> {
     frame: &'a Frame,
     ranked: &'a [Hit],
     targets: &'a [Hit],
-    tau_ac: f32,
+    decision: Decision,
 }
 
 impl Answer<'_> {
     fn mask(&self) -> Vec<bool> {
-        query::mask(self.grid, self.targets, self.frame.channels(3, 6), self.tau_ac)
+        query::mask(self.grid, self.targets, self.frame.channels(3, 6), self.decision)
     }
 
     fn report(&self, scene: &Scene, mask: &[bool], text: &str, camera: &Camera) -> Value {
-        let ids = query::restore_objects(self.grid, self.frame.channels(3, 6), self.tau_ac);
+        let ids = query::restore_objects(self.grid, self.frame.channels(3, 6), self.decision);
         let objects: Vec<Value> = self.targets.iter().map(|t| object_report(scene, &ids, self.frame.width, t)).collect();
         json!({
             "text": text,
@@ -128,7 +129,7 @@ impl Answer<'_> {
     fn relevancy(&self) -> Vec<f32> {
         let mut score = vec![0.0; self.grid.objects.len() + 1];
         self.ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
-        query::restore_objects(self.grid, self.frame.channels(3, 6), f32::INFINITY).iter().map(|id| score[usize::from(*id)]).collect()
+        query::restore_objects(self.grid, self.frame.channels(3, 6), Decision::Nearest).iter().map(|id| score[usize::from(*id)]).collect()
     }
 
     fn write(&self, folder: &Path, mask: &[bool], text: &str, camera: &Camera, heatmap: bool, value: &mut Value) -> Result<()> {

@@ -1,13 +1,16 @@
 //! `fastlgs train`: colour and semantic field together (paper, training features for Gaussians).
 
+use super::objects;
 use crate::{Outcome, report, ui};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
-use fastlgs_grid::Grid;
+use fastlgs_grid::mapping::PaperConfig;
+use fastlgs_grid::{Grid, consensus};
 use fastlgs_raster::{Target, TrainConfig, Trainer, init};
 use std::path::PathBuf;
+use std::time::Instant;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs train scenes/fox --preset quick")]
@@ -26,6 +29,24 @@ pub struct Args {
     /// Start from an existing 3DGS scene instead of points.
     #[arg(long, value_name = "FILE")]
     init_ply: Option<PathBuf>,
+    /// How masks become objects: `global` (the views vote over the trained Gaussians) or `paper` (Algorithm 1).
+    #[arg(long, default_value = "global", value_parser = ["global", "paper"])]
+    mapping: String,
+    /// How Gaussians get their codes: `lift` (one pass of votes) or `train` (gradient descent, as in the paper).
+    #[arg(long, default_value = "lift", value_parser = ["lift", "train"])]
+    feature_mode: String,
+    /// Paper mapping: fewest key-point pairs that make two masks one object.
+    #[arg(long, default_value_t = PaperConfig::default().tau)]
+    tau: u32,
+    /// Paper mapping: least similarity that makes two masks one object.
+    #[arg(long, default_value_t = PaperConfig::default().theta)]
+    theta: f32,
+    /// Paper mapping: weight of colour in the similarity.
+    #[arg(long, default_value_t = PaperConfig::default().alpha)]
+    alpha: f32,
+    /// Global mapping: share of the views that must show two regions in one mask to join them.
+    #[arg(long, default_value_t = consensus::Config::default().agreement)]
+    agreement: f32,
     /// Weight of the feature loss.
     #[arg(long, default_value_t = 1.0)]
     feature_weight: f32,
@@ -41,13 +62,23 @@ pub struct Args {
 const FEW_POINTS: usize = 500;
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let by_descent = args.feature_mode == "train";
+    if by_descent && args.mapping == "global" {
+        bail!("--feature-mode train needs the objects before training: add --mapping paper");
+    }
     let folder = SceneFolder::open(&args.scene)?;
     let mut manifest = folder.manifest()?;
     let cameras = folder.cameras()?;
-    let grid = Grid::load(&folder)?;
     let training: Vec<Camera> =
         cameras.iter().enumerate().filter(|(i, _)| !is_held_out(*i, manifest.holdout)).map(|c| c.1.clone()).collect();
-    let targets = training.iter().map(|c| target(&folder, c, &grid)).collect::<Result<Vec<_>>>()?;
+    let paper = if args.mapping == "paper" {
+        let config = PaperConfig { tau: args.tau, theta: args.theta, alpha: args.alpha };
+        Some(objects::by_algorithm_1(&folder, &training, &config, common.seed)?)
+    } else {
+        None
+    };
+    let codes = paper.as_ref().filter(|_| by_descent).map(|p| &p.grid);
+    let targets = training.iter().map(|c| target(&folder, c, codes)).collect::<Result<Vec<_>>>()?;
     let first = first_gaussians(args, &folder, &training, common.seed)?;
     let preset = match args.preset.as_str() {
         "quick" => 2_000,
@@ -58,7 +89,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         iterations: args.iterations.unwrap_or(preset),
         seed: common.seed,
         budget: args.budget,
-        feature_weight: args.feature_weight,
+        feature_weight: if by_descent { args.feature_weight } else { 0.0 },
         feature_moves_geometry: args.feature_moves_geometry,
         ..TrainConfig::default()
     };
@@ -80,9 +111,25 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     bar.finish_and_clear();
 
     let mut scene = trainer.gaussians()?;
-    for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
-        *id = grid.nearest(*feature).map_or(0, |(id, _)| id);
-    }
+    let started = Instant::now();
+    let grid = match paper {
+        Some(found) if by_descent => {
+            for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
+                *id = found.grid.nearest(*feature).map_or(0, |(id, _)| id);
+            }
+            found.grid
+        }
+        Some(found) => {
+            objects::lift(&mut scene, &training, &found.maps, &found.grid);
+            found.grid
+        }
+        None => {
+            let config = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
+            objects::by_consensus(&mut scene, &folder, &training, &config, common)?
+        }
+    };
+    let mapping_seconds = started.elapsed().as_secs_f64();
+    grid.save(&folder)?;
     ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let held_out: Vec<&Camera> = cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, manifest.holdout)).map(|c| c.1).collect();
     let mut psnr = Vec::new();
@@ -95,6 +142,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let value = serde_json::json!({
         "scene": args.scene,
         "preset": args.preset,
+        "mapping": args.mapping,
+        "feature_mode": args.feature_mode,
+        "objects": grid.objects.len(),
+        "mapping_seconds": mapping_seconds,
         "iterations": result.iterations,
         "seconds": result.seconds,
         "iterations_per_second": result.iterations_per_second,
@@ -112,19 +163,22 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Photo and code map of a view; unlabelled pixels do not count in the feature loss.
-fn target(folder: &SceneFolder, camera: &Camera, grid: &Grid) -> Result<Target> {
+/// Photo and, where features are trained, code map of a view; unlabelled pixels do not count in the feature loss.
+fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>) -> Result<Target> {
     let mut image = image_io::to_planar(&folder.photo(&camera.name)?);
-    let objects = folder.objects(&camera.name)?;
     let n = (camera.width * camera.height) as usize;
-    if image.len() != 3 * n || objects.labels.len() != n {
-        anyhow::bail!(
-            "{}: photo, masks and camera differ in size; run 'fastlgs preprocess' again",
-            folder.photo_path(&camera.name).display()
-        );
+    if image.len() != 3 * n {
+        bail!("{}: photo and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
     }
-    for k in 0..3 {
-        image.extend(objects.labels.iter().map(|&id| grid.objects.get(usize::from(id).wrapping_sub(1)).map_or(-1.0, |o| o.code[k])));
+    match codes {
+        None => image.resize(6 * n, -1.0),
+        Some(grid) => {
+            let ids = folder.objects(&camera.name)?.labels;
+            let code = |id: u16, k: usize| grid.objects.get(usize::from(id).wrapping_sub(1)).map_or(-1.0, |o| o.code[k]);
+            for k in 0..3 {
+                image.extend(ids.iter().map(|id| code(*id, k)));
+            }
+        }
     }
     Ok(Target { camera: camera.clone(), image })
 }
