@@ -3,14 +3,19 @@
 // pair_tiles     [pairs]  tile number: the key of the second sort
 // pair_gaussians [pairs]  Gaussian of pair e
 // first_pair     [n]      first pair of each Gaussian: its gradient slots are contiguous from there
+// touched        [n]      lowered to the number of pairs written
+//
+// The tiles are found by the same formula as in `project`, but another kernel may round it differently. So room that is
+// left over gets the tile after the last one, which nobody draws, and what has no room is left out.
 #import view
 #import flat
+#import footprint
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> order: array<u32>;
 @group(0) @binding(2) var<storage, read> offsets: array<u32>;
-@group(0) @binding(3) var<storage, read> rects: array<vec2<u32>>;
-@group(0) @binding(4) var<storage, read> touched: array<u32>;
+@group(0) @binding(3) var<storage, read> footprints: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> touched: array<u32>;
 @group(0) @binding(5) var<storage, read_write> pair_tiles: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pair_gaussians: array<u32>;
 @group(0) @binding(7) var<storage, read_write> first_pair: array<u32>;
@@ -27,13 +32,20 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if touched[g] == 0u {
         return;
     }
-    let first = vec2<u32>(rects[g].x & 0xffffu, rects[g].x >> 16u);
-    let end = vec2<u32>(rects[g].y & 0xffffu, rects[g].y >> 16u);
-    for (var y = first.y; y < end.y; y++) {
-        for (var x = first.x; x < end.x; x++) {
-            pair_tiles[e] = y * view.tiles.x + x;
+    let end = e + touched[g];
+    let f0 = footprints[2u * g];
+    let f1 = footprints[2u * g + 1u];
+    for (var row = u32(f1.z); row < u32(f1.w); row++) {
+        let span = footprint_span(f0, f1, row, view.tiles.x);
+        for (var x = span.x; x < span.y && e < end; x++) {
+            pair_tiles[e] = row * view.tiles.x + x;
             pair_gaussians[e] = g;
             e++;
         }
+    }
+    touched[g] = e - first_pair[g];
+    for (; e < end; e++) {
+        pair_tiles[e] = view.tiles.x * view.tiles.y;
+        pair_gaussians[e] = g;
     }
 }

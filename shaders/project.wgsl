@@ -4,18 +4,19 @@
 // splats  [n][3] vec4       (mean.xy, q.xy) (q.z, opacity, r, g) (b, f0, f1, f2);
 //                           q: the exponent in base 2, q.x dx^2 + q.y dx dy + q.z dy^2
 // depths  [n]               24-bit key, ascending with depth
-// rects   [n][2]            first tile (x | y << 16), end tile (x | y << 16), end excluded
+// footprints [n][2] vec4    the tiles it may touch: shared/footprint.wgsl
 // touched [n]               number of tiles; 0 for Gaussians that are not drawn
 #import view
 #import channels
 #import covariance
 #import flat
+#import footprint
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> params: array<f32>;
 @group(0) @binding(2) var<storage, read_write> splats: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> depths: array<u32>;
-@group(0) @binding(4) var<storage, read_write> rects: array<vec2<u32>>;
+@group(0) @binding(4) var<storage, read_write> footprints: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> touched: array<u32>;
 
 fn param3(channel: u32, i: u32) -> vec3<f32> {
@@ -53,17 +54,23 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cyy = dot(ay, ay) + DILATION;
     let det = cxx * cyy - cxy * cxy;
     let mean = view.focal * t.xy / t.z + view.centre;
-    // Half extents of the ellipse on which alpha falls to ALPHA_MIN.
-    let reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
-    let extent = reach * sqrt(vec2<f32>(cxx, cyy));
-    let finite = det > 0.0 && det < 1e30 && abs(mean.x) < 1e9 && abs(mean.y) < 1e9 && extent.x < 1e9 && extent.y < 1e9;
+    // The ellipse on which alpha falls to ALPHA_MIN, a hair larger so that rounding loses no pixel.
+    let reach2 = 2.002 * log(opacity / ALPHA_MIN) + 1e-4;
+    let half_height = sqrt(reach2 * cyy);
+    let finite = det > 0.0 && det < 1e30 && abs(mean.x) < 1e9 && abs(mean.y) < 1e9 && half_height < 1e9 && cxx < 1e15;
     if !finite {
         return;
     }
-    let limit = vec2<f32>(view.tiles);
-    let first = vec2<u32>(clamp(floor((mean - extent) / f32(TILE)), vec2<f32>(0.0), limit));
-    let end = vec2<u32>(clamp(floor((mean + extent) / f32(TILE)) + 1.0, vec2<f32>(0.0), limit));
-    let count = (max(end.x, first.x) - first.x) * (max(end.y, first.y) - first.y);
+    let f0 = vec4<f32>(mean, cxy / cyy, det / (cyy * cyy));
+    let rows = f32(view.tiles.y);
+    let first_row = clamp(ceil((mean.y - half_height + 0.5) / f32(TILE)) - 1.0, 0.0, rows);
+    let end_row = clamp(floor((mean.y + half_height - 0.5) / f32(TILE)) + 1.0, 0.0, rows);
+    let f1 = vec4<f32>(reach2 * cyy, sqrt(reach2 / cxx) * cxy, first_row, end_row);
+    var count = 0u;
+    for (var row = u32(first_row); row < u32(end_row); row++) {
+        let span = footprint_span(f0, f1, row, view.tiles.x);
+        count += span.y - span.x;
+    }
     if count == 0u {
         return;
     }
@@ -79,6 +86,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     splats[3u * i + 2u] = vec4<f32>(color.b, feature);
     // Positive floats ascend with their bits; sign and the last 7 bits are dropped.
     depths[i] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);
-    rects[i] = vec2<u32>(first.x | (first.y << 16u), end.x | (end.y << 16u));
+    footprints[2u * i] = f0;
+    footprints[2u * i + 1u] = f1;
     touched[i] = count;
 }

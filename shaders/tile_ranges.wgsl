@@ -13,6 +13,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let tile = sorted_tiles[i];
+    if tile >= view.tiles.x * view.tiles.y {
+        return;
+    }
     if i == 0u || sorted_tiles[i - 1u] != tile {
         ranges[2u * tile] = i;
     }

@@ -1,4 +1,4 @@
-//! Global mapping: objects are regions of Gaussians that most views show inside one mask.
+//! Global mapping, first step: regions of Gaussians that most views show inside one mask.
 //!
 //! Every view votes on every border: neighbouring regions are joined, most agreed first, while the views that see both
 //! put them into the same mask more often than not. The order of the photos plays no part, a wrong mask in one view is
@@ -7,7 +7,7 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 
-/// What a Gaussian sees: weight of (view, label).
+/// What a Gaussian sees: weight of (view, label); label 0 is what no mask covers.
 pub type Seen = Vec<((u16, u16), f32)>;
 
 /// Constants of the consensus.
@@ -38,7 +38,9 @@ struct Region {
 }
 
 /// Weighted mean over the views that see both of the cosine between their label distributions; 0 where none does.
-fn agreement(a: &Seen, b: &Seen) -> f32 {
+///
+/// Uncovered pixels agree with nothing, and a view that covers neither region has no vote.
+pub(crate) fn agreement(a: &Seen, b: &Seen) -> f32 {
     let (mut i, mut j) = (0, 0);
     let (mut sum, mut total) = (0.0, 0.0);
     while i < a.len() && j < b.len() {
@@ -52,6 +54,7 @@ fn agreement(a: &Seen, b: &Seen) -> f32 {
             continue;
         }
         let (mut dot, mut aa, mut bb, mut wa, mut wb) = (0.0, 0.0, 0.0, 0.0f32, 0.0f32);
+        let mut uncovered = 0.0;
         while (i < a.len() && a[i].0.0 == va) || (j < b.len() && b[j].0.0 == va) {
             let la = a.get(i).filter(|e| e.0.0 == va).map_or(u32::MAX, |e| u32::from(e.0.1));
             let lb = b.get(j).filter(|e| e.0.0 == va).map_or(u32::MAX, |e| u32::from(e.0.1));
@@ -64,14 +67,18 @@ fn agreement(a: &Seen, b: &Seen) -> f32 {
                 y = b[j].1;
                 j += 1;
             }
-            dot += x * y;
+            if la.min(lb) == 0 {
+                uncovered = x * y
+            } else {
+                dot += x * y
+            }
             aa += x * x;
             bb += y * y;
             wa += x;
             wb += y;
         }
         let common = wa.min(wb);
-        let weight = common / (common + HALF_WEIGHT);
+        let weight = common / (common + HALF_WEIGHT) * (1.0 - uncovered / (wa * wb).max(1e-12));
         sum += weight * dot / (aa * bb).sqrt().max(1e-12);
         total += weight;
     }
@@ -79,7 +86,7 @@ fn agreement(a: &Seen, b: &Seen) -> f32 {
 }
 
 /// Sum of two sorted vote lists.
-fn merged(a: &Seen, b: &Seen) -> Seen {
+pub(crate) fn merged(a: &Seen, b: &Seen) -> Seen {
     let mut out = Vec::with_capacity(a.len() + b.len());
     let (mut i, mut j) = (0, 0);
     while i < a.len() || j < b.len() {
@@ -107,11 +114,29 @@ fn merged(a: &Seen, b: &Seen) -> Seen {
     out
 }
 
-/// Object of each Gaussian, 1..=K in order of falling weight, 0 for none; and K.
+/// What the views agree on.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Regions {
+    /// Region of each Gaussian, 1..=K in order of falling weight; 0 for none.
+    pub of: Vec<u16>,
+    /// The votes of region k + 1.
+    pub seen: Vec<Seen>,
+    /// Pairs of neighbouring Gaussians that each pair of regions (a < b) shares.
+    pub contacts: BTreeMap<(u16, u16), u32>,
+}
+
+/// Joins Gaussians to regions.
 ///
 /// `seen` holds each Gaussian's votes sorted by (view, label); `near` the pairs of neighbours; `pixels` those of a view.
-pub fn objects(seen: Vec<Seen>, near: &[(u32, u32)], pixels: usize, config: &Config) -> (Vec<u16>, u16) {
+pub fn regions(mut seen: Vec<Seen>, near: &[(u32, u32)], pixels: usize, config: &Config) -> Regions {
     let n = seen.len();
+    // A Gaussian that mostly shows where no mask is belongs to no object.
+    for votes in &mut seen {
+        let weight = |covered: bool| votes.iter().filter(|v| (v.0.1 > 0) == covered).map(|v| v.1).sum::<f32>();
+        if weight(false) > weight(true) {
+            votes.clear();
+        }
+    }
     let mut regions: Vec<Region> = seen.into_iter().map(|seen| Region { seen, near: BTreeSet::new(), version: 0 }).collect();
     for &(a, b) in near {
         regions[a as usize].near.insert(b);
@@ -153,11 +178,18 @@ pub fn objects(seen: Vec<Seen>, near: &[(u32, u32)], pixels: usize, config: &Con
             }
         }
     }
-    number(&owner, &regions, pixels, config)
+    let mut out = number(&owner, &mut regions, pixels, config);
+    for &(a, b) in near {
+        let (a, b) = (out.of[a as usize], out.of[b as usize]);
+        if a != b && a.min(b) > 0 {
+            *out.contacts.entry((a.min(b), a.max(b))).or_default() += 1;
+        }
+    }
+    out
 }
 
 /// Drops what is too small or seen too rarely, and numbers the rest.
-fn number(owner: &[u32], regions: &[Region], pixels: usize, config: &Config) -> (Vec<u16>, u16) {
+fn number(owner: &[u32], regions: &mut [Region], pixels: usize, config: &Config) -> Regions {
     let mut kept: Vec<(u32, f32)> = (0..owner.len() as u32)
         .filter(|&i| owner[i as usize] == i)
         .filter_map(|i| {
@@ -177,7 +209,11 @@ fn number(owner: &[u32], regions: &[Region], pixels: usize, config: &Config) -> 
         }
         i
     };
-    ((0..owner.len() as u32).map(|i| ids.get(&root(i)).copied().unwrap_or(0)).collect(), kept.len() as u16)
+    Regions {
+        of: (0..owner.len() as u32).map(|i| ids.get(&root(i)).copied().unwrap_or(0)).collect(),
+        seen: kept.iter().map(|r| std::mem::take(&mut regions[r.0 as usize].seen)).collect(),
+        contacts: BTreeMap::new(),
+    }
 }
 
 #[cfg(test)]
@@ -211,17 +247,18 @@ mod tests {
     fn the_majority_of_views_decides_and_their_order_does_not() {
         let near: Vec<(u32, u32)> = (0..11).map(|i| (i, i + 1)).collect();
         let config = Config { min_share: 0.0, ..Config::default() };
-        let (ids, count) = objects(row([0, 1, 2, 3, 4]), &near, 1000, &config);
-        assert_eq!(count, 2);
+        let found = regions(row([0, 1, 2, 3, 4]), &near, 1000, &config);
+        let ids = &found.of;
+        assert_eq!((found.seen.len(), &found.contacts), (2, &BTreeMap::from([((1, 2), 1)])));
         assert!(ids[..6].iter().all(|i| *i == ids[0]) && ids[6..].iter().all(|i| *i == ids[6]) && ids[0] != ids[6]);
-        let (shuffled, _) = objects(row([4, 2, 0, 1, 3]), &near, 1000, &config);
-        assert_eq!(ids, shuffled);
+        let shuffled = regions(row([4, 2, 0, 1, 3]), &near, 1000, &config);
+        assert_eq!(ids, &shuffled.of);
     }
 
     #[test]
     fn what_few_views_show_is_no_object() {
         let near: Vec<(u32, u32)> = (0..11).map(|i| (i, i + 1)).collect();
-        let (ids, count) = objects(row([0, 1, 2, 3, 4]), &near, 1000, &Config { min_views: 6, ..Config::default() });
-        assert_eq!((count, ids.iter().max()), (0, Some(&0)));
+        let found = regions(row([0, 1, 2, 3, 4]), &near, 1000, &Config { min_views: 6, ..Config::default() });
+        assert_eq!((found.seen.len(), found.of.iter().max()), (0, Some(&0)));
     }
 }

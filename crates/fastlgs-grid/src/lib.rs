@@ -8,6 +8,7 @@ pub mod grid;
 pub mod mapping;
 pub mod query;
 pub mod relevancy;
+pub mod whole;
 
 pub use grid::{Grid, Object};
 

@@ -183,9 +183,9 @@ pub(crate) fn radix_sort_cpu(keys: &mut Vec<u32>, bits: u32) -> Vec<u32> {
     values
 }
 
-/// Bits of the largest tile number, at least one digit.
+/// Bits of the largest tile number and of the one after it, which marks padding.
 pub(crate) fn tile_bits(view: &View) -> u32 {
-    (32 - (view.tile_count().max(2) - 1).leading_zeros()).max(1)
+    32 - view.tile_count().leading_zeros()
 }
 
 impl CpuEngine {
@@ -200,8 +200,8 @@ impl CpuEngine {
     pub(crate) fn lists_of(params: &[f32], mut view: View) -> Forward {
         let n = view.gaussians as usize;
         let mut splats = vec![[[0.0; 4]; 3]; n];
-        let (mut depths, mut rects, mut touched) = (vec![0; n], vec![[0; 2]; n], vec![0; n]);
-        cpu::project(&view, params, &mut splats, &mut depths, &mut rects, &mut touched);
+        let (mut depths, mut footprints, mut touched) = (vec![0; n], vec![[[0.0; 4]; 2]; n], vec![0; n]);
+        cpu::project(&view, params, &mut splats, &mut depths, &mut footprints, &mut touched);
         let order = radix_sort_cpu(&mut depths, 24);
         let mut offsets = vec![0; n];
         cpu::gather_counts(&view, &order, &touched, &mut offsets);
@@ -212,7 +212,7 @@ impl CpuEngine {
         view.pairs = totals[CHUNKS];
         let pairs = view.pairs as usize;
         let (mut tiles, mut pair_gaussians, mut first_pair) = (vec![0; pairs], vec![0; pairs], vec![0; n]);
-        cpu::emit(&view, &order, &offsets, &rects, &touched, &mut tiles, &mut pair_gaussians, &mut first_pair);
+        cpu::emit(&view, &order, &offsets, &footprints, &mut touched, &mut tiles, &mut pair_gaussians, &mut first_pair);
         let sorted_pairs = radix_sort_cpu(&mut tiles, tile_bits(&view));
         let mut ranges = vec![0; 2 * view.tile_count() as usize];
         cpu::tile_ranges(&view, &tiles, &mut ranges);

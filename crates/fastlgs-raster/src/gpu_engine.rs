@@ -40,7 +40,7 @@ struct PerGaussian {
     gradients: Buffer,
     stats: Buffer,
     splats: Buffer,
-    rects: Buffer,
+    footprints: Buffer,
     touched: Buffer,
     offsets: Buffer,
     first_pair: Buffer,
@@ -202,7 +202,7 @@ impl GpuEngine {
         let uniform = self.gpu.uniform(&view);
         let mut encoder = self.gpu.encoder();
         let e = &mut encoder;
-        self.passes.project.record(&self.gpu, e, &[&uniform, &g.params, &g.splats, &g.sort.keys[0], &g.rects, &g.touched], groups);
+        self.passes.project.record(&self.gpu, e, &[&uniform, &g.params, &g.splats, &g.sort.keys[0], &g.footprints, &g.touched], groups);
         let side = self.radix_sort(e, &g.sort, n as u32, 24);
         let order = &g.sort.values[side];
         self.passes.gather_counts.record(&self.gpu, e, &[&uniform, order, &g.touched, &g.offsets], groups);
@@ -217,7 +217,7 @@ impl GpuEngine {
         let uniform = self.gpu.uniform(&view);
         let mut encoder = self.gpu.encoder();
         let e = &mut encoder;
-        let buffers = [&uniform, order, &g.offsets, &g.rects, &g.touched, &list.sort.keys[0], &list.gaussians, &g.first_pair];
+        let buffers = [&uniform, order, &g.offsets, &g.footprints, &g.touched, &list.sort.keys[0], &list.gaussians, &g.first_pair];
         self.passes.emit.record(&self.gpu, e, &buffers, groups);
         let side = self.radix_sort(e, &list.sort, view.pairs, tile_bits(&view));
         e.clear_buffer(&frame.ranges, 0, None);
@@ -251,7 +251,7 @@ impl Engine for GpuEngine {
                 gradients: storage("the gradients", CHANNELS * n)?,
                 stats: storage("density statistics", 2 * n)?,
                 splats: storage("the projected Gaussians", 12 * n)?,
-                rects: storage("tile boxes", 2 * n)?,
+                footprints: storage("footprints", 8 * n)?,
                 touched: storage("tile counts", n)?,
                 offsets: storage("tile offsets", n)?,
                 first_pair: storage("first pairs", n)?,

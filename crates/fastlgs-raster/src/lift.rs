@@ -13,7 +13,7 @@ use rayon::prelude::*;
 pub struct Vote {
     /// Index of the Gaussian.
     pub gaussian: u32,
-    /// Label, never 0.
+    /// Label; 0 is what no mask covers.
     pub label: u16,
     /// Sum of blending weights.
     pub weight: f32,
@@ -22,7 +22,7 @@ pub struct Vote {
 /// Votes below this are dust that only costs memory.
 const MIN_WEIGHT: f32 = 0.02;
 
-/// Votes of all Gaussians for the labels of a view, sorted by Gaussian and label. Unlabelled pixels cast none.
+/// Votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
 ///
 /// # Panics
 /// If map and camera differ in size.
@@ -46,7 +46,7 @@ pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote>
                     let weight = cpu::alpha(splat, dx, dy, *transmittance) * *transmittance;
                     *transmittance -= weight;
                     open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
-                    if weight > 0.0 && *label > 0 {
+                    if weight > 0.0 {
                         match out[first..].iter_mut().find(|v: &&mut Vote| v.label == *label) {
                             Some(vote) => vote.weight += weight,
                             None => out.push(Vote { gaussian, label: *label, weight }),

@@ -93,14 +93,14 @@ fn assert_close(what: &str, a: &[f32], b: &[f32], tolerance: f32, flips: f64) {
 struct Projected {
     splats: Vec<Splat>,
     depths: Vec<u32>,
-    rects: Vec<[u32; 2]>,
+    footprints: Vec<cpu::Footprint>,
     touched: Vec<u32>,
 }
 
 fn projected(view: &View, params: &[f32]) -> Projected {
     let n = view.gaussians as usize;
-    let mut p = Projected { splats: vec![[[0.0; 4]; 3]; n], depths: vec![0; n], rects: vec![[0; 2]; n], touched: vec![0; n] };
-    cpu::project(view, params, &mut p.splats, &mut p.depths, &mut p.rects, &mut p.touched);
+    let mut p = Projected { splats: vec![[[0.0; 4]; 3]; n], depths: vec![0; n], footprints: vec![[[0.0; 4]; 2]; n], touched: vec![0; n] };
+    cpu::project(view, params, &mut p.splats, &mut p.depths, &mut p.footprints, &mut p.touched);
     p
 }
 
@@ -119,7 +119,7 @@ fn project_matches_its_twin() {
             &gpu,
             &shaders::PROJECT,
             &view,
-            &[bytes(&params), &zeros, &zeros[..4 * n], &zeros[..8 * n], &zeros[..4 * n]],
+            &[bytes(&params), &zeros, &zeros[..4 * n], &zeros[..32 * n], &zeros[..4 * n]],
             (n as u32).div_ceil(64),
         );
         let touched = words(&out[4]);
@@ -195,7 +195,7 @@ fn lists(mut view: View, params: &[f32]) -> Lists {
     offsets.iter_mut().for_each(|o| sum += std::mem::replace(o, sum));
     view.pairs = sum;
     let (mut pair_tiles, mut pair_gaussians, mut first_pair) = (vec![0; sum as usize], vec![0; sum as usize], vec![0; n]);
-    cpu::emit(&view, &order, &offsets, &p.rects, &p.touched, &mut pair_tiles, &mut pair_gaussians, &mut first_pair);
+    cpu::emit(&view, &order, &offsets, &p.footprints, &mut p.touched, &mut pair_tiles, &mut pair_gaussians, &mut first_pair);
     let mut sorted_tiles = pair_tiles.clone();
     let sorted_pairs = radix_sort_cpu(&mut sorted_tiles, tile_bits(&view));
     let mut ranges = vec![0; 2 * view.tile_count() as usize];
@@ -215,7 +215,8 @@ fn listing_passes_match_their_twins() {
         let out = run_pass(&gpu, &shaders::GATHER_COUNTS, &l.view, &[bytes(&l.order), bytes(&l.p.touched), &zeros[..g4]], groups);
         let expected: Vec<u32> = l.order.iter().map(|&i| l.p.touched[i as usize]).collect();
         assert_eq!(words(&out[2]), expected);
-        let inputs = [bytes(&l.order), bytes(&l.offsets), bytes(&l.p.rects), bytes(&l.p.touched), &zeros[..p4], &zeros[..p4], &zeros[..g4]];
+        let inputs =
+            [bytes(&l.order), bytes(&l.offsets), bytes(&l.p.footprints), bytes(&l.p.touched), &zeros[..p4], &zeros[..p4], &zeros[..g4]];
         let out = run_pass(&gpu, &shaders::EMIT, &l.view, &inputs, groups);
         assert_eq!((words(&out[4]), words(&out[5]), words(&out[6])), (l.pair_tiles, l.pair_gaussians, l.first_pair));
         let out = run_pass(

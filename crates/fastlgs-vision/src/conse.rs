@@ -18,6 +18,19 @@ pub const DENSE: usize = 32;
 /// Crops in one inference.
 const BATCH: usize = 8;
 
+/// Features of the cells of a photo.
+#[derive(Clone, Debug)]
+pub struct DenseMap {
+    /// Cells in a row.
+    pub columns: usize,
+    /// Cells in a column.
+    pub rows: usize,
+    /// Values of a cell.
+    pub channels: usize,
+    /// `[rows][columns][channels]`.
+    pub values: Vec<f32>,
+}
+
 /// EfficientNet-Lite2 + MiniLM.
 pub struct Conse {
     classifier: Model,
@@ -70,32 +83,36 @@ impl Conse {
         sum
     }
 
-    /// What every part of a photo looks like: the class logits of cells of 32 pixels, without their mean over the
-    /// photo, projected to [`DENSE`] dimensions (a seeded random projection keeps distances). Returns columns, rows
-    /// and `[rows][columns][DENSE]`.
+    /// What every part of a photo looks like: the class logits of cells of 32 pixels, without their mean over the photo.
     ///
     /// # Errors
     /// When inference fails.
-    pub fn dense(&self, photo: &RgbImage) -> Result<(usize, usize, Vec<f32>)> {
+    pub fn dense(&self, photo: &RgbImage) -> Result<DenseMap> {
         let (w, h) = (photo.width() as usize, photo.height() as usize);
         let mut data = vec![0.0; 3 * w * h];
         for (i, pixel) in photo.pixels().enumerate() {
             (0..3).for_each(|k| data[k * w * h + i] = (f32::from(pixel[k]) - 127.0) / 128.0);
         }
-        let (shape, mut logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
-        let (rows, columns) = (shape[2], shape[3]);
+        let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
+        let (classes, rows, columns) = (shape[1], shape[2], shape[3]);
         let cells = rows * columns;
-        for class in logits.chunks_exact_mut(cells) {
+        let mut values = vec![0.0; cells * classes];
+        for (k, class) in logits.chunks_exact(cells).enumerate() {
             let mean = class.iter().sum::<f32>() / cells as f32;
-            class.iter_mut().for_each(|v| *v -= mean);
+            class.iter().enumerate().for_each(|(cell, v)| values[cell * classes + k] = v - mean);
         }
-        let mut out = vec![0.0; cells * DENSE];
-        for (class, axes) in logits.chunks_exact(cells).zip(&self.projection) {
-            for (cell, value) in class.iter().enumerate() {
-                out[cell * DENSE..][..DENSE].iter_mut().zip(axes).for_each(|(o, a)| *o += value * a);
+        Ok(DenseMap { columns, rows, channels: classes, values })
+    }
+
+    /// A dense map in [`DENSE`] dimensions: a seeded random projection keeps distances.
+    pub fn project(&self, map: &DenseMap) -> DenseMap {
+        let mut values = vec![0.0; map.columns * map.rows * DENSE];
+        for (cell, out) in map.values.chunks_exact(map.channels).zip(values.chunks_exact_mut(DENSE)) {
+            for (value, axes) in cell.iter().zip(&self.projection) {
+                out.iter_mut().zip(axes).for_each(|(o, a)| *o += value * a);
             }
         }
-        Ok((columns, rows, out))
+        DenseMap { channels: DENSE, values, ..*map }
     }
 
     /// The most likely class name of each mask with its probability, for reports.

@@ -1,7 +1,7 @@
 //! Object masks of photos.
 
 use crate::Result;
-use crate::conse::{Conse, DENSE};
+use crate::conse::{Conse, DENSE, DenseMap};
 use crate::edges::Hed;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::{LabelMap, image_io};
@@ -58,19 +58,19 @@ impl OfflineSegmenter {
     /// Colour and meaning of each pixel of `small`.
     fn features(&self, photo: &RgbImage, small: &RgbImage) -> Result<Vec<f32>> {
         let (w, h) = (small.width() as usize, small.height() as usize);
-        let scales = DENSE_SIDES.map(|side| self.classifier.dense(&shrunk(photo, side, true)));
+        let scales = DENSE_SIDES.map(|side| Ok(self.classifier.project(&self.classifier.dense(&at_side(photo, side))?)));
         let scales = scales.into_iter().collect::<Result<Vec<_>>>()?;
         let mut out = Vec::with_capacity(w * h * FEATURES);
         for (p, pixel) in small.pixels().enumerate() {
             out.extend(lab(pixel.0));
-            for (columns, rows, dense) in &scales {
+            for DenseMap { columns, rows, values, .. } in &scales {
                 let at =
                     |x: usize, n: usize, cells: usize| ((x as f32 + 0.5) / n as f32 * cells as f32 - 0.5).clamp(0.0, (cells - 1) as f32);
                 let (u, v) = (at(p % w, w, *columns), at(p / w, h, *rows));
                 let (i, j, fu, fv) = (u as usize, v as usize, u.fract(), v.fract());
                 let (i1, j1) = ((i + 1).min(columns - 1), (j + 1).min(rows - 1));
                 for k in 0..DENSE {
-                    let cell = |i: usize, j: usize| dense[(j * columns + i) * DENSE + k];
+                    let cell = |i: usize, j: usize| values[(j * columns + i) * DENSE + k];
                     let (upper, lower) = (cell(i, j) * (1.0 - fu) + cell(i1, j) * fu, cell(i, j1) * (1.0 - fu) + cell(i1, j1) * fu);
                     out.push(upper * (1.0 - fv) + lower * fv);
                 }
@@ -80,10 +80,9 @@ impl OfflineSegmenter {
     }
 }
 
-/// The photo with its longer side at `side`; enlarged only where allowed.
-fn shrunk(photo: &RgbImage, side: u32, enlarge: bool) -> RgbImage {
+/// The photo with its longer side at `side`, and no side below a cell of the classifier.
+pub fn at_side(photo: &RgbImage, side: u32) -> RgbImage {
     let scale = side as f32 / photo.width().max(photo.height()) as f32;
-    let scale = if enlarge { scale } else { scale.min(1.0) };
     let size = |n: u32| ((n as f32 * scale).round() as u32).max(32);
     image_io::resize(photo, size(photo.width()), size(photo.height()))
 }
@@ -94,7 +93,7 @@ impl Segmenter for OfflineSegmenter {
     }
 
     fn segment(&self, photo: &RgbImage) -> Result<Segmentation> {
-        let small = shrunk(photo, WORK_SIDE, false);
+        let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));
         let (w, h) = (small.width() as usize, small.height() as usize);
         let edges = self.edges.edges(&small)?;
         let (basins, count) = watershed(&edges, w, h);

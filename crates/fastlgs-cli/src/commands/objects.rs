@@ -5,9 +5,10 @@ use anyhow::{Result, bail};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::query::{self, Decision};
-use fastlgs_grid::{Grid, consensus, evidence};
+use fastlgs_grid::{Grid, consensus, evidence, whole};
 use fastlgs_raster::{View, lift};
-use fastlgs_vision::{Conse, Encoder, histogram};
+use fastlgs_vision::{Conse, Encoder, histogram, segmenter};
+use image::RgbImage;
 
 /// Objects of a scene with the object map of each training view.
 pub struct Objects {
@@ -15,8 +16,17 @@ pub struct Objects {
     pub maps: Vec<LabelMap>,
 }
 
+/// Constants of global mapping.
+pub struct Config {
+    pub consensus: consensus::Config,
+    /// Likeness from which touching regions are one object.
+    pub likeness: f32,
+}
+
 /// Neighbours of each Gaussian in the consensus graph.
 const NEIGHBOURS: usize = 10;
+/// Longer side of the photos whose meaning is taken: the encoder's objects fill some cells there.
+const MEANING_SIDE: u32 = 480;
 /// Smallest part of a photo, in pixels, that is worth embedding.
 const MIN_PIXELS: usize = 60;
 
@@ -59,16 +69,18 @@ fn set_codes(scene: &mut Gaussians, grid: &Grid) {
     scene.features = scene.object_ids.iter().map(code).collect();
 }
 
-/// Global mapping: the views vote over the trained Gaussians which of them form objects; the objects are then rendered
-/// into every training view and embedded from those clean masks.
+/// Global mapping: the views vote over the trained Gaussians which of them form regions, regions of like meaning become
+/// objects where the segmenter knows none, and the objects are rendered into every training view and embedded from
+/// those clean masks.
 pub fn by_consensus(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
-    config: &consensus::Config,
+    config: &Config,
     common: &ui::Common,
 ) -> Result<Grid> {
-    let bar = ui::bar(common, 2 * training.len() as u64, "objects");
+    let clock = std::time::Instant::now();
+    let bar = ui::bar(common, training.len() as u64, "votes");
     let mut seen: Vec<consensus::Seen> = vec![Vec::new(); scene.len()];
     for (view, camera) in training.iter().enumerate() {
         for vote in lift::votes(scene, camera, &whole_masks(folder, camera)?) {
@@ -76,40 +88,95 @@ pub fn by_consensus(
         }
         bar.inc(1);
     }
+    bar.finish_and_clear();
+    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), "votes");
     let pixels = (training[0].width * training[0].height) as usize;
-    let (ids, count) = consensus::objects(seen, &lift::neighbours(scene, NEIGHBOURS), pixels, config);
-    scene.object_ids = ids;
-    let empty = Grid::build(&[], &[], count, common.seed);
-    set_codes(scene, &empty);
+    let regions = consensus::regions(seen, &lift::neighbours(scene, NEIGHBOURS), pixels, &config.consensus);
+    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), regions = regions.seen.len(), "consensus");
 
     let encoder = Conse::load()?;
     let mut engine = fastlgs_raster::open_engine(&common.device)?;
-    let params = scene.to_channels();
-    let zeros = vec![0.0; params.len()];
-    engine.set_state(&params, &zeros, &zeros)?;
+    let mut paint = |scene: &mut Gaussians, count: u16| -> Result<Vec<LabelMap>> {
+        let codes = Grid::build(&[], &[], count, common.seed);
+        set_codes(scene, &codes);
+        let params = scene.to_channels();
+        let zeros = vec![0.0; params.len()];
+        engine.set_state(&params, &zeros, &zeros)?;
+        let map = |camera: &Camera| {
+            let frame = engine.render(View::new(camera, scene.len()))?;
+            let labels = query::restore_objects(&codes, frame.channels(3, 6), Decision::Nearest);
+            Ok(LabelMap { width: camera.width, height: camera.height, labels })
+        };
+        training.iter().map(map).collect()
+    };
+    scene.object_ids = regions.of.clone();
+    let mut count = regions.seen.len() as u16;
+    if folder.manifest()?.segmenter == "offline" {
+        let maps = paint(scene, count)?;
+        let meanings = meanings(folder, training, &maps, count, &encoder, common)?;
+        let (object, objects) = whole::join(&regions, meanings, config.likeness);
+        scene.object_ids = regions.of.iter().map(|r| if *r > 0 { object[usize::from(*r) - 1] } else { 0 }).collect();
+        count = objects;
+        tracing::debug!(seconds = clock.elapsed().as_secs_f64(), objects, "whole objects");
+    }
+    let maps = paint(scene, count)?;
+    let bar = ui::bar(common, training.len() as u64, "embeddings");
     let (mut masks, mut object_of) = (Vec::new(), Vec::new());
-    for (view, camera) in training.iter().enumerate() {
-        let frame = engine.render(View::new(camera, scene.len()))?;
-        let labels = query::restore_objects(&empty, frame.channels(3, 6), Decision::Nearest);
-        let mut map = LabelMap { width: camera.width, height: camera.height, labels };
+    for (view, (camera, mut map)) in training.iter().zip(maps).enumerate() {
         map.save(&folder.objects_path(&camera.name))?;
         let areas = map.areas();
         map.labels.iter_mut().filter(|l| areas[usize::from(**l)] < MIN_PIXELS).for_each(|l| *l = 0);
-        let photo = folder.photo(&camera.name)?;
-        let embeddings = encoder.embed_masks(&photo, &map)?;
-        let histograms = histogram::histograms(&photo, &map);
-        for (k, (embedding, histogram)) in embeddings.into_iter().zip(histograms).enumerate() {
-            let label = k as u16 + 1;
-            let area = areas[usize::from(label)] as f32 / pixels as f32;
-            if area > 0.0 {
-                masks.push(Mask { view, label, area, embedding, histogram });
-                object_of.push(label);
-            }
+        let found = masks_of(&folder.photo(&camera.name)?, view, &map, &encoder)?;
+        object_of.extend(found.iter().map(|m| m.label));
+        masks.extend(found);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), "embeddings");
+    Ok(Grid::build(&masks, &object_of, count, common.seed))
+}
+
+/// Embedding and colour distribution of every mask of a photo, by label.
+pub fn masks_of(photo: &RgbImage, view: usize, map: &LabelMap, encoder: &dyn Encoder) -> Result<Vec<Mask>> {
+    let embeddings = encoder.embed_masks(photo, map)?;
+    let histograms = histogram::histograms(photo, map);
+    let areas = map.areas();
+    let masks = embeddings.into_iter().zip(histograms).enumerate().map(|(k, (embedding, histogram))| {
+        let area = areas[k + 1] as f32 / map.labels.len() as f32;
+        Mask { view, label: k as u16 + 1, area, embedding, histogram }
+    });
+    Ok(masks.filter(|m| m.area > 0.0).collect())
+}
+
+/// Sum over all pixels of all views of what the encoder sees there, for each region.
+fn meanings(
+    folder: &SceneFolder,
+    training: &[Camera],
+    maps: &[LabelMap],
+    count: u16,
+    encoder: &Conse,
+    common: &ui::Common,
+) -> Result<Vec<Vec<f32>>> {
+    let bar = ui::bar(common, training.len() as u64, "meanings");
+    let mut sums: Vec<Vec<f32>> = vec![Vec::new(); usize::from(count)];
+    for (camera, map) in training.iter().zip(maps) {
+        let dense = encoder.dense(&segmenter::at_side(&folder.photo(&camera.name)?, MEANING_SIDE))?;
+        // How many pixels of a region each cell holds.
+        let mut shares: std::collections::BTreeMap<(u16, usize), f32> = Default::default();
+        for (p, label) in map.labels.iter().enumerate().filter(|l| *l.1 > 0) {
+            let (x, y) = (p % map.width as usize, p / map.width as usize);
+            let cell = y * dense.rows / map.height as usize * dense.columns + x * dense.columns / map.width as usize;
+            *shares.entry((*label, cell)).or_default() += 1.0;
+        }
+        for ((label, cell), share) in shares {
+            let sum = &mut sums[usize::from(label) - 1];
+            sum.resize(dense.channels, 0.0);
+            sum.iter_mut().zip(&dense.values[cell * dense.channels..]).for_each(|(s, v)| *s += share * v);
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok(Grid::build(&masks, &object_of, count, common.seed))
+    Ok(sums)
 }
 
 /// The segmenter's masks of a view, which must fit its camera.

@@ -1,5 +1,6 @@
 //! `fastlgs preprocess`: everything that is done once, before training.
 
+use super::objects;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
@@ -7,10 +8,10 @@ use fastlgs_core::scene_folder::{Manifest, is_held_out};
 use fastlgs_core::undistort::undistort;
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
 use fastlgs_grid::evidence;
-use fastlgs_grid::mapping::{Correspondences, Mask};
+use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::triangulate::{self, PairMatches};
-use fastlgs_vision::{Conse, Encoder, OfflineSegmenter, Segmenter, histogram};
+use fastlgs_vision::{Conse, OfflineSegmenter, Segmenter};
 use image::RgbImage;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -92,6 +93,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let pairs = correspondences(&masks, &segmented, &keypoints, &matches);
     evidence::save(&folder, &masks, &pairs)?;
     lap("points");
+    // Without Gaussians only Algorithm 1 can map the masks; `train` maps again with what it learns, or with its options.
+    let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let mapped = objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), common.seed)?;
+    mapped.grid.save(&folder)?;
+    lap("mapping");
 
     let matched: usize = matches.iter().map(|m| m.pairs.len()).sum();
     let manifest = Manifest {
@@ -113,6 +119,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "held_out": cameras.len() - training.len(),
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
         "masks": masks.len(),
+        "objects_by_algorithm_1": mapped.grid.objects.len(),
         "key_point_matches": matched,
         "points": points.len(),
         "sift": keypoints::backend(),
@@ -196,16 +203,7 @@ fn describe(training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) ->
     let bar = ui::bar(common, training.len() as u64, "embeddings");
     let mut masks = Vec::new();
     for ViewMasks { view, labels } in segmented {
-        let photo = &training[*view].pixels;
-        let embeddings = encoder.embed_masks(photo, labels)?;
-        let histograms = histogram::histograms(photo, labels);
-        let areas = labels.areas();
-        for (k, (embedding, histogram)) in embeddings.into_iter().zip(histograms).enumerate() {
-            let area = areas[k + 1] as f32 / labels.labels.len() as f32;
-            if area > 0.0 {
-                masks.push(Mask { view: *view, label: k as u16 + 1, area, embedding, histogram });
-            }
-        }
+        masks.extend(objects::masks_of(&training[*view].pixels, *view, labels, &encoder)?);
         bar.inc(1);
     }
     bar.finish_and_clear();

@@ -7,7 +7,7 @@ use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::mapping::PaperConfig;
-use fastlgs_grid::{Grid, consensus};
+use fastlgs_grid::{Grid, consensus, whole};
 use fastlgs_raster::{Target, TrainConfig, Trainer, init};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -47,6 +47,9 @@ pub struct Args {
     /// Global mapping: share of the views that must show two regions in one mask to join them.
     #[arg(long, default_value_t = consensus::Config::default().agreement)]
     agreement: f32,
+    /// Global mapping, offline segmenter: likeness of meaning and masks, 0 to 1, from which touching regions are one object.
+    #[arg(long, default_value_t = whole::LIKENESS)]
+    likeness: f32,
     /// Weight of the feature loss.
     #[arg(long, default_value_t = 1.0)]
     feature_weight: f32,
@@ -124,7 +127,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             found.grid
         }
         None => {
-            let config = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
+            let consensus = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
+            let config = objects::Config { consensus, likeness: args.likeness };
             objects::by_consensus(&mut scene, &folder, &training, &config, common)?
         }
     };

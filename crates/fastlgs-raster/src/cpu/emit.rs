@@ -1,3 +1,4 @@
+use super::footprint::{Footprint, span};
 use crate::View;
 
 /// Twin of `shaders/emit.wgsl`.
@@ -5,8 +6,8 @@ pub fn emit(
     view: &View,
     order: &[u32],
     offsets: &[u32],
-    rects: &[[u32; 2]],
-    touched: &[u32],
+    footprints: &[Footprint],
+    touched: &mut [u32],
     pair_tiles: &mut [u32],
     pair_gaussians: &mut [u32],
     first_pair: &mut [u32],
@@ -18,13 +19,19 @@ pub fn emit(
         if touched[g] == 0 {
             continue;
         }
-        let [first, end] = rects[g];
-        for y in first >> 16..end >> 16 {
-            for x in first & 0xffff..end & 0xffff {
-                pair_tiles[e] = y * view.tiles[0] + x;
-                pair_gaussians[e] = g as u32;
-                e += 1;
+        let end = e + touched[g] as usize;
+        let footprint = &footprints[g];
+        for row in footprint[1][2] as u32..footprint[1][3] as u32 {
+            for x in span(footprint, row, view.tiles[0]) {
+                if e < end {
+                    pair_tiles[e] = row * view.tiles[0] + x;
+                    pair_gaussians[e] = g as u32;
+                    e += 1;
+                }
             }
         }
+        touched[g] = e as u32 - first_pair[g];
+        pair_tiles[e..end].fill(view.tile_count());
+        pair_gaussians[e..end].fill(g as u32);
     }
 }

@@ -1,3 +1,4 @@
+use super::footprint::{Footprint, span};
 use super::{ALPHA_MIN, DILATION, NEAR, Splat, covariance};
 use crate::View;
 use crate::view::TILE;
@@ -5,7 +6,7 @@ use fastlgs_core::gaussians::{SH_C0, sigmoid};
 use glam::{Mat3, Mat4, Quat, Vec2, Vec3};
 
 /// Twin of `shaders/project.wgsl`.
-pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [u32], rects: &mut [[u32; 2]], touched: &mut [u32]) {
+pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [u32], footprints: &mut [Footprint], touched: &mut [u32]) {
     let n = view.gaussians as usize;
     let w2c = Mat4::from_cols_array(&view.world_to_camera);
     for i in 0..n {
@@ -24,16 +25,17 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
         let (cxx, cxy, cyy) = (ax.dot(ax) + DILATION, ax.dot(ay), ay.dot(ay) + DILATION);
         let det = cxx * cyy - cxy * cxy;
         let mean = Vec2::from(view.focal) * t.truncate() / t.z + Vec2::from(view.centre);
-        let reach = (2.0 * (opacity / ALPHA_MIN).ln()).sqrt();
-        let extent = reach * Vec2::new(cxx.sqrt(), cyy.sqrt());
-        let finite = det > 0.0 && det < 1e30 && mean.x.abs() < 1e9 && mean.y.abs() < 1e9 && extent.x < 1e9 && extent.y < 1e9;
+        let reach2 = 2.002 * (opacity / ALPHA_MIN).ln() + 1e-4;
+        let half_height = (reach2 * cyy).sqrt();
+        let finite = det > 0.0 && det < 1e30 && mean.x.abs() < 1e9 && mean.y.abs() < 1e9 && half_height < 1e9 && cxx < 1e15;
         if !finite {
             continue;
         }
-        let limit = Vec2::new(view.tiles[0] as f32, view.tiles[1] as f32);
-        let first = ((mean - extent) / TILE as f32).floor().clamp(Vec2::ZERO, limit).as_uvec2();
-        let end = (((mean + extent) / TILE as f32).floor() + 1.0).clamp(Vec2::ZERO, limit).as_uvec2();
-        let count = (end.x.max(first.x) - first.x) * (end.y.max(first.y) - first.y);
+        let (size, rows) = (TILE as f32, view.tiles[1] as f32);
+        let first_row = (((mean.y - half_height + 0.5) / size).ceil() - 1.0).clamp(0.0, rows);
+        let end_row = (((mean.y + half_height - 0.5) / size).floor() + 1.0).clamp(0.0, rows);
+        let footprint = [[mean.x, mean.y, cxy / cyy, det / (cyy * cyy)], [reach2 * cyy, (reach2 / cxx).sqrt() * cxy, first_row, end_row]];
+        let count = (first_row as u32..end_row as u32).map(|row| span(&footprint, row, view.tiles[0]).len() as u32).sum();
         if count == 0 {
             continue;
         }
@@ -44,7 +46,7 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
         splats[i] =
             [[mean.x, mean.y, -0.5 * log2e * qa, -log2e * qb], [-0.5 * log2e * qc, opacity, color.x, color.y], [color.z, f.x, f.y, f.z]];
         depths[i] = (t.z.to_bits() >> 7).min(0xff_fffe);
-        rects[i] = [first.x | (first.y << 16), end.x | (end.y << 16)];
+        footprints[i] = footprint;
         touched[i] = count;
     }
 }

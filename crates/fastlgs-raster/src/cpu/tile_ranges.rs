@@ -5,6 +5,9 @@ pub fn tile_ranges(view: &View, sorted_tiles: &[u32], ranges: &mut [u32]) {
     let pairs = view.pairs as usize;
     for i in 0..pairs {
         let tile = sorted_tiles[i] as usize;
+        if tile >= view.tile_count() as usize {
+            continue;
+        }
         if i == 0 || sorted_tiles[i - 1] as usize != tile {
             ranges[2 * tile] = i as u32;
         }

@@ -1,0 +1,25 @@
+//! Twin of `shaders/shared/footprint.wgsl`.
+
+use crate::view::TILE;
+
+/// The ellipse on which alpha falls to its minimum: (mean.xy, lean, spread) (half height^2, apex, first and end tile row).
+pub type Footprint = [[f32; 4]; 2];
+
+/// Tiles of a row of tiles that the ellipse touches.
+pub fn span(f: &Footprint, row: u32, tiles_x: u32) -> std::ops::Range<u32> {
+    let [[mean_x, mean_y, lean, spread], [height2, apex, ..]] = *f;
+    let half_height = height2.sqrt();
+    let top = ((row * TILE) as f32 + 0.5 - mean_y).max(-half_height);
+    let bottom = ((row * TILE + TILE) as f32 - 0.5 - mean_y).min(half_height);
+    if top > bottom {
+        return 0..0;
+    }
+    let half_width = |dy: f32| ((height2 - dy * dy).max(0.0) * spread).sqrt();
+    let (dy_right, dy_left) = (apex.clamp(top, bottom), (-apex).clamp(top, bottom));
+    let right = mean_x + lean * dy_right + half_width(dy_right);
+    let left = mean_x + lean * dy_left - half_width(dy_left);
+    let (size, limit) = (TILE as f32, tiles_x as f32);
+    let first = (((left + 0.5) / size).ceil() - 1.0).clamp(0.0, limit);
+    let end = (((right - 0.5) / size).floor() + 1.0).clamp(0.0, limit);
+    first as u32..first.max(end) as u32
+}
