@@ -30,6 +30,8 @@ enum Command {
     Query(commands::query::Args),
     /// Measures accuracy on held-out views against labels.
     Eval(commands::eval::Args),
+    /// Measures speed.
+    Bench(commands::bench::Args),
     /// Makes a scene with exact poses, depths and masks.
     Synth(commands::synth::Args),
     /// Lists or installs encoders.
@@ -59,6 +61,7 @@ fn main() -> ExitCode {
         Command::Render(args) => commands::render::run(&args, &common),
         Command::Query(args) => commands::query::run(&args, &common),
         Command::Eval(args) => commands::eval::run(&args, &common),
+        Command::Bench(args) => commands::bench::run(&args, &common),
         Command::Synth(args) => commands::synth::run(&args, &common),
         Command::Models(args) => commands::models::run(&args, &common),
         Command::Info(args) => commands::info::run(&args, &common),

@@ -91,20 +91,22 @@ impl Gaussians {
         }
     }
 
-    /// The Gaussians for which `keep` holds.
-    pub fn filtered(&self, keep: impl Fn(usize) -> bool) -> Self {
-        fn pick<T: Copy>(items: &[T], keep: &[usize]) -> Vec<T> {
-            keep.iter().map(|&i| items[i]).collect()
+    /// The Gaussians at `places`, in that order; a place may occur more than once.
+    ///
+    /// # Panics
+    /// If a place is out of range.
+    pub fn select(&self, places: &[usize]) -> Self {
+        fn pick<T: Copy>(items: &[T], places: &[usize]) -> Vec<T> {
+            places.iter().map(|&i| items[i]).collect()
         }
-        let kept: Vec<usize> = (0..self.len()).filter(|&i| keep(i)).collect();
         Self {
-            means: pick(&self.means, &kept),
-            log_scales: pick(&self.log_scales, &kept),
-            rotations: pick(&self.rotations, &kept),
-            opacity_logits: pick(&self.opacity_logits, &kept),
-            sh_dc: pick(&self.sh_dc, &kept),
-            features: pick(&self.features, &kept),
-            object_ids: pick(&self.object_ids, &kept),
+            means: pick(&self.means, places),
+            log_scales: pick(&self.log_scales, places),
+            rotations: pick(&self.rotations, places),
+            opacity_logits: pick(&self.opacity_logits, places),
+            sh_dc: pick(&self.sh_dc, places),
+            features: pick(&self.features, places),
+            object_ids: pick(&self.object_ids, places),
         }
     }
 
@@ -142,6 +144,6 @@ mod tests {
         g.object_ids = vec![3, 7];
         assert_eq!(Gaussians::from_channels(&g.to_channels(), Some(&g.object_ids)), g);
         assert!((sigmoid(g.opacity_logits[0]) - 0.25).abs() < 1e-6);
-        assert_eq!(g.filtered(|i| i == 1).object_ids, vec![7]);
+        assert_eq!(g.select(&[1]).object_ids, vec![7]);
     }
 }

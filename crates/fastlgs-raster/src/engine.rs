@@ -4,7 +4,7 @@ use crate::cpu::{self, CHUNKS, RUN, Splat};
 use crate::view::{Job, Plane, Step, View};
 use crate::{Error, GpuEngine, Result};
 use fastlgs_core::gaussians::CHANNELS;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 /// A rendered frame, planar.
 #[derive(Clone, Debug)]
@@ -107,6 +107,17 @@ pub trait Engine {
     /// # Errors
     /// When the device failed.
     fn losses(&self) -> Result<Losses>;
+    /// Starts or stops taking the time of each pass; false where the device cannot.
+    fn set_profiling(&mut self, _on: bool) -> bool {
+        false
+    }
+    /// Seconds of each pass since the last call, while profiling.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
+        Ok(BTreeMap::new())
+    }
 }
 
 /// Opens `cpu`, `auto`, or an adapter by name or index.

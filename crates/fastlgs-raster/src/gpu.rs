@@ -1,5 +1,6 @@
 //! Adapters, the device, and buffers.
 
+use crate::profile::Profile;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
 
@@ -15,6 +16,8 @@ pub struct Gpu {
     pub subgroups: bool,
     /// Largest storage binding in bytes.
     pub max_binding: u64,
+    /// Times of the passes, where asked for.
+    pub(crate) profile: Option<Profile>,
     /// First error that no one caught (out of memory, lost device).
     failure: Arc<Mutex<Option<String>>>,
 }
@@ -61,7 +64,8 @@ impl Gpu {
         let info = adapter.get_info();
         let limits = adapter.limits();
         let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && info.subgroup_min_size >= 8;
-        let features = if subgroups { wgpu::Features::SUBGROUP } else { wgpu::Features::empty() };
+        let mut features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+        features.set(wgpu::Features::SUBGROUP, subgroups);
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fastlgs"),
             required_features: features,
@@ -80,7 +84,7 @@ impl Gpu {
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
             slot.lock().expect("no panic while holding the lock").get_or_insert_with(|| e.to_string());
         }));
-        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size, failure })
+        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size, profile: None, failure })
     }
 
     /// An uninitialised storage buffer of `bytes` (at least 16).

@@ -3,10 +3,11 @@
 use crate::cpu::{CHUNKS, RUN};
 use crate::engine::{Engine, Frame, Losses, StepOptions, losses_of, planes, tile_bits};
 use crate::pass::{Pass, shaders};
+use crate::profile::Profile;
 use crate::view::{Job, Step, View};
 use crate::{Error, Gpu, Result};
 use fastlgs_core::gaussians::CHANNELS;
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use wgpu::{Buffer, CommandEncoder};
 
 /// Workgroup size of the kernels that run over Gaussians, pairs or pixels.
@@ -350,5 +351,14 @@ impl Engine for GpuEngine {
         };
         let sums = 6 * (view.size[1].div_ceil(RUN as u32) * view.size[0]) as usize;
         Ok(losses_of(view, &self.gpu.read(&t.ssim_sums, sums)?, &self.gpu.read(&t.l1_sums, sums)?))
+    }
+
+    fn set_profiling(&mut self, on: bool) -> bool {
+        self.gpu.profile = if on { Profile::new(&self.gpu) } else { None };
+        self.gpu.profile.is_some() == on
+    }
+
+    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
+        self.gpu.profile.as_ref().map_or_else(|| Ok(BTreeMap::new()), |p| p.take(&self.gpu))
     }
 }

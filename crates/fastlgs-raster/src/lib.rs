@@ -15,6 +15,7 @@ mod gpu_engine;
 pub mod init;
 pub mod lift;
 mod pass;
+mod profile;
 mod trainer;
 mod view;
 

@@ -1,0 +1,25 @@
+//! `fastlgs bench`: what the program costs and what it gives.
+
+mod speed;
+
+use crate::{Outcome, ui};
+use anyhow::Result;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench speed scenes/fox --gaussians 50000 --size 270x480")]
+pub struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand)]
+enum What {
+    /// Milliseconds of every pass, frames and training iterations a second.
+    Speed(speed::Args),
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    match &args.what {
+        What::Speed(args) => speed::run(args, common),
+    }
+}
