@@ -82,7 +82,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let log2e = 1.4426950408889634;
     let conic = vec3<f32>(cyy, -cxy, cxx) / det;
     splats[3u * i] = vec4<f32>(mean, -0.5 * log2e * conic.x, -log2e * conic.y);
-    splats[3u * i + 1u] = vec4<f32>(-0.5 * log2e * conic.z, opacity, color.r, color.g);
+    splats[3u * i + 1u] = vec4<f32>(-0.5 * log2e * conic.z, min(opacity, ALPHA_MAX), color.r, color.g);
     splats[3u * i + 2u] = vec4<f32>(color.b, feature);
     // Positive floats ascend with their bits; sign and the last 7 bits are dropped.
     depths[i] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);

@@ -57,8 +57,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     put3(FEATURE, i, c.yzw);
     let s0 = splats[3u * i];
     let s1 = splats[3u * i + 1u];
+    // Opacity is clamped at ALPHA_MAX from above.
     let opacity = s1.y;
-    gradients[OPACITY * n + i] = b.y * opacity * (1.0 - opacity);
+    gradients[OPACITY * n + i] = select(0.0, b.y * opacity * (1.0 - opacity), opacity < ALPHA_MAX);
 
     // Conic (natural exponent) from the base-2 exponent.
     let ln2 = 0.6931471805599453;

@@ -1,5 +1,8 @@
-//! Puts the WGSL passes together (`#import NAME`, `#ifdef FLAG`/`#else`/`#endif`), validates every permutation with
-//! naga, and writes `shaders.rs`: for each pass its sources and the kinds of its bindings.
+//! Puts the WGSL passes together, validates every permutation with naga, and writes `shaders.rs`: for each pass its
+//! sources and the kinds of its bindings.
+//!
+//! `#import NAME` takes in `shared/NAME.wgsl` once; `#ifdef FLAG`/`#else`/`#endif` choose by permutation; the lines between
+//! `#each Q` and `#end` are repeated for the pixel quads of an invocation, `$Q` being the quad's number.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -19,13 +22,14 @@ fn main() {
     for path in passes {
         println!("cargo::rerun-if-changed={}", path.display());
         let name = path.file_stem().expect("a file").to_str().expect("UTF-8").to_owned();
-        let plain = assemble(root, &path, false);
-        let subgroups = assemble(root, &path, true);
-        let bindings = validate(&name, &plain);
-        assert_eq!(bindings, validate(&name, &subgroups), "{name}: both permutations bind the same");
+        let sources = PERMUTATIONS.map(|flags| assemble(root, &path, flags));
+        let bindings = validate(&name, &sources[0]);
+        for source in &sources[1..] {
+            assert_eq!(bindings, validate(&name, source), "{name}: all permutations bind the same");
+        }
         writeln!(
             out,
-            "/// `shaders/{name}.wgsl`\npub static {}: Shader = Shader {{ name: {name:?}, plain: {plain:?}, subgroups: {subgroups:?}, bindings: &[{}] }};",
+            "/// `shaders/{name}.wgsl`\npub static {}: Shader = Shader {{ name: {name:?}, sources: {sources:?}, bindings: &[{}] }};",
             name.to_uppercase(),
             bindings.join(", ")
         )
@@ -34,20 +38,26 @@ fn main() {
     fs::write(Path::new(&env::var("OUT_DIR").expect("cargo sets OUT_DIR")).join("shaders.rs"), out).expect("writable OUT_DIR");
 }
 
-fn assemble(root: &Path, path: &Path, subgroups: bool) -> String {
+/// Flags of the permutations, in the order of `Shape` in `src/gpu.rs`.
+const PERMUTATIONS: [&[&str]; 3] = [&[], &["SUBGROUPS"], &["WIDE"]];
+
+fn assemble(root: &Path, path: &Path, flags: &[&str]) -> String {
     let mut seen = BTreeSet::new();
     let mut out = String::new();
-    expand(root, path, subgroups, &mut seen, &mut out);
+    expand(root, path, flags, &mut seen, &mut out);
     out
 }
 
-fn expand(root: &Path, path: &Path, subgroups: bool, seen: &mut BTreeSet<String>, out: &mut String) {
+fn expand(root: &Path, path: &Path, flags: &[&str], seen: &mut BTreeSet<String>, out: &mut String) {
     let text = fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
+    // An 8x8 tile has 16 quads; it is one invocation's, or shared by eight.
+    let quads = if flags.contains(&"WIDE") { 16 } else { 2 };
     let mut active = vec![true];
+    let mut repeated: Option<String> = None;
     for line in text.lines() {
         let words: Vec<&str> = line.split_whitespace().collect();
         match words.as_slice() {
-            ["#ifdef", "SUBGROUPS"] => active.push(subgroups),
+            ["#ifdef", flag] => active.push(flags.contains(flag)),
             ["#else"] => {
                 let last = active.last_mut().expect("#else follows #ifdef");
                 *last = !*last;
@@ -58,12 +68,18 @@ fn expand(root: &Path, path: &Path, subgroups: bool, seen: &mut BTreeSet<String>
             _ if !active.iter().all(|a| *a) => {}
             ["#import", name] => {
                 if seen.insert((*name).to_owned()) {
-                    expand(root, &root.join("shared").join(format!("{name}.wgsl")), subgroups, seen, out);
+                    expand(root, &root.join("shared").join(format!("{name}.wgsl")), flags, seen, out);
                 }
             }
+            ["#each", "Q"] => repeated = Some(String::new()),
+            ["#end"] => {
+                let lines = repeated.take().expect("#end follows #each");
+                (0..quads).for_each(|q| out.push_str(&lines.replace("$Q", &q.to_string())));
+            }
             _ => {
-                out.push_str(line);
-                out.push('\n');
+                let target = repeated.as_mut().unwrap_or(out);
+                target.push_str(line);
+                target.push('\n');
             }
         }
     }

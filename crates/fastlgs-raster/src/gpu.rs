@@ -4,6 +4,24 @@ use crate::profile::Profile;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
 
+/// How the blending kernels divide an 8x8 tile; `shaders/shared/lane.wgsl`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shape {
+    /// Eight invocations a tile, which add up their gradients in shared memory.
+    Shared,
+    /// The same with subgroup operations.
+    Subgroups,
+    /// One invocation a tile: for software rasterisers, whose invocations are vector lanes.
+    Wide,
+}
+
+impl Shape {
+    /// Workgroups that blend `tiles` tiles.
+    pub fn groups(self, tiles: u32) -> u32 {
+        if self == Shape::Wide { tiles.div_ceil(8) } else { tiles }
+    }
+}
+
 /// An opened device.
 pub struct Gpu {
     /// The logical device.
@@ -12,8 +30,8 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name of the adapter.
     pub name: String,
-    /// Whether kernels may use subgroup operations over 8 lanes.
-    pub subgroups: bool,
+    /// How the blending kernels divide a tile.
+    pub shape: Shape,
     /// Largest storage binding in bytes.
     pub max_binding: u64,
     /// Times of the passes, where asked for.
@@ -64,6 +82,11 @@ impl Gpu {
         let info = adapter.get_info();
         let limits = adapter.limits();
         let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && info.subgroup_min_size >= 8;
+        let shape = match (info.device_type, subgroups) {
+            (wgpu::DeviceType::Cpu, _) => Shape::Wide,
+            (_, true) => Shape::Subgroups,
+            _ => Shape::Shared,
+        };
         let mut features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         features.set(wgpu::Features::SUBGROUP, subgroups);
         let descriptor = wgpu::DeviceDescriptor {
@@ -84,7 +107,7 @@ impl Gpu {
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
             slot.lock().expect("no panic while holding the lock").get_or_insert_with(|| e.to_string());
         }));
-        Ok(Self { device, queue, name: info.name, subgroups, max_binding: limits.max_storage_buffer_binding_size, profile: None, failure })
+        Ok(Self { device, queue, name: info.name, shape, max_binding: limits.max_storage_buffer_binding_size, profile: None, failure })
     }
 
     /// An uninitialised storage buffer of `bytes` (at least 16).

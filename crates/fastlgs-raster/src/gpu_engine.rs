@@ -224,7 +224,7 @@ impl GpuEngine {
         e.clear_buffer(&frame.ranges, 0, None);
         self.passes.tile_ranges.record(&self.gpu, e, &[&uniform, &list.sort.keys[side], &frame.ranges], view.pairs.div_ceil(GROUP));
         let buffers = [&uniform, &frame.ranges, &list.sort.values[side], &list.gaussians, &g.splats, &frame.frame];
-        self.passes.blend.record(&self.gpu, e, &buffers, view.tile_count());
+        self.passes.blend.record(&self.gpu, e, &buffers, self.gpu.shape.groups(view.tile_count()));
         self.gpu.submit(encoder);
         Ok(view)
     }
@@ -334,7 +334,7 @@ impl Engine for GpuEngine {
         let side = tile_bits(&view).div_ceil(8) as usize % 2;
         let sorted = &list.sort.values[side];
         let buffers = [&uniform, &frame.ranges, sorted, &list.gaussians, &g.splats, &frame.frame, &t.gradient, slots];
-        self.passes.blend_backward.record(&self.gpu, e, &buffers, view.tile_count());
+        self.passes.blend_backward.record(&self.gpu, e, &buffers, self.gpu.shape.groups(view.tile_count()));
         let buffers = [&uniform, &g.params, &g.splats, &g.touched, &g.first_pair, slots, &g.gradients, &g.stats];
         self.passes.project_backward.record(&self.gpu, e, &buffers, (g.n as u32).div_ceil(GROUP));
         let step = self.gpu.uniform(step);

@@ -13,14 +13,12 @@ pub enum Binding {
     ReadWrite,
 }
 
-/// An assembled, validated shader; both permutations have the same bindings 0, 1, 2, ...
+/// An assembled, validated shader; all permutations have the same bindings 0, 1, 2, ...
 pub struct Shader {
     /// File name without ending: also that of the CPU twin.
     pub name: &'static str,
-    /// Source that needs no optional feature.
-    pub plain: &'static str,
-    /// Source that uses subgroup operations.
-    pub subgroups: &'static str,
+    /// Source for each [`crate::gpu::Shape`], in its order.
+    pub sources: [&'static str; 3],
     /// Kind of each binding.
     pub bindings: &'static [Binding],
 }
@@ -45,7 +43,7 @@ const MAX_GROUPS: u32 = 65_535;
 impl Pass {
     /// Compiles the permutation that the device can run.
     pub fn new(gpu: &Gpu, shader: &Shader) -> Self {
-        let source = if gpu.subgroups { shader.subgroups } else { shader.plain };
+        let source = shader.sources[gpu.shape as usize];
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),
             source: wgpu::ShaderSource::Wgsl(source.into()),

@@ -2,6 +2,7 @@
 
 use crate::cpu::{self, CHUNKS, RUN, Splat};
 use crate::engine::{CpuEngine, Engine, StepOptions, radix_sort_cpu, tile_bits};
+use crate::gpu::Shape;
 use crate::pass::{Pass, Shader, shaders};
 use crate::view::{Job, Plane, Step, View};
 use crate::{Gpu, GpuEngine};
@@ -232,8 +233,11 @@ fn listing_passes_match_their_twins() {
 
 #[test]
 fn blending_passes_match_their_twins() {
-    let Some(gpu) = gpu() else { return };
-    for (n, w, h) in SIZES {
+    let Some(mut gpu) = gpu() else { return };
+    let subgroups = gpu.device.features().contains(wgpu::Features::SUBGROUP);
+    let shapes = [Shape::Wide, Shape::Shared, Shape::Subgroups];
+    for (shape, (n, w, h)) in shapes.into_iter().filter(|s| subgroups || *s != Shape::Subgroups).flat_map(|s| SIZES.map(|size| (s, size))) {
+        gpu.shape = shape;
         let params = cloud(n, 9, true).to_channels();
         let mut view = View::new(&camera(w, h), params.len() / CHANNELS);
         view.background_color = [0.2, 0.4, 0.6, 0.0];
@@ -245,11 +249,11 @@ fn blending_passes_match_their_twins() {
             &shaders::BLEND,
             &l.view,
             &[bytes(&l.ranges), bytes(&l.sorted_pairs), bytes(&l.pair_gaussians), bytes(&l.p.splats), bytes(&frame)],
-            l.view.tile_count(),
+            shape.groups(l.view.tile_count()),
         );
         cpu::blend(&l.view, &l.ranges, &l.sorted_pairs, &l.pair_gaussians, &l.p.splats, &mut frame);
         let visible = 7 * l.view.pixels();
-        assert_close("frame", &floats(&out[4])[..visible], &frame[..visible], 1e-3, 0.001);
+        assert_close(&format!("frame, {shape:?}"), &floats(&out[4])[..visible], &frame[..visible], 1e-3, 0.001);
 
         let mut rng = Rng::new(2, "gradient");
         let gradient: Vec<f32> = (0..6 * l.view.pixels()).map(|_| rng.normal()).collect();
@@ -263,9 +267,9 @@ fn blending_passes_match_their_twins() {
             bytes(&gradient),
             bytes(&slots),
         ];
-        let out = run_pass(&gpu, &shaders::BLEND_BACKWARD, &l.view, &inputs, l.view.tile_count());
+        let out = run_pass(&gpu, &shaders::BLEND_BACKWARD, &l.view, &inputs, shape.groups(l.view.tile_count()));
         cpu::blend_backward(&l.view, &l.ranges, &l.sorted_pairs, &l.pair_gaussians, &l.p.splats, &frame, &gradient, &mut slots);
-        assert_close("slots", &floats(&out[6]), bytemuck::cast_slice(&slots), 0.02, 0.005);
+        assert_close(&format!("slots, {shape:?}"), &floats(&out[6]), bytemuck::cast_slice(&slots), 0.02, 0.005);
 
         let count = view.gaussians as usize;
         let (mut gradients, mut stats) = (vec![0.0; CHANNELS * count], vec![0.0; 2 * count]);

@@ -1,5 +1,5 @@
-use super::blend::{block, blocks};
-use super::{ALPHA_MAX, Splat, alpha};
+use super::blend::pixels_of;
+use super::{Splat, alpha};
 use crate::View;
 use rayon::prelude::*;
 
@@ -20,8 +20,7 @@ pub fn blend_backward(
         .into_par_iter()
         .map(|tile| {
             let pairs = &sorted_pairs[ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
-            let mut pixels: Vec<_> = blocks(tile, view)
-                .flat_map(|(x, y)| block(x, y, view))
+            let mut pixels: Vec<_> = pixels_of(tile, view)
                 .map(|(x, y)| {
                     let at = (y * view.size[0] + x) as usize;
                     let g: [f32; 6] = std::array::from_fn(|c| gradient[c * n + at]);
@@ -42,7 +41,7 @@ pub fn blend_backward(
                     let w = a * *transmittance;
                     let worth: f32 = (0..moving).map(|c| values[c] * g[c]).sum();
                     *behind -= w * worth;
-                    let d_alpha = if a < ALPHA_MAX { *transmittance * worth - *behind / (1.0 - a) } else { 0.0 };
+                    let d_alpha = *transmittance * worth - *behind / (1.0 - a);
                     *transmittance -= w;
                     let p = d_alpha * a;
                     let add = [p * dx, p * dy, p * dx * dx, p * dx * dy, p * dy * dy, p / splat[1][1]];

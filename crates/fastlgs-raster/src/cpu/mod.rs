@@ -62,8 +62,8 @@ pub(crate) fn chunk(n: usize, t: usize) -> std::ops::Range<usize> {
 
 /// Alpha of a splat at offset (dx, dy) from its mean; 0 where it is not drawn.
 pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32, transmittance: f32) -> f32 {
-    let power = (dx * (splat[0][2] * dx + splat[0][3] * dy) + splat[1][0] * dy * dy).min(0.0);
-    let alpha = (splat[1][1] * power.exp2()).min(ALPHA_MAX);
+    let power = dx * (splat[0][2] * dx + splat[0][3] * dy) + splat[1][0] * dy * dy;
+    let alpha = splat[1][1] * power.exp2();
     if alpha >= ALPHA_MIN && transmittance >= TRANSMITTANCE_MIN { alpha } else { 0.0 }
 }
 

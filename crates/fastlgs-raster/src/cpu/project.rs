@@ -1,5 +1,5 @@
 use super::footprint::{Footprint, span};
-use super::{ALPHA_MIN, DILATION, NEAR, Splat, covariance};
+use super::{ALPHA_MAX, ALPHA_MIN, DILATION, NEAR, Splat, covariance};
 use crate::View;
 use crate::view::TILE;
 use fastlgs_core::gaussians::{SH_C0, sigmoid};
@@ -43,8 +43,11 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
         let f = if view.depth_as_feature == 1 { Vec3::new(t.z, 0.0, 0.0) } else { param3(14) };
         let log2e = std::f32::consts::LOG2_E;
         let (qa, qb, qc) = (cyy / det, -cxy / det, cxx / det);
-        splats[i] =
-            [[mean.x, mean.y, -0.5 * log2e * qa, -log2e * qb], [-0.5 * log2e * qc, opacity, color.x, color.y], [color.z, f.x, f.y, f.z]];
+        splats[i] = [
+            [mean.x, mean.y, -0.5 * log2e * qa, -log2e * qb],
+            [-0.5 * log2e * qc, opacity.min(ALPHA_MAX), color.x, color.y],
+            [color.z, f.x, f.y, f.z],
+        ];
         depths[i] = (t.z.to_bits() >> 7).min(0xff_fffe);
         footprints[i] = footprint;
         touched[i] = count;

@@ -1,5 +1,5 @@
 use super::project::rotation;
-use super::{Splat, covariance};
+use super::{ALPHA_MAX, Splat, covariance};
 use crate::View;
 use fastlgs_core::gaussians::{CHANNELS, SH_C0};
 use glam::{Mat4, Vec2, Vec3, Vec4};
@@ -90,6 +90,6 @@ pub fn project_backward(
         d_t.z -= inv * inv * focal.dot(d_rows) + inv * inv * d_slope.dot(t.truncate());
         put3(0, world.transpose() * d_t);
         (0..4).for_each(|k| gradients[(6 + k) * n + i] = d_rotation[k]);
-        gradients[10 * n + i] = b[1] * opacity * (1.0 - opacity);
+        gradients[10 * n + i] = if opacity < ALPHA_MAX { b[1] * opacity * (1.0 - opacity) } else { 0.0 };
     }
 }
