@@ -25,12 +25,23 @@ pub struct Manifest {
     pub seed: u64,
     /// What was survivable but wrong in the input.
     pub warnings: Vec<String>,
+    /// Views that are not trained on because their poses contradict those of the others.
+    #[serde(default)]
+    pub excluded: Vec<String>,
     /// Seconds a stage took, by name.
     #[serde(default)]
     pub seconds: BTreeMap<String, f64>,
     /// Notes of later stages (training preset, adapter, figures).
     #[serde(default)]
     pub notes: BTreeMap<String, serde_json::Value>,
+}
+
+impl Manifest {
+    /// The views that may be trained on, in their order.
+    pub fn training(&self, cameras: &[Camera]) -> Vec<Camera> {
+        let usable = |(i, c): &(usize, &Camera)| !is_held_out(*i, self.holdout) && !self.excluded.contains(&c.name);
+        cameras.iter().enumerate().filter(usable).map(|(_, c)| c.clone()).collect()
+    }
 }
 
 /// A scene folder on disk. Paths are given by the methods; nothing is cached.

@@ -110,6 +110,13 @@ pub fn epipolar_error(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
     (residual / line_b.truncate().length().max(1e-12)).max(residual / line_a.truncate().length().max(1e-12))
 }
 
+/// Signed first-order distance in pixels of a match to the epipolar geometry (Sampson).
+pub fn epipolar_residual(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
+    let (pa, pb) = (a.extend(1.0), b.extend(1.0));
+    let (line_b, line_a) = (*f * pa, f.transpose() * pb);
+    pb.dot(line_b) / (line_b.truncate().length_squared() + line_a.truncate().length_squared()).sqrt().max(1e-12)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -9,6 +9,7 @@ pub mod encoder;
 pub mod histogram;
 pub mod keypoints;
 pub mod models;
+pub mod pose_check;
 pub mod regions;
 mod runtime;
 pub mod segmenter;

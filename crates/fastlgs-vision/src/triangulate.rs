@@ -43,7 +43,7 @@ pub fn epipolar_filter(a: (&Camera, &Keypoints), b: (&Camera, &Keypoints), pairs
 }
 
 /// The point nearest to both rays, if it lies before both cameras and reprojects well.
-fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2) -> Option<Vec3> {
+pub(crate) fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2) -> Option<Vec3> {
     let ray = |c: &Camera, p: Vec2| (c.world_to_camera.inverse().transform_vector3(c.ray(p))).normalize();
     let (oa, ob, da, db) = (a.centre(), b.centre(), ray(a, pa), ray(b, pb));
     let cosine = da.dot(db);

@@ -10,6 +10,7 @@ use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::pose_check;
 use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Conse, OfflineSegmenter, Segmenter};
 use image::RgbImage;
@@ -72,23 +73,37 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         tracing::warn!("{warning}");
     }
     let folder = SceneFolder::new(&args.output);
-    let photos = load_photos(&dataset, args.max_side, &folder, common)?;
+    let mut photos = load_photos(&dataset, args.max_side, &folder, common)?;
+    lap("photos");
+    let mut keypoints = detect(&photos, common)?;
+    lap("key_points");
+    let mut warnings = dataset.warnings.clone();
+    let checked = check_poses(&mut photos, &keypoints, common.seed, &mut warnings);
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
-    let training: Vec<Photo> = photos.into_iter().enumerate().filter(|(i, _)| !is_held_out(*i, args.holdout)).map(|p| p.1).collect();
+    let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
+    let usable = |i: usize| !is_held_out(i, args.holdout) && !checked.contradictory.contains(&i);
+    let mut index = 0..;
+    keypoints.retain(|_| index.next().is_some_and(usable));
+    let training: Vec<Photo> = photos.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
     if training.len() < 2 {
         bail!("{}: only {} photos are left for training; at least 2 are needed", args.photos.display(), training.len());
     }
-    lap("photos");
+    lap("pose_check");
 
     let segmented = segment(args, &training, &folder, common)?;
     lap("masks");
     let masks = describe(&training, &segmented, common)?;
     lap("embeddings");
-    let (keypoints, matches) = match_photos(&training, args.neighbours, common)?;
-    lap("key_points");
+    let matches = match_photos(&training, &keypoints, args.neighbours, common);
+    lap("matches");
 
-    let points = if dataset.points.is_empty() { triangulated(&training, &keypoints, &matches) } else { dataset.points.clone() };
+    // Points of moved cameras lie where those cameras were.
+    let points = if dataset.points.is_empty() || !checked.moved.is_empty() {
+        triangulated(&training, &keypoints, &matches)
+    } else {
+        dataset.points.clone()
+    };
     folder.save_points(&points)?;
     let pairs = correspondences(&masks, &segmented, &keypoints, &matches);
     evidence::save(&folder, &masks, &pairs)?;
@@ -107,7 +122,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         segmenter: args.segmenter.clone(),
         encoder: args.encoder.clone(),
         seed: common.seed,
-        warnings: dataset.warnings.clone(),
+        warnings: warnings.clone(),
+        excluded,
         seconds: seconds.clone(),
         notes: BTreeMap::new(),
     };
@@ -123,7 +139,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "key_point_matches": matched,
         "points": points.len(),
         "sift": keypoints::backend(),
-        "warnings": dataset.warnings,
+        "moved_cameras": checked.moved.len(),
+        "warnings": warnings,
         "seconds": seconds,
         "seconds_total": started.elapsed().as_secs_f64(),
     });
@@ -210,15 +227,42 @@ fn describe(training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) ->
     Ok(masks)
 }
 
-fn match_photos(training: &[Photo], neighbours: usize, common: &ui::Common) -> Result<(Vec<Keypoints>, Vec<PairMatches>)> {
-    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
-    let chosen = triangulate::overlapping_pairs(&cameras, neighbours);
-    let bar = ui::bar(common, (training.len() + chosen.len()) as u64, "key points");
+fn detect(photos: &[Photo], common: &ui::Common) -> Result<Vec<Keypoints>> {
+    let bar = ui::bar(common, photos.len() as u64, "key points");
     let mut points = Vec::new();
-    for photo in training {
+    for photo in photos {
         points.push(keypoints::detect(&image::imageops::grayscale(&photo.pixels))?);
         bar.inc(1);
     }
+    bar.finish_and_clear();
+    Ok(points)
+}
+
+/// Moves misplaced cameras and warns about them. Poses come from all photos, held out or not, as in structure from motion.
+fn check_poses(photos: &mut [Photo], keypoints: &[Keypoints], seed: u64, warnings: &mut Vec<String>) -> pose_check::Report {
+    let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
+    let report = pose_check::repair(&mut cameras, keypoints, seed);
+    let names = |list: &[usize]| list.iter().map(|&i| cameras[i].name.as_str()).collect::<Vec<_>>().join(", ");
+    for (list, what) in [
+        (&report.moved, "contradicted the photos and were moved to where the key points match"),
+        (&report.contradictory, "contradict the photos and could not be mended; these views are not trained on"),
+    ] {
+        if !list.is_empty() {
+            let warning = format!("the poses of {} of {} photos {what}: {}", list.len(), photos.len(), names(list));
+            tracing::warn!("{warning}");
+            warnings.push(warning);
+        }
+    }
+    for (photo, camera) in photos.iter_mut().zip(cameras) {
+        photo.camera = camera;
+    }
+    report
+}
+
+fn match_photos(training: &[Photo], points: &[Keypoints], neighbours: usize, common: &ui::Common) -> Vec<PairMatches> {
+    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let chosen = triangulate::overlapping_pairs(&cameras, neighbours);
+    let bar = ui::bar(common, chosen.len() as u64, "matches");
     let mut matches = Vec::new();
     for (a, b) in chosen {
         let pairs = keypoints::matches(&points[a], &points[b]);
@@ -227,7 +271,7 @@ fn match_photos(training: &[Photo], neighbours: usize, common: &ui::Common) -> R
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok((points, matches))
+    matches
 }
 
 fn triangulated(training: &[Photo], points: &[Keypoints], matches: &[PairMatches]) -> Vec<dataset::SfmPoint> {

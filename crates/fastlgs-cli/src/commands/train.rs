@@ -72,8 +72,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let folder = SceneFolder::open(&args.scene)?;
     let mut manifest = folder.manifest()?;
     let cameras = folder.cameras()?;
-    let training: Vec<Camera> =
-        cameras.iter().enumerate().filter(|(i, _)| !is_held_out(*i, manifest.holdout)).map(|c| c.1.clone()).collect();
+    let training = manifest.training(&cameras);
     let paper = if args.mapping == "paper" {
         let config = PaperConfig { tau: args.tau, theta: args.theta, alpha: args.alpha };
         Some(objects::by_algorithm_1(&folder, &training, &config, common.seed)?)
