@@ -7,6 +7,7 @@
 //! * images are row-major; planar float images are `[channel][row][column]`.
 
 pub mod camera;
+pub mod color;
 pub mod dataset;
 pub mod error;
 pub mod exr_image;

@@ -18,7 +18,7 @@ pub struct QueryConfig {
 }
 
 /// Calibrated on the offline encoder: see `docs/evaluation.md`.
-pub const MIN_SCORE: f32 = 0.95;
+pub const MIN_SCORE: f32 = 0.9;
 
 impl Default for QueryConfig {
     fn default() -> Self {

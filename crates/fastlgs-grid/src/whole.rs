@@ -8,36 +8,58 @@ use crate::consensus::{Regions, Seen, agreement, merged};
 use std::collections::BTreeMap;
 
 /// Likeness, 0 to 1, from which touching regions are one object.
-pub const LIKENESS: f32 = 0.4;
+pub const LIKENESS: f32 = 0.33;
+/// Length of the mean meaning that counts as much as colour: logits of plain walls have about 14, of known things 35.
+const HALF_TELLING: f32 = 20.0;
+/// Colour distance (CIE Lab) at which likeness falls to 1/e.
+const COLOR_RANGE: f32 = 20.0;
 /// Pairs of neighbouring Gaussians that make two regions touch, as a share of the smaller one's.
 const TOUCH: f32 = 0.02;
 
+/// What a region looks like: sums over all pixels of all views that show it.
+#[derive(Clone, Debug, Default)]
+pub struct Look {
+    /// Number of pixels.
+    pub pixels: f32,
+    /// CIE Lab colour.
+    pub color: [f32; 3],
+    /// A signed description of what is there, such as class logits without their mean.
+    pub meaning: Vec<f32>,
+}
+
 struct Group {
     seen: Seen,
-    meaning: Vec<f32>,
+    look: Look,
     gaussians: u32,
     members: Vec<u16>,
 }
 
-/// Mean of the views' agreement and the cosine of the meanings.
+/// Mean of the views' agreement and of how alike they look: by meaning where both mean something, else by colour.
 fn likeness(a: &Group, b: &Group) -> f32 {
     let dot = |x: &[f32], y: &[f32]| x.iter().zip(y).map(|(p, q)| p * q).sum::<f32>();
-    let cosine = dot(&a.meaning, &b.meaning) / (dot(&a.meaning, &a.meaning) * dot(&b.meaning, &b.meaning)).sqrt().max(1e-12);
-    0.5 * (cosine.max(0.0) + agreement(&a.seen, &b.seen))
+    let strength = |l: &Look| dot(&l.meaning, &l.meaning).sqrt();
+    let (sa, sb) = (strength(&a.look), strength(&b.look));
+    let cosine = dot(&a.look.meaning, &b.look.meaning) / (sa * sb).max(1e-12);
+    let mean = |l: &Look, k: usize| l.color[k] / l.pixels.max(1.0);
+    let distance = (0..3).map(|k| (mean(&a.look, k) - mean(&b.look, k)).powi(2)).sum::<f32>().sqrt();
+    let telling = (sa / a.look.pixels.max(1.0)).min(sb / b.look.pixels.max(1.0)).powi(2);
+    let telling = telling / (telling + HALF_TELLING * HALF_TELLING);
+    let alike = telling * cosine.max(0.0) + (1.0 - telling) * (-distance / COLOR_RANGE).exp();
+    0.5 * (alike + agreement(&a.seen, &b.seen))
 }
 
 /// Object of each region, 1..=K in order of falling number of Gaussians; and K.
 ///
-/// `meanings[k]` is the sum over all pixels that show region k + 1 of a signed description of what they look like.
-pub fn join(regions: &Regions, meanings: Vec<Vec<f32>>, least: f32) -> (Vec<u16>, u16) {
-    let mut sizes = vec![0u32; meanings.len() + 1];
+/// `looks[k]` is that of region k + 1.
+pub fn join(regions: &Regions, looks: Vec<Look>, least: f32) -> (Vec<u16>, u16) {
+    let mut sizes = vec![0u32; looks.len() + 1];
     regions.of.iter().for_each(|r| sizes[usize::from(*r)] += 1);
     let mut groups: Vec<Option<Group>> = regions
         .seen
         .iter()
-        .zip(meanings)
+        .zip(looks)
         .enumerate()
-        .map(|(k, (seen, meaning))| Some(Group { seen: seen.clone(), meaning, gaussians: sizes[k + 1], members: vec![k as u16] }))
+        .map(|(k, (seen, look))| Some(Group { seen: seen.clone(), look, gaussians: sizes[k + 1], members: vec![k as u16] }))
         .collect();
     let mut contacts: BTreeMap<(usize, usize), u32> =
         regions.contacts.iter().map(|(&(a, b), n)| ((usize::from(a) - 1, usize::from(b) - 1), *n)).collect();
@@ -50,7 +72,9 @@ pub fn join(regions: &Regions, meanings: Vec<Vec<f32>>, least: f32) -> (Vec<u16>
         let Some(gone) = groups[b].take() else { break };
         if let Some(group) = &mut groups[a] {
             group.seen = merged(&group.seen, &gone.seen);
-            group.meaning.iter_mut().zip(&gone.meaning).for_each(|(x, y)| *x += y);
+            group.look.pixels += gone.look.pixels;
+            group.look.color.iter_mut().zip(gone.look.color).for_each(|(x, y)| *x += y);
+            group.look.meaning.iter_mut().zip(gone.look.meaning).for_each(|(x, y)| *x += y);
             group.gaussians += gone.gaussians;
             group.members.extend(gone.members);
         }
@@ -89,8 +113,19 @@ mod tests {
             contacts: BTreeMap::from([((1, 2), 2), ((2, 3), 2)]),
         };
         // 1 and 2 mean the same and touch; 3 touches but means something else; 4 means the same but is elsewhere.
-        let meanings = vec![vec![1.0, 0.1], vec![1.0, 0.0], vec![0.0, 1.0], vec![1.0, 0.0]];
-        let (object, count) = join(&regions, meanings, 0.4);
+        let look = |meaning: [f32; 2]| Look { pixels: 10.0, color: [500.0, 0.0, 0.0], meaning: meaning.map(|m| 1000.0 * m).to_vec() };
+        let looks = vec![look([1.0, 0.1]), look([1.0, 0.0]), look([0.0, 1.0]), look([1.0, 0.0])];
+        let (object, count) = join(&regions, looks, 0.4);
         assert_eq!((object, count), (vec![1, 1, 2, 3], 3));
+    }
+
+    #[test]
+    fn colour_decides_where_nothing_is_recognised() {
+        let seen = |label: u16| -> Seen { (0..4).map(|view| ((view, label), 10.0)).collect() };
+        let regions =
+            Regions { of: vec![1, 2, 3], seen: (1..=3).map(seen).collect(), contacts: BTreeMap::from([((1, 2), 1), ((2, 3), 1)]) };
+        let look = |lightness: f32| Look { pixels: 10.0, color: [10.0 * lightness, 0.0, 0.0], meaning: vec![1.0, 0.0] };
+        let (object, _) = join(&regions, vec![look(80.0), look(78.0), look(20.0)], 0.33);
+        assert!(object[0] == object[1] && object[1] != object[2], "{object:?}");
     }
 }

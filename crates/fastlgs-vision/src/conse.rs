@@ -126,7 +126,8 @@ impl Conse {
         Ok(self.mask_probabilities(photo, masks)?.iter().map(best).collect())
     }
 
-    /// Mean class probabilities over the two crops of each label 1..=max; empty for labels that do not occur.
+    /// Class probabilities of each label 1..=max; empty for labels that do not occur. What surrounds a mask helps to name
+    /// it, unless the mask is a frame or a twig around which other things fill the box.
     fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let boxes = masks.boxes();
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
@@ -134,9 +135,12 @@ impl Conse {
         let cut = |&(label, bounds): &(u16, [u32; 4])| views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s));
         let crops: Vec<_> = present.iter().flat_map(cut).collect();
         let probabilities = self.classify(&crops)?;
+        let areas = masks.areas();
+        let box_area = |[x0, y0, x1, y1]: [u32; 4]| ((x1 - x0) * (y1 - y0)).max(1) as f32;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
-        for ((label, _), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {
-            out[usize::from(*label) - 1] = pair[0].iter().zip(&pair[1]).map(|(a, b)| 0.5 * (a + b)).collect();
+        for ((label, bounds), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {
+            let context = 0.5 * areas[usize::from(*label)] as f32 / box_area(*bounds);
+            out[usize::from(*label) - 1] = pair[0].iter().zip(&pair[1]).map(|(a, b)| (1.0 - context) * a + context * b).collect();
         }
         Ok(out)
     }

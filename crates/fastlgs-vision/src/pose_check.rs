@@ -24,7 +24,7 @@ pub struct Report {
 const WINDOW: usize = 4;
 /// Photos that look at the same by their poses, each is compared with.
 const OVERLAPPING: usize = 6;
-/// Of the well-placed photos, each how-manieth is compared with those of a group that nothing else can place.
+/// When looking everywhere, each how-manieth of the other photos a photo is compared with.
 const EVERYWHERE_STRIDE: usize = 2;
 /// Least cosine between viewing directions: beyond, SIFT matches are mostly repeated texture.
 const SAME_DIRECTION: f32 = 0.75;
@@ -32,6 +32,9 @@ const SAME_DIRECTION: f32 = 0.75;
 const FEW: usize = 25;
 /// Trials of the robust fit.
 const TRIALS: usize = 2000;
+/// Smallest share of matches with other groups that obey the poses of a group in its place: repeated texture alone gives
+/// about a tenth.
+const MIN_OBEYING: f32 = 0.3;
 /// Largest reprojection error of a point that supports a fit, as a share of the photo's width.
 const MAX_ERROR: f32 = 0.02;
 
@@ -102,63 +105,147 @@ struct Pair {
 }
 
 /// Compares poses and photos, moves groups of cameras that are misplaced, and says what it did.
+///
+/// First each group is fitted to those placed before it, by the links that the photos' order and the poses suggest. Once
+/// they are near their places, each is fitted again to all others, over links that are looked for everywhere.
 pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Report {
-    let mut links = links(cameras, keypoints);
+    let links = links(cameras, keypoints);
     let group = groups(cameras.len(), &links);
     let sizes = group.iter().fold(BTreeMap::<usize, usize>::new(), |mut sizes, g| {
         *sizes.entry(*g).or_default() += 1;
         sizes
     });
     let Some(base) = sizes.iter().max_by(|a, b| a.1.cmp(b.1).then(b.0.cmp(a.0))).map(|s| *s.0) else { return Report::default() };
-    let mut points = points_of(cameras, keypoints, &links, &group);
+    let points = points_of(cameras, keypoints, &links, &group);
+    let before = cameras.to_vec();
+    let mut work = Work { cameras, keypoints, links, group, points, seed };
     let (mut settled, mut failed) = (BTreeSet::from([base]), BTreeSet::new());
-    let mut report = Report::default();
-    let mut looked_everywhere = false;
-    loop {
-        let Some((next, agreed)) = next_group(&links, &group, &settled, &failed) else {
-            if failed.is_empty() || std::mem::replace(&mut looked_everywhere, true) {
-                break;
-            }
-            // Poses do not tell which photos of a misplaced group see what the others see.
-            let lost: Vec<usize> = (0..cameras.len()).filter(|&i| failed.contains(&group[i])).collect();
-            let known: Vec<usize> = (0..cameras.len()).filter(|&i| settled.contains(&group[i])).step_by(EVERYWHERE_STRIDE).collect();
-            let pairs = lost.iter().flat_map(|&a| known.iter().map(move |&b| (a.min(b), a.max(b))));
-            let new = pairs.filter(|p| !links.iter().any(|l| (l.a, l.b) == *p)).collect();
-            links.extend(matched(new, cameras, keypoints).into_iter().filter(|l| l.all.len() >= FEW));
-            failed.clear();
-            continue;
-        };
-        if agreed {
+    while let Some((next, agreed)) = next_group(&work.links, &work.group, &settled, &failed) {
+        if agreed || work.place(next, &settled, true) {
             settled.insert(next);
-            continue;
-        }
-        let moves = |i: usize| group[i] == next;
-        let is_across = |l: &Link| settled.contains(&group[l.a]) && moves(l.b) || settled.contains(&group[l.b]) && moves(l.a);
-        let across: Vec<&Link> = links.iter().filter(|l| l.all.len() >= FEW && is_across(l)).collect();
-        let pairs = pairs_between(&across, moves, keypoints, &points);
-        let Some(first) = fit(&pairs, cameras, &mut Rng::new(seed, "pose check")) else {
+            // What was out of reach may now be in reach.
+            failed.clear();
+        } else {
             failed.insert(next);
-            continue;
-        };
-        let similarity = refined(first, &across, moves, cameras, keypoints);
-        let members: Vec<usize> = (0..cameras.len()).filter(|&i| moves(i)).collect();
-        members.iter().for_each(|&i| similarity.move_camera(&mut cameras[i]));
-        points.iter_mut().filter(|((view, _), _)| moves(*view)).for_each(|(_, p)| *p = similarity.apply(*p));
-        let obeying = |links: &[Link]| links.iter().filter(|l| is_across(l)).map(|l| l.right.len()).sum::<usize>();
-        let before = obeying(&links);
-        for link in links.iter_mut().filter(|l| moves(l.a) != moves(l.b)) {
-            let (a, b) = (link.a, link.b);
-            link.right = epipolar_filter((&cameras[a], &keypoints[a]), (&cameras[b], &keypoints[b]), &link.all);
         }
-        tracing::info!(photos = members.len(), pairs = pairs.len(), before, after = obeying(&links), "matches across that obey the poses");
-        settled.insert(next);
-        // What was out of reach may now be in reach.
-        failed.clear();
-        report.moved.extend(members);
     }
-    report.contradictory = (0..cameras.len()).filter(|&i| failed.contains(&group[i])).collect();
-    report.moved.sort_unstable();
-    report
+    if work.cameras.iter().zip(&before).all(|(now, then)| now == then) && failed.is_empty() {
+        return Report::default();
+    }
+    let moved: BTreeSet<usize> = (0..before.len()).filter(|&i| work.cameras[i] != before[i]).map(|i| work.group[i]).collect();
+    let mut again: Vec<(bool, usize)> = failed.iter().map(|g| (true, *g)).chain(moved.into_iter().map(|g| (false, g))).collect();
+    again.sort_by_key(|&(lost, g)| (!lost, std::cmp::Reverse(sizes[&g]), g));
+    for (lost, next) in again {
+        work.look_everywhere(next);
+        let others = settled.iter().copied().filter(|g| *g != next).collect();
+        if work.place(next, &others, lost) {
+            settled.insert(next);
+        }
+    }
+    // The group that fits worst goes first: it may be what speaks against the others.
+    let mut bad = BTreeSet::new();
+    loop {
+        let good: BTreeSet<usize> = sizes.keys().copied().filter(|g| !bad.contains(g)).collect();
+        let shares = good.iter().filter(|g| **g != base).map(|&g| (g, work.obeying_share(g, &good)));
+        match shares.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0))) {
+            Some((g, share)) if share < MIN_OBEYING => bad.insert(g),
+            _ => break,
+        };
+    }
+    // With only good neighbours left, a bad group may find its place after all.
+    for &next in &bad.clone() {
+        let good: BTreeSet<usize> = sizes.keys().copied().filter(|g| !bad.contains(g)).collect();
+        if work.place(next, &good, true) && work.obeying_share(next, &good) >= MIN_OBEYING {
+            bad.remove(&next);
+        }
+    }
+    Report {
+        moved: (0..before.len()).filter(|&i| work.cameras[i] != before[i] && !bad.contains(&work.group[i])).collect(),
+        contradictory: (0..before.len()).filter(|&i| bad.contains(&work.group[i])).collect(),
+    }
+}
+
+/// The state of a repair.
+struct Work<'a> {
+    cameras: &'a mut [Camera],
+    keypoints: &'a [Keypoints],
+    links: Vec<Link>,
+    group: Vec<usize>,
+    /// Where key point k of view v lies, by (v, k).
+    points: HashMap<(usize, usize), Vec3>,
+    seed: u64,
+}
+
+impl Work<'_> {
+    /// Whether a link joins group `next` and one of `others`.
+    fn joins(&self, link: &Link, next: usize, others: &BTreeSet<usize>) -> bool {
+        let (a, b) = (self.group[link.a], self.group[link.b]);
+        a != b && (a == next && others.contains(&b) || b == next && others.contains(&a))
+    }
+
+    /// Share of the matches between a group and others that obey the poses; 1 where there are none.
+    fn obeying_share(&self, next: usize, others: &BTreeSet<usize>) -> f32 {
+        let counts = |l: &&Link| l.all.len() >= FEW && self.joins(l, next, others) && self.same_direction(l);
+        let (right, all) = self.links.iter().filter(counts).fold((0, 0), |(r, a), l| (r + l.right.len(), a + l.all.len()));
+        tracing::debug!(group = next, right, all, "matches that obey the poses in the end");
+        if all > 0 { right as f32 / all as f32 } else { 1.0 }
+    }
+
+    /// Whether the photos of a link look the same way by their poses as they are now: other matches are often repeated
+    /// texture.
+    fn same_direction(&self, link: &Link) -> bool {
+        self.cameras[link.a].forward().dot(self.cameras[link.b].forward()) > SAME_DIRECTION
+    }
+
+    /// Moves a group to where its matches with `others` fit; false where no place fits better than its own. A group that
+    /// is `lost` is far from its place: its links count whatever their directions are now.
+    fn place(&mut self, next: usize, others: &BTreeSet<usize>, lost: bool) -> bool {
+        let counts = |l: &&Link| l.all.len() >= FEW && self.joins(l, next, others) && (lost || self.same_direction(l));
+        let across: Vec<&Link> = self.links.iter().filter(counts).collect();
+        let moves = |i: usize| self.group[i] == next;
+        let pairs = pairs_between(&across, moves, self.keypoints, &self.points);
+        let Some(first) = fit(&pairs, self.cameras, &mut Rng::new(self.seed, "pose check")) else { return false };
+        let similarity = refined(first, &across, moves, self.cameras, self.keypoints);
+        let moved: Vec<Camera> = (self.cameras.iter().enumerate())
+            .map(|(i, c)| {
+                let mut camera = c.clone();
+                if moves(i) {
+                    similarity.move_camera(&mut camera);
+                }
+                camera
+            })
+            .collect();
+        let obeying = |cameras: &[Camera]| across.iter().map(|l| right(cameras, self.keypoints, l.a, l.b, &l.all).len()).sum::<usize>();
+        let (before, after) = (obeying(self.cameras), obeying(&moved));
+        let photos = (0..moved.len()).filter(|&i| moves(i)).count();
+        tracing::debug!(photos, links = across.len(), pairs = pairs.len(), before, after, "matches across that obey the poses");
+        if after <= before {
+            return false;
+        }
+        self.cameras.clone_from_slice(&moved);
+        let group = &self.group;
+        self.points.iter_mut().filter(|((view, _), _)| group[*view] == next).for_each(|(_, p)| *p = similarity.apply(*p));
+        for link in self.links.iter_mut().filter(|l| (group[l.a] == next) != (group[l.b] == next)) {
+            link.right = right(self.cameras, self.keypoints, link.a, link.b, &link.all);
+        }
+        true
+    }
+
+    /// Adds links between a group and a part of all other photos: misplaced poses do not tell which see the same.
+    fn look_everywhere(&mut self, next: usize) {
+        let known: BTreeSet<(usize, usize)> = self.links.iter().map(|l| (l.a, l.b)).collect();
+        let (members, others): (Vec<usize>, Vec<usize>) = (0..self.cameras.len()).partition(|&i| self.group[i] == next);
+        let others: Vec<usize> = others.into_iter().step_by(EVERYWHERE_STRIDE).collect();
+        let pairs = members.iter().flat_map(|&a| others.iter().map(move |&b| (a.min(b), a.max(b))));
+        let new = pairs.filter(|p| !known.contains(p)).collect();
+        let found = matched(new, self.cameras, self.keypoints);
+        self.links.extend(found.into_iter().filter(|l| l.all.len() >= FEW));
+    }
+}
+
+/// The matches that obey the poses.
+fn right(cameras: &[Camera], keypoints: &[Keypoints], a: usize, b: usize, all: &[(usize, usize)]) -> Vec<(usize, usize)> {
+    epipolar_filter((&cameras[a], &keypoints[a]), (&cameras[b], &keypoints[b]), all)
 }
 
 /// The group with the most matches that contradict what is settled, and whether it agrees with it all the same.
@@ -190,7 +277,7 @@ fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
 fn matched(pairs: Vec<(usize, usize)>, cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
     let link = |(a, b): (usize, usize)| {
         let all = keypoints::matches(&keypoints[a], &keypoints[b]);
-        let right = epipolar_filter((&cameras[a], &keypoints[a]), (&cameras[b], &keypoints[b]), &all);
+        let right = right(cameras, keypoints, a, b, &all);
         Link { a, b, all, right }
     };
     pairs.into_par_iter().map(link).collect()

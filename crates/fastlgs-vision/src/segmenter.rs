@@ -4,6 +4,7 @@ use crate::Result;
 use crate::conse::{Conse, DENSE, DenseMap};
 use crate::edges::Hed;
 use crate::regions::{Hierarchy, Node, watershed};
+use fastlgs_core::color::lab;
 use fastlgs_core::{LabelMap, image_io};
 use image::RgbImage;
 
@@ -146,18 +147,4 @@ fn label_map(tree: &Hierarchy, cut: &[usize], basins: &[u32], w: usize, h: usize
     let mut map = LabelMap::new(w as u32, h as u32);
     map.labels.iter_mut().zip(basins).for_each(|(l, b)| *l = label_of[*b as usize]);
     map
-}
-
-/// sRGB to CIE Lab (D65).
-fn lab(rgb: [u8; 3]) -> [f32; 3] {
-    let linear = rgb.map(|v| {
-        let v = f32::from(v) / 255.0;
-        if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
-    });
-    let [r, g, b] = linear;
-    let f = |t: f32| if t > 0.008_856 { t.cbrt() } else { 7.787 * t + 16.0 / 116.0 };
-    let x = f((0.4124 * r + 0.3576 * g + 0.1805 * b) / 0.9505);
-    let y = f(0.2126 * r + 0.7152 * g + 0.0722 * b);
-    let z = f((0.0193 * r + 0.1192 * g + 0.9505 * b) / 1.089);
-    [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
 }

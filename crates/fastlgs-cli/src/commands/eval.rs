@@ -80,6 +80,7 @@ struct Sums {
     localised: Vec<f64>,
     top1: Vec<f64>,
     present: Vec<f64>,
+    labels: Vec<String>,
     by_label: BTreeMap<String, Vec<f64>>,
     first_ms: Vec<f64>,
     next_ms: Vec<f64>,
@@ -115,9 +116,12 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         }
     }
     let absent = absent_scores(args, &scene, &grid, &mut encoder, &views)?;
-    let rejected = absent.iter().filter(|s| **s < f64::from(query::MIN_SCORE)).count();
+    let rejected = absent.iter().filter(|a| a.1 < f64::from(query::MIN_SCORE)).count();
+    let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
+    let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
+    let present_by_label: BTreeMap<&String, f64> = sums.labels.iter().zip(sums.present.iter().copied()).collect();
     let by_label: BTreeMap<&String, Option<f64>> = sums.by_label.iter().map(|(k, v)| (k, mean(v))).collect();
-    let auroc = metrics::auroc(&sums.present, &absent);
+    let auroc = metrics::auroc(&sums.present, &absent_scores);
     let camera = &scene.cameras[0];
     let value = json!({
         "scene": args.scene,
@@ -134,6 +138,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "absent_auroc": if auroc.is_nan() { Value::Null } else { json!(auroc) },
         "absent_texts": absent.len(),
         "absent_rejected": rejected,
+        "absent_best": loudest.map(|(text, score)| json!({ "text": text, "score": score })),
+        "present_scores": present_by_label,
         "psnr": psnr,
         "ssim": ssim,
         "gaussians": scene.gaussians.len(),
@@ -201,6 +207,7 @@ fn score_label(
     let (sx, sy) = (f64::from(w) / f64::from(view.width), f64::from(h) / f64::from(view.height));
     let boxes: Vec<[f64; 4]> = label.polygons.iter().map(|p| polygon_box(p, sx, sy)).collect();
     sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &boxes))));
+    sums.labels.push(label.category.clone());
     sums.present.push(f64::from(ranked.first().map_or(0.0, |r| r.score)));
     // Oracle: the best single object. Text top-1: is the first-ranked object one that mostly lies in the label?
     let present: std::collections::BTreeSet<u16> = ids.iter().copied().filter(|id| *id > 0).collect();
@@ -227,7 +234,7 @@ fn absent_scores(
     grid: &Grid,
     encoder: &mut Option<fastlgs_vision::MiniLm>,
     views: &[LabelledView],
-) -> Result<Vec<f64>> {
+) -> Result<Vec<(String, f64)>> {
     let texts: Vec<String> = match &args.absent {
         Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
         None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
@@ -239,7 +246,10 @@ fn absent_scores(
     texts
         .iter()
         .filter(|t| !t.trim().is_empty() && !named(t))
-        .map(|text| Ok(f64::from(query::rank(grid, &scene.text_query(encoder, text)?).first().map_or(0.0, |h| h.score))))
+        .map(|text| {
+            let ranked = query::rank(grid, &scene.text_query(encoder, text)?);
+            Ok((text.clone(), f64::from(ranked.first().map_or(0.0, |h| h.score))))
+        })
         .collect()
 }
 

@@ -2,13 +2,16 @@
 
 use crate::ui;
 use anyhow::{Result, bail};
+use fastlgs_core::color::lab;
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::query::{self, Decision};
-use fastlgs_grid::{Grid, consensus, evidence, whole};
+use fastlgs_grid::whole::{self, Look};
+use fastlgs_grid::{Grid, consensus, evidence};
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::{Conse, Encoder, histogram, segmenter};
 use image::RgbImage;
+use std::collections::BTreeMap;
 
 /// Objects of a scene with the object map of each training view.
 pub struct Objects {
@@ -27,6 +30,8 @@ pub struct Config {
 const NEIGHBOURS: usize = 10;
 /// Longer side of the photos whose meaning is taken: the encoder's objects fill some cells there.
 const MEANING_SIDE: u32 = 480;
+/// Views in which an object is embedded: those that show most of it.
+const EMBEDDED_VIEWS: usize = 10;
 /// Smallest part of a photo, in pixels, that is worth embedding.
 const MIN_PIXELS: usize = 60;
 
@@ -52,14 +57,13 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
 
 /// Gives every Gaussian the object that most of its blending weight falls on, and that object's code.
 pub fn lift(scene: &mut Gaussians, training: &[Camera], maps: &[LabelMap], grid: &Grid) {
-    let mut weights: Vec<std::collections::BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
+    let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
     for (camera, map) in training.iter().zip(maps) {
         for vote in lift::votes(scene, camera, map) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }
     }
-    let most =
-        |w: &std::collections::BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).map_or(0, |(id, _)| *id);
+    let most = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).map_or(0, |(id, _)| *id);
     scene.object_ids = weights.iter().map(most).collect();
     set_codes(scene, grid);
 }
@@ -113,19 +117,19 @@ pub fn by_consensus(
     let mut count = regions.seen.len() as u16;
     if folder.manifest()?.segmenter == "offline" {
         let maps = paint(scene, count)?;
-        let meanings = meanings(folder, training, &maps, count, &encoder, common)?;
-        let (object, objects) = whole::join(&regions, meanings, config.likeness);
+        let looks = looks(folder, training, &maps, count, &encoder, common)?;
+        let (object, objects) = whole::join(&regions, looks, config.likeness);
         scene.object_ids = regions.of.iter().map(|r| if *r > 0 { object[usize::from(*r) - 1] } else { 0 }).collect();
         count = objects;
         tracing::debug!(seconds = clock.elapsed().as_secs_f64(), objects, "whole objects");
     }
     let maps = paint(scene, count)?;
     let bar = ui::bar(common, training.len() as u64, "embeddings");
+    let chosen = best_views(&maps, count);
     let (mut masks, mut object_of) = (Vec::new(), Vec::new());
     for (view, (camera, mut map)) in training.iter().zip(maps).enumerate() {
         map.save(&folder.objects_path(&camera.name))?;
-        let areas = map.areas();
-        map.labels.iter_mut().filter(|l| areas[usize::from(**l)] < MIN_PIXELS).for_each(|l| *l = 0);
+        map.labels.iter_mut().filter(|l| **l > 0 && !chosen[usize::from(**l) - 1].contains(&view)).for_each(|l| *l = 0);
         let found = masks_of(&folder.photo(&camera.name)?, view, &map, &encoder)?;
         object_of.extend(found.iter().map(|m| m.label));
         masks.extend(found);
@@ -134,6 +138,21 @@ pub fn by_consensus(
     bar.finish_and_clear();
     tracing::debug!(seconds = clock.elapsed().as_secs_f64(), "embeddings");
     Ok(Grid::build(&masks, &object_of, count, common.seed))
+}
+
+/// The views that show most of each object.
+fn best_views(maps: &[LabelMap], count: u16) -> Vec<Vec<usize>> {
+    let mut seen: Vec<Vec<(usize, usize)>> = vec![Vec::new(); usize::from(count)];
+    for (view, map) in maps.iter().enumerate() {
+        for (label, area) in map.areas().into_iter().enumerate().skip(1).filter(|a| a.1 >= MIN_PIXELS) {
+            seen[label - 1].push((area, view));
+        }
+    }
+    for views in &mut seen {
+        views.sort_by_key(|&(area, view)| (std::cmp::Reverse(area), view));
+        views.truncate(EMBEDDED_VIEWS);
+    }
+    seen.into_iter().map(|views| views.into_iter().map(|v| v.1).collect()).collect()
 }
 
 /// Embedding and colour distribution of every mask of a photo, by label.
@@ -148,35 +167,39 @@ pub fn masks_of(photo: &RgbImage, view: usize, map: &LabelMap, encoder: &dyn Enc
     Ok(masks.filter(|m| m.area > 0.0).collect())
 }
 
-/// Sum over all pixels of all views of what the encoder sees there, for each region.
-fn meanings(
+/// Colour and meaning of each region over all pixels of all views.
+fn looks(
     folder: &SceneFolder,
     training: &[Camera],
     maps: &[LabelMap],
     count: u16,
     encoder: &Conse,
     common: &ui::Common,
-) -> Result<Vec<Vec<f32>>> {
+) -> Result<Vec<Look>> {
     let bar = ui::bar(common, training.len() as u64, "meanings");
-    let mut sums: Vec<Vec<f32>> = vec![Vec::new(); usize::from(count)];
+    let mut looks = vec![Look::default(); usize::from(count)];
     for (camera, map) in training.iter().zip(maps) {
-        let dense = encoder.dense(&segmenter::at_side(&folder.photo(&camera.name)?, MEANING_SIDE))?;
+        let photo = folder.photo(&camera.name)?;
+        let dense = encoder.dense(&segmenter::at_side(&photo, MEANING_SIDE))?;
         // How many pixels of a region each cell holds.
-        let mut shares: std::collections::BTreeMap<(u16, usize), f32> = Default::default();
-        for (p, label) in map.labels.iter().enumerate().filter(|l| *l.1 > 0) {
+        let mut shares: BTreeMap<(u16, usize), f32> = BTreeMap::new();
+        for ((p, label), pixel) in map.labels.iter().enumerate().zip(photo.pixels()).filter(|((_, l), _)| **l > 0) {
             let (x, y) = (p % map.width as usize, p / map.width as usize);
             let cell = y * dense.rows / map.height as usize * dense.columns + x * dense.columns / map.width as usize;
             *shares.entry((*label, cell)).or_default() += 1.0;
+            let look = &mut looks[usize::from(*label) - 1];
+            look.pixels += 1.0;
+            look.color.iter_mut().zip(lab(pixel.0)).for_each(|(sum, v)| *sum += v);
         }
         for ((label, cell), share) in shares {
-            let sum = &mut sums[usize::from(label) - 1];
+            let sum = &mut looks[usize::from(label) - 1].meaning;
             sum.resize(dense.channels, 0.0);
             sum.iter_mut().zip(&dense.values[cell * dense.channels..]).for_each(|(s, v)| *s += share * v);
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok(sums)
+    Ok(looks)
 }
 
 /// The segmenter's masks of a view, which must fit its camera.
