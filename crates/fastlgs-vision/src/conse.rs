@@ -3,6 +3,7 @@
 
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, TextEncoder, normalise};
+use crate::exposure;
 use crate::runtime::{Input, Model};
 use crate::{MiniLm, Result, models};
 use fastlgs_core::rng::Rng;
@@ -129,6 +130,7 @@ impl Conse {
     /// Class probabilities of each label 1..=max; empty for labels that do not occur. What surrounds a mask helps to name
     /// it, unless the mask is a frame or a twig around which other things fill the box.
     fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+        let photo = &exposure::lifted(photo);
         let boxes = masks.boxes();
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
         let views = [Surround::Neutral, Surround::Context];

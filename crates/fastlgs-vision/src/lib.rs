@@ -6,6 +6,7 @@ pub mod conse;
 pub mod crops;
 pub mod edges;
 pub mod encoder;
+pub mod exposure;
 pub mod histogram;
 pub mod keypoints;
 pub mod models;

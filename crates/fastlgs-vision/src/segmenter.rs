@@ -3,6 +3,7 @@
 use crate::Result;
 use crate::conse::{Conse, DENSE, DenseMap};
 use crate::edges::Hed;
+use crate::exposure;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::color::lab;
 use fastlgs_core::{LabelMap, image_io};
@@ -94,6 +95,7 @@ impl Segmenter for OfflineSegmenter {
     }
 
     fn segment(&self, photo: &RgbImage) -> Result<Segmentation> {
+        let photo = &exposure::lifted(photo);
         let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));
         let (w, h) = (small.width() as usize, small.height() as usize);
         let edges = self.edges.edges(&small)?;

@@ -9,7 +9,7 @@ use fastlgs_grid::query::{self, Decision};
 use fastlgs_grid::whole::{self, Look};
 use fastlgs_grid::{Grid, consensus, evidence};
 use fastlgs_raster::{View, lift};
-use fastlgs_vision::{Conse, Encoder, histogram, segmenter};
+use fastlgs_vision::{Conse, Encoder, exposure, histogram, segmenter};
 use image::RgbImage;
 use std::collections::BTreeMap;
 
@@ -179,7 +179,7 @@ fn looks(
     let bar = ui::bar(common, training.len() as u64, "meanings");
     let mut looks = vec![Look::default(); usize::from(count)];
     for (camera, map) in training.iter().zip(maps) {
-        let photo = folder.photo(&camera.name)?;
+        let photo = exposure::lifted(&folder.photo(&camera.name)?);
         let dense = encoder.dense(&segmenter::at_side(&photo, MEANING_SIDE))?;
         // How many pixels of a region each cell holds.
         let mut shares: BTreeMap<(u16, usize), f32> = BTreeMap::new();
