@@ -58,6 +58,7 @@ fn fixture() -> Option<&'static Fixture> {
             json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "320x240"]);
             let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
             assert_eq!((report["photos"].as_u64(), report["held_out"].as_u64()), (Some(32), Some(4)));
+            assert_eq!(report["moved_cameras"], 0, "all blocks look alike from four sides, and yet the poses are exact: {report}");
             let report = json(&["train", text(&scene), "--iterations", "900", "--budget", "15000"]);
             assert!(report["psnr_held_out"].as_f64().expect("a number") > 19.0, "{report}");
             Some(Fixture { dir, photos, scene })
@@ -127,9 +128,12 @@ fn renders_every_kind_of_picture_and_any_camera() {
     let (w, h, depth) = fastlgs_core::exr_image::read(&out.join("008.png.depth.exr")).expect("depth");
     let (_, _, truth) = fastlgs_core::exr_image::read(&f.photos.join("depth/008.png.exr")).expect("exact depth");
     assert_eq!((w, h), (320, 240));
-    let mut errors: Vec<f32> = depth[0].1.iter().zip(&truth[0].1).map(|(a, b)| (a - b).abs() / b).collect();
+    // On the things; the bare walls around them have hardly any texture that would tell their depth.
+    let things = LabelMap::load(&f.photos.join("masks/008.png.png")).expect("exact masks");
+    let pairs = depth[0].1.iter().zip(&truth[0].1).zip(&things.labels).filter(|(_, l)| **l > 0);
+    let mut errors: Vec<f32> = pairs.map(|((a, b), _)| (a - b).abs() / b).collect();
     errors.sort_by(f32::total_cmp);
-    assert!(errors[errors.len() / 2] < 0.1, "median relative depth error {}", errors[errors.len() / 2]);
+    assert!(errors[errors.len() / 2] < 0.05, "median relative depth error {}", errors[errors.len() / 2]);
     let cameras: Value = serde_json::from_slice(&std::fs::read(f.scene.join("cameras/cameras.json")).expect("cameras")).expect("JSON");
     let file = f.dir.path().join("camera.json");
     std::fs::write(&file, cameras[3].to_string()).expect("a temporary file");

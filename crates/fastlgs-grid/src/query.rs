@@ -20,6 +20,9 @@ pub struct QueryConfig {
 /// Calibrated on the offline encoder: see `docs/evaluation.md`.
 pub const MIN_SCORE: f32 = 0.9;
 
+/// Share of an object's area, over its views, that decides its score.
+pub const BEST_SHARE: f32 = 0.3;
+
 impl Default for QueryConfig {
     fn default() -> Self {
         Self { min_score: MIN_SCORE, top_k: 8, margin: 0.02 }
@@ -35,8 +38,8 @@ pub struct Hit {
     pub score: f32,
 }
 
-/// Score of an object: area-weighted mean relevancy of the better half of its views, so that one good view is enough
-/// company for a second one, and a single outlier is not.
+/// Score of an object: area-weighted mean relevancy of its best views, which together show [`BEST_SHARE`] of all the area
+/// it has in its views. An object is seldom recognised from everywhere; a single view that fools the encoder counts little.
 pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
     let mut scores: Vec<(f32, f32)> = object.embeddings.iter().map(|e| query.relevancy(e)).zip(object.areas.iter().copied()).collect();
     scores.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -45,7 +48,7 @@ pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
     for (score, area) in scores {
         sum += score * area;
         weight += area;
-        if weight >= 0.5 * total {
+        if weight >= BEST_SHARE * total {
             break;
         }
     }

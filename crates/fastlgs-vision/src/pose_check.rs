@@ -215,11 +215,17 @@ impl Work<'_> {
                 camera
             })
             .collect();
-        let obeying = |cameras: &[Camera]| across.iter().map(|l| right(cameras, self.keypoints, l.a, l.b, &l.all).len()).sum::<usize>();
+        // Over all links, and over those of photos that follow each other: what repeats in a scene fools distant views.
+        let obeying = |cameras: &[Camera]| {
+            across.iter().fold((0, 0), |(all, near), l| {
+                let count = right(cameras, self.keypoints, l.a, l.b, &l.all).len();
+                (all + count, near + if l.b - l.a <= WINDOW { count } else { 0 })
+            })
+        };
         let (before, after) = (obeying(self.cameras), obeying(&moved));
         let photos = (0..moved.len()).filter(|&i| moves(i)).count();
-        tracing::debug!(photos, links = across.len(), pairs = pairs.len(), before, after, "matches across that obey the poses");
-        if after <= before {
+        tracing::debug!(photos, links = across.len(), pairs = pairs.len(), ?before, ?after, "matches across that obey the poses");
+        if after.0 <= before.0 || after.1 < before.1 {
             return false;
         }
         self.cameras.clone_from_slice(&moved);
