@@ -44,6 +44,8 @@ pub fn bar(common: &Common, length: u64, what: &str) -> ProgressBar {
     if common.quiet || !std::io::stderr().is_terminal() {
         bar.set_draw_target(ProgressDrawTarget::hidden());
     }
-    bar.set_style(ProgressStyle::with_template("{msg:32!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})").expect("a fixed template"));
+    bar.set_style(
+        ProgressStyle::with_template("{msg:32!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})").expect("a fixed template"),
+    );
     bar
 }

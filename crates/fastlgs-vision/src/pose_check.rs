@@ -28,6 +28,8 @@ const OVERLAPPING: usize = 6;
 const EVERYWHERE_STRIDE: usize = 2;
 /// Least cosine between viewing directions: beyond, SIFT matches are mostly repeated texture.
 const SAME_DIRECTION: f32 = 0.75;
+/// Photos of a group by which others are placed: one photo says nothing about scale.
+const SOLID: usize = 3;
 /// Fewest matches that say something.
 const FEW: usize = 25;
 /// Trials of the robust fit.
@@ -154,7 +156,7 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
     }
     // With only good neighbours left, a bad group may find its place after all.
     for &next in &bad.clone() {
-        let good: BTreeSet<usize> = sizes.keys().copied().filter(|g| !bad.contains(g)).collect();
+        let good: BTreeSet<usize> = sizes.keys().copied().filter(|g| !bad.contains(g) && sizes[g] >= SOLID).collect();
         if work.place(next, &good, true) && work.obeying_share(next, &good) >= MIN_OBEYING {
             bad.remove(&next);
         }
@@ -225,7 +227,7 @@ impl Work<'_> {
         let (before, after) = (obeying(self.cameras), obeying(&moved));
         let photos = (0..moved.len()).filter(|&i| moves(i)).count();
         tracing::debug!(photos, links = across.len(), pairs = pairs.len(), ?before, ?after, "matches across that obey the poses");
-        if after.0 <= before.0 || after.1 < before.1 {
+        if after.0 <= before.0 || after.1 + FEW < before.1 {
             return false;
         }
         self.cameras.clone_from_slice(&moved);
