@@ -3,7 +3,7 @@
 // rows     [3][h][w]       from ssim_backward_rows
 // gradient [6][h][w]       dL/d frame
 // sums     [6][h runs][w]  sum of |x - y| over each run
-#import window
+#import columns
 #import flat
 
 @group(0) @binding(0) var<uniform> plane: Plane;
@@ -12,20 +12,6 @@
 @group(0) @binding(3) var<storage, read> rows: array<f32>;
 @group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
 @group(0) @binding(5) var<storage, read_write> sums: array<f32>;
-
-fn at(map: u32, column: u32, j: i32) -> f32 {
-    let row = u32(clamp(j, 0, i32(plane.height) - 1));
-    let value = rows[(map * plane.height + row) * plane.width + column];
-    return select(0.0, value, j >= 0 && j < i32(plane.height));
-}
-
-fn blurred(map: u32, column: u32, first: i32) -> array<f32, 8> {
-    return blur(array<f32, 18>(
-        at(map, column, first - 5), at(map, column, first - 4), at(map, column, first - 3), at(map, column, first - 2), at(map, column, first - 1), at(map, column, first + 0),
-        at(map, column, first + 1), at(map, column, first + 2), at(map, column, first + 3), at(map, column, first + 4), at(map, column, first + 5), at(map, column, first + 6),
-        at(map, column, first + 7), at(map, column, first + 8), at(map, column, first + 9), at(map, column, first + 10), at(map, column, first + 11), at(map, column, first + 12),
-    ));
-}
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {

@@ -36,17 +36,13 @@ fn inner_band(mask: &[bool], width: u32, height: u32, distance: u32) -> Vec<bool
 /// Pixels whose whole square neighbourhood of radius `r` lies in the mask; outside the picture counts as outside.
 pub fn erode(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
     let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
-    dilate_with(&outside, width, height, r, true).into_iter().map(|m| !m).collect()
+    dilated(&outside, width, height, r).into_iter().map(|m| !m).collect()
 }
 
-/// Pixels with a mask pixel in their square neighbourhood of radius `r`.
-pub fn dilate(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
-    dilate_with(mask, width, height, r, false)
-}
-
-fn dilate_with(mask: &[bool], width: u32, height: u32, r: u32, outside: bool) -> Vec<bool> {
+/// Pixels with a mask pixel in their square neighbourhood of radius `r`; beyond the border all is mask.
+fn dilated(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
     let (w, h, r) = (width as i64, height as i64, i64::from(r));
-    let line = |n: i64, len: i64, get: &dyn Fn(i64) -> bool| (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { outside });
+    let line = |n: i64, len: i64, get: &dyn Fn(i64) -> bool| (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { true });
     let mut rows = vec![false; mask.len()];
     for y in 0..h {
         for x in 0..w {

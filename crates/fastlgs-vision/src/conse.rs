@@ -39,7 +39,6 @@ pub struct Conse {
     class_embeddings: Vec<Vec<f32>>,
     /// `[1000][DENSE]`: random projection of logits.
     projection: Vec<[f32; DENSE]>,
-    names: Vec<String>,
 }
 
 impl Conse {
@@ -56,7 +55,7 @@ impl Conse {
         let class_embeddings = MiniLm::load()?.embed(&texts)?;
         let mut rng = Rng::new(0, "dense projection");
         let projection = names.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
-        Ok(Self { classifier, class_embeddings, projection, names })
+        Ok(Self { classifier, class_embeddings, projection })
     }
 
     /// Class probabilities `[n][1000]` of crops.
@@ -114,17 +113,6 @@ impl Conse {
             }
         }
         DenseMap { channels: DENSE, values, ..*map }
-    }
-
-    /// The most likely class name of each mask with its probability, for reports.
-    ///
-    /// # Errors
-    /// When inference fails.
-    pub fn describe(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<(String, f32)>> {
-        let best = |p: &Vec<f32>| {
-            (0..p.len()).max_by(|&a, &b| p[a].total_cmp(&p[b])).map_or((String::new(), 0.0), |i| (self.names[i].clone(), p[i]))
-        };
-        Ok(self.mask_probabilities(photo, masks)?.iter().map(best).collect())
     }
 
     /// Class probabilities of each label 1..=max; empty for labels that do not occur. What surrounds a mask helps to name
