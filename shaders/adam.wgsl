@@ -1,14 +1,22 @@
-// Adam (Kingma & Ba 2015) over all trained values, with one learning rate a channel.
+// Adam (Kingma & Ba 2015) over the trained values, with one learning rate a channel, and the regularisers of MCMC
+// (Kheradmand et al. 2024) on opacity and scale. Works on one page; shared/channels.wgsl.
 #import channels
 #import flat
 
 struct Step {
+    // Gaussians of the page.
     n: u32,
     // 1 - beta^t of both moments.
     correction1: f32,
     correction2: f32,
     epsilon: f32,
-    // Learning rates of the 17 channels, in fours.
+    // First trained channel, and the one after the last.
+    first_channel: u32,
+    end_channel: u32,
+    // Weights of the sums of opacity and of scale in the loss.
+    opacity_weight: f32,
+    scale_weight: f32,
+    // Learning rates of the channels below SH_REST, in fours, then that of all SH coefficients above degree 0.
     rates: array<vec4<f32>, 5>,
 }
 
@@ -20,16 +28,27 @@ struct Step {
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let k = flat_group(group, groups) * 64u + lane;
-    if k >= CHANNELS * step.n {
+    let i = flat_group(group, groups) * 64u + lane;
+    if i >= step.n {
         return;
     }
-    let channel = k / step.n;
-    let rate = step.rates[channel / 4u][channel % 4u];
-    let g = gradients[k];
-    let m1 = 0.9 * moment1[k] + 0.1 * g;
-    let m2 = 0.999 * moment2[k] + 0.001 * g * g;
-    moment1[k] = m1;
-    moment2[k] = m2;
-    params[k] -= rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
+    for (var channel = step.first_channel; channel < step.end_channel; channel++) {
+        let k = channel * step.n + i;
+        let slot = min(channel, SH_REST);
+        let rate = step.rates[slot / 4u][slot % 4u];
+        let value = params[k];
+        var g = gradients[k];
+        if channel == OPACITY {
+            let opacity = 1.0 / (1.0 + exp(-value));
+            g += step.opacity_weight * opacity * (1.0 - opacity);
+        }
+        if channel >= LOG_SCALE && channel < ROTATION {
+            g += step.scale_weight * exp(value);
+        }
+        let m1 = 0.9 * moment1[k] + 0.1 * g;
+        let m2 = 0.999 * moment2[k] + 0.001 * g * g;
+        moment1[k] = m1;
+        moment2[k] = m2;
+        params[k] = value - rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
+    }
 }

@@ -1,45 +1,64 @@
-// Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and the run sums of L1.
+// Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for the loss and the exposure.
 //
-// rows     [3][h][w]       from ssim_backward_rows
-// gradient [6][h][w]       dL/d frame
-// sums     [6][h runs][w]  sum of |x - y| over each run
+// rows     [3][padded rows][quads]    from ssim_backward_rows
+// gradient [6][padded rows][quads]    dL/d frame
+// sums     [4][6][tile rows][quads]   sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
 #import columns
 #import flat
 
 @group(0) @binding(0) var<uniform> plane: Plane;
-@group(0) @binding(1) var<storage, read> frame: array<f32>;
-@group(0) @binding(2) var<storage, read> target_image: array<f32>;
-@group(0) @binding(3) var<storage, read> rows: array<f32>;
-@group(0) @binding(4) var<storage, read_write> gradient: array<f32>;
-@group(0) @binding(5) var<storage, read_write> sums: array<f32>;
+@group(0) @binding(1) var<storage, read> frame: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> targets: array<vec4<u32>>;
+@group(0) @binding(3) var<storage, read> rows: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> gradient: array<vec4<f32>>;
+@group(0) @binding(5) var<storage, read_write> sums: array<vec4<f32>>;
+
+struct Totals {
+    error: vec4<f32>,
+    gain: vec4<f32>,
+    offset: vec4<f32>,
+    background: vec4<f32>,
+}
+
+fn add(totals: ptr<function, Totals>, quad: u32, row: u32, by_mean: vec4<f32>, by_square: vec4<f32>, by_product: vec4<f32>) {
+    let place = row * plane.quads + quad;
+    let at = plane.channel * plane.rows * plane.quads + place;
+    let rendered = frame[at];
+    let x = exposed(rendered, quad, row);
+    let t = wanted(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
+    let weight = select(vec4<f32>(0.0), shown(quad, row), t.counts);
+    let y = select(x, t.value, t.counts);
+    let d_ssim = by_mean + 2.0 * x * by_square + y * by_product;
+    let value = weight * plane.scale * ((1.0 - plane.lambda) * sign(x - y) - plane.lambda * d_ssim);
+    gradient[at] = plane.gain * value;
+    (*totals).error += weight * abs(x - y);
+    (*totals).gain = fma(value, rendered, (*totals).gain);
+    (*totals).offset += value;
+    // What is left of the light behind everything.
+    let transmittance = frame[6u * plane.rows * plane.quads + place];
+    (*totals).background = fma(plane.gain * value, transmittance, (*totals).background);
+}
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let runs = (plane.height + RUN - 1u) / RUN;
     let id = flat_group(group, groups) * 64u + lane;
-    if id >= runs * plane.width {
+    let runs = plane.rows / 8u;
+    if id >= runs * plane.quads {
         return;
     }
-    let column = id % plane.width;
-    let first = i32((id / plane.width) * RUN);
-    let size = plane.width * plane.height;
-    var by_mean = blurred(0u, column, first);
-    var by_square = blurred(1u, column, first);
-    var by_product = blurred(2u, column, first);
-    var total = 0.0;
-    for (var o = 0u; o < RUN; o++) {
-        let j = u32(first) + o;
-        if j < plane.height {
-            let at = plane.channel * size + j * plane.width + column;
-            let x = frame[at];
-            let t = target_image[at];
-            let counts = t >= 0.0;
-            let y = select(x, t, counts);
-            total += abs(x - y);
-            let d_ssim = by_mean[o] + 2.0 * x * by_square[o] + y * by_product[o];
-            let value = plane.scale * ((1.0 - plane.lambda) * sign(x - y) - plane.lambda * d_ssim);
-            gradient[at] = select(0.0, value, counts);
-        }
-    }
-    sums[plane.channel * runs * plane.width + id] = total;
+    let quad = id % plane.quads;
+    let first = 8u * (id / plane.quads);
+    let by_mean = blurred(0u, quad, i32(first));
+    let by_square = blurred(1u, quad, i32(first));
+    let by_product = blurred(2u, quad, i32(first));
+    var totals: Totals;
+#each K 8
+    add(&totals, quad, first + $Ku, by_mean[$K], by_square[$K], by_product[$K]);
+#end
+    let size = runs * plane.quads;
+    let place = plane.channel * size + id;
+    sums[place] = totals.error;
+    sums[6u * size + place] = totals.gain;
+    sums[12u * size + place] = totals.offset;
+    sums[18u * size + place] = totals.background;
 }

@@ -1,13 +1,14 @@
 // Projects every Gaussian: splat (what blending reads), depth key, and how many tiles it touches.
 //
-// params  [CHANNELS][n]     trained values
-// splats  [n][3] vec4       (mean.xy, q.xy) (q.z, opacity, r, g) (b, f0, f1, f2);
+// params  [page]            trained values: shared/channels.wgsl
+// splats  [n][3] vec4       (mean.xy, q.xy) (q.z, log2 of opacity, r, g) (b, f0, f1, f2);
 //                           q: the exponent in base 2, q.x dx^2 + q.y dx dy + q.z dy^2
 // depths  [n]               24-bit key, ascending with depth
 // footprints [n][2] vec4    the tiles it may touch: shared/footprint.wgsl
 // touched [n]               number of tiles; 0 for Gaussians that are not drawn
 #import view
 #import channels
+#import harmonics
 #import covariance
 #import flat
 #import footprint
@@ -19,52 +20,70 @@
 @group(0) @binding(4) var<storage, read_write> footprints: array<vec4<f32>>;
 @group(0) @binding(5) var<storage, read_write> touched: array<u32>;
 
+fn param(channel: u32, i: u32) -> f32 {
+    return params[channel * view.page + i];
+}
+
 fn param3(channel: u32, i: u32) -> vec3<f32> {
-    let n = view.gaussians;
-    return vec3<f32>(params[channel * n + i], params[(channel + 1u) * n + i], params[(channel + 2u) * n + i]);
+    return vec3<f32>(param(channel, i), param(channel + 1u, i), param(channel + 2u, i));
+}
+
+// Colour before it is cut off at zero.
+fn color_of(i: u32, mean: vec3<f32>) -> vec3<f32> {
+    var color = vec3<f32>(0.5) + SH_C0 * param3(COLOR, i);
+#ifdef WITH_SH
+    var b = basis(normalize(mean - view.camera.xyz));
+    for (var k = 0u; k < rest_of(view.sh_degree); k++) {
+        color += b[k] * param3(SH_REST + 3u * k, i);
+    }
+#endif
+    return color;
 }
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let i = flat_group(group, groups) * 64u + lane;
-    let n = view.gaussians;
-    if i >= n {
+    if i >= view.page {
         return;
     }
-    depths[i] = 0xffffffu;
-    touched[i] = 0u;
-    let t = (view.world_to_camera * vec4<f32>(param3(MEAN, i), 1.0)).xyz;
+    // Number among all Gaussians.
+    let g = view.first + i;
+    depths[g] = 0xffffffu;
+    touched[g] = 0u;
+    let mean = param3(MEAN, i);
+    let t = (view.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
     // Written so that a NaN is not drawn either.
     if !(t.z > NEAR) {
         return;
     }
-    let opacity = 1.0 / (1.0 + exp(-params[OPACITY * n + i]));
-    if !(opacity >= ALPHA_MIN) {
-        return;
-    }
-    let q = vec4<f32>(params[ROTATION * n + i], params[(ROTATION + 1u) * n + i], params[(ROTATION + 2u) * n + i], params[(ROTATION + 3u) * n + i]);
+    let q = vec4<f32>(param(ROTATION, i), param(ROTATION + 1u, i), param(ROTATION + 2u, i), param(ROTATION + 3u, i));
     let r = rotation_matrix(q / max(length(q), 1e-12));
     let s = exp(param3(LOG_SCALE, i));
     let jw = affine(t, view);
     // A = J W R S, so that the covariance is A A^T.
     let ax = (jw.x * r) * s;
     let ay = (jw.y * r) * s;
-    let cxx = dot(ax, ax) + DILATION;
-    let cxy = dot(ax, ay);
-    let cyy = dot(ay, ay) + DILATION;
+    let cov = dilated(ax, ay);
+    let cxx = cov.x;
+    let cxy = cov.y;
+    let cyy = cov.z;
     let det = cxx * cyy - cxy * cxy;
-    let mean = view.focal * t.xy / t.z + view.centre;
+    let opacity = compensation(cov, view) / (1.0 + exp(-param(OPACITY, i)));
+    if !(opacity >= ALPHA_MIN) {
+        return;
+    }
+    let center = view.focal * t.xy / t.z + view.centre;
     // The ellipse on which alpha falls to ALPHA_MIN, a hair larger so that rounding loses no pixel.
     let reach2 = 2.002 * log(opacity / ALPHA_MIN) + 1e-4;
     let half_height = sqrt(reach2 * cyy);
-    let finite = det > 0.0 && det < 1e30 && abs(mean.x) < 1e9 && abs(mean.y) < 1e9 && half_height < 1e9 && cxx < 1e15;
+    let finite = det > 0.0 && det < 1e30 && abs(center.x) < 1e9 && abs(center.y) < 1e9 && half_height < 1e9 && cxx < 1e15;
     if !finite {
         return;
     }
-    let f0 = vec4<f32>(mean, cxy / cyy, det / (cyy * cyy));
+    let f0 = vec4<f32>(center, cxy / cyy, det / (cyy * cyy));
     let rows = f32(view.tiles.y);
-    let first_row = clamp(ceil((mean.y - half_height + 0.5) / f32(TILE)) - 1.0, 0.0, rows);
-    let end_row = clamp(floor((mean.y + half_height - 0.5) / f32(TILE)) + 1.0, 0.0, rows);
+    let first_row = clamp(ceil((center.y - half_height + 0.5) / f32(TILE)) - 1.0, 0.0, rows);
+    let end_row = clamp(floor((center.y + half_height - 0.5) / f32(TILE)) + 1.0, 0.0, rows);
     let f1 = vec4<f32>(reach2 * cyy, sqrt(reach2 / cxx) * cxy, first_row, end_row);
     var count = 0u;
     for (var row = u32(first_row); row < u32(end_row); row++) {
@@ -74,19 +93,19 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if count == 0u {
         return;
     }
-    let color = max(vec3<f32>(0.5) + SH_C0 * param3(COLOR, i), vec3<f32>(0.0));
+    let color = max(color_of(i, mean), vec3<f32>(0.0));
     var feature = param3(FEATURE, i);
     if view.depth_as_feature == 1u {
         feature = vec3<f32>(t.z, 0.0, 0.0);
     }
     let log2e = 1.4426950408889634;
     let conic = vec3<f32>(cyy, -cxy, cxx) / det;
-    splats[3u * i] = vec4<f32>(mean, -0.5 * log2e * conic.x, -log2e * conic.y);
-    splats[3u * i + 1u] = vec4<f32>(-0.5 * log2e * conic.z, min(opacity, ALPHA_MAX), color.r, color.g);
-    splats[3u * i + 2u] = vec4<f32>(color.b, feature);
+    splats[3u * g] = vec4<f32>(center, -0.5 * log2e * conic.x, -log2e * conic.y);
+    splats[3u * g + 1u] = vec4<f32>(-0.5 * log2e * conic.z, log2(min(opacity, ALPHA_MAX)), color.r, color.g);
+    splats[3u * g + 2u] = vec4<f32>(color.b, feature);
     // Positive floats ascend with their bits; sign and the last 7 bits are dropped.
-    depths[i] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);
-    footprints[2u * i] = f0;
-    footprints[2u * i + 1u] = f1;
-    touched[i] = count;
+    depths[g] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);
+    footprints[2u * g] = f0;
+    footprints[2u * g + 1u] = f1;
+    touched[g] = count;
 }

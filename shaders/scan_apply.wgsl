@@ -12,12 +12,12 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let end = min(job.n, (id.x + 1u) * length);
     var sum = 0u;
     for (var t = 0u; t < id.x; t++) {
-        sum += totals[t];
+        sum = saturating(sum, totals[t]);
     }
     for (var i = id.x * length; i < end; i++) {
         let item = items[i];
         items[i] = sum;
-        sum += item;
+        sum = saturating(sum, item);
     }
     if id.x == CHUNKS - 1u {
         totals[CHUNKS] = sum;

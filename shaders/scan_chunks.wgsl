@@ -11,7 +11,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let end = min(job.n, (id.x + 1u) * length);
     var sum = 0u;
     for (var i = id.x * length; i < end; i++) {
-        sum += items[i];
+        sum = saturating(sum, items[i]);
     }
     totals[id.x] = sum;
 }

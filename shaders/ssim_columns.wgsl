@@ -1,47 +1,51 @@
 // Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments of x.
 //
-// rows     [5][h][w]  from ssim_rows
-// partials [3][h][w]  d SSIM / d (mean x, mean x^2, mean x y)
-// sums     [6][h runs][w]  sum of SSIM over each run, for the loss
+// rows     [5][padded rows][quads]  from ssim_rows
+// partials [3][padded rows][quads]  d SSIM / d (mean x, mean x^2, mean x y)
+// sums     [6][tile rows][quads]    sum of SSIM over eight rows, for the loss
 #import columns
 #import flat
 
 @group(0) @binding(0) var<uniform> plane: Plane;
-@group(0) @binding(1) var<storage, read> rows: array<f32>;
-@group(0) @binding(2) var<storage, read_write> partials: array<f32>;
-@group(0) @binding(3) var<storage, read_write> sums: array<f32>;
+@group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> partials: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> sums: array<vec4<f32>>;
+
+// SSIM of four pixels from their five local moments; stores its derivatives.
+fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, xx: vec4<f32>, yy: vec4<f32>, xy: vec4<f32>) -> vec4<f32> {
+    let a = 2.0 * mx * my + 0.0001;
+    let b = 2.0 * (xy - mx * my) + 0.0009;
+    let c = mx * mx + my * my + 0.0001;
+    let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
+    let weight = shown(quad, row);
+    let inverse = 1.0 / (c * d);
+    let value = a * b * inverse;
+    let size = plane.rows * plane.quads;
+    let place = row * plane.quads + quad;
+    // sigma terms depend on the mean too: b and d lose 2 mx my and mx^2.
+    partials[place] = weight * (2.0 * my * (b - a) * inverse - 2.0 * mx * value * (d - c) * inverse);
+    partials[size + place] = -weight * value / d;
+    partials[2u * size + place] = weight * 2.0 * a * inverse;
+    return weight * value;
+}
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let runs = (plane.height + RUN - 1u) / RUN;
     let id = flat_group(group, groups) * 64u + lane;
-    if id >= runs * plane.width {
+    let runs = plane.rows / 8u;
+    if id >= runs * plane.quads {
         return;
     }
-    let column = id % plane.width;
-    let first = i32((id / plane.width) * RUN);
-    let size = plane.width * plane.height;
-    var mx = blurred(0u, column, first);
-    var my = blurred(1u, column, first);
-    var xx = blurred(2u, column, first);
-    var yy = blurred(3u, column, first);
-    var xy = blurred(4u, column, first);
-    var total = 0.0;
-    for (var o = 0u; o < RUN; o++) {
-        let j = u32(first) + o;
-        if j < plane.height {
-            let a = 2.0 * mx[o] * my[o] + 0.0001;
-            let b = 2.0 * (xy[o] - mx[o] * my[o]) + 0.0009;
-            let c = mx[o] * mx[o] + my[o] * my[o] + 0.0001;
-            let d = (xx[o] - mx[o] * mx[o]) + (yy[o] - my[o] * my[o]) + 0.0009;
-            let ssim = a * b / (c * d);
-            total += ssim;
-            let at = j * plane.width + column;
-            // sigma terms depend on the mean too: b and d lose 2 mx my and mx^2.
-            partials[at] = (2.0 * my[o] * (b - a)) / (c * d) - 2.0 * mx[o] * ssim * (1.0 / c - 1.0 / d);
-            partials[size + at] = -ssim / d;
-            partials[2u * size + at] = 2.0 * a / (c * d);
-        }
-    }
-    sums[plane.channel * runs * plane.width + id] = total;
+    let quad = id % plane.quads;
+    let first = 8u * (id / plane.quads);
+    let mx = blurred(0u, quad, i32(first));
+    let my = blurred(1u, quad, i32(first));
+    let xx = blurred(2u, quad, i32(first));
+    let yy = blurred(3u, quad, i32(first));
+    let xy = blurred(4u, quad, i32(first));
+    var total = vec4<f32>(0.0);
+#each K 8
+    total += ssim(quad, first + $Ku, mx[$K], my[$K], xx[$K], yy[$K], xy[$K]);
+#end
+    sums[plane.channel * runs * plane.quads + id] = total;
 }

@@ -1,63 +1,52 @@
 // Blurs x, y, x^2, y^2 and x y along rows: the first half of SSIM's window.
 //
-// frame  [..][h][w] rendered x; target [..][h][w] y, negative where the pixel does not count (then y := x)
-// rows   [5][h][w]
-#import window
+// frame  [..][padded rows][quads]  rendered x
+// targets [2][padded rows][quads]   8-bit y of colour and feature; where a pixel does not count, y := x
+// rows   [5][padded rows][quads]
+#import rows
 #import flat
 
 @group(0) @binding(0) var<uniform> plane: Plane;
-@group(0) @binding(1) var<storage, read> frame: array<f32>;
-@group(0) @binding(2) var<storage, read> target_image: array<f32>;
-@group(0) @binding(3) var<storage, read_write> rows: array<f32>;
+@group(0) @binding(1) var<storage, read> frame: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read> targets: array<vec4<u32>>;
+@group(0) @binding(3) var<storage, read_write> rows: array<vec4<f32>>;
 
-// Values outside the picture are 0; loading in any case and choosing afterwards avoids branches.
-fn rendered(base: u32, i: i32) -> f32 {
-    let value = frame[base + u32(clamp(i, 0, i32(plane.width) - 1))];
-    return select(0.0, value, i >= 0 && i < i32(plane.width));
+struct Pair {
+    x: vec4<f32>,
+    y: vec4<f32>,
 }
 
-fn wanted(base: u32, i: i32, x: f32) -> f32 {
-    let value = target_image[base + u32(clamp(i, 0, i32(plane.width) - 1))];
-    return select(0.0, select(value, x, value < 0.0), i >= 0 && i < i32(plane.width));
+// Loading in any case and choosing afterwards avoids branches.
+fn load(quad: i32, row: u32) -> Pair {
+    let q = u32(clamp(quad, 0, i32(plane.quads) - 1));
+    let place = row * plane.quads + q;
+    let x = exposed(frame[plane.channel * plane.rows * plane.quads + place], q, row);
+    let y = wanted(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
+    let in_picture = quad >= 0 && quad < i32(plane.quads);
+    return Pair(select(vec4<f32>(0.0), x, in_picture), select(vec4<f32>(0.0), select(x, y.value, y.counts), in_picture));
 }
 
-fn store(map: u32, row: u32, first: i32, values: array<f32, 8>) {
-    var v = values;
-    let base = (map * plane.height + row) * plane.width + u32(first);
-    for (var o = 0u; o < RUN; o++) {
-        if u32(first) + o < plane.width {
-            rows[base + o] = v[o];
-        }
-    }
+fn store(map: u32, quad: u32, row: u32, values: array<vec4<f32>, 2>) {
+    let place = (map * plane.rows + row) * plane.quads + quad;
+    rows[place] = values[0];
+    rows[place + 1u] = values[1];
 }
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let runs = (plane.width + RUN - 1u) / RUN;
     let id = flat_group(group, groups) * 64u + lane;
-    if id >= runs * plane.height {
+    let runs = plane.quads / 2u;
+    if id >= runs * plane.rows {
         return;
     }
     let row = id / runs;
-    let first = i32((id % runs) * RUN);
-    let size = plane.width * plane.height;
-    let base = plane.channel * size + row * plane.width;
-    let x = array<f32, 18>(
-        rendered(base, first - 5), rendered(base, first - 4), rendered(base, first - 3), rendered(base, first - 2), rendered(base, first - 1), rendered(base, first + 0),
-        rendered(base, first + 1), rendered(base, first + 2), rendered(base, first + 3), rendered(base, first + 4), rendered(base, first + 5), rendered(base, first + 6),
-        rendered(base, first + 7), rendered(base, first + 8), rendered(base, first + 9), rendered(base, first + 10), rendered(base, first + 11), rendered(base, first + 12),
-    );
-    let y = array<f32, 18>(
-        wanted(base, first - 5, x[0]), wanted(base, first - 4, x[1]), wanted(base, first - 3, x[2]),
-        wanted(base, first - 2, x[3]), wanted(base, first - 1, x[4]), wanted(base, first + 0, x[5]),
-        wanted(base, first + 1, x[6]), wanted(base, first + 2, x[7]), wanted(base, first + 3, x[8]),
-        wanted(base, first + 4, x[9]), wanted(base, first + 5, x[10]), wanted(base, first + 6, x[11]),
-        wanted(base, first + 7, x[12]), wanted(base, first + 8, x[13]), wanted(base, first + 9, x[14]),
-        wanted(base, first + 10, x[15]), wanted(base, first + 11, x[16]), wanted(base, first + 12, x[17]),
-    );
-    store(0u, row, first, blur(x));
-    store(1u, row, first, blur(y));
-    store(2u, row, first, blur(times(x, x)));
-    store(3u, row, first, blur(times(y, y)));
-    store(4u, row, first, blur(times(x, y)));
+    let quad = 2u * (id % runs);
+#each K 6
+    let p$K = load(i32(quad) + $K - 2, row);
+#end
+    store(0u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x, p1.x, p2.x, p3.x, p4.x, p5.x)));
+    store(1u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.y, p1.y, p2.y, p3.y, p4.y, p5.y)));
+    store(2u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x * p0.x, p1.x * p1.x, p2.x * p2.x, p3.x * p3.x, p4.x * p4.x, p5.x * p5.x)));
+    store(3u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.y * p0.y, p1.y * p1.y, p2.y * p2.y, p3.y * p3.y, p4.y * p4.y, p5.y * p5.y)));
+    store(4u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x * p0.y, p1.x * p1.y, p2.x * p2.y, p3.x * p3.y, p4.x * p4.y, p5.x * p5.y)));
 }

@@ -2,7 +2,8 @@
 //! sources and the kinds of its bindings.
 //!
 //! `#import NAME` takes in `shared/NAME.wgsl` once; `#ifdef FLAG`/`#else`/`#endif` choose by permutation; the lines between
-//! `#each Q` and `#end` are repeated for the pixel quads of an invocation, `$Q` being the quad's number.
+//! `#each K 8` and `#end` are repeated 8 times, `$K` being the number of the repetition. `#each Q` repeats for the pixel
+//! quads of an invocation, with `$C` as the quad's column.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -22,15 +23,27 @@ fn main() {
     for path in passes {
         println!("cargo::rerun-if-changed={}", path.display());
         let name = path.file_stem().expect("a file").to_str().expect("UTF-8").to_owned();
-        let sources = PERMUTATIONS.map(|flags| assemble(root, &path, flags));
-        let bindings = validate(&name, &sources[0]);
-        for source in &sources[1..] {
+        // Shapes and channels of which the pass knows nothing would only repeat a source.
+        let mut sources: Vec<(Vec<&str>, String)> = Vec::new();
+        let choices = SHAPES.iter().flat_map(|s| CHANNELS.iter().flat_map(move |c| HARMONICS.iter().map(move |h| [*s, *c, *h].concat())));
+        for flags in choices {
+            let mut used = BTreeSet::new();
+            let source = assemble(root, &path, &flags, &mut used);
+            let flags: Vec<&str> = flags.into_iter().filter(|f| used.contains(*f)).collect();
+            if !sources.iter().any(|(known, _)| *known == flags) {
+                sources.push((flags, source));
+            }
+        }
+        let bindings = validate(&name, &sources[0].1);
+        for (_, source) in &sources[1..] {
             assert_eq!(bindings, validate(&name, source), "{name}: all permutations bind the same");
         }
+        let sources: Vec<String> = sources.iter().map(|(flags, source)| format!("(&{flags:?}, {source:?})")).collect();
         writeln!(
             out,
-            "/// `shaders/{name}.wgsl`\npub static {}: Shader = Shader {{ name: {name:?}, sources: {sources:?}, bindings: &[{}] }};",
+            "/// `shaders/{name}.wgsl`\npub static {}: Shader = Shader {{ name: {name:?}, sources: &[{}], bindings: &[{}] }};",
             name.to_uppercase(),
+            sources.join(", "),
             bindings.join(", ")
         )
         .expect("writing to a string");
@@ -38,26 +51,36 @@ fn main() {
     fs::write(Path::new(&env::var("OUT_DIR").expect("cargo sets OUT_DIR")).join("shaders.rs"), out).expect("writable OUT_DIR");
 }
 
-/// Flags of the permutations, in the order of `Shape` in `src/gpu.rs`.
-const PERMUTATIONS: [&[&str]; 3] = [&[], &["SUBGROUPS"], &["WIDE"]];
+/// Flags of `Shape` in `src/gpu.rs`.
+const SHAPES: [&[&str]; 3] = [&[], &["SUBGROUPS"], &["WIDE"]];
+/// Flags of `Channels` in `src/pass.rs`.
+const CHANNELS: [&[&str]; 4] =
+    [&["WITH_COLOR"], &["WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"]];
 
-fn assemble(root: &Path, path: &Path, flags: &[&str]) -> String {
+/// Whether colour depends on the view: a software rasteriser does not skip branches, even if all invocations would.
+const HARMONICS: [&[&str]; 2] = [&[], &["WITH_SH"]];
+
+/// The text of a pass; `used` collects the flags that it asks for.
+fn assemble(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>) -> String {
     let mut seen = BTreeSet::new();
     let mut out = String::new();
-    expand(root, path, flags, &mut seen, &mut out);
+    expand(root, path, flags, used, &mut seen, &mut out);
     out
 }
 
-fn expand(root: &Path, path: &Path, flags: &[&str], seen: &mut BTreeSet<String>, out: &mut String) {
+fn expand(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>, seen: &mut BTreeSet<String>, out: &mut String) {
     let text = fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
     // An 8x8 tile has 16 quads; it is one invocation's, or shared by eight.
-    let quads = if flags.contains(&"WIDE") { 16 } else { 2 };
+    let (quads, columns) = if flags.contains(&"WIDE") { (16, 2) } else { (2, 1) };
     let mut active = vec![true];
-    let mut repeated: Option<String> = None;
+    let mut repeated: Option<(&str, usize, String)> = None;
     for line in text.lines() {
         let words: Vec<&str> = line.split_whitespace().collect();
         match words.as_slice() {
-            ["#ifdef", flag] => active.push(flags.contains(flag)),
+            ["#ifdef", flag] => {
+                used.insert((*flag).to_owned());
+                active.push(flags.contains(flag));
+            }
             ["#else"] => {
                 let last = active.last_mut().expect("#else follows #ifdef");
                 *last = !*last;
@@ -68,16 +91,22 @@ fn expand(root: &Path, path: &Path, flags: &[&str], seen: &mut BTreeSet<String>,
             _ if !active.iter().all(|a| *a) => {}
             ["#import", name] => {
                 if seen.insert((*name).to_owned()) {
-                    expand(root, &root.join("shared").join(format!("{name}.wgsl")), flags, seen, out);
+                    expand(root, &root.join("shared").join(format!("{name}.wgsl")), flags, used, seen, out);
                 }
             }
-            ["#each", "Q"] => repeated = Some(String::new()),
+            ["#each", "Q"] => {
+                used.insert("WIDE".to_owned());
+                repeated = Some(("$Q", quads, String::new()));
+            }
+            ["#each", "K", count] => repeated = Some(("$K", count.parse().expect("a number of repetitions"), String::new())),
             ["#end"] => {
-                let lines = repeated.take().expect("#end follows #each");
-                (0..quads).for_each(|q| out.push_str(&lines.replace("$Q", &q.to_string())));
+                let (name, count, lines) = repeated.take().expect("#end follows #each");
+                for k in 0..count {
+                    out.push_str(&lines.replace(name, &k.to_string()).replace("$C", &(k % columns).to_string()));
+                }
             }
             _ => {
-                let target = repeated.as_mut().unwrap_or(out);
+                let target = repeated.as_mut().map_or(&mut *out, |r| &mut r.2);
                 target.push_str(line);
                 target.push('\n');
             }

@@ -15,3 +15,8 @@ struct Job {
 fn chunk_length(n: u32) -> u32 {
     return (n + CHUNKS - 1u) / CHUNKS;
 }
+
+// A sum beyond 32 bits stays at the largest value, which the host takes for "too many".
+fn saturating(a: u32, b: u32) -> u32 {
+    return select(a + b, 0xffffffffu, b > 0xffffffffu - a);
+}

@@ -1,16 +1,21 @@
-// The blur along columns of `rows` [maps][h][w], a buffer that the pass declares; outside the picture is zero.
+// The blur along columns of `rows` [maps][padded rows][quads], a buffer that the pass declares: eight rows of a quad.
 #import window
 
-fn at(map: u32, column: u32, j: i32) -> f32 {
-    let row = u32(clamp(j, 0, i32(plane.height) - 1));
-    let value = rows[(map * plane.height + row) * plane.width + column];
-    return select(0.0, value, j >= 0 && j < i32(plane.height));
+fn at(map: u32, quad: u32, j: i32) -> vec4<f32> {
+    let row = u32(clamp(j, 0, i32(plane.rows) - 1));
+    let value = rows[(map * plane.rows + row) * plane.quads + quad];
+    return select(vec4<f32>(0.0), value, j >= 0 && j < i32(plane.rows));
 }
 
-fn blurred(map: u32, column: u32, first: i32) -> array<f32, 8> {
-    return blur(array<f32, 18>(
-        at(map, column, first - 5), at(map, column, first - 4), at(map, column, first - 3), at(map, column, first - 2), at(map, column, first - 1), at(map, column, first + 0),
-        at(map, column, first + 1), at(map, column, first + 2), at(map, column, first + 3), at(map, column, first + 4), at(map, column, first + 5), at(map, column, first + 6),
-        at(map, column, first + 7), at(map, column, first + 8), at(map, column, first + 9), at(map, column, first + 10), at(map, column, first + 11), at(map, column, first + 12),
-    ));
+fn blurred(map: u32, quad: u32, first: i32) -> array<vec4<f32>, 8> {
+    let a = array<vec4<f32>, 18>(
+#each K 18
+        at(map, quad, first + $K - 5),
+#end
+    );
+    return array<vec4<f32>, 8>(
+#each K 8
+        window(a[$Ku + 5u], a[$Ku + 4u] + a[$Ku + 6u], a[$Ku + 3u] + a[$Ku + 7u], a[$Ku + 2u] + a[$Ku + 8u], a[$Ku + 1u] + a[$Ku + 9u], a[$Ku] + a[$Ku + 10u]),
+#end
+    );
 }

@@ -1,17 +1,5 @@
 // Geometry of one projected Gaussian (3DGS, section 4; EWA splatting).
-
-// Rotation matrix of a unit quaternion (w, x, y, z).
-fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
-    let w = q.x;
-    let x = q.y;
-    let y = q.z;
-    let z = q.w;
-    return mat3x3<f32>(
-        vec3<f32>(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        vec3<f32>(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        vec3<f32>(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
-    );
-}
+#import rotation
 
 // Ray slopes beyond 1.3 x the image's half extent are clamped: the affine approximation explodes there.
 fn clamped_slope(t: vec3<f32>, view: View) -> vec2<f32> {
@@ -34,4 +22,21 @@ fn affine(t: vec3<f32>, view: View) -> Affine {
         view.focal.x / t.z * (rows[0] - slope.x * rows[2]),
         view.focal.y / t.z * (rows[1] - slope.y * rows[2]),
     );
+}
+
+// Covariance (xx, xy, yy) in the image from the rows of A, dilated.
+fn dilated(ax: vec3<f32>, ay: vec3<f32>) -> vec3<f32> {
+    return vec3<f32>(dot(ax, ax) + DILATION, dot(ax, ay), dot(ay, ay) + DILATION);
+}
+
+// What dilation takes from the determinant, at least a millionth: squared share of light that stays (Mip-Splatting, 2-D
+// filter).
+fn determinant_share(cov: vec3<f32>) -> f32 {
+    let det = cov.x * cov.z - cov.y * cov.y;
+    return max(((cov.x - DILATION) * (cov.z - DILATION) - cov.y * cov.y) / det, 1e-6);
+}
+
+// Factor on the opacity that keeps a dilated Gaussian as bright as it was.
+fn compensation(cov: vec3<f32>, view: View) -> f32 {
+    return select(1.0, sqrt(determinant_share(cov)), view.antialias == 1u);
 }

@@ -9,21 +9,38 @@ struct View {
     // Colour (3) and feature (3) behind everything; w unused.
     background_color: vec4<f32>,
     background_feature: vec4<f32>,
+    // Position in the world; w unused.
+    camera: vec4<f32>,
     gaussians: u32,
     pairs: u32,
+    // The page of Gaussians that is bound: its first one and their number (shared/channels.wgsl).
+    first: u32,
+    page: u32,
+    // The window of gradient slots that is bound: its first pair and the number of pairs whose Gaussians start in it.
+    slot_first: u32,
+    slot_count: u32,
+    sh_degree: u32,
+    // 1: opacity pays for the dilation of small Gaussians (2-D Mip filter).
+    antialias: u32,
     // 1: the first feature channel carries the depth (for depth images).
     depth_as_feature: u32,
-    // 1: the feature loss also moves geometry.
-    feature_moves_geometry: u32,
+    unused0: u32,
+    unused1: u32,
+    unused2: u32,
 }
 
-// Tile edge in pixels; an invocation owns 4x2 pixels, so 8 invocations a tile.
+// Tile edge in pixels. Pictures on the device are padded to whole tiles; what is outside the picture is zero.
 const TILE: u32 = 8u;
 // A Gaussian is not drawn where it would add less than one grey level.
 const ALPHA_MIN: f32 = 0.00392156862745098;
 const ALPHA_MAX: f32 = 0.99;
-// A pixel is finished once less than this passes through.
+// A tile is finished once less than this passes through each of its pixels.
 const TRANSMITTANCE_MIN: f32 = 0.0001;
 // Variance (px^2) added to each projected Gaussian so that none falls between pixels (3DGS).
 const DILATION: f32 = 0.3;
 const NEAR: f32 = 0.05;
+
+// Place of four neighbouring pixels of a row in the planes of a padded picture.
+fn quad_at(channel: u32, x: u32, y: u32, view: View) -> u32 {
+    return (channel * view.tiles.y * TILE + y) * (view.tiles.x * 2u) + x / 4u;
+}

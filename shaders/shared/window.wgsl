@@ -1,40 +1,48 @@
-// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the job of its passes: one channel at a time.
+// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the job of its passes: one channel at a time, in quads of four
+// neighbouring pixels, over pictures padded to whole tiles. What is outside the picture is zero.
 struct Plane {
-    width: u32,
-    height: u32,
+    // Pixels of the picture.
+    size: vec2<u32>,
+    // Quads of a padded row, and padded rows.
+    quads: u32,
+    rows: u32,
     // Channel of the picture.
     channel: u32,
     // Weight of this channel's loss / number of its pixels.
     scale: f32,
     // The paper's lambda: share of D-SSIM against L1.
     lambda: f32,
+    // Exposure of the view: what is compared is gain * rendered + offset.
+    gain: f32,
+    offset: f32,
     unused0: u32,
     unused1: u32,
     unused2: u32,
 }
 
-// Outputs an invocation computes, sharing their inputs in registers.
-const RUN: u32 = 8u;
-
-// Eight outputs of the 11-tap window from the 18 inputs they share. Written out, so that everything stays in registers.
-fn blur(a: array<f32, 18>) -> array<f32, 8> {
-    return array<f32, 8>(
-        0.2660117249 * a[5] + 0.2130055377 * (a[4] + a[6]) + 0.1093606895 * (a[3] + a[7]) + 0.0360007721 * (a[2] + a[8]) + 0.0075987581 * (a[1] + a[9]) + 0.0010283801 * (a[0] + a[10]),
-        0.2660117249 * a[6] + 0.2130055377 * (a[5] + a[7]) + 0.1093606895 * (a[4] + a[8]) + 0.0360007721 * (a[3] + a[9]) + 0.0075987581 * (a[2] + a[10]) + 0.0010283801 * (a[1] + a[11]),
-        0.2660117249 * a[7] + 0.2130055377 * (a[6] + a[8]) + 0.1093606895 * (a[5] + a[9]) + 0.0360007721 * (a[4] + a[10]) + 0.0075987581 * (a[3] + a[11]) + 0.0010283801 * (a[2] + a[12]),
-        0.2660117249 * a[8] + 0.2130055377 * (a[7] + a[9]) + 0.1093606895 * (a[6] + a[10]) + 0.0360007721 * (a[5] + a[11]) + 0.0075987581 * (a[4] + a[12]) + 0.0010283801 * (a[3] + a[13]),
-        0.2660117249 * a[9] + 0.2130055377 * (a[8] + a[10]) + 0.1093606895 * (a[7] + a[11]) + 0.0360007721 * (a[6] + a[12]) + 0.0075987581 * (a[5] + a[13]) + 0.0010283801 * (a[4] + a[14]),
-        0.2660117249 * a[10] + 0.2130055377 * (a[9] + a[11]) + 0.1093606895 * (a[8] + a[12]) + 0.0360007721 * (a[7] + a[13]) + 0.0075987581 * (a[6] + a[14]) + 0.0010283801 * (a[5] + a[15]),
-        0.2660117249 * a[11] + 0.2130055377 * (a[10] + a[12]) + 0.1093606895 * (a[9] + a[13]) + 0.0360007721 * (a[8] + a[14]) + 0.0075987581 * (a[7] + a[15]) + 0.0010283801 * (a[6] + a[16]),
-        0.2660117249 * a[12] + 0.2130055377 * (a[11] + a[13]) + 0.1093606895 * (a[10] + a[14]) + 0.0360007721 * (a[9] + a[15]) + 0.0075987581 * (a[8] + a[16]) + 0.0010283801 * (a[7] + a[17]),
-    );
+// One output from the middle input and the sums of the pairs beside it, from near to far.
+fn window(a0: vec4<f32>, a1: vec4<f32>, a2: vec4<f32>, a3: vec4<f32>, a4: vec4<f32>, a5: vec4<f32>) -> vec4<f32> {
+    return 0.2660117249 * a0 + 0.2130055377 * a1 + 0.1093606895 * a2 + 0.0360007721 * a3 + 0.0075987581 * a4 + 0.0010283801 * a5;
 }
 
-// Element-wise product.
-fn times(a: array<f32, 18>, b: array<f32, 18>) -> array<f32, 18> {
-    return array<f32, 18>(
-        a[0] * b[0], a[1] * b[1], a[2] * b[2], a[3] * b[3], a[4] * b[4], a[5] * b[5],
-        a[6] * b[6], a[7] * b[7], a[8] * b[8], a[9] * b[9], a[10] * b[10], a[11] * b[11],
-        a[12] * b[12], a[13] * b[13], a[14] * b[14], a[15] * b[15], a[16] * b[16], a[17] * b[17],
-    );
+// 1 for the pixels of a quad that lie in the picture, else 0.
+fn shown(quad: u32, row: u32) -> vec4<f32> {
+    let in_row = vec4<u32>(4u * quad) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(plane.size.x);
+    return select(vec4<f32>(0.0), vec4<f32>(1.0), in_row & vec4<bool>(row < plane.size.y));
+}
+
+struct Wanted {
+    value: vec4<f32>,
+    counts: vec4<bool>,
+}
+
+// A quad of an 8-bit target: three channels, then 255 where the pixel counts.
+fn wanted(packed: vec4<u32>, channel: u32) -> Wanted {
+    let value = vec4<f32>((packed >> vec4<u32>(8u * (channel % 3u))) & vec4<u32>(255u)) / 255.0;
+    return Wanted(value, packed >= vec4<u32>(0x80000000u));
+}
+
+// What the loss sees of a rendered quad.
+fn exposed(rendered: vec4<f32>, quad: u32, row: u32) -> vec4<f32> {
+    return shown(quad, row) * (plane.gain * rendered + plane.offset);
 }

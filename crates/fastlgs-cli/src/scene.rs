@@ -6,7 +6,8 @@ use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_grid::query::Decision;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_grid::{Grid, codes};
-use fastlgs_raster::{Engine, Frame, View};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::{MiniLm, TextEncoder};
 use std::path::{Path, PathBuf};
 
@@ -30,9 +31,7 @@ impl Scene {
         let folder = SceneFolder::open(root)?;
         let gaussians = folder.gaussians()?;
         let mut engine = fastlgs_raster::open_engine(device)?;
-        let params = gaussians.to_channels();
-        let zeros = vec![0.0; params.len()];
-        engine.set_state(&params, &zeros, &zeros)?;
+        engine.set_state(&State::of(&gaussians))?;
         Ok(Self { manifest: folder.manifest()?, cameras: folder.cameras()?, folder, gaussians, engine })
     }
 
@@ -43,14 +42,24 @@ impl Scene {
 
     /// Renders colour, feature and transmittance.
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
-        Ok(self.engine.render(View::new(camera, self.gaussians.len()))?)
+        Ok(self.engine.render(self.view(camera), Channels::Both)?)
+    }
+
+    /// The frame of a camera, rendered in the way the scene was trained.
+    fn view(&self, camera: &Camera) -> View {
+        let mut view = View::new(camera, self.gaussians.len(), self.gaussians.sh_degree);
+        if let Some(train) = self.manifest.notes.get("train") {
+            view.antialias = u32::from(train["antialias"] == true);
+            for (k, value) in train["background"].as_array().into_iter().flatten().take(3).enumerate() {
+                view.background_color[k] = value.as_f64().unwrap_or(0.0) as f32;
+            }
+        }
+        view
     }
 
     /// Renders the expected depth (sum of w z / sum of w), infinite where nothing is.
     pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
-        let mut view = View::new(camera, self.gaussians.len());
-        view.depth_as_feature = 1;
-        let frame = self.engine.render(view)?;
+        let frame = self.engine.render(View { depth_as_feature: 1, ..self.view(camera) }, Channels::Feature)?;
         let solid = |(z, t): (&f32, &f32)| if *t < 0.999 { z / (1.0 - t) } else { f32::INFINITY };
         Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
     }

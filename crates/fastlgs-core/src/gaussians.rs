@@ -8,7 +8,7 @@ pub const SH_C0: f32 = 0.282_094_79;
 /// 3-D Gaussians with colour, semantic feature and object id. All vectors have the same length.
 ///
 /// Values are stored as they are optimised and as the PLY of 3DGS holds them: scales as logarithms, opacity as a
-/// logit, rotation as an unnormalised quaternion (w, x, y, z), colour as the zeroth SH coefficient.
+/// logit, rotation as an unnormalised quaternion (w, x, y, z), colour as SH coefficients.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
     /// Centre in the world.
@@ -21,14 +21,32 @@ pub struct Gaussians {
     pub opacity_logits: Vec<f32>,
     /// SH coefficient of degree 0; colour = 0.5 + [`SH_C0`] * dc.
     pub sh_dc: Vec<Vec3>,
+    /// Highest spherical-harmonic degree of colour, 0 to [`MAX_SH_DEGREE`].
+    pub sh_degree: u32,
+    /// SH coefficients of degrees 1 and up, [`rest_len`] red-green-blue triples a Gaussian.
+    pub sh_rest: Vec<Vec3>,
     /// Low-dimensional semantic code, nominally in (0, 1)^3 (the paper's f).
     pub features: Vec<Vec3>,
     /// Object of the table that the Gaussian belongs to; 0 means none.
     pub object_ids: Vec<u16>,
 }
 
-/// Number of trained floats a Gaussian has here: mean 3, log-scale 3, rotation 4, opacity 1, colour 3, feature 3.
-pub const CHANNELS: usize = 17;
+/// Trained floats of a Gaussian without view-dependent colour: mean 3, log-scale 3, rotation 4, opacity 1, colour 3,
+/// feature 3. The SH coefficients of higher degrees follow, coefficient by coefficient.
+pub const BASE_CHANNELS: usize = 17;
+
+/// Highest degree that kernels and files know.
+pub const MAX_SH_DEGREE: u32 = 3;
+
+/// SH coefficients of degrees 1 to `degree` for each colour.
+pub const fn rest_len(degree: u32) -> usize {
+    ((degree + 1) * (degree + 1) - 1) as usize
+}
+
+/// Number of trained floats a Gaussian has at an SH degree.
+pub const fn channels(degree: u32) -> usize {
+    BASE_CHANNELS + 3 * rest_len(degree)
+}
 
 impl Gaussians {
     /// How many there are.
@@ -48,23 +66,41 @@ impl Gaussians {
         self.rotations.push([1.0, 0.0, 0.0, 0.0]);
         self.opacity_logits.push(logit(opacity));
         self.sh_dc.push((Vec3::from(color) - 0.5) / SH_C0);
+        self.sh_rest.extend(std::iter::repeat_n(Vec3::ZERO, rest_len(self.sh_degree)));
         self.features.push(Vec3::ZERO);
         self.object_ids.push(0);
     }
 
-    /// All trained values as `[CHANNELS][n]`, the layout of the kernels.
+    /// The SH coefficients of Gaussian `i` above degree 0.
+    pub fn rest(&self, i: usize) -> &[Vec3] {
+        let k = rest_len(self.sh_degree);
+        &self.sh_rest[i * k..(i + 1) * k]
+    }
+
+    /// The same scene with view-dependent colour up to `degree`: what is above is dropped, what is missing is zero.
+    pub fn with_sh_degree(mut self, degree: u32) -> Self {
+        let (from, to) = (rest_len(self.sh_degree), rest_len(degree));
+        let value = |i: usize, k: usize| if k < from { self.sh_rest[i * from + k] } else { Vec3::ZERO };
+        let rest = (0..self.len()).flat_map(|i| (0..to).map(move |k| (i, k))).map(|(i, k)| value(i, k)).collect();
+        self.sh_rest = rest;
+        self.sh_degree = degree;
+        self
+    }
+
+    /// All trained values as `[channels(sh_degree)][n]`, the layout of the kernels.
     pub fn to_channels(&self) -> Vec<f32> {
         let n = self.len();
-        let mut out = vec![0.0; CHANNELS * n];
+        let mut out = vec![0.0; channels(self.sh_degree) * n];
         for i in 0..n {
-            for (c, value) in self.values(i).into_iter().enumerate() {
+            let rest = self.rest(i).iter().flat_map(|v| v.to_array());
+            for (c, value) in self.values(i).into_iter().chain(rest).enumerate() {
                 out[c * n + i] = value;
             }
         }
         out
     }
 
-    fn values(&self, i: usize) -> [f32; CHANNELS] {
+    fn values(&self, i: usize) -> [f32; BASE_CHANNELS] {
         let (m, s, r) = (self.means[i], self.log_scales[i], self.rotations[i]);
         let (c, f) = (self.sh_dc[i], self.features[i]);
         let o = self.opacity_logits[i];
@@ -74,18 +110,21 @@ impl Gaussians {
     /// The inverse of [`Self::to_channels`]; object ids become 0 where `ids` does not give them.
     ///
     /// # Panics
-    /// If `channels` is not a multiple of [`CHANNELS`] long.
-    pub fn from_channels(channels: &[f32], ids: Option<&[u16]>) -> Self {
-        assert_eq!(channels.len() % CHANNELS, 0, "channels of unequal length");
-        let n = channels.len() / CHANNELS;
-        let v = |c: usize, i: usize| channels[c * n + i];
-        let vec3 = |c: usize| (0..n).map(|i| Vec3::new(v(c, i), v(c + 1, i), v(c + 2, i))).collect::<Vec<_>>();
+    /// If `values` is not a multiple of [`channels`] long.
+    pub fn from_channels(values: &[f32], sh_degree: u32, ids: Option<&[u16]>) -> Self {
+        assert_eq!(values.len() % channels(sh_degree), 0, "channels of unequal length");
+        let n = values.len() / channels(sh_degree);
+        let v = |c: usize, i: usize| values[c * n + i];
+        let at = |c: usize, i: usize| Vec3::new(v(c, i), v(c + 1, i), v(c + 2, i));
+        let vec3 = |c: usize| (0..n).map(|i| at(c, i)).collect::<Vec<_>>();
         Self {
             means: vec3(0),
             log_scales: vec3(3),
             rotations: (0..n).map(|i| [v(6, i), v(7, i), v(8, i), v(9, i)]).collect(),
-            opacity_logits: channels[10 * n..11 * n].to_vec(),
+            opacity_logits: values[10 * n..11 * n].to_vec(),
             sh_dc: vec3(11),
+            sh_degree,
+            sh_rest: (0..n).flat_map(|i| (0..rest_len(sh_degree)).map(move |k| at(BASE_CHANNELS + 3 * k, i))).collect(),
             features: vec3(14),
             object_ids: ids.map_or_else(|| vec![0; n], <[u16]>::to_vec),
         }
@@ -105,6 +144,8 @@ impl Gaussians {
             rotations: pick(&self.rotations, places),
             opacity_logits: pick(&self.opacity_logits, places),
             sh_dc: pick(&self.sh_dc, places),
+            sh_degree: self.sh_degree,
+            sh_rest: places.iter().flat_map(|&i| self.rest(i)).copied().collect(),
             features: pick(&self.features, places),
             object_ids: pick(&self.object_ids, places),
         }
@@ -118,7 +159,7 @@ impl Gaussians {
 
     /// Index of the first Gaussian with a value that is not finite.
     pub fn first_not_finite(&self) -> Option<usize> {
-        (0..self.len()).find(|&i| !self.values(i).iter().all(|v| v.is_finite()))
+        (0..self.len()).find(|&i| !self.values(i).iter().all(|v| v.is_finite()) || !self.rest(i).iter().all(|v| v.is_finite()))
     }
 }
 
@@ -142,7 +183,12 @@ mod tests {
         g.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.5, 0.25, [0.1, 0.2, 0.3]);
         g.push_sphere(Vec3::new(-1.0, 0.0, 9.0), 0.1, 0.75, [0.9, 0.8, 0.7]);
         g.object_ids = vec![3, 7];
-        assert_eq!(Gaussians::from_channels(&g.to_channels(), Some(&g.object_ids)), g);
+        assert_eq!(Gaussians::from_channels(&g.to_channels(), 0, Some(&g.object_ids)), g);
+        let mut round = g.clone().with_sh_degree(2);
+        round.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        assert_eq!(Gaussians::from_channels(&round.to_channels(), 2, Some(&g.object_ids)), round);
+        assert_eq!(round.select(&[1]).rest(0)[0], Vec3::splat(8.0));
+        assert_eq!(round.with_sh_degree(1).with_sh_degree(0), g);
         assert!((sigmoid(g.opacity_logits[0]) - 0.25).abs() < 1e-6);
         assert_eq!(g.select(&[1]).object_ids, vec![7]);
     }

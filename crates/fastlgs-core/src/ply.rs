@@ -1,35 +1,23 @@
 //! The PLY that 3DGS programs exchange: binary little-endian (or ASCII on reading), one `vertex` element of floats.
 //!
-//! Written columns: `x y z nx ny nz f_dc_0..2 opacity scale_0..2 rot_0..3`, then `feature_0..2` (float) and
-//! `object_id` (ushort), which other viewers skip. On reading, unknown columns are skipped and missing features are 0.
+//! Written columns: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3` (`f_rest` as in 3DGS: all of red,
+//! then green, then blue), then `feature_0..2` (float) and `object_id` (ushort), which other viewers skip. On reading,
+//! unknown columns are skipped, missing features are 0, and the SH degree is what the number of `f_rest` columns gives.
 
+use crate::gaussians::{MAX_SH_DEGREE, rest_len};
 use crate::{Error, Gaussians, Result, fs};
 use glam::Vec3;
 use std::io::Write;
 use std::path::Path;
 
-const FLOATS: [&str; 20] = [
-    "x",
-    "y",
-    "z",
-    "nx",
-    "ny",
-    "nz",
-    "f_dc_0",
-    "f_dc_1",
-    "f_dc_2",
-    "opacity",
-    "scale_0",
-    "scale_1",
-    "scale_2",
-    "rot_0",
-    "rot_1",
-    "rot_2",
-    "rot_3",
-    "feature_0",
-    "feature_1",
-    "feature_2",
-];
+/// Names of the float columns at an SH degree, in their order.
+fn float_columns(degree: u32) -> Vec<String> {
+    let numbered = |name: &str, n: usize| (0..n).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
+    let fixed = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned);
+    let groups = [("f_dc", 3), ("f_rest", 3 * rest_len(degree))].map(|(name, n)| numbered(name, n));
+    let tail = [("scale", 3), ("rot", 4), ("feature", 3)].map(|(name, n)| numbered(name, n));
+    fixed.into_iter().chain(groups.concat()).chain(["opacity".to_owned()]).chain(tail.concat()).collect()
+}
 
 /// Writes the scene atomically.
 ///
@@ -38,15 +26,17 @@ const FLOATS: [&str; 20] = [
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     fs::write_atomic(path, |file| {
         writeln!(file, "ply\nformat binary_little_endian 1.0\ncomment FastLGS\nelement vertex {}", scene.len())?;
-        for name in FLOATS {
+        for name in float_columns(scene.sh_degree) {
             writeln!(file, "property float {name}")?;
         }
         writeln!(file, "property ushort object_id\nend_header")?;
         for i in 0..scene.len() {
             let (m, c, s, r) = (scene.means[i], scene.sh_dc[i], scene.log_scales[i], scene.rotations[i]);
             let (o, f) = (scene.opacity_logits[i], scene.features[i]);
-            let row = [m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z, o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z];
-            for value in row {
+            let head = [m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z];
+            let rest = (0..3).flat_map(|color| scene.rest(i).iter().map(move |v| v[color]));
+            let tail = [o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z];
+            for value in head.into_iter().chain(rest).chain(tail) {
                 file.write_all(&value.to_le_bytes())?;
             }
             file.write_all(&scene.object_ids[i].to_le_bytes())?;
@@ -204,12 +194,21 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let zeros = vec![0.0; n];
     let rot = [need("rot_0")?, need("rot_1")?, need("rot_2")?, need("rot_3")?];
     let feature = |k: usize| find(&format!("feature_{k}")).unwrap_or(&zeros);
+    let rest_columns = header.columns.iter().filter(|c| c.0.starts_with("f_rest_")).count();
+    let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest_columns).ok_or_else(|| {
+        Error::format(path, format!("{rest_columns} columns 'f_rest_*': 0, 9, 24 or 45 are those of SH degrees 0 to {MAX_SH_DEGREE}"))
+    })?;
+    let per_color = rest_len(sh_degree);
+    let rest = (0..rest_columns).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<Vec<_>>>()?;
+    let coefficient = |i: usize, k: usize| [0, 1, 2].map(|color| rest[color * per_color + k][i] as f32);
     let scene = Gaussians {
         means: vec3(need("x")?, need("y")?, need("z")?),
         log_scales: vec3(need("scale_0")?, need("scale_1")?, need("scale_2")?),
         rotations: (0..n).map(|i| rot.map(|r| r[i] as f32)).collect(),
         opacity_logits: need("opacity")?.iter().map(|&v| v as f32).collect(),
         sh_dc: vec3(need("f_dc_0")?, need("f_dc_1")?, need("f_dc_2")?),
+        sh_degree,
+        sh_rest: (0..n).flat_map(|i| (0..per_color).map(move |k| (i, k))).map(|(i, k)| coefficient(i, k).into()).collect(),
         features: vec3(feature(0), feature(1), feature(2)),
         object_ids: find("object_id").unwrap_or(&zeros).iter().map(|&v| v as u16).collect(),
     };
@@ -230,6 +229,8 @@ mod tests {
         }
         g.features[2] = Vec3::new(0.1, 0.2, 0.3);
         g.object_ids[4] = 513;
+        let mut g = g.with_sh_degree(3);
+        g.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::new(k as f32, -0.5, 0.25 * k as f32));
         g
     }
 

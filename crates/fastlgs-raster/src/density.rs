@@ -1,12 +1,16 @@
-//! Density control of 3DGS (section 5) as small named operations on the training state.
+//! Density control as small named operations on the training state: clone, split, prune and opacity reset of 3DGS
+//! (section 5), and relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024).
 
-use fastlgs_core::gaussians::{CHANNELS, logit, sigmoid};
+use fastlgs_core::Gaussians;
+use fastlgs_core::gaussians::{channels, logit, sigmoid};
 use fastlgs_core::rng::Rng;
 use glam::{Quat, Vec3};
 
-/// Trained values and both Adam moments, each `[CHANNELS][n]`.
+/// Trained values and both Adam moments, each `[channels(sh_degree)][n]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct State {
+    /// SH degree of colour.
+    pub sh_degree: u32,
     /// Trained values.
     pub params: Vec<f32>,
     /// First moment.
@@ -46,9 +50,16 @@ pub struct Counts {
 }
 
 impl State {
+    /// The state of a scene that no optimiser has touched.
+    pub fn of(scene: &Gaussians) -> Self {
+        let params = scene.to_channels();
+        let zeros = vec![0.0; params.len()];
+        Self { sh_degree: scene.sh_degree, params, moment1: zeros.clone(), moment2: zeros }
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
-        self.params.len() / CHANNELS
+        self.params.len() / channels(self.sh_degree)
     }
 
     /// Whether there are none.
@@ -73,12 +84,19 @@ impl State {
     fn gathered(&self, sources: &[(usize, bool)]) -> Self {
         let n = self.len();
         let pick = |values: &[f32], keep_fresh: bool| {
-            (0..CHANNELS)
+            (0..channels(self.sh_degree))
                 .flat_map(|c| sources.iter().map(move |&(i, fresh)| (c, i, fresh)))
                 .map(|(c, i, fresh)| if fresh && !keep_fresh { 0.0 } else { values[c * n + i] })
                 .collect()
         };
-        Self { params: pick(&self.params, true), moment1: pick(&self.moment1, false), moment2: pick(&self.moment2, false) }
+        let (params, moment1, moment2) = (pick(&self.params, true), pick(&self.moment1, false), pick(&self.moment2, false));
+        Self { sh_degree: self.sh_degree, params, moment1, moment2 }
+    }
+
+    /// Leaves only the Gaussians at `places`.
+    pub fn keep(&mut self, places: &[usize]) {
+        let sources: Vec<(usize, bool)> = places.iter().map(|&i| (i, false)).collect();
+        *self = self.gathered(&sources);
     }
 
     /// Moves Gaussian `i` to a sample of its own distribution and shrinks it by 1.6.
@@ -145,15 +163,88 @@ pub fn reset_opacity(state: &mut State, ceiling: f32) {
     }
 }
 
+/// Opacity at or below which MCMC calls a Gaussian dead.
+const DEAD: f32 = 0.005;
+
+/// Moves dead Gaussians onto live ones, chosen with the probability of their opacity; the place looks as before.
+/// Returns how many moved.
+pub fn relocate(state: &mut State, rng: &mut Rng) -> usize {
+    let dead: Vec<usize> = (0..state.len()).filter(|&i| state.opacity(i) <= DEAD).collect();
+    if dead.len() == state.len() {
+        return 0;
+    }
+    let mut sources: Vec<usize> = (0..state.len()).collect();
+    for (&place, source) in dead.iter().zip(sampled(state, dead.len(), rng)) {
+        sources[place] = source;
+    }
+    share(state, &sources);
+    dead.len()
+}
+
+/// Adds copies of Gaussians chosen with the probability of their opacity, a twentieth more at most, within the budget.
+/// Returns how many were added.
+pub fn grow(state: &mut State, budget: usize, rng: &mut Rng) -> usize {
+    let n = state.len();
+    let added = (n / 20).min(budget.saturating_sub(n));
+    let sources: Vec<usize> = (0..n).chain(sampled(state, added, rng)).collect();
+    share(state, &sources);
+    added
+}
+
+/// `count` live Gaussians, drawn with the probability of their opacity.
+fn sampled(state: &State, count: usize, rng: &mut Rng) -> Vec<usize> {
+    let mut sum = 0.0f64;
+    let live = |o: f32| if o > DEAD { f64::from(o) } else { 0.0 };
+    let cumulative: Vec<f64> = (0..state.len())
+        .map(|i| {
+            sum += live(state.opacity(i));
+            sum
+        })
+        .collect();
+    (0..count).map(|_| cumulative.partition_point(|c| *c <= f64::from(rng.uniform()) * sum).min(state.len() - 1)).collect()
+}
+
+/// The state whose Gaussian k is a copy of `sources[k]`, copies of one being made fainter and smaller so that together
+/// they look like it (MCMC, eq. 9); those start without momentum.
+fn share(state: &mut State, sources: &[usize]) {
+    let mut copies = vec![0usize; state.len()];
+    sources.iter().for_each(|&s| copies[s] += 1);
+    let fresh: Vec<(usize, bool)> = sources.iter().map(|&s| (s, copies[s] > 1)).collect();
+    *state = state.gathered(&fresh);
+    let n = state.len();
+    for (i, &source) in sources.iter().enumerate().filter(|(_, s)| copies[**s] > 1) {
+        let (opacity, shrink) = shared(state.opacity(i), copies[source]);
+        state.params[10 * n + i] = logit(opacity.clamp(DEAD, 1.0 - f32::EPSILON));
+        (3..6).for_each(|c| state.params[c * n + i] += shrink.ln());
+    }
+}
+
+/// Opacity of each of `copies` in one place, and the factor on their scales.
+fn shared(opacity: f32, copies: usize) -> (f32, f32) {
+    // More copies than these change nothing that can be seen, and their binomials overflow.
+    let copies = copies.min(50);
+    let old = f64::from(opacity).min(1.0 - 1e-7);
+    let new = 1.0 - (1.0 - old).powf(1.0 / copies as f64);
+    let mut denominator = 0.0;
+    for i in 0..copies {
+        let mut binomial = 1.0f64;
+        for k in 0..=i {
+            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            denominator += binomial * sign * new.powi(k as i32 + 1) / ((k + 1) as f64).sqrt();
+            binomial *= (i - k) as f64 / (k + 1) as f64;
+        }
+    }
+    (new as f32, (old / denominator) as f32)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fastlgs_core::Gaussians;
 
     fn state(scene: &Gaussians) -> State {
-        let params = scene.to_channels();
-        let zeros = vec![1.0; params.len()];
-        State { params, moment1: zeros.clone(), moment2: zeros }
+        let state = State::of(scene);
+        let ones = vec![1.0; state.params.len()];
+        State { moment1: ones.clone(), moment2: ones, ..state }
     }
 
     #[test]
@@ -168,7 +259,7 @@ mod tests {
         let stats = [1.0, 1.0, 1.0, 0.0, 10.0, 10.0, 10.0, 10.0];
         let counts = refine(&mut s, &stats, 1.0, &Config::default(), &mut Rng::new(1, "test"));
         assert_eq!(counts, Counts { cloned: 1, split: 1, pruned: 1 });
-        let after = Gaussians::from_channels(&s.params, None);
+        let after = Gaussians::from_channels(&s.params, 0, None);
         assert_eq!(after.len(), 5);
         assert_eq!(after.means[0], after.means[1]);
         assert!((after.log_scales[2].x - (0.5f32 / 1.6).ln()).abs() < 1e-5);
@@ -186,5 +277,29 @@ mod tests {
         let config = Config { budget: 13, ..Config::default() };
         refine(&mut s, &[1.0; 20], 1.0, &config, &mut Rng::new(1, "test"));
         assert_eq!(s.len(), 13);
+    }
+
+    #[test]
+    fn relocation_revives_the_dead_where_it_is_dense() {
+        let mut scene = Gaussians::default();
+        scene.push_sphere(Vec3::ZERO, 0.5, 0.9, [0.5; 3]);
+        scene.push_sphere(Vec3::X, 0.5, 0.001, [0.5; 3]);
+        let mut s = state(&scene);
+        assert_eq!(relocate(&mut s, &mut Rng::new(1, "test")), 1);
+        assert_eq!(s.vec3(0, 1), Vec3::ZERO);
+        // Two of them, one behind the other, let through what the one did.
+        assert!(((1.0 - s.opacity(0)).powi(2) - 0.1).abs() < 1e-3);
+        assert!(s.largest_scale(0) < 0.5 && s.largest_scale(0) > 0.3, "{}", s.largest_scale(0));
+        assert_eq!(shared(0.7, 1), (0.7, 1.0));
+    }
+
+    #[test]
+    fn growth_stops_at_the_budget() {
+        let mut scene = Gaussians::default();
+        (0..100).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
+        let mut s = state(&scene);
+        assert_eq!(grow(&mut s, 103, &mut Rng::new(1, "test")), 3);
+        assert_eq!(s.len(), 103);
+        assert_eq!(grow(&mut s, 103, &mut Rng::new(1, "test")), 0);
     }
 }

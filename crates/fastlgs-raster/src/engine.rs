@@ -1,10 +1,12 @@
-//! One interface for the GPU and its twins.
+//! One interface for the GPU and the fast CPU backend.
 
-use crate::cpu::{self, CHUNKS, RUN, Splat};
-use crate::view::{Job, Plane, Step, View};
-use crate::{Error, GpuEngine, Result};
-use fastlgs_core::gaussians::CHANNELS;
-use std::collections::{BTreeMap, HashMap};
+use crate::cpu::RUN;
+use crate::density::State;
+use crate::native::CpuEngine;
+use crate::pass::Channels;
+use crate::view::{Plane, Step, View};
+use crate::{GpuEngine, Result};
+use std::collections::BTreeMap;
 
 /// A rendered frame, planar.
 #[derive(Clone, Debug)]
@@ -13,7 +15,7 @@ pub struct Frame {
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
-    /// `[8][h][w]`: r, g, b, f0, f1, f2, transmittance left, pairs walked.
+    /// `[8][h][w]`: r, g, b, f0, f1, f2, transmittance left, pairs walked. Channels that were not asked for hold anything.
     pub data: Vec<f32>,
     /// (tile, Gaussian) pairs of the frame.
     pub pairs: u32,
@@ -27,16 +29,61 @@ impl Frame {
     }
 }
 
-/// Weights of one training step's loss.
-#[derive(Clone, Copy, Debug)]
-pub struct StepOptions {
-    /// Share of D-SSIM (the paper's lambda).
-    pub lambda: f32,
-    /// Weight of the feature loss; 0 leaves the feature channels out.
-    pub feature_weight: f32,
+/// What a view should look like, in 8 bits a channel.
+#[derive(Clone, Debug, Default)]
+pub struct TargetImage {
+    /// Pixels along x and y.
+    pub size: [u32; 2],
+    /// [`pack`]ed colours, row by row.
+    pub color: Vec<u32>,
+    /// [`pack`]ed features (0 to 1 as 0 to 255), row by row; may be empty where features are not trained.
+    pub feature: Vec<u32>,
 }
 
-/// Loss of the last step.
+/// A pixel of a target; one that does not count is left out of the loss.
+pub fn pack(values: [u8; 3], counts: bool) -> u32 {
+    u32::from_le_bytes([values[0], values[1], values[2], if counts { 255 } else { 0 }])
+}
+
+impl TargetImage {
+    /// `[2][padded rows][padded columns]`, as it lies on the device; pixels without feature do not count.
+    pub(crate) fn padded(&self, view: &View) -> Vec<u32> {
+        let mut planes = self.color.clone();
+        planes.extend(&self.feature);
+        planes.resize(2 * self.color.len(), 0);
+        view.padded(&planes)
+    }
+}
+
+/// Affine exposure of a view for each colour: the photo is compared with gain * rendered + offset.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Exposure {
+    /// Factors of red, green and blue.
+    pub gain: [f32; 3],
+    /// Summands of red, green and blue.
+    pub offset: [f32; 3],
+}
+
+impl Default for Exposure {
+    fn default() -> Self {
+        Self { gain: [1.0; 3], offset: [0.0; 3] }
+    }
+}
+
+/// What a training step does.
+#[derive(Clone, Copy, Debug)]
+pub struct StepOptions {
+    /// What is trained.
+    pub channels: Channels,
+    /// Share of D-SSIM (the paper's lambda).
+    pub lambda: f32,
+    /// Weight of the feature loss.
+    pub feature_weight: f32,
+    /// Exposure of the view.
+    pub exposure: Exposure,
+}
+
+/// Loss of the last step, and its gradients by what is not stored with the Gaussians.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Losses {
     /// Mean absolute error of colour.
@@ -45,9 +92,15 @@ pub struct Losses {
     pub color_ssim: f64,
     /// Mean absolute error of the feature.
     pub feature_l1: f64,
+    /// By the exposure's gains.
+    pub by_gain: [f64; 3],
+    /// By the exposure's offsets.
+    pub by_offset: [f64; 3],
+    /// By the background's colour and feature.
+    pub by_background: [f64; 6],
 }
 
-/// Runs the passes. State: trained values `[CHANNELS][n]`, both Adam moments of the same shape, and density statistics.
+/// Runs the passes.
 pub trait Engine {
     /// The adapter, for reports.
     fn name(&self) -> String;
@@ -61,17 +114,12 @@ pub trait Engine {
     ///
     /// # Errors
     /// When they do not fit the device.
-    fn set_state(&mut self, params: &[f32], moment1: &[f32], moment2: &[f32]) -> Result<()>;
-    /// Trained values.
+    fn set_state(&mut self, state: &State) -> Result<()>;
+    /// Trained values and moments.
     ///
     /// # Errors
     /// When the device failed.
-    fn params(&self) -> Result<Vec<f32>>;
-    /// Both moments.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn moments(&self) -> Result<(Vec<f32>, Vec<f32>)>;
+    fn state(&self) -> Result<State>;
     /// Statistics `[2][n]` since the last [`Self::set_state`]; `shaders/project_backward.wgsl`.
     ///
     /// # Errors
@@ -82,226 +130,116 @@ pub trait Engine {
     /// # Errors
     /// When the device failed.
     fn set_stats(&mut self, stats: &[f32]) -> Result<()>;
-    /// Gradient `[CHANNELS][n]` of the last step.
+    /// Gradient of the last step, laid out like the state's values; zero where nothing was trained.
     ///
     /// # Errors
     /// When the device failed.
     fn gradients(&self) -> Result<Vec<f32>>;
-    /// Keeps a target `[6][h][w]` on the device; negative values do not count.
+    /// Keeps a target on the device.
     ///
     /// # Errors
     /// When it does not fit.
-    fn set_target(&mut self, id: usize, target: &[f32]) -> Result<()>;
+    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()>;
     /// Renders a frame; `view.gaussians` must equal [`Self::len`].
     ///
     /// # Errors
     /// When it does not fit or the device failed.
-    fn render(&mut self, view: View) -> Result<Frame>;
-    /// One training step towards target `id`: forward, loss, backward, Adam.
+    fn render(&mut self, view: View, channels: Channels) -> Result<Frame>;
+    /// One training step towards target `id`: forward, loss, backward, Adam. With [`Channels::Feature`] geometry must
+    /// stay as it was since the last [`Self::set_state`].
     ///
     /// # Errors
     /// As [`Self::render`].
-    fn step(&mut self, view: View, id: usize, options: StepOptions, step: &Step) -> Result<()>;
+    fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()>;
+    /// Adds the noise of MCMC to the means.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()>;
     /// Losses of the last step.
     ///
     /// # Errors
     /// When the device failed.
     fn losses(&self) -> Result<Losses>;
+    /// Bytes that the engine holds for itself now, and of these what Gaussians, moments and key lists take.
+    fn memory(&self) -> Memory;
     /// Starts or stops taking the time of each pass; false where the device cannot.
-    fn set_profiling(&mut self, _on: bool) -> bool {
-        false
-    }
+    fn set_profiling(&mut self, on: bool) -> bool;
     /// Seconds of each pass since the last call, while profiling.
     ///
     /// # Errors
     /// When the device failed.
-    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
-        Ok(BTreeMap::new())
-    }
+    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>>;
 }
 
-/// Opens `cpu`, `auto`, or an adapter by name or index.
+/// Bytes that an engine holds.
+#[derive(Clone, Copy, Debug, Default, serde::Serialize)]
+pub struct Memory {
+    /// Trained values and both moments.
+    pub state: u64,
+    /// Key lists: what sorting needs, and the gradient slots of the (tile, Gaussian) pairs.
+    pub lists: u64,
+    /// Everything else for Gaussians: gradients, splats, footprints, counts.
+    pub gaussians: u64,
+    /// Frames and what the loss needs.
+    pub frame: u64,
+    /// Targets and cached lists of views.
+    pub views: u64,
+}
+
+/// Opens `cpu` (the fast CPU backend), `auto`, or an adapter by name or index.
 ///
 /// # Errors
 /// When there is no such adapter.
 pub fn open_engine(device: &str) -> Result<Box<dyn Engine>> {
     if device == "cpu" {
-        return Ok(Box::new(CpuEngine::default()));
+        return Ok(Box::new(CpuEngine::new()));
     }
     Ok(Box::new(GpuEngine::new(crate::Gpu::open(device)?)))
 }
 
-/// Loss planes of a step: colour channels 0..3, then feature channels 3..6 where they have weight.
+/// Loss planes of a step: colour channels 0..3 and feature channels 3..6, as far as they are trained.
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
-    let [width, height] = view.size;
-    let per_pixel = 1.0 / (3.0 * width as f32 * height as f32);
-    let weight = |c: u32| if c < 3 { 1.0 } else { options.feature_weight };
-    (0..6)
-        .filter(|c| weight(*c) > 0.0)
-        .map(|channel| Plane { width, height, channel, scale: weight(channel) * per_pixel, lambda: options.lambda, unused: [0; 3] })
+    let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
+    let trained = |c: &usize| if *c < 3 { options.channels.color() } else { options.channels.feature() };
+    (0..6usize)
+        .filter(trained)
+        .map(|channel| Plane {
+            size: view.size,
+            quads: 2 * view.tiles[0],
+            rows: RUN as u32 * view.tiles[1],
+            channel: channel as u32,
+            scale: if channel < 3 { per_pixel } else { options.feature_weight * per_pixel },
+            lambda: options.lambda,
+            gain: if channel < 3 { options.exposure.gain[channel] } else { 1.0 },
+            offset: if channel < 3 { options.exposure.offset[channel] } else { 0.0 },
+            unused: [0; 3],
+        })
         .collect()
 }
 
-/// Losses from the run sums `[6][runs][w]` of SSIM and L1.
-pub(crate) fn losses_of(view: &View, ssim: &[f32], l1: &[f32]) -> Losses {
-    let per_channel = view.size[1].div_ceil(RUN as u32) as usize * view.size[0] as usize;
-    let mean = |sums: &[f32], from: usize| {
-        let part = &sums[from * per_channel..(from + 3) * per_channel];
-        part.iter().map(|v| f64::from(*v)).sum::<f64>() / (3.0 * view.pixels() as f64)
+/// Losses from the sums of `shaders/ssim_columns.wgsl` and `shaders/loss_gradient.wgsl`.
+pub(crate) fn losses_of(view: &View, channels: Channels, ssim: &[f32], sums: &[f32]) -> Losses {
+    let per_channel = (view.tiles[1] * view.tiles[0] * RUN as u32) as usize;
+    let sum = |sums: &[f32], plane: usize| -> f64 {
+        let part = &sums[plane * per_channel..(plane + 1) * per_channel];
+        part.iter().map(|v| f64::from(*v)).sum()
     };
-    Losses { color_l1: mean(l1, 0), color_ssim: mean(ssim, 0), feature_l1: mean(l1, 3) }
-}
-
-/// The twins, for machines without Vulkan and for finding a wrong pass.
-#[derive(Default)]
-pub struct CpuEngine {
-    params: Vec<f32>,
-    moments: (Vec<f32>, Vec<f32>),
-    stats: Vec<f32>,
-    gradients: Vec<f32>,
-    targets: HashMap<usize, Vec<f32>>,
-    last: Option<(View, Vec<f32>, Vec<f32>)>,
-}
-
-/// Everything the backward passes need of a forward run.
-pub(crate) struct Forward {
-    view: View,
-    pub splats: Vec<Splat>,
-    touched: Vec<u32>,
-    first_pair: Vec<u32>,
-    pub ranges: Vec<u32>,
-    pub sorted_pairs: Vec<u32>,
-    pub pair_gaussians: Vec<u32>,
-    frame: Vec<f32>,
-}
-
-/// Stable sort of `keys` by their lowest `bits`, with what was at which place before.
-pub(crate) fn radix_sort_cpu(keys: &mut Vec<u32>, bits: u32) -> Vec<u32> {
-    let n = keys.len();
-    let mut values: Vec<u32> = vec![0; n];
-    let (mut keys_out, mut values_out) = (vec![0; n], vec![0; n]);
-    let (mut histogram, mut totals) = (vec![0; 256 * CHUNKS], vec![0; CHUNKS + 1]);
-    for (round, shift) in (0..bits).step_by(8).enumerate() {
-        let job = Job { n: n as u32, shift, first: u32::from(round == 0), unused: 0 };
-        cpu::radix_count(&job, keys, &mut histogram);
-        let scan = Job { n: histogram.len() as u32, ..job };
-        cpu::scan_chunks(&scan, &histogram, &mut totals);
-        cpu::scan_apply(&scan, &mut histogram, &mut totals);
-        cpu::radix_scatter(&job, keys, &values, &mut histogram, &mut keys_out, &mut values_out);
-        std::mem::swap(keys, &mut keys_out);
-        std::mem::swap(&mut values, &mut values_out);
+    let mean = |sums: &[f32], from: usize| (from..from + 3).map(|p| sum(sums, p)).sum::<f64>() / (3.0 * view.pixels() as f64);
+    let (color, feature) = (channels.color(), channels.feature());
+    let three = |from: usize| if color { [0, 1, 2].map(|c| sum(sums, from + c)) } else { [0.0; 3] };
+    let trained = |c: usize| if c < 3 { color } else { feature };
+    Losses {
+        color_l1: if color { mean(sums, 0) } else { 0.0 },
+        color_ssim: if color { mean(ssim, 0) } else { 0.0 },
+        feature_l1: if feature { mean(sums, 3) } else { 0.0 },
+        by_gain: three(6),
+        by_offset: three(12),
+        by_background: std::array::from_fn(|c| if trained(c) { sum(sums, 18 + c) } else { 0.0 }),
     }
-    values
 }
 
 /// Bits of the largest tile number and of the one after it, which marks padding.
 pub(crate) fn tile_bits(view: &View) -> u32 {
     32 - view.tile_count().leading_zeros()
-}
-
-impl CpuEngine {
-    fn forward(&self, view: View) -> Forward {
-        let mut f = Self::lists_of(&self.params, view);
-        f.frame = vec![0.0; 8 * view.pixels()];
-        cpu::blend(&f.view, &f.ranges, &f.sorted_pairs, &f.pair_gaussians, &f.splats, &mut f.frame);
-        f
-    }
-
-    /// Everything up to blending.
-    pub(crate) fn lists_of(params: &[f32], mut view: View) -> Forward {
-        let n = view.gaussians as usize;
-        let mut splats = vec![[[0.0; 4]; 3]; n];
-        let (mut depths, mut footprints, mut touched) = (vec![0; n], vec![[[0.0; 4]; 2]; n], vec![0; n]);
-        cpu::project(&view, params, &mut splats, &mut depths, &mut footprints, &mut touched);
-        let order = radix_sort_cpu(&mut depths, 24);
-        let mut offsets = vec![0; n];
-        cpu::gather_counts(&view, &order, &touched, &mut offsets);
-        let mut totals = vec![0; CHUNKS + 1];
-        let job = Job { n: n as u32, shift: 0, first: 0, unused: 0 };
-        cpu::scan_chunks(&job, &offsets, &mut totals);
-        cpu::scan_apply(&job, &mut offsets, &mut totals);
-        view.pairs = totals[CHUNKS];
-        let pairs = view.pairs as usize;
-        let (mut tiles, mut pair_gaussians, mut first_pair) = (vec![0; pairs], vec![0; pairs], vec![0; n]);
-        cpu::emit(&view, &order, &offsets, &footprints, &mut touched, &mut tiles, &mut pair_gaussians, &mut first_pair);
-        let sorted_pairs = radix_sort_cpu(&mut tiles, tile_bits(&view));
-        let mut ranges = vec![0; 2 * view.tile_count() as usize];
-        cpu::tile_ranges(&view, &tiles, &mut ranges);
-        Forward { view, splats, touched, first_pair, ranges, sorted_pairs, pair_gaussians, frame: Vec::new() }
-    }
-}
-
-impl Engine for CpuEngine {
-    fn name(&self) -> String {
-        "cpu".to_owned()
-    }
-
-    fn len(&self) -> usize {
-        self.params.len() / CHANNELS
-    }
-
-    fn set_state(&mut self, params: &[f32], moment1: &[f32], moment2: &[f32]) -> Result<()> {
-        self.params = params.to_vec();
-        self.moments = (moment1.to_vec(), moment2.to_vec());
-        self.stats = vec![0.0; 2 * self.len()];
-        self.gradients = vec![0.0; params.len()];
-        Ok(())
-    }
-
-    fn params(&self) -> Result<Vec<f32>> {
-        Ok(self.params.clone())
-    }
-
-    fn moments(&self) -> Result<(Vec<f32>, Vec<f32>)> {
-        Ok(self.moments.clone())
-    }
-
-    fn stats(&self) -> Result<Vec<f32>> {
-        Ok(self.stats.clone())
-    }
-
-    fn set_stats(&mut self, stats: &[f32]) -> Result<()> {
-        self.stats = stats.to_vec();
-        Ok(())
-    }
-
-    fn gradients(&self) -> Result<Vec<f32>> {
-        Ok(self.gradients.clone())
-    }
-
-    fn set_target(&mut self, id: usize, target: &[f32]) -> Result<()> {
-        self.targets.insert(id, target.to_vec());
-        Ok(())
-    }
-
-    fn render(&mut self, view: View) -> Result<Frame> {
-        let f = self.forward(view);
-        Ok(Frame { width: view.size[0], height: view.size[1], data: f.frame, pairs: f.view.pairs })
-    }
-
-    fn step(&mut self, view: View, id: usize, options: StepOptions, step: &Step) -> Result<()> {
-        let f = self.forward(view);
-        let target = self.targets.get(&id).filter(|t| t.len() == 6 * view.pixels());
-        let target = target.ok_or_else(|| Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])))?;
-        let n = view.pixels();
-        let sums = 6 * view.size[1].div_ceil(RUN as u32) as usize * view.size[0] as usize;
-        let (mut rows, mut partials, mut gradient) = (vec![0.0; 5 * n], vec![0.0; 3 * n], vec![0.0; 6 * n]);
-        let (mut ssim, mut l1) = (vec![0.0; sums], vec![0.0; sums]);
-        for plane in planes(&view, &options) {
-            cpu::ssim_rows(&plane, &f.frame, target, &mut rows);
-            cpu::ssim_columns(&plane, &rows, &mut partials, &mut ssim);
-            cpu::ssim_backward_rows(&plane, &partials, &mut rows);
-            cpu::loss_gradient(&plane, &f.frame, target, &rows, &mut gradient, &mut l1);
-        }
-        let mut slots = vec![[[0.0; 4]; 3]; f.view.pairs as usize];
-        cpu::blend_backward(&f.view, &f.ranges, &f.sorted_pairs, &f.pair_gaussians, &f.splats, &f.frame, &gradient, &mut slots);
-        cpu::project_backward(&f.view, &self.params, &f.splats, &f.touched, &f.first_pair, &slots, &mut self.gradients, &mut self.stats);
-        cpu::adam(step, &self.gradients, &mut self.params, &mut self.moments.0, &mut self.moments.1);
-        self.last = Some((view, ssim, l1));
-        Ok(())
-    }
-
-    fn losses(&self) -> Result<Losses> {
-        Ok(self.last.as_ref().map(|(view, ssim, l1)| losses_of(view, ssim, l1)).unwrap_or_default())
-    }
 }

@@ -16,6 +16,15 @@ pub enum Shape {
 }
 
 impl Shape {
+    /// Flag of the shaders' permutations.
+    pub(crate) fn flag(self) -> Option<&'static str> {
+        match self {
+            Shape::Shared => None,
+            Shape::Subgroups => Some("SUBGROUPS"),
+            Shape::Wide => Some("WIDE"),
+        }
+    }
+
     /// Workgroups that blend `tiles` tiles.
     pub fn groups(self, tiles: u32) -> u32 {
         if self == Shape::Wide { tiles.div_ceil(8) } else { tiles }
@@ -95,6 +104,7 @@ impl Gpu {
             required_limits: wgpu::Limits {
                 max_storage_buffer_binding_size: limits.max_storage_buffer_binding_size,
                 max_buffer_size: limits.max_buffer_size,
+                // What every adapter of WebGPU grants; blend_backward uses them all.
                 max_storage_buffers_per_shader_stage: 8,
                 ..wgpu::Limits::default()
             },
@@ -105,7 +115,11 @@ impl Gpu {
         let failure = Arc::new(Mutex::new(None));
         let slot = failure.clone();
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            slot.lock().expect("no panic while holding the lock").get_or_insert_with(|| e.to_string());
+            let reason = match e {
+                wgpu::Error::OutOfMemory { .. } => "it is out of memory; lower --budget, --size or --sh-degree".to_owned(),
+                other => other.to_string(),
+            };
+            slot.lock().expect("no panic while holding the lock").get_or_insert(reason);
         }));
         Ok(Self { device, queue, name: info.name, shape, max_binding: limits.max_storage_buffer_binding_size, profile: None, failure })
     }

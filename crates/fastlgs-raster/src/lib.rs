@@ -2,32 +2,40 @@
 //! trainer on top. The way of a frame:
 //!
 //! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles -> `tile_ranges` ->
-//! `blend` -> (training) `ssim_rows`, `ssim_columns`, `ssim_backward_rows`, `loss_gradient` -> `blend_backward` ->
-//! `project_backward` -> `adam`.
+//! `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`, `ssim_columns`, `ssim_backward_rows`,
+//! `loss_gradient` -> `blend_backward` -> `project_backward` -> `adam` (-> `perturb` with MCMC).
 //!
-//! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as their twins ([`CpuEngine`]).
+//! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as vectorised Rust ([`CpuEngine`]).
 
+pub mod budget;
+mod checkpoint;
 pub mod cpu;
 pub mod density;
 mod engine;
+mod exposure;
 mod gpu;
 mod gpu_engine;
 pub mod init;
 pub mod lift;
+mod native;
 mod pass;
 mod profile;
+mod schedule;
 mod trainer;
 mod view;
 
 #[cfg(test)]
 mod tests;
 
-pub use engine::{CpuEngine, Engine, Frame, Losses, StepOptions, open_engine};
+pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, open_engine, pack};
 pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;
+pub use native::CpuEngine;
+pub use pass::Channels;
 
-pub use trainer::{Progress, Target, TrainConfig, TrainReport, Trainer};
-pub use view::{Step, View};
+pub use schedule::{Budget, Strategy, TrainConfig};
+pub use trainer::{Progress, Target, TrainReport, Trainer};
+pub use view::{Rates, Step, View};
 
 /// Errors of the rasteriser.
 #[derive(Debug, thiserror::Error)]

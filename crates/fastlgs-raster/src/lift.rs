@@ -1,7 +1,7 @@
 //! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
 
 use crate::cpu;
-use crate::engine::CpuEngine;
+use crate::native::Lists;
 use crate::view::View;
 use fastlgs_core::{Camera, Gaussians, LabelMap};
 use kiddo::{KdTree, SquaredEuclidean};
@@ -28,22 +28,22 @@ const MIN_WEIGHT: f32 = 0.02;
 /// If map and camera differ in size.
 pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote> {
     assert_eq!((camera.width, camera.height), (labels.width, labels.height), "the label map has the view's size");
-    let view = View::new(camera, scene.len());
-    let lists = CpuEngine::lists_of(&scene.to_channels(), view);
+    let lists = lists_of(scene, camera);
+    let view = View::new(camera, scene.len(), 0);
     let mut all: Vec<Vote> = (0..view.tile_count())
         .into_par_iter()
         .flat_map_iter(|tile| {
-            let range = lists.ranges[2 * tile as usize] as usize..lists.ranges[2 * tile as usize + 1] as usize;
-            let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, labels.at(x, y), 1.0f32)).collect();
+            let [start, end] = lists.ranges[tile as usize].map(|p| p as usize);
+            let shown = cpu::pixels_of(tile, &view).filter(|(x, y)| cpu::shown(*x, *y, &view) > 0.0);
+            let mut pixels: Vec<_> = shown.map(|(x, y)| (x, y, labels.at(x, y), 1.0f32)).collect();
             let mut out = Vec::new();
-            for &e in &lists.sorted_pairs[range] {
-                let gaussian = lists.pair_gaussians[e as usize];
+            for &gaussian in &lists.gaussians[start..end] {
                 let splat = &lists.splats[gaussian as usize];
                 let first = out.len();
                 let mut open = false;
                 for (x, y, label, transmittance) in &mut pixels {
                     let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
-                    let weight = cpu::alpha(splat, dx, dy, *transmittance) * *transmittance;
+                    let weight = cpu::alpha(splat, dx, dy) * *transmittance;
                     *transmittance -= weight;
                     open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
                     if weight > 0.0 {
@@ -69,6 +69,46 @@ pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote>
     });
     all.retain(|v| v.weight >= MIN_WEIGHT);
     all
+}
+
+/// Tile lists of a view; what depends on the viewing direction is left out.
+fn lists_of(scene: &Gaussians, camera: &Camera) -> Lists {
+    let params = scene.to_channels();
+    let n = scene.len();
+    Lists::new(&View::new(camera, n, 0), |i, c| params[c * n + i])
+}
+
+/// Largest blending weight alpha * transmittance of each Gaussian over all pixels of a view.
+pub fn largest_weights(scene: &Gaussians, camera: &Camera) -> Vec<f32> {
+    let view = View::new(camera, scene.len(), 0);
+    let lists = lists_of(scene, camera);
+    let of_tile = |tile: u32| {
+        let [start, end] = lists.ranges[tile as usize].map(|p| p as usize);
+        let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, cpu::shown(x, y, &view))).collect();
+        let mut out = Vec::with_capacity(end - start);
+        for &gaussian in &lists.gaussians[start..end] {
+            let splat = &lists.splats[gaussian as usize];
+            let (mut largest, mut open) = (0.0f32, false);
+            for (x, y, transmittance) in &mut pixels {
+                let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
+                let weight = cpu::alpha(splat, dx, dy) * *transmittance;
+                *transmittance -= weight;
+                largest = largest.max(weight);
+                open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
+            }
+            out.push((gaussian, largest));
+            if !open {
+                break;
+            }
+        }
+        out
+    };
+    let mut largest = vec![0.0f32; scene.len()];
+    let tiles: Vec<_> = (0..view.tile_count()).into_par_iter().map(of_tile).collect();
+    for (gaussian, weight) in tiles.into_iter().flatten() {
+        largest[gaussian as usize] = largest[gaussian as usize].max(weight);
+    }
+    largest
 }
 
 /// Pairs of neighbouring Gaussians (a < b, sorted): each with its `k` nearest by centre.

@@ -1,6 +1,7 @@
 //! A compute pass made from an assembled shader.
 
 use crate::gpu::Gpu;
+use crate::{Result, cpu};
 
 /// How a shader uses a binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -13,12 +14,51 @@ pub enum Binding {
     ReadWrite,
 }
 
+/// What a step renders and trains.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+pub enum Channels {
+    /// Geometry and colour.
+    Color,
+    /// The feature alone, geometry being frozen.
+    Feature,
+    /// Both; the feature does not move geometry.
+    Both,
+    /// Both, and the feature moves geometry too.
+    Coupled,
+}
+
+impl Channels {
+    /// Whether geometry and colour are among them.
+    pub fn color(self) -> bool {
+        self != Self::Feature
+    }
+
+    /// Whether the feature is among them.
+    pub fn feature(self) -> bool {
+        self != Self::Color
+    }
+
+    /// Groups of four floats in a gradient slot.
+    pub(crate) fn slot(self) -> usize {
+        if self.color() { 3 } else { 1 }
+    }
+
+    fn flags(self) -> &'static [&'static str] {
+        match self {
+            Self::Color => &["WITH_COLOR"],
+            Self::Feature => &["WITH_FEATURE"],
+            Self::Both => &["WITH_COLOR", "WITH_FEATURE"],
+            Self::Coupled => &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"],
+        }
+    }
+}
+
 /// An assembled, validated shader; all permutations have the same bindings 0, 1, 2, ...
 pub struct Shader {
     /// File name without ending: also that of the CPU twin.
     pub name: &'static str,
-    /// Source for each [`crate::gpu::Shape`], in its order.
-    pub sources: [&'static str; 3],
+    /// Sources by the flags that they were assembled for.
+    pub sources: &'static [(&'static [&'static str], &'static str)],
     /// Kind of each binding.
     pub bindings: &'static [Binding],
 }
@@ -33,17 +73,80 @@ pub mod shaders {
 /// A pipeline with an explicit layout (an automatic one drops bindings that a permutation does not use).
 pub struct Pass {
     name: &'static str,
+    kinds: &'static [Binding],
+    channels: Channels,
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
+}
+
+/// Records passes one after the other. The first `on_cpu` of them run as their twins instead, which finds a wrong one.
+pub(crate) struct Recorder<'a> {
+    gpu: &'a Gpu,
+    encoder: wgpu::CommandEncoder,
+    on_cpu: usize,
+}
+
+impl<'a> Recorder<'a> {
+    pub fn new(gpu: &'a Gpu, on_cpu: usize) -> Self {
+        Self { gpu, encoder: gpu.encoder(), on_cpu }
+    }
+
+    /// One pass over its uniform and storage buffers.
+    pub fn run<U: bytemuck::Pod>(&mut self, pass: &Pass, uniform: &U, storages: &[&wgpu::Buffer], groups: u32) -> Result<()> {
+        if self.on_cpu > 0 {
+            self.on_cpu -= 1;
+            return self.run_twin(pass, bytemuck::bytes_of(uniform), storages);
+        }
+        let uniform = self.gpu.uniform(uniform);
+        let buffers: Vec<_> = std::iter::once(&uniform).chain(storages.iter().copied()).collect();
+        pass.record(self.gpu, &mut self.encoder, &buffers, groups);
+        Ok(())
+    }
+
+    fn run_twin(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer]) -> Result<()> {
+        self.flush();
+        let words = |b: &&wgpu::Buffer| self.gpu.read::<u32>(b, (b.size() / 4) as usize);
+        let mut contents = storages.iter().map(words).collect::<Result<Vec<_>>>()?;
+        cpu::run(pass.name, pass.channels, uniform, &mut contents);
+        for ((buffer, content), kind) in storages.iter().zip(&contents).zip(&pass.kinds[1..]) {
+            if *kind == Binding::ReadWrite {
+                self.gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(content));
+            }
+        }
+        Ok(())
+    }
+
+    /// Sets a buffer to zero.
+    pub fn clear(&mut self, buffer: &wgpu::Buffer) {
+        self.encoder.clear_buffer(buffer, 0, None);
+    }
+
+    /// Copies the start of one buffer.
+    pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
+        self.encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size().min(from.size()));
+    }
+
+    fn flush(&mut self) {
+        self.gpu.submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
+    }
+
+    /// Submits what was recorded; returns how many passes may still run on the CPU.
+    pub fn submit(self) -> usize {
+        self.gpu.submit(self.encoder);
+        self.on_cpu
+    }
 }
 
 /// Largest number of workgroups along one dimension that every adapter grants.
 const MAX_GROUPS: u32 = 65_535;
 
 impl Pass {
-    /// Compiles the permutation that the device can run.
-    pub fn new(gpu: &Gpu, shader: &Shader) -> Self {
-        let source = shader.sources[gpu.shape as usize];
+    /// Compiles the permutation for the device's shape and for `channels`, with colour that depends on the view or not.
+    pub fn new(gpu: &Gpu, shader: &Shader, channels: Channels, harmonics: bool) -> Self {
+        let wanted = |flag: &&str| gpu.shape.flag() == Some(*flag) || channels.flags().contains(flag) || (harmonics && *flag == "WITH_SH");
+        // Of the permutations all of whose flags are wanted, the one with most: it leaves out only what the pass ignores.
+        let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(|f| wanted(f)));
+        let source = fitting.max_by_key(|(flags, _)| flags.len()).expect("a permutation for every choice").1;
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),
             source: wgpu::ShaderSource::Wgsl(source.into()),
@@ -81,7 +184,7 @@ impl Pass {
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             cache: None,
         });
-        Self { name: shader.name, pipeline, layout }
+        Self { name: shader.name, kinds: shader.bindings, channels, pipeline, layout }
     }
 
     /// Records one dispatch of `groups` workgroups, split over y above the limit.

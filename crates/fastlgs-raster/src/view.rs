@@ -2,6 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 use fastlgs_core::Camera;
+use fastlgs_core::gaussians::BASE_CHANNELS;
 
 /// Tile edge in pixels.
 pub const TILE: u32 = 8;
@@ -24,19 +25,33 @@ pub struct View {
     pub background_color: [f32; 4],
     /// Feature behind everything.
     pub background_feature: [f32; 4],
+    /// Position in the world; the last entry is unused.
+    pub camera: [f32; 4],
     /// Number of Gaussians.
     pub gaussians: u32,
     /// Number of (tile, Gaussian) pairs, once known.
     pub pairs: u32,
+    /// First Gaussian of the page that is bound.
+    pub first: u32,
+    /// Gaussians of that page.
+    pub page: u32,
+    /// First pair of the window of gradient slots that is bound.
+    pub slot_first: u32,
+    /// Number of pairs whose Gaussians start in that window.
+    pub slot_count: u32,
+    /// Degree up to which colour depends on the view now.
+    pub sh_degree: u32,
+    /// 1: opacity pays for dilation (2-D Mip filter).
+    pub antialias: u32,
     /// 1: the first feature channel carries the depth.
     pub depth_as_feature: u32,
-    /// 1: the feature loss also moves geometry.
-    pub feature_moves_geometry: u32,
+    /// Padding to 16 bytes.
+    pub unused: [u32; 3],
 }
 
 impl View {
-    /// The frame of `camera` for `gaussians` Gaussians before a black background.
-    pub fn new(camera: &Camera, gaussians: usize) -> Self {
+    /// The frame of `camera` for `gaussians` Gaussians with colour up to `sh_degree`, before a black background.
+    pub fn new(camera: &Camera, gaussians: usize, sh_degree: u32) -> Self {
         Self {
             world_to_camera: camera.world_to_camera.to_cols_array(),
             focal: [camera.fx, camera.fy],
@@ -45,16 +60,53 @@ impl View {
             tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
             background_color: [0.0; 4],
             background_feature: [0.0; 4],
+            camera: camera.centre().extend(0.0).to_array(),
             gaussians: gaussians as u32,
             pairs: 0,
+            first: 0,
+            page: gaussians as u32,
+            slot_first: 0,
+            slot_count: u32::MAX / 2,
+            sh_degree,
+            antialias: 0,
             depth_as_feature: 0,
-            feature_moves_geometry: 0,
+            unused: [0; 3],
         }
     }
 
     /// Pixels of the frame.
     pub fn pixels(&self) -> usize {
         (self.size[0] * self.size[1]) as usize
+    }
+
+    /// Pixels of the frame padded to whole tiles, as it lies on the device.
+    pub fn padded_pixels(&self) -> usize {
+        (self.tile_count() * TILE * TILE) as usize
+    }
+
+    /// Place of a pixel in a padded plane.
+    pub(crate) fn at(&self, x: u32, y: u32) -> usize {
+        (y * self.tiles[0] * TILE + x) as usize
+    }
+
+    /// Planes as they lie on the device, without the padding.
+    pub(crate) fn cropped<T: Copy>(&self, planes: &[T]) -> Vec<T> {
+        let [w, h] = self.size;
+        let rows = planes.chunks_exact(self.padded_pixels()).flat_map(|plane| (0..h).map(move |y| &plane[self.at(0, y)..][..w as usize]));
+        rows.flatten().copied().collect()
+    }
+
+    /// The inverse of [`Self::cropped`]; the padding is zero.
+    pub(crate) fn padded<T: Copy + Default>(&self, planes: &[T]) -> Vec<T> {
+        let [w, h] = self.size.map(|s| s as usize);
+        let mut out = vec![T::default(); planes.len() / (w * h) * self.padded_pixels()];
+        for (plane, from) in out.chunks_exact_mut(self.padded_pixels()).zip(planes.chunks_exact(w * h)) {
+            for (y, row) in from.chunks_exact(w).enumerate() {
+                let at = self.at(0, y as u32);
+                plane[at..at + w].copy_from_slice(row);
+            }
+        }
+        out
     }
 
     /// Tiles of the frame.
@@ -67,7 +119,7 @@ impl View {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Step {
-    /// Number of Gaussians.
+    /// Gaussians of the page.
     pub n: u32,
     /// 1 - 0.9^t.
     pub correction1: f32,
@@ -75,34 +127,75 @@ pub struct Step {
     pub correction2: f32,
     /// Added to the root of the second moment.
     pub epsilon: f32,
-    /// Learning rate of each channel (17 used).
+    /// First trained channel.
+    pub first_channel: u32,
+    /// The channel after the last trained one.
+    pub end_channel: u32,
+    /// Weight of the sum of opacities in the loss.
+    pub opacity_weight: f32,
+    /// Weight of the sum of scales in the loss.
+    pub scale_weight: f32,
+    /// Learning rates of the base channels, then that of all SH coefficients above degree 0.
     pub rates: [f32; 20],
 }
 
+/// Learning rates of the base channels, then that of all SH coefficients above degree 0.
+pub type Rates = [f32; BASE_CHANNELS + 1];
+
 impl Step {
-    /// Step number `t` (from 1) with the given learning rates.
-    pub fn new(n: usize, t: u32, rates: [f32; fastlgs_core::gaussians::CHANNELS]) -> Self {
+    /// Step number `t` (from 1) over the channels of `range` with the given learning rates.
+    pub fn new(t: u32, range: std::ops::Range<usize>, rates: &Rates) -> Self {
         let mut all = [0.0; 20];
-        all[..rates.len()].copy_from_slice(&rates);
+        all[..rates.len()].copy_from_slice(rates);
         let correction = |beta: f64| (1.0 - beta.powi(t as i32)) as f32;
-        Self { n: n as u32, correction1: correction(0.9), correction2: correction(0.999), epsilon: 1e-15, rates: all }
+        Self {
+            n: 0,
+            correction1: correction(0.9),
+            correction2: correction(0.999),
+            epsilon: 1e-15,
+            first_channel: range.start as u32,
+            end_channel: range.end as u32,
+            opacity_weight: 0.0,
+            scale_weight: 0.0,
+            rates: all,
+        }
     }
+}
+
+/// Uniform of the MCMC noise pass.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Perturb {
+    /// Gaussians of the page.
+    pub n: u32,
+    /// The first of them.
+    pub first: u32,
+    /// Number of this step in the run's random sequence.
+    pub seed: u32,
+    /// Noise scale times the means' learning rate.
+    pub amount: f32,
 }
 
 /// Uniform of the loss passes; `shaders/shared/window.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Plane {
-    /// Pixels along x.
-    pub width: u32,
-    /// Pixels along y.
-    pub height: u32,
+    /// Pixels of the picture.
+    pub size: [u32; 2],
+    /// Quads of four pixels in a padded row.
+    pub quads: u32,
+    /// Padded rows.
+    pub rows: u32,
     /// Channel of the frame.
     pub channel: u32,
     /// Loss weight of one pixel of this channel.
     pub scale: f32,
     /// Share of D-SSIM.
     pub lambda: f32,
+    /// Exposure of the view: factor.
+    pub gain: f32,
+    /// Exposure of the view: summand.
+    pub offset: f32,
     /// Padding to 16 bytes.
     pub unused: [u32; 3],
 }

@@ -8,7 +8,8 @@ use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::query::{self, Decision};
 use fastlgs_grid::whole::{self, Look};
 use fastlgs_grid::{Grid, consensus, evidence};
-use fastlgs_raster::{View, lift};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, View, lift};
 use fastlgs_vision::{Conse, Encoder, exposure, histogram, segmenter};
 use image::RgbImage;
 use std::collections::BTreeMap;
@@ -103,11 +104,9 @@ pub fn by_consensus(
     let mut paint = |scene: &mut Gaussians, count: u16| -> Result<Vec<LabelMap>> {
         let codes = Grid::build(&[], &[], count, common.seed);
         set_codes(scene, &codes);
-        let params = scene.to_channels();
-        let zeros = vec![0.0; params.len()];
-        engine.set_state(&params, &zeros, &zeros)?;
+        engine.set_state(&State::of(scene))?;
         let map = |camera: &Camera| {
-            let frame = engine.render(View::new(camera, scene.len()))?;
+            let frame = engine.render(View::new(camera, scene.len(), 0), Channels::Feature)?;
             let labels = query::restore_objects(&codes, frame.channels(3, 6), Decision::Nearest);
             Ok(LabelMap { width: camera.width, height: camera.height, labels })
         };

@@ -8,7 +8,7 @@ use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::{Grid, consensus, whole};
-use fastlgs_raster::{Target, TrainConfig, Trainer, init};
+use fastlgs_raster::{Budget, Channels, Strategy, Target, TargetImage, TrainConfig, Trainer, init, pack};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -23,9 +23,27 @@ pub struct Args {
     /// Iterations, instead of the preset's.
     #[arg(long)]
     iterations: Option<u32>,
-    /// Most Gaussians.
-    #[arg(long, default_value_t = 60_000)]
-    budget: usize,
+    /// Gaussians: `auto` (as many as pay for themselves), or exactly how many there may be.
+    #[arg(long, default_value = "auto", value_parser = parse_budget)]
+    budget: Budget,
+    /// How their number is controlled: `classic` (clone, split, prune, opacity reset) or `mcmc` (relocation and noise).
+    #[arg(long, default_value = "classic", value_parser = ["classic", "mcmc"])]
+    strategy: String,
+    /// Highest spherical-harmonic degree of colour, 0 to 3; by default the preset's.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3))]
+    sh_degree: Option<u32>,
+    /// Anti-aliasing by the 2-D Mip filter.
+    #[arg(long)]
+    antialias: bool,
+    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`.
+    #[arg(long, default_value = "0,0,0", value_parser = parse_background)]
+    background: Background,
+    /// Learn an affine exposure for each training photo.
+    #[arg(long)]
+    exposure: bool,
+    /// Keep geometry and colour as --init-ply gives them; train features only.
+    #[arg(long, requires = "init_ply")]
+    freeze: bool,
     /// Start from an existing 3DGS scene instead of points.
     #[arg(long, value_name = "FILE")]
     init_ply: Option<PathBuf>,
@@ -61,6 +79,8 @@ pub struct Args {
     resume: bool,
 }
 
+/// No automatic budget goes beyond this.
+const AUTO_MOST: usize = 1_000_000;
 /// Fewest triangulated points worth starting from.
 const FEW_POINTS: usize = 500;
 
@@ -82,33 +102,49 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let codes = paper.as_ref().filter(|_| by_descent).map(|p| &p.grid);
     let targets = training.iter().map(|c| target(&folder, c, codes)).collect::<Result<Vec<_>>>()?;
     let first = first_gaussians(args, &folder, &training, common.seed)?;
-    let preset = match args.preset.as_str() {
-        "quick" => 2_000,
-        "standard" => 7_000,
-        _ => 30_000,
+    if args.freeze && !by_descent {
+        bail!("--freeze trains features: add --feature-mode train --mapping paper; or, to lift objects only, use --iterations 0");
+    }
+    let (preset, preset_degree) = match args.preset.as_str() {
+        "quick" => (2_000, 0),
+        "standard" => (7_000, 1),
+        _ => (30_000, 3),
+    };
+    let channels = match (args.freeze, by_descent, args.feature_moves_geometry) {
+        (true, ..) => Channels::Feature,
+        (_, false, _) => Channels::Color,
+        (_, true, false) => Channels::Both,
+        (_, true, true) => Channels::Coupled,
     };
     let config = TrainConfig {
         iterations: args.iterations.unwrap_or(preset),
         seed: common.seed,
         budget: args.budget,
-        feature_weight: if by_descent { args.feature_weight } else { 0.0 },
-        feature_moves_geometry: args.feature_moves_geometry,
+        strategy: if args.strategy == "mcmc" { Strategy::Mcmc } else { Strategy::Classic },
+        channels,
+        sh_degree: args.sh_degree.unwrap_or(if args.freeze { first.sh_degree } else { preset_degree }),
+        feature_weight: args.feature_weight,
+        antialias: args.antialias,
+        background: args.background.color,
+        learn_background: args.background.learn,
+        exposure: args.exposure,
         ..TrainConfig::default()
     };
     let engine = fastlgs_raster::open_engine(&common.device)?;
     let bar = ui::bar(common, u64::from(config.iterations), "training");
-    let mut trainer = Trainer::new(engine, &first, targets, config)?;
+    let mut trainer = Trainer::new(engine, &first, targets, config.clone())?;
     let checkpoint = folder.root.join("checkpoints/train");
     if args.resume && !trainer.resume(&checkpoint)? {
         tracing::warn!("{}: no checkpoint to resume from; starting anew", checkpoint.display());
     }
-    let result = trainer.run(Some(&checkpoint), |p| {
+    let result = trainer.run(Some(&checkpoint), |p, _| {
         bar.set_position(u64::from(p.iteration));
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
         bar.set_message(format!("loss {loss:.4} {:.1} dB {:.0}k G", p.psnr, p.gaussians as f64 / 1000.0));
         if p.iteration % 200 == 0 {
             tracing::info!(iteration = p.iteration, loss, psnr = p.psnr, feature_l1 = p.losses.feature_l1, gaussians = p.gaussians);
         }
+        Ok(())
     })?;
     bar.finish_and_clear();
 
@@ -153,6 +189,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "seconds": result.seconds,
         "iterations_per_second": result.iterations_per_second,
         "gaussians": result.gaussians,
+        "removals": result.removals,
+        "sh_degree": scene.sh_degree,
+        "antialias": config.antialias,
+        "background": &result.background[..3],
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
         "psnr_held_out": if psnr.is_empty() { None } else { Some(mean) },
         "adapter": result.adapter,
@@ -168,22 +208,45 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 
 /// Photo and, where features are trained, code map of a view; unlabelled pixels do not count in the feature loss.
 fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>) -> Result<Target> {
-    let mut image = image_io::to_planar(&folder.photo(&camera.name)?);
-    let n = (camera.width * camera.height) as usize;
-    if image.len() != 3 * n {
+    let photo = folder.photo(&camera.name)?;
+    if (photo.width(), photo.height()) != (camera.width, camera.height) {
         bail!("{}: photo and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
     }
-    match codes {
-        None => image.resize(6 * n, -1.0),
-        Some(grid) => {
-            let ids = folder.objects(&camera.name)?.labels;
-            let code = |id: u16, k: usize| grid.objects.get(usize::from(id).wrapping_sub(1)).map_or(-1.0, |o| o.code[k]);
-            for k in 0..3 {
-                image.extend(ids.iter().map(|id| code(*id, k)));
-            }
-        }
+    let color = photo.pixels().map(|p| pack(p.0, true)).collect();
+    let code = |grid: &Grid, id: u16| match grid.objects.get(usize::from(id).wrapping_sub(1)) {
+        Some(object) => pack(object.code.to_array().map(|v| (v * 255.0).round() as u8), true),
+        None => pack([0; 3], false),
+    };
+    let feature = match codes {
+        None => Vec::new(),
+        Some(grid) => folder.objects(&camera.name)?.labels.iter().map(|id| code(grid, *id)).collect(),
+    };
+    Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature } })
+}
+
+/// Parses `auto` or a number.
+fn parse_budget(text: &str) -> Result<Budget, String> {
+    if text == "auto" {
+        return Ok(Budget::Auto(AUTO_MOST));
     }
-    Ok(Target { camera: camera.clone(), image })
+    text.parse().ok().filter(|n| *n > 0).map(Budget::Fixed).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
+}
+
+/// What lies behind everything.
+#[derive(Clone, Debug)]
+struct Background {
+    color: [f32; 3],
+    learn: bool,
+}
+
+/// Parses `0,0.5,1` or `learn`.
+fn parse_background(text: &str) -> Result<Background, String> {
+    if text == "learn" {
+        return Ok(Background { color: [0.5; 3], learn: true });
+    }
+    let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
+    let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1"))?;
+    Ok(Background { color, learn: false })
 }
 
 /// The given PLY, else the scene's points, else random ones.
@@ -199,6 +262,6 @@ fn first_gaussians(args: &Args, folder: &SceneFolder, training: &[Camera], seed:
     }
     // More points than half the budget would leave no room to grow where it matters.
     rng.shuffle(&mut points);
-    points.truncate((args.budget / 2).max(1));
+    points.truncate((args.budget.most() / 2).max(1));
     Ok(init::from_points(&points))
 }

@@ -1,60 +1,74 @@
-use super::blend::pixels_of;
+use super::blend::{pixels_of, shown};
 use super::{Splat, alpha};
 use crate::View;
+use crate::pass::Channels;
+use crate::view::TILE;
 use rayon::prelude::*;
 
-/// Twin of `shaders/blend_backward.wgsl`.
+/// Twin of `shaders/blend_backward.wgsl`. `slots` holds 12 floats a pair of the window, or 4 with frozen geometry.
 pub fn blend_backward(
     view: &View,
+    channels: Channels,
     ranges: &[u32],
+    tile_order: &[u32],
     sorted_pairs: &[u32],
     pair_gaussians: &[u32],
     splats: &[Splat],
     frame: &[f32],
     gradient: &[f32],
-    slots: &mut [Splat],
+    slots: &mut [f32],
 ) {
-    let n = view.pixels();
-    let moving = if view.feature_moves_geometry == 1 { 6 } else { 3 };
-    let tiles: Vec<Vec<(u32, Splat)>> = (0..view.tile_count())
-        .into_par_iter()
-        .map(|tile| {
-            let pairs = &sorted_pairs[ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
+    let n = view.padded_pixels();
+    // Channels that move geometry.
+    let moving = match channels {
+        Channels::Feature => 0,
+        Channels::Color | Channels::Both => 3,
+        Channels::Coupled => 6,
+    };
+    let trained = |c: usize| if c < 3 { channels.color() } else { channels.feature() };
+    let tiles: Vec<Vec<(u32, [f32; 12])>> = tile_order
+        .par_iter()
+        .map(|&tile| {
+            let range = ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize;
+            let walked = frame[7 * n + view.at(tile % view.tiles[0] * TILE, tile / view.tiles[0] * TILE)] as usize;
             let mut pixels: Vec<_> = pixels_of(tile, view)
                 .map(|(x, y)| {
-                    let at = (y * view.size[0] + x) as usize;
-                    let g: [f32; 6] = std::array::from_fn(|c| gradient[c * n + at]);
+                    let at = view.at(x, y);
+                    let g: [f32; 6] = std::array::from_fn(|c| if trained(c) { gradient[c * n + at] } else { 0.0 });
                     let behind: f32 = (0..moving).map(|c| frame[c * n + at] * g[c]).sum();
-                    (x as f32 + 0.5, y as f32 + 0.5, 1.0f32, behind, g)
+                    (x as f32 + 0.5, y as f32 + 0.5, shown(x, y, view), behind, g)
                 })
                 .collect();
-            let backward = |e: u32| {
+            let backward = |(k, e): (usize, u32)| {
+                let mut slot = [0.0f32; 12];
+                if k >= walked {
+                    return (e, slot);
+                }
                 let splat = &splats[pair_gaussians[e as usize] as usize];
                 let values = [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]];
-                let mut slot = [[0.0f32; 4]; 3];
                 for (x, y, transmittance, behind, g) in &mut pixels {
                     let (dx, dy) = (*x - splat[0][0], *y - splat[0][1]);
-                    let a = alpha(splat, dx, dy, *transmittance);
-                    if a == 0.0 {
-                        continue;
-                    }
+                    let a = alpha(splat, dx, dy);
                     let w = a * *transmittance;
-                    let worth: f32 = (0..moving).map(|c| values[c] * g[c]).sum();
-                    *behind -= w * worth;
-                    let d_alpha = *transmittance * worth - *behind / (1.0 - a);
                     *transmittance -= w;
-                    let p = d_alpha * a;
-                    let add = [p * dx, p * dy, p * dx * dx, p * dx * dy, p * dy * dy, p / splat[1][1]];
-                    for (k, value) in add.into_iter().chain(g.iter().map(|g| w * g)).enumerate() {
-                        slot[k / 4][k % 4] += value;
+                    let gain: f32 = w * (0..moving).map(|c| values[c] * g[c]).sum::<f32>();
+                    *behind -= gain;
+                    let p = gain - *behind * (a / (1.0 - a));
+                    let add = [p * dx, p * dy, p * dx * dx, p * dx * dy, p * dy * dy, p];
+                    for (sum, value) in slot.iter_mut().zip(add.into_iter().chain(g.iter().map(|g| w * g))) {
+                        *sum += value;
                     }
                 }
                 (e, slot)
             };
-            pairs.iter().copied().map(backward).collect()
+            sorted_pairs[range].iter().copied().enumerate().map(backward).collect()
         })
         .collect();
+    let floats = 4 * channels.slot();
     for (e, slot) in tiles.into_iter().flatten() {
-        slots[e as usize] = slot;
+        if e >= view.slot_first && e - view.slot_first < view.slot_count + view.tile_count() {
+            let at = (e - view.slot_first) as usize * floats;
+            slots[at..at + floats].copy_from_slice(&slot[12 - floats..]);
+        }
     }
 }

@@ -1,14 +1,18 @@
 //! CPU twins: one plain function for each WGSL pass, of the same name, on the same buffers in the same order.
 //!
-//! They are the reference of the parity tests and the engine of `--device cpu`.
+//! They are the reference of the parity tests and can stand in for the first passes of a frame, to find a wrong one
+//! ([`run`]). What concerns a single Gaussian is shared with the fast backend in [`crate::native`].
 
 mod adam;
 mod blend;
 mod blend_backward;
+mod covariance;
 mod emit;
 mod footprint;
 mod gather_counts;
+mod harmonics;
 mod loss_gradient;
+mod perturb;
 mod project;
 mod project_backward;
 mod radix_count;
@@ -18,26 +22,38 @@ mod scan_chunks;
 mod ssim_backward_rows;
 mod ssim_columns;
 mod ssim_rows;
+mod tile_load;
 mod tile_ranges;
+mod run;
 
 pub use adam::adam;
+pub(crate) use adam::adam_one;
 pub use blend::blend;
-pub(crate) use blend::pixels_of;
+pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;
 pub use emit::emit;
 pub use footprint::Footprint;
+pub(crate) use footprint::span;
 pub use gather_counts::gather_counts;
 pub use loss_gradient::loss_gradient;
+pub use perturb::perturb;
+pub(crate) use perturb::perturb_one;
 pub use project::project;
+pub(crate) use project::{NOT_DRAWN, Projected, project_one};
 pub use project_backward::project_backward;
+pub(crate) use project_backward::backward_one;
 pub use radix_count::radix_count;
 pub use radix_scatter::radix_scatter;
+pub(crate) use run::run;
 pub use scan_apply::scan_apply;
 pub use scan_chunks::scan_chunks;
 pub use ssim_backward_rows::ssim_backward_rows;
 pub use ssim_columns::ssim_columns;
 pub use ssim_rows::ssim_rows;
+pub use tile_load::tile_load;
 pub use tile_ranges::tile_ranges;
+
+use crate::view::Plane;
 
 /// Invocations of the serial-chunk passes; `shaders/shared/chunks.wgsl`.
 pub const CHUNKS: usize = 256;
@@ -61,34 +77,32 @@ pub(crate) fn chunk(n: usize, t: usize) -> std::ops::Range<usize> {
 }
 
 /// Alpha of a splat at offset (dx, dy) from its mean; 0 where it is not drawn.
-pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32, transmittance: f32) -> f32 {
-    let power = dx * (splat[0][2] * dx + splat[0][3] * dy) + splat[1][0] * dy * dy;
-    let alpha = splat[1][1] * power.exp2();
-    if alpha >= ALPHA_MIN && transmittance >= TRANSMITTANCE_MIN { alpha } else { 0.0 }
+pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32) -> f32 {
+    let exponent = dx * (splat[0][2] * dx + splat[0][3] * dy) + (splat[1][0] * dy * dy + splat[1][1]);
+    let alpha = exponent.exp2();
+    if alpha >= ALPHA_MIN { alpha } else { 0.0 }
 }
 
-/// Geometry of one projected Gaussian; `shaders/shared/covariance.wgsl`.
-pub(crate) mod covariance {
-    use crate::View;
-    use glam::{Mat3, Mat4, Vec2, Vec3};
+/// Whether a pixel of a padded plane lies in the picture: 1 or 0.
+fn shown_plane(plane: &Plane, i: usize, j: usize) -> f32 {
+    if i < plane.size[0] as usize && j < plane.size[1] as usize { 1.0 } else { 0.0 }
+}
 
-    /// World to camera rotation, its rows being the camera axes.
-    pub fn world(view: &View) -> Mat3 {
-        Mat3::from_mat4(Mat4::from_cols_array(&view.world_to_camera))
-    }
+/// What the loss compares at one pixel; `shaders/shared/window.wgsl`.
+struct Compared {
+    x: f32,
+    y: f32,
+    /// 1 where the pixel counts.
+    weight: f32,
+}
 
-    /// x/z and y/z, clamped to 1.3 x the image's half extent.
-    pub fn clamped_slope(t: Vec3, view: &View) -> Vec2 {
-        let (focal, centre) = (Vec2::from(view.focal), Vec2::from(view.centre));
-        let size = Vec2::new(view.size[0] as f32, view.size[1] as f32);
-        (t.truncate() / t.z).clamp(-1.3 * centre / focal, 1.3 * (size - centre) / focal)
-    }
-
-    /// The two rows of J W.
-    pub fn affine(t: Vec3, view: &View) -> [Vec3; 2] {
-        let slope = clamped_slope(t, view);
-        let w = world(view);
-        let (x, y, z) = (w.row(0), w.row(1), w.row(2));
-        [view.focal[0] / t.z * (x - slope.x * z), view.focal[1] / t.z * (y - slope.y * z)]
-    }
+fn shown_target(plane: &Plane, frame: &[f32], targets: &[u32], i: usize, j: usize) -> Compared {
+    let at = (j * 4 * plane.quads as usize) + i;
+    let size = (4 * plane.quads * plane.rows) as usize;
+    let inside = shown_plane(plane, i, j);
+    let x = inside * (plane.gain * frame[plane.channel as usize * size + at] + plane.offset);
+    let packed = targets[plane.channel as usize / 3 * size + at];
+    let counts = packed >= 0x8000_0000;
+    let y = (packed >> (8 * (plane.channel % 3)) & 255) as f32 / 255.0;
+    Compared { x, y: if counts { y } else { x }, weight: if counts { inside } else { 0.0 } }
 }

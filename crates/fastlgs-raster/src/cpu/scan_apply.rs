@@ -6,7 +6,8 @@ pub fn scan_apply(job: &Job, items: &mut [u32], totals: &mut [u32]) {
     let mut sum = 0;
     for t in 0..CHUNKS {
         for i in chunk(job.n as usize, t) {
-            sum += std::mem::replace(&mut items[i], sum);
+            let item = std::mem::replace(&mut items[i], sum);
+            sum = u32::saturating_add(sum, item);
         }
     }
     totals[CHUNKS] = sum;

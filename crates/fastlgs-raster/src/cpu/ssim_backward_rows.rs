@@ -4,7 +4,7 @@ use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 /// Twin of `shaders/ssim_backward_rows.wgsl`.
 pub fn ssim_backward_rows(plane: &Plane, partials: &[f32], rows: &mut [f32]) {
     let window = ssim_window();
-    let (w, h) = (plane.width as usize, plane.height as usize);
+    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
     for j in 0..3 * h {
         for i in 0..w {
             let taps = i.saturating_sub(SSIM_RADIUS)..=(i + SSIM_RADIUS).min(w - 1);

@@ -1,19 +1,19 @@
-use super::RUN;
+use super::{RUN, shown_plane};
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
 /// Blurs one map of `rows` along its column at (i, j).
 pub(super) fn blur_column(plane: &Plane, rows: &[f32], map: usize, i: usize, j: usize) -> f32 {
     let window = ssim_window();
-    let (w, h) = (plane.width as usize, plane.height as usize);
+    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
     let taps = j.saturating_sub(SSIM_RADIUS)..=(j + SSIM_RADIUS).min(h - 1);
-    taps.map(|k| window[k + SSIM_RADIUS - j] * rows[map * w * h + k * w + i]).sum()
+    taps.map(|k| window[k + SSIM_RADIUS - j] * rows[(map * h + k) * w + i]).sum()
 }
 
 /// Twin of `shaders/ssim_columns.wgsl`.
 pub fn ssim_columns(plane: &Plane, rows: &[f32], partials: &mut [f32], sums: &mut [f32]) {
-    let (w, h) = (plane.width as usize, plane.height as usize);
-    let runs = h.div_ceil(RUN);
+    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
+    let runs = h / RUN;
     let base = plane.channel as usize * runs * w;
     sums[base..base + runs * w].fill(0.0);
     for j in 0..h {
@@ -24,11 +24,12 @@ pub fn ssim_columns(plane: &Plane, rows: &[f32], partials: &mut [f32], sums: &mu
             let c = mx * mx + my * my + 0.0001;
             let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
             let ssim = a * b / (c * d);
-            sums[base + (j / RUN) * w + i] += ssim;
+            let weight = shown_plane(plane, i, j);
+            sums[base + (j / RUN) * w + i] += weight * ssim;
             let at = j * w + i;
-            partials[at] = (2.0 * my * (b - a)) / (c * d) - 2.0 * mx * ssim * (1.0 / c - 1.0 / d);
-            partials[w * h + at] = -ssim / d;
-            partials[2 * w * h + at] = 2.0 * a / (c * d);
+            partials[at] = weight * ((2.0 * my * (b - a)) / (c * d) - 2.0 * mx * ssim * (d - c) / (c * d));
+            partials[w * h + at] = -weight * ssim / d;
+            partials[2 * w * h + at] = weight * 2.0 * a / (c * d);
         }
     }
 }

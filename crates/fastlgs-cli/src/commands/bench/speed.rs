@@ -6,10 +6,11 @@
 use crate::scene::parse_size;
 use crate::{Outcome, report, ui};
 use anyhow::{Result, bail};
-use fastlgs_core::gaussians::CHANNELS;
+use fastlgs_core::gaussians::{BASE_CHANNELS, channels};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
-use fastlgs_raster::{Engine, Step, StepOptions, View};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, Engine, Exposure, Step, StepOptions, TargetImage, View, pack};
 use glam::Vec3;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -34,6 +35,8 @@ pub struct Args {
 
 /// Views that take turns.
 const VIEWS: usize = 4;
+/// Rounds over the views in which passes are timed.
+const ROUNDS: usize = 5;
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let (scene, cameras) = match &args.scene {
@@ -53,11 +56,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut rows = Vec::new();
     for &count in &counts {
         let resized = resampled(&scene, count, common.seed);
-        let params = resized.to_channels();
-        let zeros = vec![0.0; params.len()];
-        engine.set_state(&params, &zeros, &zeros)?;
+        engine.set_state(&State::of(&resized))?;
         for &(w, h) in &sizes {
-            let views: Vec<View> = cameras.iter().step_by(stride).map(|c| View::new(&c.resized(w, h), count)).collect();
+            let views: Vec<View> = cameras.iter().step_by(stride).map(|c| View::new(&c.resized(w, h), count, resized.sh_degree)).collect();
             rows.push(setting(engine.as_mut(), &views, args.steps)?);
         }
     }
@@ -75,38 +76,53 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 /// Times one number of Gaussians at one resolution.
 fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
     let pixels = views[0].pixels();
-    let step = Step::new(engine.len(), 1, [0.0; CHANNELS]);
-    let full = StepOptions { lambda: 0.2, feature_weight: 1.0 };
-    let color_only = StepOptions { feature_weight: 0.0, ..full };
-    engine.set_target(0, &vec![0.5; 6 * pixels])?;
+    let zero = [0.0; BASE_CHANNELS + 1];
+    let degree = views[0].sh_degree;
+    let frozen = Step::new(1, 14..BASE_CHANNELS, &zero);
+    let step = Step::new(1, 0..channels(degree), &zero);
+    let options = |channels: Channels| StepOptions { channels, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
+    let full = options(Channels::Both);
+    let target = TargetImage { size: views[0].size, color: vec![pack([128; 3], true); pixels], feature: vec![pack([128; 3], true); pixels] };
+    (0..views.len()).try_for_each(|id| engine.set_target(id, &target))?;
     let (mut pairs, mut walked) = (0.0, 0.0);
-    for view in views {
-        let frame = engine.render(*view)?;
+    for (id, view) in views.iter().enumerate() {
+        let frame = engine.render(*view, Channels::Both)?;
         pairs += f64::from(frame.pairs) / views.len() as f64;
         walked += frame.channels(7, 8).iter().map(|w| f64::from(*w)).sum::<f64>() / (pixels * views.len()) as f64;
-        engine.step(*view, 0, full, &step)?;
+        engine.step(*view, id, &full, &step)?;
+        engine.step(*view, id, &options(Channels::Color), &step)?;
+        engine.step(*view, id, &options(Channels::Feature), &frozen)?;
     }
     engine.losses()?;
-    let mut timed = |options: StepOptions| -> Result<f64> {
+    let mut timed = |channels: Channels, step: &Step| -> Result<f64> {
         let started = Instant::now();
-        for k in 0..steps {
-            engine.step(views[k as usize % views.len()], 0, options, &step)?;
+        for k in 0..steps as usize {
+            engine.step(views[k % views.len()], k % views.len(), &options(channels), step)?;
         }
         engine.losses()?;
         Ok(started.elapsed().as_secs_f64() / f64::from(steps))
     };
-    let (full_seconds, color_seconds) = (timed(full)?, timed(color_only)?);
+    let full_seconds = timed(Channels::Both, &step)?;
+    let color_seconds = timed(Channels::Color, &step)?;
+    let feature_seconds = timed(Channels::Feature, &frozen)?;
     let started = Instant::now();
     for k in 0..steps {
-        engine.render(views[k as usize % views.len()])?;
+        engine.render(views[k as usize % views.len()], Channels::Both)?;
     }
     let render_seconds = started.elapsed().as_secs_f64() / f64::from(steps);
     let mut passes: BTreeMap<&str, f64> = BTreeMap::new();
     if engine.set_profiling(true) {
-        for view in views {
-            engine.step(*view, 0, full, &step)?;
-            for (name, seconds) in engine.take_profile()? {
-                *passes.entry(name).or_default() += 1e3 * seconds / views.len() as f64;
+        // Other programs on the machine only ever slow a pass down: the fastest of some rounds is its time.
+        for _ in 0..ROUNDS {
+            let mut round: BTreeMap<&str, f64> = BTreeMap::new();
+            for (id, view) in views.iter().enumerate() {
+                engine.step(*view, id, &full, &step)?;
+                for (name, seconds) in engine.take_profile()? {
+                    *round.entry(name).or_default() += 1e3 * seconds / views.len() as f64;
+                }
+            }
+            for (name, ms) in round {
+                passes.entry(name).and_modify(|best| *best = best.min(ms)).or_insert(ms);
             }
         }
         engine.set_profiling(false);
@@ -118,6 +134,7 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value>
         "evaluated_per_pixel": walked,
         "train_iterations_per_second": 1.0 / full_seconds,
         "train_color_only_iterations_per_second": 1.0 / color_seconds,
+        "train_feature_only_iterations_per_second": 1.0 / feature_seconds,
         "render_ms": 1e3 * render_seconds,
         "train_ms": 1e3 * full_seconds,
         "train_pass_ms": passes,

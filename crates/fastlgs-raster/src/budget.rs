@@ -1,0 +1,101 @@
+//! No more Gaussians than the scene needs (`--budget auto`).
+//!
+//! *Growth* stops when it no longer pays: some training views are kept aside and watched; every [`WATCH_EVERY`] steps, if
+//! the scene has grown by at least [`GROWTH`] since the last look and the watched views gained less than [`GAIN`] dB, it
+//! may grow no further, and the watched views join the training.
+//!
+//! *Pruning* then removes Gaussians that nobody sees: those whose largest blending weight over all training views stays
+//! under [`MIN_WEIGHT`] (as in RadSplat, Niemeyer et al. 2024). What is left is refined by the rest of the run.
+
+use crate::lift::largest_weights;
+use fastlgs_core::{Camera, Gaussians};
+use serde::{Deserialize, Serialize};
+
+/// Steps between two looks at the watched views.
+pub(crate) const WATCH_EVERY: u32 = 500;
+/// Relative growth that has to show an effect.
+const GROWTH: f64 = 0.1;
+/// Gain on the watched views, in dB, that pays for it.
+const GAIN: f64 = 0.1;
+/// Largest blending weight below which a Gaussian is removed.
+pub const MIN_WEIGHT: f32 = 0.05;
+/// Every so many training views one is watched.
+const WATCHED: usize = 10;
+
+/// Whether training view `index` of `count` is watched and not trained on while the scene grows.
+pub(crate) fn is_watched(index: usize, count: usize) -> bool {
+    count >= 2 * WATCHED && index % WATCHED == WATCHED / 2
+}
+
+/// The rule that ends growth.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Growth {
+    /// The scene may grow no further.
+    pub stopped: bool,
+    /// Gaussians and PSNR of the watched views at the last look.
+    last: Option<(usize, f64)>,
+}
+
+impl Growth {
+    /// Takes a look: so many Gaussians give so many dB.
+    pub fn look(&mut self, gaussians: usize, psnr: f64) {
+        if let Some((before, then)) = self.last {
+            let grown = gaussians as f64 >= before as f64 * (1.0 + GROWTH);
+            if !grown {
+                return;
+            }
+            self.stopped |= psnr - then < GAIN;
+        }
+        self.last = Some((gaussians, psnr));
+    }
+}
+
+/// What a removal cost, for reports.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Removal {
+    /// Steps done before it.
+    pub iteration: u32,
+    /// Gaussians before it.
+    pub before: usize,
+    /// Gaussians after it.
+    pub after: usize,
+}
+
+/// Places of the Gaussians that some view sees with at least `threshold`.
+pub fn seen(scene: &Gaussians, cameras: &[Camera], threshold: f32) -> Vec<usize> {
+    let mut largest = vec![0.0f32; scene.len()];
+    for camera in cameras {
+        largest.iter_mut().zip(largest_weights(scene, camera)).for_each(|(l, w)| *l = l.max(w));
+    }
+    (0..scene.len()).filter(|&i| largest[i] >= threshold).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn growth_stops_when_it_does_not_pay() {
+        let mut growth = Growth::default();
+        growth.look(1000, 20.0);
+        growth.look(2000, 22.0);
+        growth.look(2050, 22.01); // hardly grown: no verdict
+        assert!(!growth.stopped);
+        growth.look(3000, 22.05);
+        assert!(growth.stopped);
+    }
+
+    #[test]
+    fn what_is_hidden_everywhere_is_not_seen() {
+        let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let mut scene = Gaussians::default();
+        for depth in [0.0, 0.1, 0.2] {
+            scene.push_sphere(Vec3::Z * depth, 0.2, 0.99, [0.5; 3]);
+        }
+        scene.push_sphere(Vec3::Z * 0.3, 0.05, 0.99, [0.5; 3]);
+        assert_eq!(seen(&scene, std::slice::from_ref(&camera), MIN_WEIGHT), [0, 1, 2]);
+        let other = Camera::look_at("b", Vec3::new(0.0, 0.0, 4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        assert_eq!(seen(&scene, &[camera, other], MIN_WEIGHT), [0, 1, 2, 3]);
+    }
+}

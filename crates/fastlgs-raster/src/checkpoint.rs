@@ -1,0 +1,74 @@
+//! Checkpoints: a JSON header that names a file of tensors, so that either the old or the new one is whole.
+
+use crate::Result;
+use crate::budget::{Growth, Removal};
+use crate::density::State;
+use crate::exposure::{Learned, LearnedExposure};
+use crate::schedule::TrainConfig;
+use fastlgs_core::fs;
+use fastlgs_core::gaussians::channels;
+use fastlgs_core::rng::Rng;
+use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// Everything of a run that is not a tensor.
+#[derive(Clone, Serialize, Deserialize)]
+pub(crate) struct Course {
+    pub config: TrainConfig,
+    pub iteration: u32,
+    pub gaussians: usize,
+    pub order: Vec<usize>,
+    pub rng: Rng,
+    pub growth: Growth,
+    pub removals: Vec<Removal>,
+    pub exposures: Vec<LearnedExposure>,
+    pub background: Learned<6>,
+}
+
+fn tensors_path(path: &Path, iteration: u32) -> PathBuf {
+    path.with_extension(format!("{iteration}.safetensors"))
+}
+
+/// Writes `path.json` and the tensors it names; older tensors are then removed.
+pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -> Result<()> {
+    let n = state.len();
+    let shape = vec![channels(state.sh_degree), n];
+    let tensors = [
+        ("params", shape.clone(), state.params.as_slice()),
+        ("moment1", shape.clone(), &state.moment1),
+        ("moment2", shape, &state.moment2),
+        ("stats", vec![2, n], stats),
+    ];
+    let keep = tensors_path(path, course.iteration);
+    save_tensors(&keep, &tensors)?;
+    fs::write_json(&path.with_extension("json"), course)?;
+    let folder = path.parent().unwrap_or(Path::new("."));
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let old = entry.path();
+        if old != keep && old.extension().is_some_and(|e| e == "safetensors") {
+            let _ = std::fs::remove_file(old);
+        }
+    }
+    Ok(())
+}
+
+/// Reads a checkpoint; nothing where there is none.
+pub(crate) fn load(path: &Path) -> Result<Option<(Course, State, Vec<f32>)>> {
+    let header = path.with_extension("json");
+    if !header.is_file() {
+        return Ok(None);
+    }
+    let course: Course = fs::read_json(&header)?;
+    let tensors_path = tensors_path(path, course.iteration);
+    let mut tensors = load_tensors(&tensors_path)?;
+    let mut take = |name: &str, rows: usize| {
+        let found = tensors.remove(name).filter(|t| t.0 == [rows, course.gaussians]).map(|t| t.1);
+        found.ok_or_else(|| fastlgs_core::Error::format(&tensors_path, format!("tensor '{name}' is missing or misshapen")))
+    };
+    let sh_degree = course.config.sh_degree;
+    let rows = channels(sh_degree);
+    let state = State { sh_degree, params: take("params", rows)?, moment1: take("moment1", rows)?, moment2: take("moment2", rows)? };
+    let stats = take("stats", 2)?;
+    Ok(Some((course, state, stats)))
+}

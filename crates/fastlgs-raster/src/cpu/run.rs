@@ -1,0 +1,59 @@
+//! Any twin by its name, on raw buffers.
+
+use super::*;
+use crate::pass::Channels;
+use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
+
+/// Runs the twin of the pass `name` on its uniform and its storage buffers, in the order of the bindings.
+///
+/// # Panics
+/// If there is no such pass, or a buffer is too small.
+pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut [Vec<u32>]) {
+    fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
+        bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
+    }
+    let view = || uniform_of::<crate::View>(uniform);
+    let job = || uniform_of::<crate::view::Job>(uniform);
+    let plane = || uniform_of::<Plane>(uniform);
+    match (name, buffers) {
+        ("project", [params, splats, depths, footprints, touched]) => {
+            project(&view(), read(params), write(splats), depths, write(footprints), touched);
+        }
+        ("radix_count", [keys, histogram]) => radix_count(&job(), keys, histogram),
+        ("radix_scatter", [keys, values, histogram, keys_out, values_out]) => {
+            radix_scatter(&job(), keys, values, histogram, keys_out, values_out);
+        }
+        ("scan_chunks", [items, totals]) => scan_chunks(&job(), items, totals),
+        ("scan_apply", [items, totals]) => scan_apply(&job(), items, totals),
+        ("gather_counts", [order, touched, offsets]) => gather_counts(&view(), order, touched, offsets),
+        ("emit", [order, offsets, footprints, touched, tiles, gaussians, first]) => {
+            emit(&view(), order, offsets, read(footprints), touched, tiles, gaussians, first);
+        }
+        ("tile_ranges", [tiles, ranges]) => tile_ranges(&view(), tiles, ranges),
+        ("tile_load", [ranges, keys]) => tile_load(&view(), ranges, keys),
+        ("blend", [ranges, order, sorted, gaussians, splats, frame]) => {
+            let order = &order[..view().tile_count() as usize];
+            blend(&view(), channels, ranges, order, sorted, gaussians, read(splats), write(frame));
+        }
+        ("ssim_rows", [frame, targets, rows]) => ssim_rows(&plane(), read(frame), targets, write(rows)),
+        ("ssim_columns", [rows, partials, sums]) => ssim_columns(&plane(), read(rows), write(partials), write(sums)),
+        ("ssim_backward_rows", [partials, rows]) => ssim_backward_rows(&plane(), read(partials), write(rows)),
+        ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
+            loss_gradient(&plane(), read(frame), targets, read(rows), write(gradient), write(sums));
+        }
+        ("blend_backward", [ranges, order, sorted, gaussians, splats, frame, gradient, slots]) => {
+            let order = &order[..view().tile_count() as usize];
+            let (frame, gradient) = (read(frame), read(gradient));
+            blend_backward(&view(), channels, ranges, order, sorted, gaussians, read(splats), frame, gradient, write(slots));
+        }
+        ("project_backward", [params, splats, order, touched, first, slots, gradients, stats]) => {
+            let (params, slots) = (read(params), read(slots));
+            project_backward(&view(), channels, params, read(splats), order, touched, first, slots, write(gradients), write(stats));
+        }
+        ("adam", [gradients, params, moment1, moment2]) => {
+            adam(&uniform_of(uniform), read(gradients), write(params), write(moment1), write(moment2));
+        }
+        ("perturb", [params]) => perturb(&uniform_of(uniform), write(params)),
+        (name, buffers) => panic!("no twin '{name}' of {} buffers", buffers.len()),
+    }
+}

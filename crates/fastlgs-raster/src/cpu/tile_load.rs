@@ -1,0 +1,9 @@
+use crate::View;
+
+/// Twin of `shaders/tile_load.wgsl`.
+pub fn tile_load(view: &View, ranges: &[u32], keys: &mut [u32]) {
+    for tile in 0..view.tile_count() as usize {
+        let length = ranges[2 * tile + 1] - ranges[2 * tile];
+        keys[tile] = 255 - ((16.0 * ((length + 1) as f32).log2()) as u32).min(255);
+    }
+}

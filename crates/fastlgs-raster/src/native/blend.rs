@@ -1,0 +1,207 @@
+//! Blending and its gradients, a tile at a time with its 64 pixels in vector registers.
+
+use super::simd::{exp2, madd, vectorised};
+use crate::cpu::{ALPHA_MIN, BATCH, Splat, TRANSMITTANCE_MIN};
+use crate::view::View;
+
+/// Pixels along a tile's edge.
+const EDGE: usize = crate::view::TILE as usize;
+
+/// A value for each pixel of a tile, row by row.
+pub type Tile = [[f32; EDGE]; EDGE];
+
+/// What the forward pass makes of a tile.
+#[derive(Clone)]
+pub struct Blended {
+    /// r, g, b, f0, f1, f2 without the background.
+    pub sums: [Tile; 6],
+    /// Transmittance left.
+    pub transmittance: Tile,
+    /// Pairs walked.
+    pub walked: u32,
+}
+
+/// A tile's place and its list.
+pub struct Job<'a> {
+    /// Upper left pixel.
+    pub x: f32,
+    /// Upper left pixel.
+    pub y: f32,
+    /// Gaussians front to back.
+    pub gaussians: &'a [u32],
+    /// All splats.
+    pub splats: &'a [Splat],
+}
+
+impl<'a> Job<'a> {
+    /// The job of tile number `tile`.
+    pub fn new(view: &View, tile: usize, gaussians: &'a [u32], splats: &'a [Splat]) -> Self {
+        let (column, row) = (tile % view.tiles[0] as usize, tile / view.tiles[0] as usize);
+        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, gaussians, splats }
+    }
+}
+
+/// 1 for the pixels of the picture, 0 for those of the padding.
+pub fn shown(view: &View, job: &Job) -> Tile {
+    let [w, h] = view.size.map(|s| s as f32);
+    std::array::from_fn(|j| std::array::from_fn(|i| if job.x + (i as f32) < w && job.y + (j as f32) < h { 1.0 } else { 0.0 }))
+}
+
+/// Rows of the tile in which a splat can reach the least alpha: where its exponent's maximum over x allows it.
+#[inline(always)]
+fn rows_of(splat: &Splat, y: f32) -> std::ops::Range<usize> {
+    let [[_, my, qx, qy], [qz, log_opacity, ..], _] = *splat;
+    // Over x the exponent is at most (qz - qy^2 / 4 qx) dy^2 + log2(opacity).
+    let bend = qz - 0.25 * qy * qy / qx;
+    let reach = ((-8.0 - log_opacity) / bend).max(0.0).sqrt() + 0.01;
+    let first = (my - reach - y - 0.5).ceil().clamp(0.0, EDGE as f32);
+    let end = ((my + reach - y - 0.5).floor() + 1.0).clamp(first, EDGE as f32);
+    first as usize..end as usize
+}
+
+/// Alphas of a splat along a row.
+#[inline(always)]
+fn alphas<const FMA: bool>(splat: &Splat, dx: &[f32; EDGE], dy: f32) -> [f32; EDGE] {
+    let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *splat;
+    let (c1, c0) = (qy * dy, madd::<FMA>(qz * dy, dy, log_opacity));
+    let mut out = [0.0; EDGE];
+    for i in 0..EDGE {
+        let alpha = exp2::<FMA>(madd::<FMA>(dx[i], madd::<FMA>(qx, dx[i], c1), c0));
+        out[i] = if alpha >= ALPHA_MIN { alpha } else { 0.0 };
+    }
+    out
+}
+
+#[inline(always)]
+fn values_of(splat: &Splat) -> [f32; 6] {
+    [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]]
+}
+
+#[inline(always)]
+fn offsets(x: f32) -> [f32; EDGE] {
+    std::array::from_fn(|i| x + i as f32 + 0.5)
+}
+
+/// Channels of a step: colour 0..3, feature 3..6.
+#[inline(always)]
+fn channels<const COLOR: bool, const FEATURE: bool>() -> std::ops::Range<usize> {
+    (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 })
+}
+
+vectorised! {
+    /// Blends the list of a tile; `out.transmittance` must hold 1 for pixels of the picture and 0 for others.
+    fn forward<const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) = forward_body
+}
+
+#[inline(always)]
+fn forward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) {
+    for batch in job.gaussians.chunks(BATCH) {
+        for &g in batch {
+            let splat = &job.splats[g as usize];
+            let values = values_of(splat);
+            let dx = offsets(job.x - splat[0][0]);
+            for j in rows_of(splat, job.y) {
+                let alpha = alphas::<FMA>(splat, &dx, job.y + j as f32 + 0.5 - splat[0][1]);
+                let transmittance = &mut out.transmittance[j];
+                let mut w = [0.0; EDGE];
+                for i in 0..EDGE {
+                    w[i] = alpha[i] * transmittance[i];
+                    transmittance[i] -= w[i];
+                }
+                for c in channels::<COLOR, FEATURE>() {
+                    let sums = &mut out.sums[c][j];
+                    for i in 0..EDGE {
+                        sums[i] = madd::<FMA>(w[i], values[c], sums[i]);
+                    }
+                }
+            }
+        }
+        out.walked += batch.len() as u32;
+        if out.transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+            break;
+        }
+    }
+}
+
+/// What the backward pass starts from.
+pub struct Given {
+    /// dL/d(colour, feature).
+    pub gradient: [Tile; 6],
+    /// R.g: what the light behind is worth; shaders/blend_backward.wgsl.
+    pub behind: Tile,
+    /// 1 for pixels of the picture, 0 for others.
+    pub transmittance: Tile,
+    /// Pairs that the forward pass walked.
+    pub walked: u32,
+}
+
+vectorised! {
+    /// Gradient slots of a tile's pairs, in the order of its list.
+    fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; 12]])
+        = backward_body
+}
+
+#[inline(always)]
+fn backward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
+    job: &Job<'_>,
+    given: &mut Given,
+    slots: &mut [[f32; 12]],
+) {
+    let walked = given.walked as usize;
+    for (&g, slot) in job.gaussians[..walked].iter().zip(&mut *slots) {
+        let splat = &job.splats[g as usize];
+        let values = values_of(splat);
+        let dx = offsets(job.x - splat[0][0]);
+        let (mut p_sum, mut py_sum, mut pyy_sum) = ([0.0; EDGE], [0.0; EDGE], [0.0; EDGE]);
+        let mut sums = [[0.0; EDGE]; 6];
+        for j in rows_of(splat, job.y) {
+            let dy = job.y + j as f32 + 0.5 - splat[0][1];
+            let alpha = alphas::<FMA>(splat, &dx, dy);
+            let mut w = [0.0; EDGE];
+            for i in 0..EDGE {
+                w[i] = alpha[i] * given.transmittance[j][i];
+                given.transmittance[j][i] -= w[i];
+            }
+            for c in channels::<COLOR, FEATURE>() {
+                for i in 0..EDGE {
+                    sums[c][i] = madd::<FMA>(w[i], given.gradient[c][j][i], sums[c][i]);
+                }
+            }
+            if COLOR {
+                let mut worth = [0.0; EDGE];
+                for c in 0..if MOVES { 6 } else { 3 } {
+                    for i in 0..EDGE {
+                        worth[i] = madd::<FMA>(values[c], given.gradient[c][j][i], worth[i]);
+                    }
+                }
+                for i in 0..EDGE {
+                    let gain = w[i] * worth[i];
+                    let behind = given.behind[j][i] - gain;
+                    given.behind[j][i] = behind;
+                    let p = gain - behind * (alpha[i] / (1.0 - alpha[i]));
+                    p_sum[i] += p;
+                    py_sum[i] = madd::<FMA>(p, dy, py_sum[i]);
+                    pyy_sum[i] = madd::<FMA>(p, dy * dy, pyy_sum[i]);
+                }
+            }
+        }
+        let total = |values: &[f32; EDGE]| values.iter().sum::<f32>();
+        let by = |values: &[f32; EDGE], factor: &[f32; EDGE]| std::array::from_fn::<f32, EDGE, _>(|i| values[i] * factor[i]);
+        let px = by(&p_sum, &dx);
+        *slot = [
+            total(&px),
+            total(&py_sum),
+            total(&by(&px, &dx)),
+            total(&by(&py_sum, &dx)),
+            total(&pyy_sum),
+            total(&p_sum),
+            total(&sums[0]),
+            total(&sums[1]),
+            total(&sums[2]),
+            total(&sums[3]),
+            total(&sums[4]),
+            total(&sums[5]),
+        ];
+    }
+    slots[walked..].fill([0.0; 12]);
+}

@@ -1,0 +1,343 @@
+//! The fast CPU backend: the same frames and gradients as the shaders', with vectors and all cores.
+
+mod blend;
+mod lists;
+mod loss;
+mod simd;
+
+use crate::cpu::{self, perturb_one};
+use crate::density::State;
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, planes};
+use crate::pass::Channels;
+use crate::view::{Perturb, Step, TILE, View};
+use crate::{Error, Result};
+use blend::{Blended, Given, Job, Tile};
+use fastlgs_core::gaussians::channels as channels_of;
+pub(crate) use lists::Lists;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, HashMap};
+use std::time::Instant;
+
+/// Planes padded to whole tiles, `[row][C][padded width]`, so that a row of tiles is one piece of memory.
+#[derive(Default)]
+pub struct Picture<const C: usize> {
+    width: usize,
+    data: Vec<f32>,
+}
+
+impl<const C: usize> Picture<C> {
+    fn prepare(&mut self, view: &View) {
+        self.width = (view.tiles[0] * TILE) as usize;
+        self.data.resize(C * view.padded_pixels(), 0.0);
+    }
+
+    fn row(&self, channel: usize, y: usize) -> &[f32] {
+        &self.data[(y * C + channel) * self.width..][..self.width]
+    }
+
+    fn rows_mut(&mut self) -> rayon::slice::ChunksExactMut<'_, f32> {
+        self.data.par_chunks_exact_mut(C * self.width)
+    }
+
+    /// The pixels of a tile.
+    fn tile(&self, channel: usize, job: &Job) -> Tile {
+        std::array::from_fn(|j| {
+            let row = &self.row(channel, job.y as usize + j)[job.x as usize..];
+            std::array::from_fn(|i| row[i])
+        })
+    }
+}
+
+/// [`Engine`] on the processor.
+#[derive(Default)]
+pub struct CpuEngine {
+    n: usize,
+    sh_degree: u32,
+    /// Trained values and moments, each `[n][channels]`.
+    params: Vec<f32>,
+    moment1: Vec<f32>,
+    moment2: Vec<f32>,
+    gradients: Vec<f32>,
+    stats: Vec<f32>,
+    targets: HashMap<usize, TargetImage>,
+    frame: Picture<8>,
+    gradient: Picture<6>,
+    scratch: loss::Scratch,
+    walked: Vec<u32>,
+    slots: Vec<[f32; 12]>,
+    lists: Option<Lists>,
+    /// Lists of views whose geometry is frozen.
+    cached: HashMap<usize, Lists>,
+    losses: Losses,
+    profile: Option<BTreeMap<&'static str, f64>>,
+}
+
+/// Rows `[n][channels]` from columns `[channels][n]`.
+fn rows_of(columns: &[f32], n: usize) -> Vec<f32> {
+    let channels = columns.len() / n.max(1);
+    (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
+}
+
+impl CpuEngine {
+    /// An engine without Gaussians.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    fn timed<T>(&mut self, name: &'static str, work: impl FnOnce(&mut Self) -> T) -> T {
+        let started = Instant::now();
+        let out = work(self);
+        if let Some(profile) = &mut self.profile {
+            *profile.entry(name).or_default() += started.elapsed().as_secs_f64();
+        }
+        out
+    }
+
+    fn forward(&mut self, view: &View, channels: Channels, frozen: Option<usize>) -> Result<()> {
+        if view.gaussians as usize != self.n || self.n == 0 {
+            return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {}", view.gaussians, self.n)));
+        }
+        self.timed("lists", |s| {
+            let (params, width) = (&s.params, channels_of(s.sh_degree));
+            let param = |i: usize, c: usize| params[i * width + c];
+            s.lists = match frozen.and_then(|id| s.cached.remove(&id)) {
+                Some(mut lists) => {
+                    lists.refresh(view, param);
+                    Some(lists)
+                }
+                None => Some(Lists::new(view, param)),
+            };
+        });
+        self.timed("blend", |s| match channels {
+            Channels::Color => s.blend::<true, false>(view),
+            Channels::Feature => s.blend::<false, true>(view),
+            Channels::Both | Channels::Coupled => s.blend::<true, true>(view),
+        });
+        Ok(())
+    }
+
+    fn blend<const COLOR: bool, const FEATURE: bool>(&mut self, view: &View) {
+        self.frame.prepare(view);
+        self.walked.resize(view.tile_count() as usize, 0);
+        let lists = self.lists.as_ref().expect("made before blending");
+        let (width, tiles_x) = (self.frame.width, view.tiles[0] as usize);
+        let background: [f32; 6] = std::array::from_fn(|c| if c < 3 { view.background_color[c] } else { view.background_feature[c - 3] });
+        let bands = self.frame.data.par_chunks_exact_mut(TILE as usize * 8 * width).zip(self.walked.par_chunks_exact_mut(tiles_x));
+        bands.enumerate().for_each(|(row, (band, walked))| {
+            for column in 0..tiles_x {
+                let tile = row * tiles_x + column;
+                let [start, end] = lists.ranges[tile].map(|p| p as usize);
+                let job = Job::new(view, tile, &lists.gaussians[start..end], &lists.splats);
+                let shown = blend::shown(view, &job);
+                let mut out = Blended { sums: [Tile::default(); 6], transmittance: shown, walked: 0 };
+                blend::forward::<COLOR, FEATURE>(&job, &mut out);
+                walked[column] = out.walked;
+                for j in 0..TILE as usize {
+                    let at = |c: usize| (j * 8 + c) * width + column * TILE as usize;
+                    for c in (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 }) {
+                        for i in 0..TILE as usize {
+                            band[at(c) + i] = shown[j][i] * (out.sums[c][j][i] + out.transmittance[j][i] * background[c]);
+                        }
+                    }
+                    band[at(6)..][..TILE as usize].copy_from_slice(&out.transmittance[j]);
+                    band[at(7)..][..TILE as usize].fill(out.walked as f32);
+                }
+            }
+        });
+    }
+
+    fn blend_backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(&mut self, view: &View) {
+        let lists = self.lists.as_ref().expect("made by the forward pass");
+        self.slots.resize(lists.gaussians.len(), [0.0; 12]);
+        let tiles_x = view.tiles[0] as usize;
+        // Each row of tiles owns a stretch of the slots.
+        let mut bands = Vec::new();
+        let mut rest = &mut self.slots[..];
+        for row in lists.ranges.chunks_exact(tiles_x) {
+            let (band, after) = rest.split_at_mut((row[tiles_x - 1][1] - row[0][0]) as usize);
+            bands.push(band);
+            rest = after;
+        }
+        let (frame, gradient, walked) = (&self.frame, &self.gradient, &self.walked);
+        bands.into_par_iter().enumerate().for_each(|(row, band)| {
+            let first = lists.ranges[row * tiles_x][0] as usize;
+            for tile in row * tiles_x..(row + 1) * tiles_x {
+                let [start, end] = lists.ranges[tile].map(|p| p as usize);
+                let job = Job::new(view, tile, &lists.gaussians[start..end], &lists.splats);
+                let trained = |c: usize| if c < 3 { COLOR } else { FEATURE };
+                let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { Tile::default() });
+                let mut behind = Tile::default();
+                for c in 0..if MOVES { 6 } else { 3 } {
+                    let light = frame.tile(c, &job);
+                    for (b, (l, g)) in behind.iter_mut().flatten().zip(light.iter().flatten().zip(g[c].iter().flatten())) {
+                        *b += l * g;
+                    }
+                }
+                let mut given = Given { gradient: g, behind, transmittance: blend::shown(view, &job), walked: walked[tile] };
+                blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, &mut band[start - first..end - first]);
+            }
+        });
+    }
+
+    /// From slots to gradients, statistics and the next values.
+    fn update(&mut self, view: &View, channels: Channels, step: &Step) {
+        let lists = self.lists.as_ref().expect("made by the forward pass");
+        let (slots, width) = (&self.slots, channels_of(self.sh_degree));
+        let (lengths, counts) = self.stats.split_at_mut(self.n);
+        let rows = self.params.par_chunks_exact_mut(width).zip(self.moment1.par_chunks_exact_mut(width));
+        let rows = rows.zip(self.moment2.par_chunks_exact_mut(width)).zip(self.gradients.par_chunks_exact_mut(width));
+        let rows = rows.zip(lengths.par_iter_mut().zip(counts)).enumerate().with_min_len(256);
+        rows.for_each(|(i, ((((params, m1), m2), gradients), (length, count)))| {
+            let places = &lists.places[lists.first[i] as usize..lists.first[i + 1] as usize];
+            let mut slot = [0.0; 12];
+            for place in places {
+                slot.iter_mut().zip(&slots[*place as usize]).for_each(|(sum, value)| *sum += value);
+            }
+            let put = |c: usize, value: f32| gradients[c] = value;
+            let drawn = cpu::backward_one(view, channels, |c| params[c], !places.is_empty(), &lists.splats[i], &slot, put);
+            if let Some(moved) = drawn.filter(|_| channels.color()) {
+                *length += moved;
+                *count += 1.0;
+            }
+            for c in step.first_channel as usize..step.end_channel as usize {
+                cpu::adam_one(step, c, gradients[c], &mut params[c], &mut m1[c], &mut m2[c]);
+            }
+        });
+    }
+}
+
+impl Engine for CpuEngine {
+    fn name(&self) -> String {
+        let vectors = if cfg!(target_arch = "x86_64") { x86_vectors() } else { "" };
+        format!("cpu ({} threads{vectors})", rayon::current_num_threads())
+    }
+
+    fn len(&self) -> usize {
+        self.n
+    }
+
+    fn set_state(&mut self, state: &State) -> Result<()> {
+        self.n = state.len();
+        self.sh_degree = state.sh_degree;
+        self.params = rows_of(&state.params, self.n);
+        self.moment1 = rows_of(&state.moment1, self.n);
+        self.moment2 = rows_of(&state.moment2, self.n);
+        self.gradients = vec![0.0; self.params.len()];
+        self.stats = vec![0.0; 2 * self.n];
+        self.cached.clear();
+        Ok(())
+    }
+
+    fn state(&self) -> Result<State> {
+        let columns = |rows: &[f32]| rows_of(rows, channels_of(self.sh_degree));
+        let (params, moment1, moment2) = (columns(&self.params), columns(&self.moment1), columns(&self.moment2));
+        Ok(State { sh_degree: self.sh_degree, params, moment1, moment2 })
+    }
+
+    fn stats(&self) -> Result<Vec<f32>> {
+        Ok(self.stats.clone())
+    }
+
+    fn set_stats(&mut self, stats: &[f32]) -> Result<()> {
+        self.stats = stats.to_vec();
+        Ok(())
+    }
+
+    fn gradients(&self) -> Result<Vec<f32>> {
+        Ok(rows_of(&self.gradients, channels_of(self.sh_degree)))
+    }
+
+    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
+        let mut target = target.clone();
+        target.feature.resize(target.color.len(), 0);
+        target.color.append(&mut target.feature);
+        self.targets.insert(id, target);
+        self.cached.remove(&id);
+        Ok(())
+    }
+
+    fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
+        self.forward(&view, channels, None)?;
+        let [w, h] = view.size.map(|s| s as usize);
+        let rows = (0..8).flat_map(|c| (0..h).map(move |y| (c, y)));
+        let data = rows.flat_map(|(c, y)| &self.frame.row(c, y)[..w]).copied().collect();
+        let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len()) as u32;
+        Ok(Frame { width: view.size[0], height: view.size[1], data, pairs })
+    }
+
+    fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {
+        let channels = options.channels;
+        if self.targets.get(&id).is_none_or(|t| t.size != view.size) {
+            return Err(Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])));
+        }
+        let frozen = (channels == Channels::Feature).then_some(id);
+        self.forward(&view, channels, frozen)?;
+        self.timed("loss", |s| {
+            s.gradient.prepare(&view);
+            s.losses = Losses::default();
+            for plane in planes(&view, options) {
+                s.scratch.plane(&plane, &s.frame, &s.targets[&id].color, &mut s.gradient, &mut s.losses);
+            }
+        });
+        self.timed("blend_backward", |s| match channels {
+            Channels::Color => s.blend_backward::<true, false, false>(&view),
+            Channels::Feature => s.blend_backward::<false, true, false>(&view),
+            Channels::Both => s.blend_backward::<true, true, false>(&view),
+            Channels::Coupled => s.blend_backward::<true, true, true>(&view),
+        });
+        self.timed("update", |s| s.update(&view, channels, step));
+        if let Some(id) = frozen {
+            self.cached.extend(self.lists.take().map(|lists| (id, lists)));
+        }
+        Ok(())
+    }
+
+    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()> {
+        let job = Perturb { n: self.n as u32, first: 0, seed, amount };
+        self.params.par_chunks_exact_mut(channels_of(self.sh_degree)).enumerate().for_each(|(i, row)| {
+            let offset = perturb_one(&job, i as u32, |c| row[c]);
+            (0..3).for_each(|k| row[k] += offset[k]);
+        });
+        Ok(())
+    }
+
+    fn losses(&self) -> Result<Losses> {
+        Ok(self.losses)
+    }
+
+    fn memory(&self) -> Memory {
+        let bytes = |words: usize| 4 * words as u64;
+        let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len());
+        Memory {
+            state: bytes(3 * self.params.len()),
+            lists: bytes(2 * pairs + 12 * self.slots.len()),
+            gaussians: bytes(self.gradients.len() + 23 * self.n),
+            frame: bytes(self.frame.data.len() + self.gradient.data.len() + self.scratch.words()),
+            views: self.targets.values().map(|t| bytes(t.color.len())).sum::<u64>()
+                + self.cached.values().map(|l| bytes(2 * l.gaussians.len() + 23 * self.n)).sum::<u64>(),
+        }
+    }
+
+    fn set_profiling(&mut self, on: bool) -> bool {
+        self.profile = on.then(BTreeMap::new);
+        true
+    }
+
+    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
+        Ok(self.profile.as_mut().map(std::mem::take).unwrap_or_default())
+    }
+}
+
+/// Which vectors the processor has, for reports.
+fn x86_vectors() -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if is_x86_feature_detected!("avx512dq") {
+            return ", AVX-512";
+        }
+        if is_x86_feature_detected!("avx2") {
+            return ", AVX2";
+        }
+    }
+    ""
+}
