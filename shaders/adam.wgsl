@@ -1,11 +1,11 @@
 // Adam (Kingma & Ba 2015) over the trained values, with one learning rate a channel, and the regularisers of MCMC
-// (Kheradmand et al. 2024) on opacity and scale. Works on one page; shared/channels.wgsl.
+// (Kheradmand et al. 2024) on opacity and scale. Works on one page, four Gaussians an invocation; shared/channels.wgsl.
 #import channels
 #import flat
 
 struct Step {
-    // Gaussians of the page.
-    n: u32,
+    // Stride of the page's channels, in fours.
+    quads: u32,
     // 1 - beta^t of both moments.
     correction1: f32,
     correction2: f32,
@@ -21,19 +21,19 @@ struct Step {
 }
 
 @group(0) @binding(0) var<uniform> step: Step;
-@group(0) @binding(1) var<storage, read> gradients: array<f32>;
-@group(0) @binding(2) var<storage, read_write> params: array<f32>;
-@group(0) @binding(3) var<storage, read_write> moment1: array<f32>;
-@group(0) @binding(4) var<storage, read_write> moment2: array<f32>;
+@group(0) @binding(1) var<storage, read> gradients: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> params: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> moment1: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read_write> moment2: array<vec4<f32>>;
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let i = flat_group(group, groups) * 64u + lane;
-    if i >= step.n {
+    if i >= step.quads {
         return;
     }
     for (var channel = step.first_channel; channel < step.end_channel; channel++) {
-        let k = channel * step.n + i;
+        let k = channel * step.quads + i;
         let slot = min(channel, SH_REST);
         let rate = step.rates[slot / 4u][slot % 4u];
         let value = params[k];

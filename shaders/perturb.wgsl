@@ -38,10 +38,10 @@ fn uniforms(words: vec3<u32>) -> vec3<f32> {
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let i = flat_group(group, groups) * 64u + lane;
-    let n = job.n;
-    if i >= n {
+    if i >= job.n {
         return;
     }
+    let n = stride(job.n);
     // Box and Muller.
     let u = uniforms(pcg3d(vec3<u32>(job.first + i, job.seed, 0u)));
     let v = uniforms(pcg3d(vec3<u32>(job.first + i, job.seed, 1u)));

@@ -21,7 +21,7 @@
 @group(0) @binding(5) var<storage, read_write> touched: array<u32>;
 
 fn param(channel: u32, i: u32) -> f32 {
-    return params[channel * view.page + i];
+    return params[channel * stride(view.page) + i];
 }
 
 fn param3(channel: u32, i: u32) -> vec3<f32> {

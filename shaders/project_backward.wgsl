@@ -22,7 +22,7 @@
 @group(0) @binding(8) var<storage, read_write> stats: array<f32>;
 
 fn param(channel: u32, i: u32) -> f32 {
-    return params[channel * view.page + i];
+    return params[channel * stride(view.page) + i];
 }
 
 fn param3(channel: u32, i: u32) -> vec3<f32> {
@@ -30,7 +30,7 @@ fn param3(channel: u32, i: u32) -> vec3<f32> {
 }
 
 fn put(channel: u32, i: u32, value: f32) {
-    gradients[channel * view.page + i] = value;
+    gradients[channel * stride(view.page) + i] = value;
 }
 
 fn put3(channel: u32, i: u32, value: vec3<f32>) {

@@ -1,5 +1,5 @@
-// Trained floats of a Gaussian. They are stored in pages, each as [channel][gaussian of the page], so that no binding
-// exceeds the adapter's limit. Mirrors `fastlgs_core::gaussians::BASE_CHANNELS`; SH coefficients of degree 1 and up
+// Trained floats of a Gaussian. They are stored in pages, each as [channel][gaussian of the page, padded to fours], so
+// that no binding exceeds the adapter's limit. Mirrors `fastlgs_core::gaussians::BASE_CHANNELS`; SH coefficients of degree 1 and up
 // follow, coefficient by coefficient.
 const MEAN: u32 = 0u;
 const LOG_SCALE: u32 = 3u;
@@ -8,3 +8,7 @@ const OPACITY: u32 = 10u;
 const COLOR: u32 = 11u;
 const FEATURE: u32 = 14u;
 const SH_REST: u32 = 17u;
+
+fn stride(page: u32) -> u32 {
+    return (page + 3u) & ~3u;
+}

@@ -5,7 +5,7 @@ use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, losses_of, planes, tile_bits};
 use crate::pass::{Channels, Pass, Recorder, Shader, shaders};
 use crate::profile::Profile;
-use crate::view::{Job, Perturb, Step, View};
+use crate::view::{Job, Perturb, Step, View, stride};
 use crate::{Error, Gpu, Result};
 use fastlgs_core::gaussians::channels as channels_of;
 use std::collections::{BTreeMap, HashMap};
@@ -400,9 +400,10 @@ impl GpuEngine {
         let channels = channels_of(g.sh_degree);
         let mut out = vec![0.0; channels * g.n];
         for page in &g.pages {
-            let values: Vec<f32> = self.gpu.read(what(page), channels * page.n)?;
+            let stride = stride(page.n);
+            let values: Vec<f32> = self.gpu.read(what(page), channels * stride)?;
             for c in 0..channels {
-                out[c * g.n + page.first..][..page.n].copy_from_slice(&values[c * page.n..(c + 1) * page.n]);
+                out[c * g.n + page.first..][..page.n].copy_from_slice(&values[c * stride..][..page.n]);
             }
         }
         Ok(out)
@@ -420,9 +421,10 @@ fn same_camera(a: &View, b: &View) -> bool {
     key(a) == key(b)
 }
 
-/// The Gaussians `first..first + n` of values `[channels][all]`.
+/// The Gaussians `first..first + n` of values `[channels][all]`, with the page's stride.
 fn page_of(values: &[f32], all: usize, first: usize, n: usize) -> Vec<f32> {
-    values.chunks_exact(all).flat_map(|channel| &channel[first..first + n]).copied().collect()
+    let padding = std::iter::repeat_n(0.0, stride(n) - n);
+    values.chunks_exact(all).flat_map(|channel| channel[first..first + n].iter().copied().chain(padding.clone())).collect()
 }
 
 impl Engine for GpuEngine {
@@ -445,7 +447,7 @@ impl Engine for GpuEngine {
             let size = ((gpu.max_binding / 4) as usize / channels / 64 * 64).max(64);
             let page = |first: usize| {
                 let length = size.min(n - first);
-                let values = |what: &str| storage(what, channels * length);
+                let values = |what: &str| storage(what, channels * stride(length));
                 Ok(Page {
                     first,
                     n: length,
@@ -553,9 +555,9 @@ impl Engine for GpuEngine {
             }
         }
         for page in &g.pages {
-            let step = Step { n: page.n as u32, ..*step };
+            let step = Step { quads: stride(page.n) as u32 / 4, ..*step };
             let buffers = [&page.gradients, &page.params, &page.moment1, &page.moment2];
-            r.run(&self.passes.adam, &step, &buffers, step.n.div_ceil(GROUP))?;
+            r.run(&self.passes.adam, &step, &buffers, step.quads.div_ceil(GROUP))?;
         }
         r.submit();
         self.last = Some((view, channels));

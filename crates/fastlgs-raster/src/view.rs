@@ -119,8 +119,8 @@ impl View {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Step {
-    /// Gaussians of the page.
-    pub n: u32,
+    /// Stride of the page's channels, in fours.
+    pub quads: u32,
     /// 1 - 0.9^t.
     pub correction1: f32,
     /// 1 - 0.999^t.
@@ -149,7 +149,7 @@ impl Step {
         all[..rates.len()].copy_from_slice(rates);
         let correction = |beta: f64| (1.0 - beta.powi(t as i32)) as f32;
         Self {
-            n: 0,
+            quads: 0,
             correction1: correction(0.9),
             correction2: correction(0.999),
             epsilon: 1e-15,
@@ -212,4 +212,9 @@ pub struct Job {
     pub first: u32,
     /// Padding.
     pub unused: u32,
+}
+
+/// Distance between the channels of a page of `n` Gaussians; `shaders/shared/channels.wgsl`.
+pub fn stride(n: usize) -> usize {
+    n.next_multiple_of(4)
 }

@@ -3,7 +3,7 @@ use fastlgs_core::gaussians::{BASE_CHANNELS, sigmoid};
 
 /// Twin of `shaders/adam.wgsl`.
 pub fn adam(step: &Step, gradients: &[f32], params: &mut [f32], moment1: &mut [f32], moment2: &mut [f32]) {
-    let n = step.n as usize;
+    let n = 4 * step.quads as usize;
     for channel in step.first_channel as usize..step.end_channel as usize {
         for k in channel * n..(channel + 1) * n {
             adam_one(step, channel, gradients[k], &mut params[k], &mut moment1[k], &mut moment2[k]);

@@ -1,12 +1,12 @@
 use super::covariance;
-use crate::view::Perturb;
+use crate::view::{Perturb, stride};
 use fastlgs_core::gaussians::sigmoid;
 use glam::{UVec3, Vec3};
 
 /// Twin of `shaders/perturb.wgsl`.
 pub fn perturb(job: &Perturb, params: &mut [f32]) {
-    let n = job.n as usize;
-    for i in 0..n {
+    let n = stride(job.n as usize);
+    for i in 0..job.n as usize {
         let offset = perturb_one(job, i as u32, |c| params[c * n + i]);
         (0..3).for_each(|k| params[k * n + i] += offset[k]);
     }

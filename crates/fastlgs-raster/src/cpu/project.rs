@@ -2,7 +2,7 @@ use super::footprint::{Footprint, span};
 use super::harmonics::basis;
 use super::{ALPHA_MAX, ALPHA_MIN, NEAR, Splat, covariance};
 use crate::View;
-use crate::view::TILE;
+use crate::view::{TILE, stride};
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, Vec2, Vec3};
 
@@ -24,7 +24,7 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
     for i in 0..page {
         let g = first + i;
         (depths[g], touched[g]) = (NOT_DRAWN, 0);
-        if let Some(p) = project_one(view, |c| params[c * page + i]) {
+        if let Some(p) = project_one(view, |c| params[c * stride(page) + i]) {
             (splats[g], depths[g], footprints[g], touched[g]) = (p.splat, p.depth, p.footprint, p.touched);
         }
     }

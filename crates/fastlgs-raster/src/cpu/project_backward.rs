@@ -2,6 +2,7 @@ use super::harmonics::{basis, basis_slopes};
 use super::{ALPHA_MAX, DILATION, Splat, covariance};
 use crate::View;
 use crate::pass::Channels;
+use crate::view::stride;
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, Vec2, Vec3, Vec4};
 
@@ -18,7 +19,7 @@ pub fn project_backward(
     gradients: &mut [f32],
     stats: &mut [f32],
 ) {
-    let page = view.page as usize;
+    let page = stride(view.page as usize);
     let floats = 4 * channels.slot();
     for &g in &order[..view.gaussians as usize] {
         let start = first_pair[g as usize];

@@ -1,0 +1,137 @@
+//! Whole frames and steps: GPU against CPU, pages and windows against one piece, passes as twins against all on the device.
+
+use super::{CHANNELS, assert_close, camera, cloud, gpu, target};
+use crate::density::State;
+use crate::{Channels, CpuEngine, Engine, Exposure, GpuEngine, StepOptions};
+use crate::{Step, View};
+use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
+
+fn options(channels: Channels) -> StepOptions {
+    let exposure = Exposure { gain: [1.1, 0.9, 1.0], offset: [0.02, 0.0, -0.03] };
+    StepOptions { channels, lambda: 0.2, feature_weight: 0.7, exposure }
+}
+
+/// Frame and gradients of one step with learning rates of zero.
+fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, size: (u32, u32)) -> (Vec<f32>, Vec<f32>, crate::Losses) {
+    engine.set_state(state).unwrap();
+    engine.set_target(0, &target(size.0, size.1)).unwrap();
+    let frame = engine.render(view, channels).unwrap();
+    let all = 0..channels_of(state.sh_degree);
+    engine.step(view, 0, &options(channels), &Step::new(1, all, &[0.0; BASE_CHANNELS + 1])).unwrap();
+    let n = (size.0 * size.1) as usize;
+    let shown = if channels.color() { 0..3 * n } else { 3 * n..6 * n };
+    (frame.data[shown].to_vec(), engine.gradients().unwrap(), engine.losses().unwrap())
+}
+
+#[test]
+fn gpu_and_cpu_agree() {
+    let Some(gpu) = gpu() else { return };
+    let mut device = GpuEngine::new(gpu);
+    let mut cpu = CpuEngine::new();
+    let cases = [(1, 17, 13, 0), (2000, 96, 64, 3), (20_000, 270, 480, 1), (200_000, 1440, 1080, 0)];
+    for (k, (n, w, h, degree)) in cases.into_iter().enumerate() {
+        let scene = cloud(n, 21, degree, true);
+        let state = State::of(&scene);
+        let view = View {
+            antialias: k as u32 % 2,
+            background_color: [0.1, 0.2, 0.3, 0.0],
+            background_feature: [0.3, 0.2, 0.1, 0.0],
+            ..View::new(&camera(w, h), scene.len(), degree)
+        };
+        for channels in CHANNELS.into_iter().take(if n > 100_000 { 1 } else { 4 }) {
+            let what = format!("{n} Gaussians at {w}x{h}, {channels:?}");
+            let a = once(&mut device, view, channels, &state, (w, h));
+            let b = once(&mut cpu, view, channels, &state, (w, h));
+            assert_close(&format!("frame, {what}"), &a.0, &b.0, 2e-3, 0.002);
+            for c in 0..channels_of(degree) {
+                let range = c * scene.len()..(c + 1) * scene.len();
+                assert_close(&format!("gradient of channel {c}, {what}"), &a.1[range.clone()], &b.1[range], 0.03, 0.02);
+            }
+            let near = |a: f64, b: f64| assert!((a - b).abs() <= 1e-4 + 2e-3 * b.abs(), "{what}: {a} against {b}");
+            near(a.2.color_l1, b.2.color_l1);
+            near(a.2.color_ssim, b.2.color_ssim);
+            near(a.2.feature_l1, b.2.feature_l1);
+            (0..3).for_each(|c| near(a.2.by_gain[c], b.2.by_gain[c]));
+            (0..6).for_each(|c| near(a.2.by_background[c], b.2.by_background[c]));
+        }
+    }
+}
+
+#[test]
+fn many_bindings_give_what_one_gives() {
+    let (Some(whole), Some(mut small)) = (gpu(), gpu()) else { return };
+    let scene = cloud(12_000, 5, 1, true);
+    let state = State::of(&scene);
+    let view = View::new(&camera(96, 64), scene.len(), 1);
+    // Pages of 64 Gaussians' values would be 26 x 64 x 4 bytes; the splats need 48 bytes each in one piece.
+    small.max_binding = 48 * scene.len() as u64 + 16;
+    assert!(u64::from(26 * scene.len() as u32 * 4) > small.max_binding / 2, "several pages");
+    let (mut whole, mut small) = (GpuEngine::new(whole), GpuEngine::new(small));
+    for channels in CHANNELS {
+        let a = once(&mut whole, view, channels, &state, (96, 64));
+        let b = once(&mut small, view, channels, &state, (96, 64));
+        assert_eq!(a.0, b.0, "{channels:?}");
+        assert_eq!(a.1, b.1, "{channels:?}");
+    }
+    // Half of that does not hold the splats: said, not drawn wrong.
+    let mut tiny = super::gpu().unwrap();
+    tiny.max_binding = 24 * scene.len() as u64;
+    let message = GpuEngine::new(tiny).set_state(&state).unwrap_err().to_string();
+    assert!(message.contains("lower --size or --budget"), "{message}");
+}
+
+#[test]
+fn any_number_of_first_passes_may_run_as_twins() {
+    let Some(gpu) = gpu() else { return };
+    let mut engine = GpuEngine::new(gpu);
+    let scene = cloud(300, 6, 1, false);
+    let state = State::of(&scene);
+    let view = View::new(&camera(40, 30), scene.len(), 1);
+    let reference = once(&mut engine, view, Channels::Both, &state, (40, 30));
+    for passes in [1, 14, 30, 34, 40, 58, 1000] {
+        engine.passes_on_cpu = passes;
+        let mixed = once(&mut engine, view, Channels::Both, &state, (40, 30));
+        assert_close(&format!("frame, {passes} passes"), &mixed.0, &reference.0, 2e-3, 0.002);
+        assert_close(&format!("gradients, {passes} passes"), &mixed.1, &reference.1, 0.03, 0.01);
+    }
+}
+
+#[test]
+fn frozen_geometry_keeps_its_lists_and_learns_features() {
+    let Some(gpu) = gpu() else { return };
+    let engines: [Box<dyn Engine>; 2] = [Box::new(GpuEngine::new(gpu)), Box::new(CpuEngine::new())];
+    for mut engine in engines {
+        let scene = cloud(2000, 7, 0, false);
+        let state = State::of(&scene);
+        engine.set_state(&state).unwrap();
+        engine.set_target(0, &target(96, 64)).unwrap();
+        let view = View::new(&camera(96, 64), scene.len(), 0);
+        let mut errors = Vec::new();
+        for t in 1..=20 {
+            let step = Step::new(t, 14..BASE_CHANNELS, &[0.02; BASE_CHANNELS + 1]);
+            engine.step(view, 0, &options(Channels::Feature), &step).unwrap();
+            errors.push(engine.losses().unwrap().feature_l1);
+        }
+        assert!(errors[19] < 0.9 * errors[0], "{}: {errors:?}", engine.name());
+        let after = engine.state().unwrap().params;
+        assert_eq!(after[..14 * 2000], state.params[..14 * 2000], "geometry and colour stay");
+    }
+}
+
+#[test]
+fn the_gpu_repeats_itself_to_the_byte() {
+    let Some(_) = gpu() else { return };
+    let scene = cloud(2000, 21, 2, false);
+    let run = || {
+        let mut engine = GpuEngine::new(gpu().unwrap());
+        engine.set_state(&State::of(&scene)).unwrap();
+        engine.set_target(0, &target(96, 64)).unwrap();
+        for t in 1..=5 {
+            let step = Step::new(t, 0..channels_of(2), &[1e-3; BASE_CHANNELS + 1]);
+            engine.step(View::new(&camera(96, 64), 2000, 2), 0, &options(Channels::Coupled), &step).unwrap();
+            engine.perturb(t, 0.01).unwrap();
+        }
+        engine.state().unwrap().params.iter().map(|v| v.to_bits()).collect::<Vec<_>>()
+    };
+    assert_eq!(run(), run());
+}

@@ -1,0 +1,83 @@
+//! Every pass against its CPU twin on a real adapter, both engines against each other, and gradients against differences.
+
+mod engines;
+mod gradients;
+mod passes;
+mod training;
+
+use crate::{Channels, Gpu, TargetImage, pack};
+use fastlgs_core::rng::Rng;
+use fastlgs_core::{Camera, Gaussians};
+use glam::Vec3;
+
+/// The adapter, or a loud skip. FASTLGS_REQUIRE_GPU=1 turns the skip into a failure (set by test.sh).
+fn gpu() -> Option<Gpu> {
+    match Gpu::open("auto") {
+        Ok(gpu) => Some(gpu),
+        Err(e) if std::env::var_os("FASTLGS_REQUIRE_GPU").is_some() => panic!("{e}"),
+        Err(e) => {
+            eprintln!("SKIPPED: {e}");
+            None
+        }
+    }
+}
+
+fn camera(width: u32, height: u32) -> Camera {
+    Camera::look_at("test", Vec3::new(0.3, 0.5, -4.0), Vec3::ZERO, Vec3::Y, width, height, 0.9)
+}
+
+/// A cloud around the origin; `nasty` adds Gaussians that must not be drawn or are hard to draw.
+fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussians {
+    let mut rng = Rng::new(seed, "cloud");
+    // The more there are, the smaller they are, as in trained scenes.
+    let shrink = (n as f32 / 20_000.0).max(1.0).ln();
+    let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
+    for i in 0..n {
+        let mean = Vec3::new(rng.normal(), rng.normal(), rng.normal());
+        scene.push_sphere(mean, 0.05, rng.range(0.05, 0.95), [rng.uniform(), rng.uniform(), rng.uniform()]);
+        scene.log_scales[i] = Vec3::new(rng.range(-4.0, -1.5), rng.range(-4.0, -1.5), rng.range(-4.0, -1.5)) - shrink;
+        scene.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
+        scene.features[i] = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
+    }
+    scene.sh_rest.iter_mut().for_each(|v| *v = 0.1 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+    if nasty {
+        let at = |x: f32| Vec3::new(x, 0.0, 0.0);
+        scene.push_sphere(Vec3::new(0.0, 0.0, -9.0), 0.1, 0.5, [1.0; 3]); // behind the camera
+        scene.push_sphere(at(f32::NAN), 0.1, 0.5, [1.0; 3]);
+        scene.push_sphere(at(0.1), 1e-8, 0.9, [1.0, 0.0, 0.0]);
+        scene.push_sphere(at(0.2), 50.0, 0.1, [0.0, 1.0, 0.0]);
+        scene.push_sphere(at(0.25), 1e30, 0.1, [0.0, 1.0, 0.0]); // a covariance that is not finite
+        scene.push_sphere(at(0.3), 0.1, 0.5, [0.0, 0.0, 1.0]);
+        scene.push_sphere(at(0.3), 0.1, 0.5, [1.0, 0.0, 1.0]); // the same depth
+        *scene.opacity_logits.last_mut().unwrap() = 40.0; // opacity 1
+        scene.push_sphere(at(0.4), 0.1, 0.5, [1.0; 3]);
+        *scene.opacity_logits.last_mut().unwrap() = -40.0; // opacity 0
+        scene.push_sphere(at(0.5), 0.1, 0.5, [1.0; 3]);
+        *scene.rotations.last_mut().unwrap() = [0.0; 4]; // no rotation at all
+    }
+    scene
+}
+
+/// A wavy picture; every 31st pixel does not count.
+fn target(width: u32, height: u32) -> TargetImage {
+    let wave = |i: u32, c: u32| (127.0 + 100.0 * ((i + 977 * c) as f32 * 0.013).sin()) as u8;
+    let plane = |from: u32| (0..width * height).map(|i| pack([wave(i, from), wave(i, from + 1), wave(i, from + 2)], i % 31 != 0)).collect();
+    TargetImage { size: [width, height], color: plane(0), feature: plane(3) }
+}
+
+const CHANNELS: [Channels; 4] = [Channels::Color, Channels::Feature, Channels::Both, Channels::Coupled];
+
+fn floats(words: &[u32]) -> &[f32] {
+    bytemuck::cast_slice(words)
+}
+
+/// Tight agreement but for a bounded share of values, which flip where a Gaussian crosses a cut-off.
+fn assert_close(what: &str, a: &[f32], b: &[f32], tolerance: f32, flips: f64) {
+    assert_eq!(a.len(), b.len(), "{what}: lengths");
+    let scale = b.iter().filter(|v| v.is_finite()).fold(0.0f32, |m, v| m.max(v.abs())).max(1e-6);
+    let agree = |a: f32, b: f32| (a - b).abs() <= tolerance * (scale * 0.01 + b.abs()) || (a.is_nan() && b.is_nan());
+    let off = a.iter().zip(b).filter(|(a, b)| !agree(**a, **b)).count();
+    let worst = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0f32, f32::max);
+    let share = off as f64 / a.len().max(1) as f64;
+    assert!(share <= flips, "{what}: {off} of {} values differ (worst {worst}, scale {scale})", a.len());
+}

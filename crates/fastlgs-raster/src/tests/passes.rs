@@ -1,0 +1,294 @@
+//! Each WGSL pass against its twin, on the twins' own inputs.
+
+use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
+use crate::cpu::{self, CHUNKS};
+use crate::gpu::Shape;
+use crate::pass::{Pass, Shader, shaders};
+use crate::view::{Job, Perturb, Plane, Step, View, stride};
+use crate::{Channels, Gpu};
+use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
+use fastlgs_core::rng::Rng;
+use std::collections::BTreeMap;
+
+/// Gaussians, width, height: from one to two hundred thousand, in pictures with empty and with crowded tiles.
+const SIZES: [(usize, u32, u32); 5] = [(1, 17, 13), (300, 64, 48), (5000, 97, 61), (20_000, 270, 480), (200_000, 480, 360)];
+
+/// Runs one pass on the device; `buffers` hold the storage buffers in the order of their bindings and are replaced.
+fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mut [Vec<u32>], groups: u32) {
+    let uniform = gpu.uniform(uniform);
+    let storages: Vec<_> = buffers.iter().map(|b| gpu.storage_with("test", b).unwrap()).collect();
+    let all: Vec<_> = std::iter::once(&uniform).chain(&storages).collect();
+    let mut encoder = gpu.encoder();
+    pass.record(gpu, &mut encoder, &all, groups);
+    gpu.submit(encoder);
+    for (buffer, storage) in buffers.iter_mut().zip(&storages) {
+        *buffer = gpu.read(storage, buffer.len()).unwrap();
+    }
+}
+
+/// Both results of a pass on the same buffers: the device's, then the twin's.
+fn both<U: bytemuck::Pod>(
+    gpu: &Gpu,
+    shader: &Shader,
+    channels: Channels,
+    harmonics: bool,
+    uniform: &U,
+    buffers: &[&[u32]],
+    groups: u32,
+) -> [Vec<Vec<u32>>; 2] {
+    let mut device: Vec<Vec<u32>> = buffers.iter().map(|b| b.to_vec()).collect();
+    let mut twin = device.clone();
+    on_device(gpu, &Pass::new(gpu, shader, channels, harmonics), uniform, &mut device, groups);
+    cpu::run(shader.name, channels, bytemuck::bytes_of(uniform), &mut twin);
+    [device, twin]
+}
+
+/// One page with the kernels' stride, as words.
+fn page(params: &[f32], n: usize) -> Vec<u32> {
+    let padding = std::iter::repeat_n(0.0f32, stride(n) - n);
+    params.chunks_exact(n).flat_map(|c| c.iter().copied().chain(padding.clone())).map(f32::to_bits).collect()
+}
+
+fn zeros(n: usize) -> Vec<u32> {
+    vec![0; n]
+}
+
+/// Everything up to blending, by the twins.
+struct Lists {
+    view: View,
+    params: Vec<u32>,
+    buffers: BTreeMap<&'static str, Vec<u32>>,
+}
+
+/// Runs a twin on named buffers.
+fn twin<U: bytemuck::Pod>(all: &mut BTreeMap<&'static str, Vec<u32>>, name: &str, uniform: &U, names: &[&'static str]) {
+    let mut buffers: Vec<_> = names.iter().map(|n| std::mem::take(all.get_mut(n).unwrap_or_else(|| panic!("{n}")))).collect();
+    cpu::run(name, Channels::Both, bytemuck::bytes_of(uniform), &mut buffers);
+    for (name, buffer) in names.iter().zip(buffers) {
+        all.insert(name, buffer);
+    }
+}
+
+/// Stable sort of `keys`; the former places go to `values`.
+fn sort_twin(all: &mut BTreeMap<&'static str, Vec<u32>>, keys: &'static str, values: &'static str) {
+    let list = &all[keys];
+    let mut order: Vec<u32> = (0..list.len() as u32).collect();
+    order.sort_by_key(|&i| list[i as usize]);
+    let sorted = order.iter().map(|&i| list[i as usize]).collect();
+    all.insert(keys, sorted);
+    all.insert(values, order);
+}
+
+fn lists(n: usize, w: u32, h: u32, sh_degree: u32, antialias: bool) -> Lists {
+    let scene = cloud(n, 9, sh_degree, true);
+    let n = scene.len();
+    let mut view = View::new(&camera(w, h), n, sh_degree);
+    view.background_color = [0.2, 0.4, 0.6, 0.0];
+    view.antialias = u32::from(antialias);
+    let params = page(&scene.to_channels(), n);
+    let mut b: BTreeMap<&'static str, Vec<u32>> = BTreeMap::new();
+    b.insert("params", params.clone());
+    for (name, words) in [("splats", 12), ("keys", 1), ("footprints", 8), ("touched", 1), ("offsets", 1), ("first", 1)] {
+        b.insert(name, zeros(words * n));
+    }
+    twin(&mut b, "project", &view, &["params", "splats", "keys", "footprints", "touched"]);
+    sort_twin(&mut b, "keys", "order");
+    twin(&mut b, "gather_counts", &view, &["order", "touched", "offsets"]);
+    b.insert("totals", zeros(CHUNKS + 1));
+    let job = Job { n: n as u32, shift: 0, first: 0, unused: 0 };
+    twin(&mut b, "scan_chunks", &job, &["offsets", "totals"]);
+    twin(&mut b, "scan_apply", &job, &["offsets", "totals"]);
+    view.pairs = b["totals"][CHUNKS];
+    b.insert("tiles", zeros(view.pairs as usize));
+    b.insert("gaussians", zeros(view.pairs as usize));
+    twin(&mut b, "emit", &view, &["order", "offsets", "footprints", "touched", "tiles", "gaussians", "first"]);
+    sort_twin(&mut b, "tiles", "sorted");
+    b.insert("ranges", zeros(2 * view.tile_count() as usize));
+    b.insert("loads", zeros(view.tile_count() as usize));
+    twin(&mut b, "tile_ranges", &view, &["tiles", "ranges"]);
+    twin(&mut b, "tile_load", &view, &["ranges", "loads"]);
+    sort_twin(&mut b, "loads", "tile_order");
+    Lists { view, params, buffers: b }
+}
+
+#[test]
+fn project() {
+    let Some(gpu) = gpu() else { return };
+    for (seed, (n, w, h)) in SIZES.into_iter().enumerate() {
+        let sh_degree = seed as u32 % 4;
+        let scene = cloud(n, seed as u64, sh_degree, true);
+        let n = scene.len();
+        let view = View { antialias: seed as u32 % 2, ..View::new(&camera(w, h), n, sh_degree) };
+        let params = page(&scene.to_channels(), n);
+        let blank = zeros(12 * n);
+        let buffers = [&params[..], &blank, &blank[..n], &blank[..8 * n], &blank[..n]];
+        let [device, twin] = both(&gpu, &shaders::PROJECT, Channels::Both, sh_degree > 0, &view, &buffers, (n as u32).div_ceil(64));
+        let flips = device[4].iter().zip(&twin[4]).filter(|(a, b)| a != b).count();
+        assert!(flips as f64 <= 0.002 * n as f64, "{flips} of {n} tile counts differ");
+        assert!(device[4].iter().any(|t| *t > 0));
+        let drawn: Vec<usize> = (0..n).filter(|&i| device[4][i] > 0 && twin[4][i] > 0).collect();
+        let pick = |words: &[u32]| drawn.iter().flat_map(|&i| floats(&words[12 * i..12 * i + 12]).to_vec()).collect::<Vec<_>>();
+        assert_close("splats", &pick(&device[1]), &pick(&twin[1]), 2e-3, 0.002);
+        let depth_flips = device[2].iter().zip(&twin[2]).filter(|(a, b)| a.abs_diff(**b) > 1).count();
+        assert!(depth_flips <= flips, "{depth_flips} depth keys differ");
+    }
+}
+
+#[test]
+fn sorting_and_scanning() {
+    let Some(gpu) = gpu() else { return };
+    let mut rng = Rng::new(3, "sort");
+    for n in [1usize, 255, 256, 257, 100_003] {
+        let keys: Vec<u32> = (0..n).map(|_| rng.next_u64() as u32 & 0xffff).collect();
+        let values: Vec<u32> = (0..n as u32).rev().collect();
+        let job = Job { n: n as u32, shift: 8, first: 0, unused: 0 };
+        let exact = |shader: &Shader, job: &Job, buffers: &[&[u32]]| {
+            let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, 4);
+            assert_eq!(device, twin, "{} of {n}", shader.name);
+            device
+        };
+        let histogram = exact(&shaders::RADIX_COUNT, &job, &[&keys, &vec![7; 256 * CHUNKS]]).remove(1);
+        let scan = Job { n: histogram.len() as u32, ..job };
+        let totals = exact(&shaders::SCAN_CHUNKS, &scan, &[&histogram, &zeros(CHUNKS + 1)]).remove(1);
+        let scanned = exact(&shaders::SCAN_APPLY, &scan, &[&histogram, &totals]);
+        assert_eq!(scanned[1][CHUNKS] as usize, n);
+        let sorted = exact(&shaders::RADIX_SCATTER, &job, &[&keys, &values, &scanned[0], &zeros(n), &zeros(n)]);
+        assert!(sorted[3].windows(2).all(|p| p[0] >> 8 <= p[1] >> 8));
+        // Ties keep their order, which here is that of falling values.
+        assert!((1..n).all(|i| sorted[3][i - 1] >> 8 != sorted[3][i] >> 8 || sorted[4][i - 1] > sorted[4][i]));
+        // Sums beyond 32 bits stay at the largest value instead of starting anew.
+        let huge = vec![u32::MAX / 2; 3 * CHUNKS];
+        let job = Job { n: huge.len() as u32, ..job };
+        let totals = exact(&shaders::SCAN_CHUNKS, &job, &[&huge, &zeros(CHUNKS + 1)]).remove(1);
+        assert_eq!(exact(&shaders::SCAN_APPLY, &job, &[&huge, &totals])[1][CHUNKS], u32::MAX);
+    }
+}
+
+#[test]
+fn listing() {
+    let Some(gpu) = gpu() else { return };
+    for (n, w, h) in SIZES {
+        let l = lists(n, w, h, 0, false);
+        let b = |name: &str| &l.buffers[name][..];
+        let exact = |shader: &Shader, buffers: &[&[u32]], items: u32| {
+            let [device, twin] = both(&gpu, shader, Channels::Both, false, &l.view, buffers, items.div_ceil(64));
+            assert_eq!(device, twin, "{} of {n}", shader.name);
+        };
+        exact(&shaders::GATHER_COUNTS, &[b("order"), b("touched"), b("offsets")], l.view.gaussians);
+        let (pairs, blank) = (l.view.pairs as usize, zeros((l.view.pairs + l.view.gaussians) as usize));
+        let inputs = [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
+        exact(&shaders::EMIT, &inputs, l.view.gaussians);
+        exact(&shaders::TILE_RANGES, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
+        // log2 may differ in its last bit, and with it the key by one.
+        let [device, twin] =
+            both(&gpu, &shaders::TILE_LOAD, Channels::Both, false, &l.view, &[b("ranges"), b("loads")], l.view.tile_count().div_ceil(64));
+        assert!(device[1].iter().zip(&twin[1]).all(|(a, b)| a.abs_diff(*b) <= 1));
+    }
+}
+
+#[test]
+fn blending_and_its_gradients() {
+    let Some(mut gpu) = gpu() else { return };
+    let subgroups = gpu.device.features().contains(wgpu::Features::SUBGROUP);
+    let shapes = [Shape::Wide, Shape::Shared, Shape::Subgroups];
+    for (k, (n, w, h)) in SIZES.into_iter().enumerate() {
+        let sh_degree = k as u32 % 4;
+        let l = lists(n, w, h, sh_degree, k % 2 == 1);
+        let view = l.view;
+        let b = |name: &str| &l.buffers[name][..];
+        // The largest size once, the others in all shapes and for all that can be trained.
+        let choices = shapes.iter().flat_map(|s| CHANNELS.iter().map(move |c| (*s, *c)));
+        for (shape, channels) in choices.filter(|(s, _)| subgroups || *s != Shape::Subgroups).take(if n > 100_000 { 1 } else { 12 }) {
+            gpu.shape = shape;
+            let what = format!("{n} Gaussians, {shape:?}, {channels:?}");
+            let groups = shape.groups(view.tile_count());
+            let listed = [b("ranges"), b("tile_order"), b("sorted"), b("gaussians"), b("splats")];
+            let pixels = view.padded_pixels();
+            let frame = zeros(8 * pixels);
+            let [device, twin] = both(&gpu, &shaders::BLEND, channels, false, &view, &[&listed[..], &[&frame]].concat(), groups);
+            let [seen, expected] = [&device, &twin].map(|all| &floats(&all[5])[..7 * pixels]);
+            if shape == Shape::Wide {
+                assert_close(&format!("frame, {what}"), seen, expected, 1e-3, 0.001);
+            } else {
+                // Blocks that are finished before their tile leave out no more than passes through them then.
+                let left_out = seen.iter().zip(expected).filter(|(a, b)| (*a - *b).abs() > 2.0 * cpu::TRANSMITTANCE_MIN).count();
+                assert!(left_out * 1000 <= seen.len(), "frame, {what}: {left_out} values differ");
+            }
+            let frame = &twin[5];
+
+            let mut rng = Rng::new(2, "gradient");
+            let gradient: Vec<u32> = (0..6 * pixels).map(|_| rng.normal().to_bits()).collect();
+            let slots = vec![9.0f32.to_bits(); 4 * channels.slot() * view.pairs as usize];
+            let buffers = [&listed[..], &[frame, &gradient, &slots]].concat();
+            let [device, twin] = both(&gpu, &shaders::BLEND_BACKWARD, channels, false, &view, &buffers, groups);
+            assert_close(&format!("slots, {what}"), floats(&device[7]), floats(&twin[7]), 0.02, 0.005);
+
+            let count = view.gaussians as usize;
+            let (gradients, stats) = (zeros(l.params.len()), zeros(2 * count));
+            let buffers = [&l.params[..], b("splats"), b("order"), b("touched"), b("first"), &twin[7], &gradients, &stats];
+            let groups = view.gaussians.div_ceil(64);
+            let [device, twin] = both(&gpu, &shaders::PROJECT_BACKWARD, channels, sh_degree > 0, &view, &buffers, groups);
+            for c in 0..channels_of(sh_degree) {
+                let range = c * stride(count)..(c + 1) * stride(count);
+                let [device, twin] = [&device, &twin].map(|all| &floats(&all[6])[range.clone()]);
+                assert_close(&format!("gradient of channel {c}, {what}"), device, twin, 0.02, 0.005);
+            }
+            assert_close(&format!("stats, {what}"), floats(&device[7]), floats(&twin[7]), 0.02, 0.005);
+        }
+    }
+}
+
+#[test]
+fn loss() {
+    let Some(gpu) = gpu() else { return };
+    for (w, h) in [(17u32, 13u32), (64, 50), (131, 77), (1440, 1080)] {
+        let view = View::new(&camera(w, h), 1, 0);
+        let n = view.padded_pixels();
+        let mut rng = Rng::new(4, "loss");
+        let frame: Vec<u32> = (0..8 * n).map(|_| rng.uniform().to_bits()).collect();
+        let targets: Vec<u32> = (0..2 * n).map(|i| rng.next_u64() as u32 | if i % 31 == 0 { 0 } else { 0x8000_0000 }).collect();
+        let (quads, rows) = (2 * view.tiles[0], 8 * view.tiles[1]);
+        let plane =
+            Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
+        let (row_groups, column_groups) = ((quads / 2 * rows).div_ceil(64), (rows / 8 * quads).div_ceil(64));
+        let sums = zeros(24 * (rows / 8 * quads * 4) as usize);
+        let run = |shader: &Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
+            let [device, twin] = both(&gpu, shader, Channels::Both, false, &plane, buffers, groups);
+            for (k, tolerance) in tolerances {
+                assert_close(&format!("{} {k} at {w}x{h}", shader.name), floats(&device[*k]), floats(&twin[*k]), *tolerance, 0.0);
+            }
+            twin
+        };
+        let blurred = run(&shaders::SSIM_ROWS, &[&frame, &targets, &zeros(5 * n)], row_groups, &[(2, 1e-4)]);
+        let ssim = run(&shaders::SSIM_COLUMNS, &[&blurred[2], &zeros(3 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
+        let back = run(&shaders::SSIM_BACKWARD_ROWS, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
+        run(&shaders::LOSS_GRADIENT, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
+    }
+}
+
+#[test]
+fn adam_and_perturb() {
+    let Some(gpu) = gpu() else { return };
+    for (n, degree) in [(1usize, 0u32), (1001, 3)] {
+        let mut rng = Rng::new(4, "adam");
+        let words = channels_of(degree) * stride(n);
+        let mut random = |scale: f32| (0..words).map(|_| (scale * rng.normal()).to_bits()).collect::<Vec<u32>>();
+        let (gradients, params, m1) = (random(1.0), random(1.0), random(1.0));
+        let m2: Vec<u32> = random(1.0).iter().map(|v| (f32::from_bits(*v).powi(2)).to_bits()).collect();
+        let rates: [f32; BASE_CHANNELS + 1] = std::array::from_fn(|c| 0.01 * (c + 1) as f32);
+        let step = Step {
+            quads: stride(n) as u32 / 4,
+            opacity_weight: 0.3,
+            scale_weight: 0.2,
+            ..Step::new(7, 3..channels_of(degree), &rates)
+        };
+        let [device, twin] = both(&gpu, &shaders::ADAM, Channels::Both, false, &step, &[&gradients, &params, &m1, &m2], step.quads.div_ceil(64));
+        for k in 1..4 {
+            assert_close("adam", floats(&device[k]), floats(&twin[k]), 1e-3, 0.0);
+        }
+        assert_eq!(device[1][..3 * stride(n)], params[..3 * stride(n)], "channels that are not trained stay");
+        let job = Perturb { n: n as u32, first: 77, seed: 5, amount: 0.1 };
+        let [device, twin] = both(&gpu, &shaders::PERTURB, Channels::Both, false, &job, &[&params], (n as u32).div_ceil(64));
+        assert_close("perturb", floats(&device[0]), floats(&twin[0]), 1e-3, 0.0);
+    }
+}

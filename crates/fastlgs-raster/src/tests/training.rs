@@ -1,0 +1,104 @@
+//! Whole runs: resumed ones, all strategies, and what is learned beside the Gaussians.
+
+use super::{camera, cloud, gpu, target};
+use crate::{Budget, CpuEngine, Engine, Gpu, GpuEngine, Strategy, Target, TrainConfig, TrainReport, Trainer};
+use fastlgs_core::Camera;
+use glam::Vec3;
+
+fn views(count: usize) -> Vec<Target> {
+    let around = |k: usize| {
+        let angle = k as f32 * 0.3;
+        Camera::look_at(&format!("v{k}"), 4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
+    };
+    (0..count).map(|k| Target { camera: around(k), image: target(64, 48) }).collect()
+}
+
+fn trainer(engine: Box<dyn Engine>, config: TrainConfig) -> Trainer {
+    Trainer::new(engine, &cloud(200, 8, 0, false), views(24), config).unwrap()
+}
+
+fn run(config: TrainConfig) -> (Trainer, TrainReport) {
+    let mut trainer = trainer(Box::new(CpuEngine::new()), config);
+    let report = trainer.run(None, |_, _| Ok(())).unwrap();
+    (trainer, report)
+}
+
+#[test]
+fn resumes_to_the_same_bytes() {
+    let Some(_) = gpu() else { return };
+    for strategy in [Strategy::Classic, Strategy::Mcmc] {
+        let dir = tempfile::tempdir().unwrap();
+        let config = TrainConfig {
+            iterations: 600,
+            budget: Budget::Auto(400),
+            strategy,
+            sh_degree: 1,
+            exposure: true,
+            learn_background: true,
+            ..TrainConfig::default()
+        };
+        let start = || trainer(Box::new(GpuEngine::new(Gpu::open("auto").unwrap())), config.clone());
+        let bytes = |trainer: &Trainer, name: &str| {
+            let path = dir.path().join(name);
+            fastlgs_core::ply::write(&path, &trainer.gaussians().unwrap()).unwrap();
+            std::fs::read(path).unwrap()
+        };
+        let checkpoint = dir.path().join("train");
+        let mut whole = start();
+        whole.run(Some(&checkpoint), |_, _| Ok(())).unwrap();
+        let mut again = start();
+        again.run(None, |_, _| Ok(())).unwrap();
+        assert_eq!(bytes(&whole, "a.ply"), bytes(&again, "b.ply"), "{strategy:?}: twice in a row");
+        let mut resumed = start();
+        assert!(resumed.resume(&checkpoint).unwrap(), "a checkpoint was left at step 500");
+        let report = resumed.run(None, |_, _| Ok(())).unwrap();
+        assert_eq!(report.steps_here, 100);
+        assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "{strategy:?}: resumed");
+        assert_eq!(whole.exposures(), resumed.exposures());
+        let other = TrainConfig { lambda: 0.3, ..config };
+        let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
+        assert!(message.contains("other options"), "{message}");
+    }
+}
+
+#[test]
+fn strategies_keep_the_budget() {
+    let config = TrainConfig { iterations: 800, budget: Budget::Fixed(300), ..TrainConfig::default() };
+    for strategy in [Strategy::Classic, Strategy::Mcmc] {
+        let (_, report) = run(TrainConfig { strategy, ..config.clone() });
+        assert!(report.gaussians <= 300 && report.gaussians > 200, "{strategy:?}: {}", report.gaussians);
+        assert!(report.removals.is_empty());
+    }
+}
+
+#[test]
+fn an_automatic_budget_removes_what_nobody_sees() {
+    let (_, report) = run(TrainConfig { iterations: 800, budget: Budget::Auto(1000), ..TrainConfig::default() });
+    assert_eq!(report.removals.len(), 2);
+    assert!(report.removals.iter().all(|r| r.after <= r.before));
+    assert_eq!(report.gaussians, report.removals[1].after);
+}
+
+#[test]
+fn exposure_and_background_are_learned() {
+    // Photos of a constant grey that nothing but background and exposure can explain: no Gaussian is in sight.
+    let mut targets = views(2);
+    let gray = |v: u8| vec![crate::pack([v; 3], true); 64 * 48];
+    (targets[0].image.color, targets[1].image.color) = (gray(100), gray(110));
+    let mut scene = cloud(1, 1, 0, false);
+    scene.means[0] = Vec3::new(0.0, 500.0, 0.0);
+    let config = TrainConfig { iterations: 600, exposure: true, learn_background: true, background: [0.5; 3], ..TrainConfig::default() };
+    let config = TrainConfig { refine_until: 0.0, ..config };
+    let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &scene, targets, config).unwrap();
+    let report = trainer.run(None, |_, _| Ok(())).unwrap();
+    let seen = |k: usize| trainer.exposures()[k].gain[0] * report.background[0] + trainer.exposures()[k].offset[0];
+    assert!((seen(0) - 100.0 / 255.0).abs() < 0.01 && (seen(1) - 110.0 / 255.0).abs() < 0.01, "{} {}", seen(0), seen(1));
+}
+
+#[test]
+fn nothing_to_train_is_said() {
+    let engine = Box::new(CpuEngine::new());
+    let message = Trainer::new(engine, &cloud(5, 1, 0, false), Vec::new(), TrainConfig::default()).err().unwrap().to_string();
+    assert!(message.contains("no training views"), "{message}");
+    assert!(camera(4, 4).check().is_ok());
+}
