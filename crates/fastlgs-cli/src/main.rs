@@ -32,6 +32,8 @@ enum Command {
     Eval(commands::eval::Args),
     /// Measures speed.
     Bench(commands::bench::Args),
+    /// Writes a trained scene as PLY or SPZ, or as a small folder for queries.
+    Export(commands::export::Args),
     /// Makes a scene with exact poses, depths and masks.
     Synth(commands::synth::Args),
     /// Lists or installs encoders.
@@ -62,6 +64,7 @@ fn main() -> ExitCode {
         Command::Query(args) => commands::query::run(&args, &common),
         Command::Eval(args) => commands::eval::run(&args, &common),
         Command::Bench(args) => commands::bench::run(&args, &common),
+        Command::Export(args) => commands::export::run(&args, &common),
         Command::Synth(args) => commands::synth::run(&args, &common),
         Command::Models(args) => commands::models::run(&args, &common),
         Command::Info(args) => commands::info::run(&args, &common),

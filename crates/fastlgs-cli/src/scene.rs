@@ -29,7 +29,10 @@ impl Scene {
     /// Loads SCENE and puts it on the device.
     pub fn open(root: &Path, device: &str) -> Result<Self> {
         let folder = SceneFolder::open(root)?;
-        let gaussians = folder.gaussians()?;
+        let mut gaussians = folder.gaussians()?;
+        if folder.is_compressed() {
+            Grid::load(&folder).context("the object grid cannot be read; export the scene again")?.set_codes(&mut gaussians);
+        }
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
         Ok(Self { manifest: folder.manifest()?, cameras: folder.cameras()?, folder, gaussians, engine })
@@ -88,6 +91,13 @@ impl Scene {
         let canonical = embeddings.split_off(1);
         Ok(TextQuery { text: embeddings.remove(0), canonical })
     }
+}
+
+/// Bytes of everything that a query needs.
+pub fn bytes(root: &Path) -> u64 {
+    let model = if root.join("scene.ply").is_file() { ["scene.ply", ""] } else { ["scene.spz", "object_ids.bin"] };
+    let files = model.into_iter().filter(|f| !f.is_empty()).chain(["grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"]);
+    files.filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
 }
 
 /// Which cameras a command works on.

@@ -1,7 +1,7 @@
 //! Photos and pictures on disk.
 
 use crate::{Error, Result, fs};
-use image::{DynamicImage, ImageFormat, ImageReader, RgbImage, imageops::FilterType};
+use image::{DynamicImage, GrayImage, ImageFormat, ImageReader, RgbImage, imageops::FilterType};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -10,11 +10,43 @@ use std::path::Path;
 /// # Errors
 /// [`Error::Io`], or [`Error::Format`] when it cannot be decoded.
 pub fn load_rgb(path: &Path) -> Result<RgbImage> {
+    Ok(decode(path)?.into_rgb8())
+}
+
+fn decode(path: &Path) -> Result<DynamicImage> {
     let data = fs::read(path)?;
     let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
-    let decoded =
-        reader.decode().map_err(|e| Error::format(path, format!("the photo cannot be read ({e}); export it again or remove it")))?;
-    Ok(decoded.into_rgb8())
+    reader.decode().map_err(|e| Error::format(path, format!("the picture cannot be read ({e}); export it again or remove it")))
+}
+
+/// A photo with what it says about itself.
+pub struct Photo {
+    /// Colours, not multiplied by alpha.
+    pub pixels: RgbImage,
+    /// Coverage, 0 to 255, of photos with an alpha channel that is not opaque everywhere.
+    pub alpha: Option<GrayImage>,
+}
+
+/// Reads a photo as 8-bit RGB, and its alpha channel.
+///
+/// # Errors
+/// As [`load_rgb`].
+pub fn load_photo(path: &Path) -> Result<Photo> {
+    let decoded = decode(path)?;
+    let alpha = decoded.color().has_alpha().then(|| {
+        let rgba = decoded.to_rgba8();
+        GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]))
+    });
+    let transparent = |a: &GrayImage| a.pixels().any(|p| p[0] < 255);
+    Ok(Photo { pixels: decoded.into_rgb8(), alpha: alpha.filter(transparent) })
+}
+
+/// Reads a mask: brightness, 0 to 255.
+///
+/// # Errors
+/// As [`load_rgb`].
+pub fn load_gray(path: &Path) -> Result<GrayImage> {
+    Ok(decode(path)?.into_luma8())
 }
 
 /// Width and height without decoding the pixels.
@@ -32,6 +64,11 @@ pub fn resize(photo: &RgbImage, width: u32, height: u32) -> RgbImage {
         return photo.clone();
     }
     image::imageops::resize(photo, width, height, FilterType::Triangle)
+}
+
+/// As [`resize`], for masks.
+pub fn resize_gray(mask: &GrayImage, width: u32, height: u32) -> GrayImage {
+    image::imageops::resize(mask, width, height, FilterType::Triangle)
 }
 
 /// Writes a PNG atomically.

@@ -20,6 +20,7 @@ pub mod metrics;
 pub mod ply;
 pub mod rng;
 pub mod scene_folder;
+pub mod spz;
 pub mod synth;
 pub mod turbo;
 pub mod undistort;

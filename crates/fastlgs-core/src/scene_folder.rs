@@ -1,7 +1,7 @@
 //! The scene folder: one place for everything a stage leaves for the next.
 
 use crate::dataset::SfmPoint;
-use crate::{Camera, Error, Gaussians, LabelMap, Result, fs, image_io, ply};
+use crate::{Camera, Error, Gaussians, LabelMap, Result, fs, image_io, ply, spz};
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -98,11 +98,44 @@ impl SceneFolder {
         fs::write_json(&self.manifest_path(), manifest)
     }
 
+    fn spz_path(&self) -> PathBuf {
+        self.root.join("scene.spz")
+    }
+
+    fn ids_path(&self) -> PathBuf {
+        self.root.join("object_ids.bin")
+    }
+
+    /// Whether the scene is there in compressed form only: features are then those of the objects' codes.
+    pub fn is_compressed(&self) -> bool {
+        !self.ply_path().is_file() && self.spz_path().is_file()
+    }
+
+    /// Writes the compressed form: `scene.spz`, and 16 bits (little-endian) of object id for each Gaussian.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save_compressed(&self, scene: &Gaussians) -> Result<()> {
+        spz::write(&self.spz_path(), scene)?;
+        let ids: Vec<u8> = scene.object_ids.iter().flat_map(|id| id.to_le_bytes()).collect();
+        fs::write_atomic(&self.ids_path(), |file| std::io::Write::write_all(file, &ids))
+    }
+
     /// The trained Gaussians.
     ///
     /// # Errors
-    /// When the scene was never trained or the PLY is damaged.
+    /// When the scene was never trained or its file is damaged.
     pub fn gaussians(&self) -> Result<Gaussians> {
+        if self.is_compressed() {
+            let mut scene = spz::read(&self.spz_path())?;
+            let ids = fs::read(&self.ids_path())?;
+            if ids.len() != 2 * scene.len() {
+                let reason = format!("{} bytes for {} Gaussians; export the scene again", ids.len(), scene.len());
+                return Err(Error::format(&self.ids_path(), reason));
+            }
+            scene.object_ids = ids.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
+            return Ok(scene);
+        }
         let path = self.ply_path();
         if !path.is_file() {
             let root = self.root.display();
@@ -154,6 +187,16 @@ impl SceneFolder {
     /// Undistorted, scaled photo of a view.
     pub fn photo_path(&self, view: &str) -> PathBuf {
         self.root.join("photos").join(format!("{view}.png"))
+    }
+
+    /// Coverage of a view whose photo has an alpha channel.
+    pub fn alpha_path(&self, view: &str) -> PathBuf {
+        self.root.join("alpha").join(format!("{view}.png"))
+    }
+
+    /// What does not count in a view: black there.
+    pub fn ignore_path(&self, view: &str) -> PathBuf {
+        self.root.join("ignore").join(format!("{view}.png"))
     }
 
     /// Reads a view's photo.

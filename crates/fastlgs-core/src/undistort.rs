@@ -2,7 +2,7 @@
 
 use crate::Camera;
 use glam::Vec2;
-use image::{Rgb, RgbImage};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 
 /// Distortion coefficients; all zero means an ideal pinhole.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -43,6 +43,13 @@ pub fn undistort(photo: &RgbImage, camera: &Camera, distortion: &Distortion) -> 
         let d = distortion.distort(ray);
         sample(photo, camera.fx * d.x + camera.cx - 0.5, camera.fy * d.y + camera.cy - 0.5)
     })
+}
+
+/// As [`undistort`], for masks.
+pub fn undistort_gray(mask: &GrayImage, camera: &Camera, distortion: &Distortion) -> GrayImage {
+    let rgb = RgbImage::from_fn(mask.width(), mask.height(), |x, y| Rgb([mask.get_pixel(x, y)[0]; 3]));
+    let out = undistort(&rgb, camera, distortion);
+    GrayImage::from_fn(mask.width(), mask.height(), |x, y| Luma([out.get_pixel(x, y)[0]]))
 }
 
 /// Bilinear sample with coordinates of pixel centres at whole numbers.

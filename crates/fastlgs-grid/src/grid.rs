@@ -3,7 +3,7 @@
 use crate::mapping::Mask;
 use crate::{Result, codes};
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Error, SceneFolder, fs};
+use fastlgs_core::{Gaussians, Error, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 
@@ -64,6 +64,16 @@ impl Grid {
     pub fn nearest(&self, feature: Vec3) -> Option<(u16, f32)> {
         let distances = self.objects.iter().map(|o| (o.id, codes::distance(feature, o.code)));
         distances.min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// Code of an object; zero for object 0 and unknown ones.
+    pub fn code_of(&self, id: u16) -> Vec3 {
+        self.objects.get(usize::from(id).wrapping_sub(1)).map_or(Vec3::ZERO, |o| o.code)
+    }
+
+    /// Gives every Gaussian its object's code as feature.
+    pub fn set_codes(&self, scene: &mut Gaussians) {
+        scene.features = scene.object_ids.iter().map(|id| self.code_of(*id)).collect();
     }
 
     /// Writes `grid.safetensors` and then `grid.json`.

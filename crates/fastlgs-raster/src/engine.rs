@@ -161,6 +161,11 @@ pub trait Engine {
     /// # Errors
     /// When the device failed.
     fn losses(&self) -> Result<Losses>;
+    /// Floating-point operations a second that the device reaches at best, a multiply-add being two: measured now.
+    ///
+    /// # Errors
+    /// When the device failed.
+    fn ceiling(&self) -> Result<f64>;
     /// Bytes that the engine holds for itself now, and of these what Gaussians, moments and key lists take.
     fn memory(&self) -> Memory;
     /// Starts or stops taking the time of each pass; false where the device cannot.

@@ -1,14 +1,15 @@
 //! The passes on a wgpu device.
 
-use crate::cpu::{CHUNKS, RUN};
+use crate::cpu::{CHAINS, CHUNKS, RUN};
 use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, losses_of, planes, tile_bits};
 use crate::pass::{Channels, Pass, Recorder, Shader, shaders};
 use crate::profile::Profile;
-use crate::view::{Job, Perturb, Step, View, stride};
+use crate::view::{Ceiling, Job, Perturb, Step, View, stride};
 use crate::{Error, Gpu, Result};
 use fastlgs_core::gaussians::channels as channels_of;
 use std::collections::{BTreeMap, HashMap};
+use std::time::Instant;
 use wgpu::Buffer;
 
 /// Workgroup size of the kernels that run over Gaussians, pairs or pixels.
@@ -580,6 +581,30 @@ impl Engine for GpuEngine {
         };
         let sums = 6 * RUN * view.tile_count() as usize;
         Ok(losses_of(view, *channels, &self.gpu.read(&t.ssim_sums, sums)?, &self.gpu.read(&t.sums, 4 * sums)?))
+    }
+
+    fn ceiling(&self) -> Result<f64> {
+        let pass = Pass::new(&self.gpu, &shaders::CEILING, Channels::Both, false);
+        let out = self.gpu.storage("the ceiling", 4 * 65_536)?;
+        let mut best = 0.0f64;
+        let mut rounds = 100;
+        // The first run compiles the kernel; each later one is longer, until the launch no longer counts.
+        for attempt in 0..6 {
+            let job = Ceiling { invocations: 65_536, rounds, factor: 0.999, summand: 0.001 };
+            let started = Instant::now();
+            let mut r = Recorder::new(&self.gpu, 0);
+            r.run(&pass, &job, &[&out], job.invocations / GROUP)?;
+            r.submit();
+            self.gpu.read::<f32>(&out, 1)?;
+            let seconds = started.elapsed().as_secs_f64();
+            if attempt > 0 {
+                best = best.max(f64::from(rounds) * (65_536 * CHAINS * 4 * 2) as f64 / seconds);
+            }
+            if attempt > 0 && seconds < 0.05 {
+                rounds *= 4;
+            }
+        }
+        Ok(best)
     }
 
     fn memory(&self) -> Memory {

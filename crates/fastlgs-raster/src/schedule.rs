@@ -78,7 +78,7 @@ impl Default for TrainConfig {
             lambda: 0.2,
             feature_weight: 1.0,
             refine_every: 100,
-            refine_until: 0.6,
+            refine_until: 0.5,
             coarse_until: 0.2,
             antialias: false,
             background: [0.0; 3],
@@ -93,7 +93,7 @@ const FIRST_REFINEMENT: u32 = 300;
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
 /// Shares of the iterations after which unimportant Gaussians are removed under an automatic budget.
-const PRUNE_AT: [f32; 2] = [0.65, 0.8];
+const PRUNE_AT: [f32; 2] = [0.55, 0.75];
 /// Noise scale of MCMC against the means' learning rate.
 const NOISE: f32 = 5e5;
 
@@ -166,12 +166,14 @@ mod tests {
         let config = TrainConfig { iterations: 8000, sh_degree: 3, budget: Budget::Auto(1000), ..TrainConfig::default() };
         assert_eq!([0, 999, 1000, 2500, 7999].map(|i| config.degree(i)), [0, 0, 1, 2, 3]);
         assert!(config.coarse(1599) && !config.coarse(1600));
-        assert!(config.refines(300) && !config.refines(200) && config.refines(4800) && !config.refines(4900));
-        assert!(config.resets_opacity(3000) && !config.resets_opacity(6000));
-        assert!(config.prunes(5200) && config.prunes(6400) && !config.prunes(6401));
+        assert!(config.refines(300) && !config.refines(200) && config.refines(4000) && !config.refines(4100));
+        assert!(!config.resets_opacity(3000), "too late to recover");
+        let long = TrainConfig { iterations: 30_000, ..config.clone() };
+        assert!(long.resets_opacity(3000) && long.resets_opacity(12_000) && !long.resets_opacity(15_000));
+        assert!(config.prunes(4400) && config.prunes(6000) && !config.prunes(6001));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
-        assert!(!frozen.refines(300) && !frozen.prunes(5200));
+        assert!(!frozen.refines(300) && !frozen.prunes(4400));
     }
 }

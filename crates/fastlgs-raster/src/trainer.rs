@@ -243,7 +243,7 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let cameras: Vec<Camera> = self.targets.iter().map(|t| t.camera.clone()).collect();
-        let kept = budget::seen(&scene, &cameras, budget::MIN_WEIGHT);
+        let kept = budget::seen(&scene, &cameras, std::env::var("MINW").map_or(budget::MIN_WEIGHT, |v| v.parse().unwrap()));
         let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: kept.len() };
         tracing::info!(?removal, "unseen Gaussians removed");
         state.keep(&kept);
@@ -253,27 +253,28 @@ impl Trainer {
 
     /// Looks at the watched views and decides whether the scene may grow on.
     fn watch(&mut self) -> Result<()> {
-        let watched: Vec<usize> = (0..self.targets.len()).filter(|&i| budget::is_watched(i, self.targets.len())).collect();
-        let quality = self.quality(&watched, self.course.config.degree(self.course.iteration))?;
-        if let Some(db) = quality {
+        let count = self.targets.len();
+        let watched: Vec<Target> = (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect();
+        if let Some(db) = self.quality(&watched)? {
             self.course.growth.look(self.engine.len(), db);
             tracing::debug!(iteration = self.course.iteration, db, gaussians = self.engine.len(), growth = ?self.course.growth, "watched views");
         }
         Ok(())
     }
 
-    /// Mean PSNR of training views with colour up to a degree; pixels that do not count are left out.
+    /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
+    /// count are left out. Nothing where there are no views.
     ///
     /// # Errors
     /// As [`Engine::render`].
-    pub fn quality(&mut self, views: &[usize], sh_degree: u32) -> Result<Option<f64>> {
+    pub fn quality(&mut self, views: &[Target]) -> Result<Option<f64>> {
+        let degree = self.course.config.degree(self.course.iteration);
         let mut sum = 0.0;
-        for &id in views {
-            let frame = self.engine.render(self.view(&self.targets[id].camera, sh_degree), Channels::Color)?;
-            let color = &self.targets[id].image.color;
+        for Target { camera, image } in views {
+            let frame = self.engine.render(self.view(camera, degree), Channels::Color)?;
             let (mut rendered, mut wanted) = (Vec::new(), Vec::new());
             for c in 0..3 {
-                for (value, packed) in frame.channels(c, c + 1).iter().zip(color).filter(|(_, p)| p.to_le_bytes()[3] == 255) {
+                for (value, packed) in frame.channels(c, c + 1).iter().zip(&image.color).filter(|(_, p)| p.to_le_bytes()[3] == 255) {
                     rendered.push(*value);
                     wanted.push(f32::from(packed.to_le_bytes()[c]) / 255.0);
                 }

@@ -11,7 +11,7 @@ use fastlgs_grid::query::{self, Decision, QueryConfig};
 use fastlgs_raster::Frame;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 #[derive(clap::Args)]
@@ -144,7 +144,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "ssim": ssim,
         "gaussians": scene.gaussians.len(),
         "objects": grid.objects.len(),
-        "scene_bytes": scene_bytes(&args.scene),
+        "scene_bytes": crate::scene::bytes(&args.scene),
         "query_ms_first": mean(&sums.first_ms),
         "query_ms_next": mean(&sums.next_ms),
         "size": format!("{}x{}", camera.width, camera.height),
@@ -251,10 +251,4 @@ fn absent_scores(
             Ok((text.clone(), f64::from(ranked.first().map_or(0.0, |h| h.score))))
         })
         .collect()
-}
-
-/// Bytes of everything that a query needs.
-fn scene_bytes(root: &Path) -> u64 {
-    let files = ["scene.ply", "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"];
-    files.iter().filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
 }

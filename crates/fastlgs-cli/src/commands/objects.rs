@@ -66,12 +66,7 @@ pub fn lift(scene: &mut Gaussians, training: &[Camera], maps: &[LabelMap], grid:
     }
     let most = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).map_or(0, |(id, _)| *id);
     scene.object_ids = weights.iter().map(most).collect();
-    set_codes(scene, grid);
-}
-
-fn set_codes(scene: &mut Gaussians, grid: &Grid) {
-    let code = |id: &u16| grid.objects.get(usize::from(*id).wrapping_sub(1)).map_or(glam::Vec3::ZERO, |o| o.code);
-    scene.features = scene.object_ids.iter().map(code).collect();
+    grid.set_codes(scene);
 }
 
 /// Global mapping: the views vote over the trained Gaussians which of them form regions, regions of like meaning become
@@ -103,7 +98,7 @@ pub fn by_consensus(
     let mut engine = fastlgs_raster::open_engine(&common.device)?;
     let mut paint = |scene: &mut Gaussians, count: u16| -> Result<Vec<LabelMap>> {
         let codes = Grid::build(&[], &[], count, common.seed);
-        set_codes(scene, &codes);
+        codes.set_codes(scene);
         engine.set_state(&State::of(scene))?;
         let map = |camera: &Camera| {
             let frame = engine.render(View::new(camera, scene.len(), 0), Channels::Feature)?;

@@ -5,7 +5,7 @@ use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
 use fastlgs_core::scene_folder::{Manifest, is_held_out};
-use fastlgs_core::undistort::undistort;
+use fastlgs_core::undistort::{undistort, undistort_gray};
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
@@ -13,7 +13,7 @@ use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::pose_check;
 use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Conse, OfflineSegmenter, Segmenter};
-use image::RgbImage;
+use image::{GrayImage, RgbImage};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -48,6 +48,10 @@ pub struct Args {
 struct Photo {
     camera: Camera,
     pixels: RgbImage,
+    /// Coverage of photos with an alpha channel.
+    alpha: Option<GrayImage>,
+    /// Black where nothing counts.
+    ignore: Option<GrayImage>,
 }
 
 /// Masks of one training view.
@@ -153,7 +157,16 @@ fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &
     let mut photos = Vec::new();
     for posed in &dataset.photos {
         let photo = load_photo(posed, max_side)?;
-        image_io::save_png(&folder.photo_path(&photo.camera.name), photo.pixels.clone())?;
+        let name = &photo.camera.name;
+        image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
+        for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
+            match mask {
+                Some(mask) => image_io::save_png(&path, mask.clone())?,
+                // A mask that an earlier run left would now be wrong.
+                None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
+                None => {}
+            }
+        }
         photos.push(photo);
         bar.inc(1);
     }
@@ -163,7 +176,7 @@ fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &
 
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
 fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
-    let raw = image_io::load_rgb(&posed.path)?;
+    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path)?;
     // The file decides the true size; some tools scale photos and leave the poses' file as it was.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
     let aspect = f64::from(posed.camera.width) / f64::from(posed.camera.height) * f64::from(raw.height()) / f64::from(raw.width());
@@ -179,7 +192,9 @@ fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     }
     let small = image_io::resize(&raw, camera.width, camera.height);
     let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
-    Ok(Photo { camera, pixels })
+    let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
+    let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
+    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
 }
 
 fn segment(args: &Args, training: &[Photo], folder: &SceneFolder, common: &ui::Common) -> Result<Vec<ViewMasks>> {

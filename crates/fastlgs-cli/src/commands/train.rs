@@ -68,6 +68,9 @@ pub struct Args {
     /// Global mapping, offline segmenter: likeness of meaning and masks, 0 to 1, from which touching regions are one object.
     #[arg(long, default_value_t = whole::LIKENESS)]
     likeness: f32,
+    /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    curve: Option<u32>,
     /// Weight of the feature loss.
     #[arg(long, default_value_t = 1.0)]
     feature_weight: f32,
@@ -100,7 +103,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         None
     };
     let codes = paper.as_ref().filter(|_| by_descent).map(|p| &p.grid);
-    let targets = training.iter().map(|c| target(&folder, c, codes)).collect::<Result<Vec<_>>>()?;
+    let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
+    let held_out: Vec<&Camera> = cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, manifest.holdout)).map(|c| c.1).collect();
+    let held_out = held_out.into_iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
     let first = first_gaussians(args, &folder, &training, common.seed)?;
     if args.freeze && !by_descent {
         bail!("--freeze trains features: add --feature-mode train --mapping paper; or, to lift objects only, use --iterations 0");
@@ -137,7 +142,13 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if args.resume && !trainer.resume(&checkpoint)? {
         tracing::warn!("{}: no checkpoint to resume from; starting anew", checkpoint.display());
     }
-    let result = trainer.run(Some(&checkpoint), |p, _| {
+    let mut curve = Vec::new();
+    let result = trainer.run(Some(&checkpoint), |p, trainer| {
+        if args.curve.is_some_and(|every| p.iteration % every.next_multiple_of(20) == 0) {
+            let psnr = trainer.quality(&held_out)?;
+            tracing::info!(iteration = p.iteration, seconds = p.seconds, psnr_held_out = psnr, gaussians = p.gaussians, "curve");
+            curve.push(serde_json::json!({ "iteration": p.iteration, "seconds": p.seconds, "psnr": psnr, "gaussians": p.gaussians }));
+        }
         bar.set_position(u64::from(p.iteration));
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
         bar.set_message(format!("loss {loss:.4} {:.1} dB {:.0}k G", p.psnr, p.gaussians as f64 / 1000.0));
@@ -170,14 +181,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mapping_seconds = started.elapsed().as_secs_f64();
     grid.save(&folder)?;
     ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
-    let held_out: Vec<&Camera> = cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, manifest.holdout)).map(|c| c.1).collect();
-    let mut psnr = Vec::new();
-    for camera in held_out {
-        let frame = trainer.render(camera)?;
-        let photo = image_io::to_planar(&folder.photo(&camera.name)?);
-        psnr.push(fastlgs_core::metrics::psnr(frame.channels(0, 3), &photo));
-    }
-    let mean = psnr.iter().sum::<f64>() / psnr.len().max(1) as f64;
+    let psnr = trainer.quality(&held_out)?;
     let value = serde_json::json!({
         "scene": args.scene,
         "preset": args.preset,
@@ -194,7 +198,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "antialias": config.antialias,
         "background": &result.background[..3],
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
-        "psnr_held_out": if psnr.is_empty() { None } else { Some(mean) },
+        "psnr_held_out": psnr,
+        "curve": curve,
         "adapter": result.adapter,
     });
     manifest.seconds.insert("train".to_owned(), result.seconds);
@@ -206,13 +211,27 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Photo and, where features are trained, code map of a view; unlabelled pixels do not count in the feature loss.
-fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>) -> Result<Target> {
+/// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count, nor do
+/// unlabelled ones in the feature loss; transparent ones show the background.
+fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, background: &Background) -> Result<Target> {
     let photo = folder.photo(&camera.name)?;
     if (photo.width(), photo.height()) != (camera.width, camera.height) {
         bail!("{}: photo and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
     }
-    let color = photo.pixels().map(|p| pack(p.0, true)).collect();
+    let mask = |path: PathBuf| path.is_file().then(|| image_io::load_gray(&path)).transpose();
+    let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
+    if alpha.is_some() && background.learn {
+        bail!("--background learn: the photo of '{}' is transparent, so that its background must be given", camera.name);
+    }
+    let color = photo.enumerate_pixels().map(|(x, y, p)| {
+        let covered = alpha.as_ref().map_or(255, |a| a.get_pixel(x, y)[0]);
+        let over = |c: usize| {
+            let share = f32::from(covered) / 255.0;
+            (f32::from(p[c]) * share + 255.0 * background.color[c] * (1.0 - share) + 0.5) as u8
+        };
+        pack([over(0), over(1), over(2)], ignore.as_ref().is_none_or(|m| m.get_pixel(x, y)[0] >= 128))
+    });
+    let color = color.collect();
     let code = |grid: &Grid, id: u16| match grid.objects.get(usize::from(id).wrapping_sub(1)) {
         Some(object) => pack(object.code.to_array().map(|v| (v * 255.0).round() as u8), true),
         None => pack([0; 3], false),

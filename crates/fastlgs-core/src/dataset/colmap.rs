@@ -98,6 +98,7 @@ fn posed(path: PathBuf, image: &Registered, lens: &Lens) -> PosedPhoto {
         },
         path,
         distortion: lens.distortion,
+        ignore: None,
     }
 }
 

@@ -17,6 +17,8 @@ pub struct PosedPhoto {
     pub camera: Camera,
     /// Lens distortion to be removed.
     pub distortion: Distortion,
+    /// Mask of what does not count: black there.
+    pub ignore: Option<PathBuf>,
 }
 
 /// A reconstructed 3-D point (structure from motion).
@@ -39,7 +41,7 @@ pub struct Dataset {
     pub warnings: Vec<String>,
 }
 
-/// Loads PHOTOS: `sparse/0` or `sparse` (COLMAP, binary or text) or `transforms.json` (nerfstudio, instant-ngp).
+/// Loads PHOTOS, with the masks in `ignore/`: `sparse/0` or `sparse` (COLMAP, binary or text) or `transforms.json` (nerfstudio, instant-ngp).
 ///
 /// # Errors
 /// When no poses are found, a file is damaged, a pose is not finite, or no posed photo is left.
@@ -68,8 +70,17 @@ pub fn load(photos: &Path) -> Result<Dataset> {
     if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
         return Err(Error::format(photos, format!("two poses for the photo '{}'", pair[0].camera.name)));
     }
+    for photo in dataset.photos.iter_mut().filter(|p| p.ignore.is_none()) {
+        photo.ignore = ignore_mask(photos, &photo.camera.name);
+    }
     warn_of_photos_without_pose(photos, &mut dataset);
     Ok(dataset)
+}
+
+/// `PHOTOS/ignore/NAME.png`, with or without the photo's own ending.
+fn ignore_mask(photos: &Path, name: &str) -> Option<PathBuf> {
+    let stem = Path::new(name).file_stem()?.to_string_lossy().into_owned();
+    [name, &stem].iter().map(|n| photos.join("ignore").join(format!("{n}.png"))).find(|p| p.is_file())
 }
 
 /// Photos that no pose names are left out; the user hears of it once.

@@ -25,6 +25,8 @@ struct Lens {
 #[derive(Deserialize)]
 struct Frame {
     file_path: String,
+    /// Black where the photo does not count.
+    mask_path: Option<String>,
     transform_matrix: [[Option<f64>; 4]; 4],
     #[serde(flatten)]
     lens: Lens,
@@ -95,6 +97,10 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
     }
     let camera_to_world = Mat4::from_cols_array_2d(&rows.map(|r| r.to_array())).transpose();
     let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
+    let ignore = frame.mask_path.as_ref().map(|mask| file.with_file_name(mask));
+    if let Some(mask) = ignore.as_ref().filter(|m| !m.is_file()) {
+        return Err(Error::format(file, format!("the mask '{}' of '{name}' is missing; add it or remove its mask_path", mask.display())));
+    }
     Ok(PosedPhoto {
         path: photo,
         camera: Camera {
@@ -113,5 +119,6 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
             p1: either(|l| l.p1).unwrap_or(0.0) as f32,
             p2: either(|l| l.p2).unwrap_or(0.0) as f32,
         },
+        ignore,
     })
 }

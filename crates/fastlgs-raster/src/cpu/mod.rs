@@ -6,6 +6,7 @@
 mod adam;
 mod blend;
 mod blend_backward;
+mod ceiling;
 mod covariance;
 mod emit;
 mod footprint;
@@ -31,6 +32,8 @@ pub(crate) use adam::adam_one;
 pub use blend::blend;
 pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;
+pub use ceiling::ceiling;
+pub(crate) use ceiling::CHAINS;
 pub use emit::emit;
 pub use footprint::Footprint;
 pub(crate) use footprint::span;

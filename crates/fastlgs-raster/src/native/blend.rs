@@ -1,4 +1,4 @@
-//! Blending and its gradients, a tile at a time with its 64 pixels in vector registers.
+//! Blending and its gradients, a tile at a time, two of its rows in one vector of sixteen.
 
 use super::simd::{exp2, madd, vectorised};
 use crate::cpu::{ALPHA_MIN, BATCH, Splat, TRANSMITTANCE_MIN};
@@ -7,8 +7,11 @@ use crate::view::View;
 /// Pixels along a tile's edge.
 const EDGE: usize = crate::view::TILE as usize;
 
+/// Pixels of two rows: what AVX-512 handles at once.
+const LANES: usize = 2 * EDGE;
+
 /// A value for each pixel of a tile, row by row.
-pub type Tile = [[f32; EDGE]; EDGE];
+pub type Tile = [[f32; LANES]; EDGE / 2];
 
 /// What the forward pass makes of a tile.
 #[derive(Clone)]
@@ -44,10 +47,11 @@ impl<'a> Job<'a> {
 /// 1 for the pixels of the picture, 0 for those of the padding.
 pub fn shown(view: &View, job: &Job) -> Tile {
     let [w, h] = view.size.map(|s| s as f32);
-    std::array::from_fn(|j| std::array::from_fn(|i| if job.x + (i as f32) < w && job.y + (j as f32) < h { 1.0 } else { 0.0 }))
+    let at = |j: usize, i: usize| (job.x + (i % EDGE) as f32, job.y + (2 * j + i / EDGE) as f32);
+    std::array::from_fn(|j| std::array::from_fn(|i| if at(j, i).0 < w && at(j, i).1 < h { 1.0 } else { 0.0 }))
 }
 
-/// Rows of the tile in which a splat can reach the least alpha: where its exponent's maximum over x allows it.
+/// Pairs of rows of the tile in which a splat can reach the least alpha: where its exponent's maximum over x allows it.
 #[inline(always)]
 fn rows_of(splat: &Splat, y: f32) -> std::ops::Range<usize> {
     let [[_, my, qx, qy], [qz, log_opacity, ..], _] = *splat;
@@ -56,17 +60,29 @@ fn rows_of(splat: &Splat, y: f32) -> std::ops::Range<usize> {
     let reach = ((-8.0 - log_opacity) / bend).max(0.0).sqrt() + 0.01;
     let first = (my - reach - y - 0.5).ceil().clamp(0.0, EDGE as f32);
     let end = ((my + reach - y - 0.5).floor() + 1.0).clamp(first, EDGE as f32);
-    first as usize..end as usize
+    first as usize / 2..(end as usize).div_ceil(2)
 }
 
-/// Alphas of a splat along a row.
+/// Offsets of the pixels of two rows from a splat's mean.
 #[inline(always)]
-fn alphas<const FMA: bool>(splat: &Splat, dx: &[f32; EDGE], dy: f32) -> [f32; EDGE] {
+fn offsets(x: f32) -> [f32; LANES] {
+    std::array::from_fn(|i| x + (i % EDGE) as f32 + 0.5)
+}
+
+/// The same along y, `y` being the first of the two rows.
+#[inline(always)]
+fn row_offsets(y: f32) -> [f32; LANES] {
+    std::array::from_fn(|i| y + (i / EDGE) as f32 + 0.5)
+}
+
+/// Alphas of a splat along two rows.
+#[inline(always)]
+fn alphas<const FMA: bool>(splat: &Splat, dx: &[f32; LANES], dy: &[f32; LANES]) -> [f32; LANES] {
     let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *splat;
-    let (c1, c0) = (qy * dy, madd::<FMA>(qz * dy, dy, log_opacity));
-    let mut out = [0.0; EDGE];
-    for i in 0..EDGE {
-        let alpha = exp2::<FMA>(madd::<FMA>(dx[i], madd::<FMA>(qx, dx[i], c1), c0));
+    let mut out = [0.0; LANES];
+    for i in 0..LANES {
+        let c0 = madd::<FMA>(qz * dy[i], dy[i], log_opacity);
+        let alpha = exp2::<FMA>(madd::<FMA>(dx[i], madd::<FMA>(qx, dx[i], qy * dy[i]), c0));
         out[i] = if alpha >= ALPHA_MIN { alpha } else { 0.0 };
     }
     out
@@ -75,11 +91,6 @@ fn alphas<const FMA: bool>(splat: &Splat, dx: &[f32; EDGE], dy: f32) -> [f32; ED
 #[inline(always)]
 fn values_of(splat: &Splat) -> [f32; 6] {
     [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]]
-}
-
-#[inline(always)]
-fn offsets(x: f32) -> [f32; EDGE] {
-    std::array::from_fn(|i| x + i as f32 + 0.5)
 }
 
 /// Channels of a step: colour 0..3, feature 3..6.
@@ -101,16 +112,16 @@ fn forward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool>(job: &J
             let values = values_of(splat);
             let dx = offsets(job.x - splat[0][0]);
             for j in rows_of(splat, job.y) {
-                let alpha = alphas::<FMA>(splat, &dx, job.y + j as f32 + 0.5 - splat[0][1]);
+                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
                 let transmittance = &mut out.transmittance[j];
-                let mut w = [0.0; EDGE];
-                for i in 0..EDGE {
+                let mut w = [0.0; LANES];
+                for i in 0..LANES {
                     w[i] = alpha[i] * transmittance[i];
                     transmittance[i] -= w[i];
                 }
                 for c in channels::<COLOR, FEATURE>() {
                     let sums = &mut out.sums[c][j];
-                    for i in 0..EDGE {
+                    for i in 0..LANES {
                         sums[i] = madd::<FMA>(w[i], values[c], sums[i]);
                     }
                 }
@@ -152,41 +163,41 @@ fn backward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool, const 
         let splat = &job.splats[g as usize];
         let values = values_of(splat);
         let dx = offsets(job.x - splat[0][0]);
-        let (mut p_sum, mut py_sum, mut pyy_sum) = ([0.0; EDGE], [0.0; EDGE], [0.0; EDGE]);
-        let mut sums = [[0.0; EDGE]; 6];
+        let (mut p_sum, mut py_sum, mut pyy_sum) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+        let mut sums = [[0.0; LANES]; 6];
         for j in rows_of(splat, job.y) {
-            let dy = job.y + j as f32 + 0.5 - splat[0][1];
-            let alpha = alphas::<FMA>(splat, &dx, dy);
-            let mut w = [0.0; EDGE];
-            for i in 0..EDGE {
+            let dy = row_offsets(job.y + (2 * j) as f32 - splat[0][1]);
+            let alpha = alphas::<FMA>(splat, &dx, &dy);
+            let mut w = [0.0; LANES];
+            for i in 0..LANES {
                 w[i] = alpha[i] * given.transmittance[j][i];
                 given.transmittance[j][i] -= w[i];
             }
             for c in channels::<COLOR, FEATURE>() {
-                for i in 0..EDGE {
+                for i in 0..LANES {
                     sums[c][i] = madd::<FMA>(w[i], given.gradient[c][j][i], sums[c][i]);
                 }
             }
             if COLOR {
-                let mut worth = [0.0; EDGE];
+                let mut worth = [0.0; LANES];
                 for c in 0..if MOVES { 6 } else { 3 } {
-                    for i in 0..EDGE {
+                    for i in 0..LANES {
                         worth[i] = madd::<FMA>(values[c], given.gradient[c][j][i], worth[i]);
                     }
                 }
-                for i in 0..EDGE {
+                for i in 0..LANES {
                     let gain = w[i] * worth[i];
                     let behind = given.behind[j][i] - gain;
                     given.behind[j][i] = behind;
                     let p = gain - behind * (alpha[i] / (1.0 - alpha[i]));
                     p_sum[i] += p;
-                    py_sum[i] = madd::<FMA>(p, dy, py_sum[i]);
-                    pyy_sum[i] = madd::<FMA>(p, dy * dy, pyy_sum[i]);
+                    py_sum[i] = madd::<FMA>(p, dy[i], py_sum[i]);
+                    pyy_sum[i] = madd::<FMA>(p * dy[i], dy[i], pyy_sum[i]);
                 }
             }
         }
-        let total = |values: &[f32; EDGE]| values.iter().sum::<f32>();
-        let by = |values: &[f32; EDGE], factor: &[f32; EDGE]| std::array::from_fn::<f32, EDGE, _>(|i| values[i] * factor[i]);
+        let total = |values: &[f32; LANES]| values.iter().sum::<f32>();
+        let by = |values: &[f32; LANES], factor: &[f32; LANES]| std::array::from_fn::<f32, LANES, _>(|i| values[i] * factor[i]);
         let px = by(&p_sum, &dx);
         *slot = [
             total(&px),

@@ -1,6 +1,7 @@
 //! The fast CPU backend: the same frames and gradients as the shaders', with vectors and all cores.
 
 mod blend;
+mod ceiling;
 mod lists;
 mod loss;
 mod simd;
@@ -41,9 +42,10 @@ impl<const C: usize> Picture<C> {
 
     /// The pixels of a tile.
     fn tile(&self, channel: usize, job: &Job) -> Tile {
+        const EDGE: usize = TILE as usize;
         std::array::from_fn(|j| {
-            let row = &self.row(channel, job.y as usize + j)[job.x as usize..];
-            std::array::from_fn(|i| row[i])
+            let rows = [0, 1].map(|k| &self.row(channel, job.y as usize + 2 * j + k)[job.x as usize..][..EDGE]);
+            std::array::from_fn(|i| rows[i / EDGE][i % EDGE])
         })
     }
 }
@@ -132,15 +134,19 @@ impl CpuEngine {
                 let mut out = Blended { sums: [Tile::default(); 6], transmittance: shown, walked: 0 };
                 blend::forward::<COLOR, FEATURE>(&job, &mut out);
                 walked[column] = out.walked;
-                for j in 0..TILE as usize {
-                    let at = |c: usize| (j * 8 + c) * width + column * TILE as usize;
+                const EDGE: usize = TILE as usize;
+                for y in 0..EDGE {
+                    // Two rows lie in one vector.
+                    let (j, half) = (y / 2, y % 2 * EDGE);
+                    let at = |c: usize| (y * 8 + c) * width + column * EDGE;
                     for c in (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 }) {
-                        for i in 0..TILE as usize {
-                            band[at(c) + i] = shown[j][i] * (out.sums[c][j][i] + out.transmittance[j][i] * background[c]);
+                        for i in 0..EDGE {
+                            let k = half + i;
+                            band[at(c) + i] = shown[j][k] * (out.sums[c][j][k] + out.transmittance[j][k] * background[c]);
                         }
                     }
-                    band[at(6)..][..TILE as usize].copy_from_slice(&out.transmittance[j]);
-                    band[at(7)..][..TILE as usize].fill(out.walked as f32);
+                    band[at(6)..][..EDGE].copy_from_slice(&out.transmittance[j][half..half + EDGE]);
+                    band[at(7)..][..EDGE].fill(out.walked as f32);
                 }
             }
         });
@@ -303,6 +309,10 @@ impl Engine for CpuEngine {
 
     fn losses(&self) -> Result<Losses> {
         Ok(self.losses)
+    }
+
+    fn ceiling(&self) -> Result<f64> {
+        Ok(ceiling::flops())
     }
 
     fn memory(&self) -> Memory {

@@ -4,7 +4,7 @@ use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
 use crate::cpu::{self, CHUNKS};
 use crate::gpu::Shape;
 use crate::pass::{Pass, Shader, shaders};
-use crate::view::{Job, Perturb, Plane, Step, View, stride};
+use crate::view::{Ceiling, Job, Perturb, Plane, Step, View, stride};
 use crate::{Channels, Gpu};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::rng::Rng;
@@ -264,6 +264,14 @@ fn loss() {
         let back = run(&shaders::SSIM_BACKWARD_ROWS, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
         run(&shaders::LOSS_GRADIENT, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
     }
+}
+
+#[test]
+fn ceiling() {
+    let Some(gpu) = gpu() else { return };
+    let job = Ceiling { invocations: 100, rounds: 50, factor: 0.99, summand: 0.01 };
+    let [device, twin] = both(&gpu, &shaders::CEILING, Channels::Both, false, &job, &[&zeros(100)], 2);
+    assert_close("ceiling", floats(&device[0]), floats(&twin[0]), 1e-4, 0.0);
 }
 
 #[test]

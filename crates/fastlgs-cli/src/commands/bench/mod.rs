@@ -1,5 +1,6 @@
 //! `fastlgs bench`: what the program costs and what it gives.
 
+mod chart;
 mod speed;
 
 use crate::{Outcome, ui};

@@ -1,8 +1,9 @@
-//! `fastlgs bench speed`: milliseconds of every pass over Gaussians x resolutions.
+//! `fastlgs bench speed`: milliseconds of every pass over devices x Gaussians x resolutions, and how they grow.
 //!
 //! Every setting renders and trains the same views of the scene with learning rates of zero, so that all steps cost the
 //! same; kernels are compiled before the clock starts.
 
+use super::chart;
 use crate::scene::parse_size;
 use crate::{Outcome, report, ui};
 use anyhow::{Result, bail};
@@ -11,7 +12,7 @@ use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Exposure, Step, StepOptions, TargetImage, View, pack};
-use glam::Vec3;
+use glam::{DMat3, DVec3, Vec3};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -28,6 +29,15 @@ pub struct Args {
     /// Sizes of the pictures as WIDTHxHEIGHT, separated by commas; the scene's own by default.
     #[arg(long, value_delimiter = ',', value_parser = parse_size)]
     size: Vec<(u32, u32)>,
+    /// Devices to compare, separated by commas (as for --device, which this overrides).
+    #[arg(long, value_delimiter = ',')]
+    devices: Vec<String>,
+    /// Folder for speed.json and the chart speed.svg.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// SH degree of colour, instead of the scene's.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3))]
+    sh_degree: Option<u32>,
     /// Training steps that are timed in each setting.
     #[arg(long, default_value_t = 20)]
     steps: u32,
@@ -51,30 +61,101 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
     let counts = if args.gaussians.is_empty() { vec![scene.len()] } else { args.gaussians.clone() };
     let sizes = if args.size.is_empty() { vec![(cameras[0].width, cameras[0].height)] } else { args.size.clone() };
-    let mut engine = fastlgs_raster::open_engine(&common.device)?;
+    let scene = scene.clone().with_sh_degree(args.sh_degree.unwrap_or(scene.sh_degree));
+    let devices = if args.devices.is_empty() { vec![common.device.clone()] } else { args.devices.clone() };
     let stride = cameras.len().div_ceil(VIEWS);
-    let mut rows = Vec::new();
-    for &count in &counts {
-        let resized = resampled(&scene, count, common.seed);
-        engine.set_state(&State::of(&resized))?;
-        for &(w, h) in &sizes {
-            let views: Vec<View> = cameras.iter().step_by(stride).map(|c| View::new(&c.resized(w, h), count, resized.sh_degree)).collect();
-            rows.push(setting(engine.as_mut(), &views, args.steps)?);
+    let (mut tables, mut lines) = (Vec::new(), Vec::new());
+    for device in &devices {
+        let mut engine = fastlgs_raster::open_engine(device)?;
+        let ceiling = engine.ceiling()?;
+        let mut settings = Vec::new();
+        for &count in &counts {
+            let resized = resampled(&scene, count, common.seed);
+            engine.set_state(&State::of(&resized))?;
+            for &(w, h) in &sizes {
+                let views: Vec<View> =
+                    cameras.iter().step_by(stride).map(|c| View::new(&c.resized(w, h), count, resized.sh_degree)).collect();
+                settings.push(Setting { gaussians: count, size: (w, h), row: setting(engine.as_mut(), &views, args.steps, ceiling)? });
+            }
         }
+        for &(w, h) in &sizes {
+            let points = settings.iter().filter(|s| s.size == (w, h)).map(|s| (s.gaussians as f64, s.number("train_iterations_per_second")));
+            lines.push(chart::Line { name: format!("{}, {w}x{h}", engine.name()), points: points.collect() });
+        }
+        tables.push(json!({
+            "adapter": engine.name(),
+            "ceiling_gflops": ceiling / 1e9,
+            "growth": growth(&settings),
+            "settings": settings.into_iter().map(|s| s.row).collect::<Vec<_>>(),
+        }));
     }
     let value = json!({
         "scene": args.scene,
-        "adapter": engine.name(),
         "cores": std::thread::available_parallelism().map_or(1, usize::from),
-        "sh_degree": 0,
-        "settings": rows,
+        "sh_degree": scene.sh_degree,
+        "peak_process_bytes": peak_process_bytes(),
+        "devices": tables,
     });
+    if let Some(folder) = &args.output {
+        fastlgs_core::fs::write_json(&folder.join("speed.json"), &value)?;
+        let axes = chart::Axes { title: "Training: colour + features + D-SSIM", x: "Gaussians", y: "iterations a second" };
+        chart::write(&folder.join("speed.svg"), &axes, &lines)?;
+    }
     report::give(common, &value)?;
     Ok(Outcome::Done)
 }
 
+/// One number of Gaussians at one resolution, and what was measured there.
+struct Setting {
+    gaussians: usize,
+    size: (u32, u32),
+    row: Value,
+}
+
+impl Setting {
+    fn number(&self, field: &str) -> f64 {
+        self.row[field].as_f64().unwrap_or(f64::NAN)
+    }
+}
+
+/// Exponents a and b of time ~ Gaussians^a * pixels^b, by least squares over the logarithms; null where the settings do
+/// not tell.
+fn growth(settings: &[Setting]) -> Value {
+    let exponents = |field: &str| -> Value {
+        let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+        for s in settings {
+            let x = DVec3::new(1.0, (s.gaussians as f64).ln(), (f64::from(s.size.0) * f64::from(s.size.1)).ln());
+            normal += DMat3::from_cols(x * x.x, x * x.y, x * x.z);
+            right += x * s.number(field).ln();
+        }
+        let several = |f: &dyn Fn(&Setting) -> f64| settings.iter().any(|s| f(s) != f(&settings[0]));
+        let (by_count, by_size) = (several(&|s| s.gaussians as f64), several(&|s| f64::from(s.size.0) * f64::from(s.size.1)));
+        // What does not vary is pinned to an exponent of zero.
+        if !by_count {
+            normal.y_axis.y += 1e12;
+        }
+        if !by_size {
+            normal.z_axis.z += 1e12;
+        }
+        let fit = normal.inverse() * right;
+        json!({ "gaussians": by_count.then_some(fit.y), "pixels": by_size.then_some(fit.z) })
+    };
+    json!({ "train_ms": exponents("train_ms"), "render_ms": exponents("render_ms") })
+}
+
+/// The most memory this process ever held, where the system tells.
+fn peak_process_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok().map(|kib| 1024 * kib)
+}
+
+/// Floating-point operations of one evaluated pair of pixel and Gaussian in forward blending: exponent 4, exp2 counted as 10
+/// (what a polynomial takes), weight 1, six channels 12, transmittance 1.
+const FLOPS_A_PAIR: f64 = 28.0;
+
 /// Times one number of Gaussians at one resolution.
-fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
+fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) -> Result<Value> {
     let pixels = views[0].pixels();
     let zero = [0.0; BASE_CHANNELS + 1];
     let degree = views[0].sh_degree;
@@ -127,11 +208,18 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value>
         }
         engine.set_profiling(false);
     }
+    let memory = engine.memory();
+    // Blending alone, where the device tells; else the whole frame.
+    let blend_seconds = passes.get("blend").map_or(render_seconds, |ms| ms / 1e3);
+    let evaluated = walked * pixels as f64 / blend_seconds;
     Ok(json!({
         "gaussians": engine.len(),
         "size": format!("{}x{}", views[0].size[0], views[0].size[1]),
         "pairs": pairs,
         "evaluated_per_pixel": walked,
+        "evaluated_per_second": evaluated,
+        "share_of_ceiling": evaluated * FLOPS_A_PAIR / ceiling,
+        "memory": memory,
         "train_iterations_per_second": 1.0 / full_seconds,
         "train_color_only_iterations_per_second": 1.0 / color_seconds,
         "train_feature_only_iterations_per_second": 1.0 / feature_seconds,

@@ -1,0 +1,92 @@
+//! `fastlgs export`: a trained scene for other programs, or a small folder with just what a query needs.
+
+use crate::scene::Scene;
+use crate::{Outcome, report, ui};
+use anyhow::{Context, Result, bail};
+use fastlgs_core::metrics::psnr;
+use fastlgs_core::scene_folder::is_held_out;
+use fastlgs_core::{Camera, SceneFolder, ply, spz};
+use fastlgs_raster::density::State;
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args)]
+#[command(after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox")]
+pub struct Args {
+    /// Trained scene folder.
+    scene: PathBuf,
+    /// FILE.ply (3DGS columns), FILE.spz (compressed, without objects), or a folder for everything that queries need.
+    output: PathBuf,
+    /// Drop colour's SH coefficients above this degree.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3))]
+    sh_degree: Option<u32>,
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let mut scene = Scene::open(&args.scene, &common.device)?;
+    let before = pictures(&mut scene)?;
+    let degree = args.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
+    scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
+    let ending = args.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    let written = match ending {
+        "ply" => {
+            ply::write(&args.output, &scene.gaussians)?;
+            ply::read(&args.output)?
+        }
+        "spz" => {
+            spz::write(&args.output, &scene.gaussians)?;
+            spz::read(&args.output)?
+        }
+        _ => small_folder(&scene, &args.output)?,
+    };
+    scene.engine.set_state(&State::of(&written))?;
+    scene.gaussians = written;
+    let after = pictures(&mut scene)?;
+    // Both against each other, not against photos: an exported scene may have none.
+    let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
+    let value = serde_json::json!({
+        "scene": args.scene,
+        "output": args.output,
+        "bytes": bytes_of(&args.output),
+        "bytes_before": crate::scene::bytes(&args.scene),
+        "gaussians": scene.gaussians.len(),
+        "sh_degree": scene.gaussians.sh_degree,
+        "psnr_against_original": same.iter().sum::<f64>() / same.len().max(1) as f64,
+        "adapter": scene.engine.name(),
+    });
+    report::give(common, &value)?;
+    Ok(Outcome::Done)
+}
+
+/// Colours of the held-out views, or of the first one where none is.
+fn pictures(scene: &mut Scene) -> Result<Vec<Vec<f32>>> {
+    let holdout = scene.manifest.holdout;
+    let mut views: Vec<Camera> = scene.cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, holdout)).map(|c| c.1.clone()).collect();
+    views.extend(scene.cameras.first().filter(|_| holdout == 0).cloned());
+    views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
+}
+
+/// Writes what queries need: the compressed scene, object ids, grid, cameras and manifest. Returns the scene as it reads.
+fn small_folder(scene: &Scene, root: &Path) -> Result<fastlgs_core::Gaussians> {
+    if root.exists() && !root.join("scene.json").is_file() && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
+        bail!("{}: not empty and not a scene; name a new folder", root.display());
+    }
+    if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
+        bail!("{}: this is the scene itself; name another folder", root.display());
+    }
+    let folder = SceneFolder::new(root);
+    let grid = scene.grid()?;
+    if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
+        bail!("the scene's features were trained by descent, which a small folder cannot hold; export FILE.ply instead");
+    }
+    folder.save_compressed(&scene.gaussians)?;
+    grid.save(&folder)?;
+    folder.save_cameras(&scene.cameras)?;
+    folder.save_manifest(&scene.manifest).context("the manifest cannot be written")?;
+    let mut written = folder.gaussians()?;
+    grid.set_codes(&mut written);
+    Ok(written)
+}
+
+fn bytes_of(path: &Path) -> u64 {
+    if path.is_dir() { crate::scene::bytes(path) } else { std::fs::metadata(path).map_or(0, |m| m.len()) }
+}
