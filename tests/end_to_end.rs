@@ -4,6 +4,7 @@
 //! unless FASTLGS_REQUIRE_GPU is set, which makes them a must.
 
 use fastlgs_core::label_map::LabelMap;
+use fastlgs_core::ply;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -106,6 +107,104 @@ fn the_papers_mapping_and_trained_features_work_too() {
     let right = mask.labels.iter().zip(&truth.labels).filter(|(m, t)| **m > 0 && **t == 2).count();
     assert!(2 * right > found, "{right} of {found} pixels are the coffee's");
     fails(&["train", text(&scene), "--feature-mode", "train"], &["--mapping paper"]);
+
+    // Features alone, on geometry and colour that stay as another program made them.
+    let before = ply::read(&start).expect("the start");
+    args.extend(["--freeze", "--device", "cpu"]);
+    args[5] = "100";
+    let report = json(&args);
+    let after = ply::read(&scene.join("scene.ply")).expect("the scene");
+    assert_eq!((&before.means, &before.sh_dc, &before.opacity_logits), (&after.means, &after.sh_dc, &after.opacity_logits));
+    assert_ne!(before.features, after.features);
+    assert!(report["adapter"].as_str().is_some_and(|a| a.starts_with("cpu")), "{report}");
+}
+
+#[test]
+fn exports_keep_what_queries_need() {
+    let Some(f) = fixture() else { return };
+    let at = |name: &str| f.dir.path().join("export").join(name);
+    let ply_report = json(&["export", text(&f.scene), text(&at("scene.ply"))]);
+    assert_eq!(ply::read(&at("scene.ply")).expect("the export"), ply::read(&f.scene.join("scene.ply")).expect("the scene"));
+    let spz_report = json(&["export", text(&f.scene), text(&at("scene.spz"))]);
+    assert!(spz_report["psnr_against_original"].as_f64().is_some_and(|db| db > 35.0), "{spz_report}");
+    let bytes = |report: &Value| report["bytes"].as_u64().expect("a number");
+    assert!(4 * bytes(&spz_report) < bytes(&ply_report), "{spz_report} {ply_report}");
+    let small = at("small");
+    let report = json(&["export", text(&f.scene), text(&small)]);
+    assert!(2 * bytes(&report) < report["bytes_before"].as_u64().expect("a number"), "{report}");
+    let ask = |scene: &Path| json(&["query", text(scene), "coffee", "--view", "008", "-o", text(&at("out"))]);
+    let (whole, compressed) = (ask(&f.scene), ask(&small));
+    assert_eq!(whole["objects"][0]["id"], compressed["objects"][0]["id"]);
+    let pixels = |answer: &Value| answer["pixels"].as_f64().expect("a number");
+    assert!((pixels(&whole) / pixels(&compressed) - 1.0).abs() < 0.05, "{whole} {compressed}");
+    fails(&["export", text(&f.scene), text(&f.scene)], &["the scene itself"]);
+    let ids = small.join("object_ids.bin");
+    std::fs::write(&ids, [0, 0]).expect("a file");
+    fails(&["query", text(&small), "coffee"], &["object_ids.bin", "export the scene again"]);
+}
+
+#[test]
+fn transparent_and_masked_pixels_do_not_count() {
+    let Some(f) = fixture() else { return };
+    let (photos, scene) = (f.dir.path().join("masked"), f.dir.path().join("masked-scene"));
+    json(&["synth", "room", "-o", text(&photos), "--views", "8", "--size", "96x64"]);
+    let opaque = image::open(photos.join("images/001.png")).expect("a photo").into_rgb8();
+    // The left half is transparent, and holds nonsense.
+    let half = |x: u32| x < opaque.width() / 2;
+    let nonsense = |x: u32, y: u32| {
+        if half(x) {
+            [255, 0, 255, 0]
+        } else {
+            let p = opaque.get_pixel(x, y);
+            [p[0], p[1], p[2], 255]
+        }
+    };
+    image::RgbaImage::from_fn(96, 64, |x, y| image::Rgba(nonsense(x, y))).save(photos.join("images/001.png")).expect("a photo");
+    std::fs::create_dir_all(photos.join("ignore")).expect("a folder");
+    image::GrayImage::from_fn(96, 64, |_, y| image::Luma([if y < 32 { 0 } else { 255 }]))
+        .save(photos.join("ignore/002.png"))
+        .expect("a mask");
+    json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--holdout", "0"]);
+    assert!(scene.join("alpha/001.png.png").is_file() && scene.join("ignore/002.png.png").is_file());
+    assert!(!scene.join("alpha/003.png.png").exists());
+    let train = |background: &str| {
+        json(&[
+            "train",
+            text(&scene),
+            "--iterations",
+            "60",
+            "--budget",
+            "2000",
+            "--device",
+            "cpu",
+            "--curve",
+            "40",
+            "--background",
+            background,
+        ])
+    };
+    let report = train("0,1,0");
+    assert_eq!(report["background"], serde_json::json!([0.0, 1.0, 0.0]));
+    assert_eq!(report["curve"][0]["iteration"], 40);
+    fails(&["train", text(&scene), "--iterations", "1", "--background", "learn"], &["001.png", "transparent"]);
+}
+
+#[test]
+fn speed_is_charted_for_several_devices() {
+    let Some(f) = fixture() else { return };
+    let out = f.dir.path().join("speed");
+    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", "auto,cpu", "-o", text(&out)];
+    let report = json(&[&["bench", "speed", text(&f.scene)], &settings[..]].concat());
+    let devices = report["devices"].as_array().expect("a table");
+    assert_eq!(devices.len(), 2);
+    for device in devices {
+        assert_eq!(device["settings"].as_array().map(Vec::len), Some(4));
+        assert!(device["ceiling_gflops"].as_f64().is_some_and(|v| v > 0.1), "{device}");
+        assert!(device["growth"]["train_ms"]["gaussians"].is_number() && device["growth"]["render_ms"]["pixels"].is_number(), "{device}");
+        assert!(device["settings"][0]["train_pass_ms"]["blend"].is_number() && device["settings"][0]["memory"]["state"].is_number());
+    }
+    assert!(std::fs::read_to_string(out.join("speed.svg")).expect("a chart").contains("iterations a second"));
+    assert!(out.join("speed.json").is_file());
 }
 
 #[test]

@@ -131,7 +131,7 @@ impl SceneFolder {
             let ids = fs::read(&self.ids_path())?;
             if ids.len() != 2 * scene.len() {
                 let reason = format!("{} bytes for {} Gaussians; export the scene again", ids.len(), scene.len());
-                return Err(Error::format(&self.ids_path(), reason));
+                return Err(Error::format(self.ids_path(), reason));
             }
             scene.object_ids = ids.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
             return Ok(scene);

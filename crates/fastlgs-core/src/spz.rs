@@ -119,7 +119,8 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         [(1.0 - v.length_squared()).max(0.0).sqrt(), v.x, v.y, v.z]
     });
     let rotations = rotations.collect();
-    let sh_rest = take(3 * n * rest).chunks_exact(3).enumerate().map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % rest]).collect();
+    let sh_rest =
+        take(3 * n * rest).chunks_exact(3).enumerate().map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % rest]).collect();
     Ok(Gaussians {
         means,
         log_scales,

@@ -3,7 +3,7 @@
 use crate::mapping::Mask;
 use crate::{Result, codes};
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Gaussians, Error, SceneFolder, fs};
+use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
 

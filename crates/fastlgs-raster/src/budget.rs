@@ -18,7 +18,9 @@ const GROWTH: f64 = 0.1;
 /// Gain on the watched views, in dB, that pays for it.
 const GAIN: f64 = 0.1;
 /// Largest blending weight below which a Gaussian is removed.
-pub const MIN_WEIGHT: f32 = 0.05;
+pub const MIN_WEIGHT: f32 = 0.1;
+/// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
+pub const DEGREE_LOSS: f64 = 0.02;
 /// Every so many training views one is watched.
 const WATCHED: usize = 10;
 

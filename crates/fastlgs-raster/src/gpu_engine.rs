@@ -147,7 +147,7 @@ pub struct GpuEngine {
     /// Lists of views whose geometry is frozen.
     cached: HashMap<usize, Lists>,
     last: Option<(View, Channels)>,
-    /// This many first passes of every frame run as their CPU twins.
+    /// This many first passes of every frame run as their CPU twins, to find a wrong one; `FASTLGS_PASSES_ON_CPU` sets it.
     pub passes_on_cpu: usize,
 }
 
@@ -185,7 +185,7 @@ impl GpuEngine {
             targets: HashMap::new(),
             cached: HashMap::new(),
             last: None,
-            passes_on_cpu: 0,
+            passes_on_cpu: std::env::var("FASTLGS_PASSES_ON_CPU").ok().and_then(|k| k.parse().ok()).unwrap_or(0),
         }
     }
 
@@ -507,7 +507,8 @@ impl Engine for GpuEngine {
     }
 
     fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
-        let camera_less = View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
+        let camera_less =
+            View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
         let buffer = self.gpu.storage_with("a target picture", &target.padded(&camera_less))?;
         self.targets.insert(id, (target.size, buffer));
         self.cached.remove(&id);
@@ -536,7 +537,8 @@ impl Engine for GpuEngine {
         let slots = self.slots.as_ref().expect("made");
         let mut r = Recorder::new(&self.gpu, on_cpu);
         for plane in planes(&view, options) {
-            let (row_groups, column_groups) = ((plane.quads / 2 * plane.rows).div_ceil(GROUP), (plane.rows / 8 * plane.quads).div_ceil(GROUP));
+            let (row_groups, column_groups) =
+                ((plane.quads / 2 * plane.rows).div_ceil(GROUP), (plane.rows / 8 * plane.quads).div_ceil(GROUP));
             r.run(&self.passes.ssim_rows, &plane, &[&frame.frame, target, &t.rows], row_groups)?;
             r.run(&self.passes.ssim_columns, &plane, &[&t.rows, &t.partials, &t.ssim_sums], column_groups)?;
             r.run(&self.passes.ssim_backward_rows, &plane, &[&t.partials, &t.rows], row_groups)?;
@@ -550,8 +552,7 @@ impl Engine for GpuEngine {
             r.run(&blending.blend_backward, &view, &buffers, self.gpu.shape.groups(view.tile_count()))?;
             for page in &g.pages {
                 let view = View { first: page.first as u32, page: page.n as u32, ..view };
-                let buffers =
-                    [&page.params, &g.splats, &lists.order, &lists.touched, &lists.first_pair, slots, &page.gradients, &g.stats];
+                let buffers = [&page.params, &g.splats, &lists.order, &lists.touched, &lists.first_pair, slots, &page.gradients, &g.stats];
                 r.run(&blending.project_backward, &view, &buffers, view.gaussians.div_ceil(GROUP))?;
             }
         }
@@ -617,7 +618,8 @@ impl Engine for GpuEngine {
             memory.gaussians += bytes_of(&[&g.stats, &g.splats, &g.footprints, &g.offsets, &g.touched, &g.first_pair]);
             memory.lists += g.sort.bytes();
         }
-        memory.lists += self.pairs.as_ref().map_or(0, |p| p.gaussians.size() + p.sort.bytes()) + self.slots.as_ref().map_or(0, Buffer::size);
+        memory.lists +=
+            self.pairs.as_ref().map_or(0, |p| p.gaussians.size() + p.sort.bytes()) + self.slots.as_ref().map_or(0, Buffer::size);
         if let Some(f) = &self.frame {
             memory.frame += bytes_of(&[&f.ranges, &f.frame]) + f.tile_sort.bytes();
             memory.frame += f.training.as_ref().map_or(0, |t| bytes_of(&[&t.gradient, &t.rows, &t.partials, &t.ssim_sums, &t.sums]));

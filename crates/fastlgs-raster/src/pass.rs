@@ -145,7 +145,7 @@ impl Pass {
     pub fn new(gpu: &Gpu, shader: &Shader, channels: Channels, harmonics: bool) -> Self {
         let wanted = |flag: &&str| gpu.shape.flag() == Some(*flag) || channels.flags().contains(flag) || (harmonics && *flag == "WITH_SH");
         // Of the permutations all of whose flags are wanted, the one with most: it leaves out only what the pass ignores.
-        let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(|f| wanted(f)));
+        let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(&wanted));
         let source = fitting.max_by_key(|(flags, _)| flags.len()).expect("a permutation for every choice").1;
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(shader.name),

@@ -43,7 +43,8 @@ impl Target {
                     let bytes = block.map(|(x, y)| plane[(y * w + x) as usize].to_le_bytes());
                     let counting = bytes.iter().filter(|b| b[3] == 255);
                     let n = counting.clone().count() as u32;
-                    let mean = |c: usize| (counting.clone().map(|b| u32::from(b[c])).sum::<u32>() + n / 2).checked_div(n).unwrap_or(0) as u8;
+                    let mean =
+                        |c: usize| (counting.clone().map(|b| u32::from(b[c])).sum::<u32>() + n / 2).checked_div(n).unwrap_or(0) as u8;
                     crate::pack([mean(0), mean(1), mean(2)], n > 0)
                 })
                 .collect()
@@ -151,7 +152,9 @@ impl Trainer {
 
     fn growth_is_over(&self) -> bool {
         let config = &self.course.config;
-        self.course.growth.stopped || !config.channels.color() || self.course.iteration as f32 >= config.iterations as f32 * config.refine_until
+        self.course.growth.stopped
+            || !config.channels.color()
+            || self.course.iteration as f32 >= config.iterations as f32 * config.refine_until
     }
 
     fn view(&self, camera: &Camera, sh_degree: u32) -> View {
@@ -243,7 +246,7 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let cameras: Vec<Camera> = self.targets.iter().map(|t| t.camera.clone()).collect();
-        let kept = budget::seen(&scene, &cameras, std::env::var("MINW").map_or(budget::MIN_WEIGHT, |v| v.parse().unwrap()));
+        let kept = budget::seen(&scene, &cameras, budget::MIN_WEIGHT);
         let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: kept.len() };
         tracing::info!(?removal, "unseen Gaussians removed");
         state.keep(&kept);
@@ -253,22 +256,44 @@ impl Trainer {
 
     /// Looks at the watched views and decides whether the scene may grow on.
     fn watch(&mut self) -> Result<()> {
-        let count = self.targets.len();
-        let watched: Vec<Target> = (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect();
-        if let Some(db) = self.quality(&watched)? {
+        let degree = self.course.config.degree(self.course.iteration);
+        if let Some(db) = self.quality(&self.watched(), Some(degree))? {
             self.course.growth.look(self.engine.len(), db);
             tracing::debug!(iteration = self.course.iteration, db, gaussians = self.engine.len(), growth = ?self.course.growth, "watched views");
         }
         Ok(())
     }
 
-    /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
-    /// count are left out. Nothing where there are no views.
+    /// The training views that are kept aside while the scene grows.
+    fn watched(&self) -> Vec<Target> {
+        let count = self.targets.len();
+        (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect()
+    }
+
+    /// The lowest SH degree that shows the watched views as well as all degrees do, but for [`budget::DEGREE_LOSS`] dB; the
+    /// highest where the budget is fixed or no view is watched.
     ///
     /// # Errors
     /// As [`Engine::render`].
-    pub fn quality(&mut self, views: &[Target]) -> Result<Option<f64>> {
-        let degree = self.course.config.degree(self.course.iteration);
+    pub fn needed_degree(&mut self) -> Result<u32> {
+        let (highest, watched) = (self.course.config.degree(self.course.iteration), self.watched());
+        let automatic = matches!(self.course.config.budget, Budget::Auto(_));
+        let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else { return Ok(highest) };
+        for degree in 0..highest {
+            if self.quality(&watched, Some(degree))?.is_some_and(|db| best - db <= budget::DEGREE_LOSS) {
+                return Ok(degree);
+            }
+        }
+        Ok(highest)
+    }
+
+    /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
+    /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views.
+    ///
+    /// # Errors
+    /// As [`Engine::render`].
+    pub fn quality(&mut self, views: &[Target], sh_degree: Option<u32>) -> Result<Option<f64>> {
+        let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
         for Target { camera, image } in views {
             let frame = self.engine.render(self.view(camera, degree), Channels::Color)?;
@@ -301,7 +326,10 @@ impl Trainer {
                 self.engine.losses()?;
                 started = Instant::now();
             }
-            if iteration.is_multiple_of(budget::WATCH_EVERY) && matches!(self.course.config.budget, Budget::Auto(_)) && !self.growth_is_over() {
+            if iteration.is_multiple_of(budget::WATCH_EVERY)
+                && matches!(self.course.config.budget, Budget::Auto(_))
+                && !self.growth_is_over()
+            {
                 self.watch()?;
             }
             if self.course.config.refines(iteration) {

@@ -111,8 +111,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         bail!("--freeze trains features: add --feature-mode train --mapping paper; or, to lift objects only, use --iterations 0");
     }
     let (preset, preset_degree) = match args.preset.as_str() {
-        "quick" => (2_000, 0),
-        "standard" => (7_000, 1),
+        "quick" => (2_000, 2),
+        "standard" => (7_000, 2),
         _ => (30_000, 3),
     };
     let channels = match (args.freeze, by_descent, args.feature_moves_geometry) {
@@ -145,7 +145,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut curve = Vec::new();
     let result = trainer.run(Some(&checkpoint), |p, trainer| {
         if args.curve.is_some_and(|every| p.iteration % every.next_multiple_of(20) == 0) {
-            let psnr = trainer.quality(&held_out)?;
+            let psnr = trainer.quality(&held_out, None)?;
             tracing::info!(iteration = p.iteration, seconds = p.seconds, psnr_held_out = psnr, gaussians = p.gaussians, "curve");
             curve.push(serde_json::json!({ "iteration": p.iteration, "seconds": p.seconds, "psnr": psnr, "gaussians": p.gaussians }));
         }
@@ -159,7 +159,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     })?;
     bar.finish_and_clear();
 
-    let mut scene = trainer.gaussians()?;
+    let degree = trainer.needed_degree()?;
+    let psnr = trainer.quality(&held_out, Some(degree))?;
+    let mut scene = trainer.gaussians()?.with_sh_degree(degree);
     let started = Instant::now();
     let grid = match paper {
         Some(found) if by_descent => {
@@ -181,7 +183,6 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mapping_seconds = started.elapsed().as_secs_f64();
     grid.save(&folder)?;
     ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
-    let psnr = trainer.quality(&held_out)?;
     let value = serde_json::json!({
         "scene": args.scene,
         "preset": args.preset,

@@ -123,12 +123,8 @@ impl Part {
 
 /// Drawn Gaussians by ascending depth; those of the same depth by their number.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
-    let mut keys: Vec<u64> = projected
-        .iter()
-        .enumerate()
-        .filter(|(_, p)| p.touched > 0)
-        .map(|(i, p)| u64::from(p.depth) << 32 | i as u64)
-        .collect();
+    let mut keys: Vec<u64> =
+        projected.iter().enumerate().filter(|(_, p)| p.touched > 0).map(|(i, p)| u64::from(p.depth) << 32 | i as u64).collect();
     keys.par_sort_unstable();
     keys.into_iter().map(|k| k as u32).collect()
 }

@@ -20,6 +20,16 @@ struct Around {
     offset: [f64; 3],
 }
 
+/// A projected Gaussian.
+struct Splat {
+    depth: f64,
+    mean: DVec2,
+    /// Inverse covariance: xx, xy, yy.
+    conic: [f64; 3],
+    opacity: f64,
+    values: [f64; 6],
+}
+
 /// Six planes and the loss's picture of them: every Gaussian on every pixel, from the formulas of the 3DGS paper.
 fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
     let n = view.gaussians as usize;
@@ -28,8 +38,9 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
     let pose = DMat4::from_cols_array(&view.world_to_camera.map(f64::from));
     let eye = pose.inverse().w_axis.truncate();
     let rotation = DMat3::from_mat4(pose);
-    let (focal, centre) = (DVec2::new(view.focal[0].into(), view.focal[1].into()), DVec2::new(view.centre[0].into(), view.centre[1].into()));
-    let mut splats: Vec<(f64, DVec2, [f64; 3], f64, [f64; 6])> = (0..n)
+    let (focal, centre) =
+        (DVec2::new(view.focal[0].into(), view.focal[1].into()), DVec2::new(view.centre[0].into(), view.centre[1].into()));
+    let mut splats: Vec<Splat> = (0..n)
         .map(|i| {
             let t = pose.transform_point3(vec3(0, i));
             let q = DQuat::from_xyzw(at(7, i), at(8, i), at(9, i), at(6, i)).normalize();
@@ -52,16 +63,16 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
             }
             let values = [color.x.max(0.0), color.y.max(0.0), color.z.max(0.0), at(14, i), at(15, i), at(16, i)];
             let opacity = kept / (1.0 + (-at(10, i)).exp());
-            (t.z, focal * t.truncate() / t.z + centre, [dyy / det, -xy / det, dxx / det], opacity, values)
+            Splat { depth: t.z, mean: focal * t.truncate() / t.z + centre, conic: [dyy / det, -xy / det, dxx / det], opacity, values }
         })
         .collect();
-    splats.sort_by(|a, b| a.0.total_cmp(&b.0));
+    splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
     let (w, h) = SIZE;
     let mut planes = vec![0.0; 6 * w * h];
     for (j, i) in (0..h).flat_map(|j| (0..w).map(move |i| (j, i))) {
         let mut transmittance = 1.0;
         let mut sums = [0.0; 6];
-        for (_, mean, conic, opacity, values) in &splats {
+        for Splat { mean, conic, opacity, values, .. } in &splats {
             let d = DVec2::new(i as f64 + 0.5, j as f64 + 0.5) - *mean;
             let power = -0.5 * (conic[0] * d.x * d.x + 2.0 * conic[1] * d.x * d.y + conic[2] * d.y * d.y);
             let weight = transmittance * opacity * power.exp();
@@ -173,8 +184,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     engine.set_state(&State::of(&scene)).unwrap();
     engine.set_target(0, &target).unwrap();
     let exposure = Exposure { gain: around.gain.map(|v| v as f32), offset: around.offset.map(|v| v as f32) };
-    let options =
-        StepOptions { channels: Channels::Coupled, lambda: LAMBDA as f32, feature_weight: FEATURE_WEIGHT as f32, exposure };
+    let options = StepOptions { channels: Channels::Coupled, lambda: LAMBDA as f32, feature_weight: FEATURE_WEIGHT as f32, exposure };
     engine.step(view, 0, &options, &Step::new(1, 0..channels_of(sh_degree), &[0.0; BASE_CHANNELS + 1])).unwrap();
     let (gradients, losses) = (engine.gradients().unwrap(), engine.losses().unwrap());
 

@@ -176,7 +176,8 @@ fn listing() {
         };
         exact(&shaders::GATHER_COUNTS, &[b("order"), b("touched"), b("offsets")], l.view.gaussians);
         let (pairs, blank) = (l.view.pairs as usize, zeros((l.view.pairs + l.view.gaussians) as usize));
-        let inputs = [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
+        let inputs =
+            [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
         exact(&shaders::EMIT, &inputs, l.view.gaussians);
         exact(&shaders::TILE_RANGES, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
         // log2 may differ in its last bit, and with it the key by one.
@@ -248,8 +249,7 @@ fn loss() {
         let frame: Vec<u32> = (0..8 * n).map(|_| rng.uniform().to_bits()).collect();
         let targets: Vec<u32> = (0..2 * n).map(|i| rng.next_u64() as u32 | if i % 31 == 0 { 0 } else { 0x8000_0000 }).collect();
         let (quads, rows) = (2 * view.tiles[0], 8 * view.tiles[1]);
-        let plane =
-            Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
+        let plane = Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
         let (row_groups, column_groups) = ((quads / 2 * rows).div_ceil(64), (rows / 8 * quads).div_ceil(64));
         let sums = zeros(24 * (rows / 8 * quads * 4) as usize);
         let run = |shader: &Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
@@ -284,13 +284,10 @@ fn adam_and_perturb() {
         let (gradients, params, m1) = (random(1.0), random(1.0), random(1.0));
         let m2: Vec<u32> = random(1.0).iter().map(|v| (f32::from_bits(*v).powi(2)).to_bits()).collect();
         let rates: [f32; BASE_CHANNELS + 1] = std::array::from_fn(|c| 0.01 * (c + 1) as f32);
-        let step = Step {
-            quads: stride(n) as u32 / 4,
-            opacity_weight: 0.3,
-            scale_weight: 0.2,
-            ..Step::new(7, 3..channels_of(degree), &rates)
-        };
-        let [device, twin] = both(&gpu, &shaders::ADAM, Channels::Both, false, &step, &[&gradients, &params, &m1, &m2], step.quads.div_ceil(64));
+        let step =
+            Step { quads: stride(n) as u32 / 4, opacity_weight: 0.3, scale_weight: 0.2, ..Step::new(7, 3..channels_of(degree), &rates) };
+        let [device, twin] =
+            both(&gpu, &shaders::ADAM, Channels::Both, false, &step, &[&gradients, &params, &m1, &m2], step.quads.div_ceil(64));
         for k in 1..4 {
             assert_close("adam", floats(&device[k]), floats(&twin[k]), 1e-3, 0.0);
         }

@@ -79,7 +79,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             }
         }
         for &(w, h) in &sizes {
-            let points = settings.iter().filter(|s| s.size == (w, h)).map(|s| (s.gaussians as f64, s.number("train_iterations_per_second")));
+            let points =
+                settings.iter().filter(|s| s.size == (w, h)).map(|s| (s.gaussians as f64, s.number("train_iterations_per_second")));
             lines.push(chart::Line { name: format!("{}, {w}x{h}", engine.name()), points: points.collect() });
         }
         tables.push(json!({
@@ -163,7 +164,8 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
     let step = Step::new(1, 0..channels(degree), &zero);
     let options = |channels: Channels| StepOptions { channels, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
     let full = options(Channels::Both);
-    let target = TargetImage { size: views[0].size, color: vec![pack([128; 3], true); pixels], feature: vec![pack([128; 3], true); pixels] };
+    let target =
+        TargetImage { size: views[0].size, color: vec![pack([128; 3], true); pixels], feature: vec![pack([128; 3], true); pixels] };
     (0..views.len()).try_for_each(|id| engine.set_target(id, &target))?;
     let (mut pairs, mut walked) = (0.0, 0.0);
     for (id, view) in views.iter().enumerate() {
