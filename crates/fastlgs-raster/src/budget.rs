@@ -1,7 +1,7 @@
 //! No more Gaussians than the scene needs (`--budget auto`).
 //!
-//! *Growth* stops when it no longer pays: some training views are kept aside and watched; every [`WATCH_EVERY`] steps, if
-//! the scene has grown by at least [`GROWTH`] since the last look and the watched views gained less than [`GAIN`] dB, it
+//! *Growth* stops when it no longer pays: some training views are kept aside and watched; every `WATCH_EVERY` steps, if
+//! the scene has grown by at least `GROWTH` since the last look and the watched views gained less than `GAIN` dB, it
 //! may grow no further, and the watched views join the training.
 //!
 //! *Pruning* then removes Gaussians that nobody sees: those whose largest blending weight over all training views stays

@@ -1,7 +1,7 @@
 //! CPU twins: one plain function for each WGSL pass, of the same name, on the same buffers in the same order.
 //!
 //! They are the reference of the parity tests and can stand in for the first passes of a frame, to find a wrong one
-//! ([`run`]). What concerns a single Gaussian is shared with the fast backend in [`crate::native`].
+//! (`run`). What concerns a single Gaussian is shared with the fast backend in `native`.
 
 mod adam;
 mod blend;
