@@ -32,10 +32,14 @@ fn param3(channel: u32, i: u32) -> vec3<f32> {
 fn color_of(i: u32, mean: vec3<f32>) -> vec3<f32> {
     var color = vec3<f32>(0.5) + SH_C0 * param3(COLOR, i);
 #ifdef WITH_SH
-    var b = basis(normalize(mean - view.camera.xyz));
-    for (var k = 0u; k < rest_of(view.sh_degree); k++) {
-        color += b[k] * param3(SH_REST + 3u * k, i);
+    let b = basis(normalize(mean - view.camera.xyz));
+    let rest = rest_of(view.sh_degree);
+    // Written out, so that the basis stays in registers.
+#each K 15
+    if $Ku < rest {
+        color += b[$K] * param3(SH_REST + 3u * $Ku, i);
     }
+#end
 #endif
     return color;
 }

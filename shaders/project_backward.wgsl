@@ -48,13 +48,17 @@ fn color_backward(i: u32, mean: vec3<f32>, splat_color: vec3<f32>, gradient: vec
     let ray = mean - view.camera.xyz;
     let distance = length(ray);
     let direction = ray / distance;
-    var b = basis(direction);
-    var slopes = basis_slopes(direction);
+    let b = basis(direction);
+    let slopes = basis_slopes(direction);
+    let rest = rest_of(view.sh_degree);
     var d_direction = vec3<f32>(0.0);
-    for (var k = 0u; k < rest_of(view.sh_degree); k++) {
-        put3(SH_REST + 3u * k, i, b[k] * d);
-        d_direction += dot(param3(SH_REST + 3u * k, i), d) * slopes[k];
+    // Written out, so that the basis stays in registers.
+#each K 15
+    if $Ku < rest {
+        put3(SH_REST + 3u * $Ku, i, b[$K] * d);
+        d_direction += dot(param3(SH_REST + 3u * $Ku, i), d) * slopes[$K];
     }
+#end
     return (d_direction - direction * dot(direction, d_direction)) / distance;
 #else
     return vec3<f32>(0.0);
