@@ -200,7 +200,11 @@ pub fn open_engine(device: &str) -> Result<Box<dyn Engine>> {
     if device == "cpu" {
         return Ok(Box::new(CpuEngine::new()));
     }
-    Ok(Box::new(GpuEngine::new(crate::Gpu::open(device)?)))
+    let gpu = crate::Gpu::open(device)?;
+    if gpu.shape == crate::gpu::Shape::Wide {
+        tracing::info!("'{}' is a software device; --device cpu does the same about twice as fast", gpu.name);
+    }
+    Ok(Box::new(GpuEngine::new(gpu)))
 }
 
 /// Loss planes of a step: colour channels 0..3 and feature channels 3..6, as far as they are trained.
