@@ -1,8 +1,8 @@
 //! No more Gaussians than the scene needs (`--budget auto`).
 //!
 //! *Growth* stops when it no longer pays: some training views are kept aside and watched; every `WATCH_EVERY` steps, if
-//! the scene has grown by at least `GROWTH` since the last look and the watched views gained less than `GAIN` dB, it
-//! may grow no further, and the watched views join the training.
+//! the scene has grown by at least `GROWTH` since the last look and the watched views gained less than `GAIN` dB a
+//! doubling, it may grow no further, and the watched views join the training.
 //!
 //! *Pruning* then removes Gaussians that nobody sees: those whose largest blending weight over all training views stays
 //! under [`MIN_WEIGHT`] (as in RadSplat, Niemeyer et al. 2024). What is left is refined by the rest of the run.
@@ -15,8 +15,8 @@ use serde::{Deserialize, Serialize};
 pub(crate) const WATCH_EVERY: u32 = 500;
 /// Relative growth that has to show an effect.
 const GROWTH: f64 = 0.1;
-/// Gain on the watched views, in dB, that pays for it.
-const GAIN: f64 = 0.1;
+/// Gain on the watched views, in dB, that pays for twice as many Gaussians.
+const GAIN: f64 = 0.5;
 /// Largest blending weight below which a Gaussian is removed.
 pub const MIN_WEIGHT: f32 = 0.1;
 /// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
@@ -42,11 +42,11 @@ impl Growth {
     /// Takes a look: so many Gaussians give so many dB.
     pub fn look(&mut self, gaussians: usize, psnr: f64) {
         if let Some((before, then)) = self.last {
-            let grown = gaussians as f64 >= before as f64 * (1.0 + GROWTH);
-            if !grown {
+            let grown = gaussians as f64 / before as f64;
+            if grown < 1.0 + GROWTH {
                 return;
             }
-            self.stopped |= psnr - then < GAIN;
+            self.stopped |= psnr - then < GAIN * grown.log2();
         }
         self.last = Some((gaussians, psnr));
     }

@@ -82,7 +82,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut keypoints = detect(&photos, common)?;
     lap("key_points");
     let mut warnings = dataset.warnings.clone();
-    let checked = check_poses(&mut photos, &keypoints, common.seed, &mut warnings);
+    let checked = check_poses(&mut photos, &keypoints, common, &mut warnings)?;
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
@@ -253,10 +253,21 @@ fn detect(photos: &[Photo], common: &ui::Common) -> Result<Vec<Keypoints>> {
     Ok(points)
 }
 
+/// Longer side of the pictures on which poses are checked. Its tolerances are pixels, and the coarser key points of small
+/// pictures are those that wide baselines share.
+const CHECK_SIDE: u32 = 480;
+
 /// Moves misplaced cameras and warns about them. Poses come from all photos, held out or not, as in structure from motion.
-fn check_poses(photos: &mut [Photo], keypoints: &[Keypoints], seed: u64, warnings: &mut Vec<String>) -> pose_check::Report {
-    let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
-    let report = pose_check::repair(&mut cameras, keypoints, seed);
+fn check_poses(
+    photos: &mut [Photo],
+    keypoints: &[Keypoints],
+    common: &ui::Common,
+    warnings: &mut Vec<String>,
+) -> Result<pose_check::Report> {
+    let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
+    let small = photos.iter().zip(&cameras).any(|(p, c)| p.camera.width != c.width);
+    let detected = if small { Some(detect_small(photos, &cameras, common)?) } else { None };
+    let report = pose_check::repair(&mut cameras, detected.as_deref().unwrap_or(keypoints), common.seed);
     let names = |list: &[usize]| list.iter().map(|&i| cameras[i].name.as_str()).collect::<Vec<_>>().join(", ");
     for (list, what) in [
         (&report.moved, "contradicted the photos and were moved to where the key points match"),
@@ -269,9 +280,22 @@ fn check_poses(photos: &mut [Photo], keypoints: &[Keypoints], seed: u64, warning
         }
     }
     for (photo, camera) in photos.iter_mut().zip(cameras) {
-        photo.camera = camera;
+        photo.camera.world_to_camera = camera.world_to_camera;
     }
-    report
+    Ok(report)
+}
+
+/// Key points of the photos at the sizes of `cameras`.
+fn detect_small(photos: &[Photo], cameras: &[Camera], common: &ui::Common) -> Result<Vec<Keypoints>> {
+    let bar = ui::bar(common, photos.len() as u64, "key points for the pose check");
+    let mut points = Vec::new();
+    for (photo, camera) in photos.iter().zip(cameras) {
+        let small = image_io::resize(&photo.pixels, camera.width, camera.height);
+        points.push(keypoints::detect(&image::imageops::grayscale(&small))?);
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(points)
 }
 
 fn match_photos(training: &[Photo], points: &[Keypoints], neighbours: usize, common: &ui::Common) -> Vec<PairMatches> {

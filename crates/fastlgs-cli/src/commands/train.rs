@@ -23,9 +23,10 @@ pub struct Args {
     /// Iterations, instead of the preset's.
     #[arg(long)]
     iterations: Option<u32>,
-    /// Gaussians: `auto` (as many as pay for themselves), or exactly how many there may be.
+    /// Gaussians: `auto` (as many as pay for themselves; at most 100,000 with the preset quick, 300,000 with standard, a
+    /// million with paper), or exactly how many there may be.
     #[arg(long, default_value = "auto", value_parser = parse_budget)]
-    budget: Budget,
+    budget: BudgetChoice,
     /// How their number is controlled: `classic` (clone, split, prune, opacity reset) or `mcmc` (relocation and noise).
     #[arg(long, default_value = "classic", value_parser = ["classic", "mcmc"])]
     strategy: String,
@@ -82,8 +83,6 @@ pub struct Args {
     resume: bool,
 }
 
-/// No automatic budget goes beyond this.
-const AUTO_MOST: usize = 1_000_000;
 /// Fewest triangulated points worth starting from.
 const FEW_POINTS: usize = 500;
 
@@ -106,15 +105,16 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
     let held_out: Vec<&Camera> = cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, manifest.holdout)).map(|c| c.1).collect();
     let held_out = held_out.into_iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
-    let first = first_gaussians(args, &folder, &training, common.seed)?;
+    let (preset, preset_degree, preset_most) = match args.preset.as_str() {
+        "quick" => (2_000, 2, 100_000),
+        "standard" => (7_000, 2, 300_000),
+        _ => (30_000, 3, 1_000_000),
+    };
+    let budget = args.budget.map_or(Budget::Auto(preset_most), Budget::Fixed);
+    let first = first_gaussians(args, &folder, &training, budget, common.seed)?;
     if args.freeze && !by_descent {
         bail!("--freeze trains features: add --feature-mode train --mapping paper; or, to lift objects only, use --iterations 0");
     }
-    let (preset, preset_degree) = match args.preset.as_str() {
-        "quick" => (2_000, 2),
-        "standard" => (7_000, 2),
-        _ => (30_000, 3),
-    };
     let channels = match (args.freeze, by_descent, args.feature_moves_geometry) {
         (true, ..) => Channels::Feature,
         (_, false, _) => Channels::Color,
@@ -124,7 +124,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let config = TrainConfig {
         iterations: args.iterations.unwrap_or(preset),
         seed: common.seed,
-        budget: args.budget,
+        budget,
         strategy: if args.strategy == "mcmc" { Strategy::Mcmc } else { Strategy::Classic },
         channels,
         sh_degree: args.sh_degree.unwrap_or(if args.freeze { first.sh_degree } else { preset_degree }),
@@ -244,12 +244,15 @@ fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, backgroun
     Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature } })
 }
 
+/// Nothing for `auto`.
+type BudgetChoice = Option<usize>;
+
 /// Parses `auto` or a number.
-fn parse_budget(text: &str) -> Result<Budget, String> {
+fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
     if text == "auto" {
-        return Ok(Budget::Auto(AUTO_MOST));
+        return Ok(None);
     }
-    text.parse().ok().filter(|n| *n > 0).map(Budget::Fixed).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
+    text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
 }
 
 /// What lies behind everything.
@@ -270,7 +273,7 @@ fn parse_background(text: &str) -> Result<Background, String> {
 }
 
 /// The given PLY, else the scene's points, else random ones.
-fn first_gaussians(args: &Args, folder: &SceneFolder, training: &[Camera], seed: u64) -> Result<Gaussians> {
+fn first_gaussians(args: &Args, folder: &SceneFolder, training: &[Camera], budget: Budget, seed: u64) -> Result<Gaussians> {
     if let Some(path) = &args.init_ply {
         return Ok(ply::read(path)?);
     }
@@ -282,6 +285,6 @@ fn first_gaussians(args: &Args, folder: &SceneFolder, training: &[Camera], seed:
     }
     // More points than half the budget would leave no room to grow where it matters.
     rng.shuffle(&mut points);
-    points.truncate((args.budget.most() / 2).max(1));
+    points.truncate((budget.most() / 2).max(1));
     Ok(init::from_points(&points))
 }
