@@ -5,7 +5,7 @@ use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::scene_folder::is_held_out;
-use fastlgs_core::{Camera, SceneFolder, ply, spz};
+use fastlgs_core::{Camera, SceneFolder, image_io, ply, spz};
 use fastlgs_raster::density::State;
 use std::path::{Path, PathBuf};
 
@@ -50,6 +50,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "bytes_before": crate::scene::bytes(&args.scene),
         "gaussians": scene.gaussians.len(),
         "sh_degree": scene.gaussians.sh_degree,
+        "psnr_held_out": { "before": against_photos(&scene, &before), "after": against_photos(&scene, &after) },
         "psnr_against_original": same.iter().sum::<f64>() / same.len().max(1) as f64,
         "adapter": scene.engine.name(),
     });
@@ -57,12 +58,27 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Colours of the held-out views, or of the first one where none is.
-fn pictures(scene: &mut Scene) -> Result<Vec<Vec<f32>>> {
+/// The held-out views, or the first one where none is.
+fn views(scene: &Scene) -> Vec<Camera> {
     let holdout = scene.manifest.holdout;
     let mut views: Vec<Camera> = scene.cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, holdout)).map(|c| c.1.clone()).collect();
     views.extend(scene.cameras.first().filter(|_| holdout == 0).cloned());
-    views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
+    views
+}
+
+/// Colours of these views.
+fn pictures(scene: &mut Scene) -> Result<Vec<Vec<f32>>> {
+    views(scene).iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
+}
+
+/// Mean PSNR against the photos, where the scene still has them all.
+fn against_photos(scene: &Scene, pictures: &[Vec<f32>]) -> Option<f64> {
+    let each = views(scene).into_iter().zip(pictures).map(|(camera, picture)| {
+        let photo = scene.folder.photo(&camera.name).ok().map(|photo| image_io::to_planar(&photo));
+        photo.filter(|photo| photo.len() == picture.len()).map(|photo| psnr(picture, &photo))
+    });
+    let each: Vec<f64> = each.collect::<Option<_>>()?;
+    Some(each.iter().sum::<f64>() / each.len().max(1) as f64)
 }
 
 /// Writes what queries need: the compressed scene, object ids, grid, cameras and manifest. Returns the scene as it reads.
