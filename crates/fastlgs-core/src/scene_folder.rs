@@ -42,6 +42,11 @@ impl Manifest {
         let usable = |(i, c): &(usize, &Camera)| !is_held_out(*i, self.holdout) && !self.excluded.contains(&c.name);
         cameras.iter().enumerate().filter(usable).map(|(_, c)| c.clone()).collect()
     }
+
+    /// The views that are held out, in their order.
+    pub fn held_out(&self, cameras: &[Camera]) -> Vec<Camera> {
+        cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, self.holdout)).map(|(_, c)| c.clone()).collect()
+    }
 }
 
 /// A scene folder on disk. Paths are given by the methods; nothing is cached.

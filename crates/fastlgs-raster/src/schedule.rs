@@ -46,6 +46,8 @@ pub struct TrainConfig {
     pub channels: crate::Channels,
     /// Highest SH degree of colour; it grows step by step.
     pub sh_degree: u32,
+    /// SH degree at the start: that of a scene that was trained before, else 0.
+    pub first_degree: u32,
     /// Share of D-SSIM in both losses (the paper's lambda).
     pub lambda: f32,
     /// Weight of the feature loss.
@@ -75,6 +77,7 @@ impl Default for TrainConfig {
             strategy: Strategy::Classic,
             channels: crate::Channels::Color,
             sh_degree: 0,
+            first_degree: 0,
             lambda: 0.2,
             feature_weight: 1.0,
             refine_every: 100,
@@ -123,7 +126,7 @@ impl TrainConfig {
     /// SH degree in use: one more every 1,000 steps as in 3DGS, sooner in short runs.
     pub(crate) fn degree(&self, iteration: u32) -> u32 {
         let every = (self.iterations / 8).clamp(1, 1000);
-        (iteration / every).min(self.sh_degree)
+        (iteration / every).max(self.first_degree).min(self.sh_degree)
     }
 
     /// Whether a step is done at half the resolution.
@@ -173,6 +176,8 @@ mod tests {
         assert!(config.prunes(4400) && config.prunes(6000) && !config.prunes(6001));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
+        let continued = TrainConfig { first_degree: 2, ..config.clone() };
+        assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
         assert!(!frozen.refines(300) && !frozen.prunes(4400));
     }

@@ -4,7 +4,6 @@ use crate::scene::Scene;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, SceneFolder, image_io, ply, spz};
 use fastlgs_raster::density::State;
 use std::path::{Path, PathBuf};
@@ -60,9 +59,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 
 /// The held-out views, or the first one where none is.
 fn views(scene: &Scene) -> Vec<Camera> {
-    let holdout = scene.manifest.holdout;
-    let mut views: Vec<Camera> = scene.cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, holdout)).map(|c| c.1.clone()).collect();
-    views.extend(scene.cameras.first().filter(|_| holdout == 0).cloned());
+    let mut views = scene.manifest.held_out(&scene.cameras);
+    if views.is_empty() {
+        views.extend(scene.cameras.first().cloned());
+    }
     views
 }
 

@@ -3,7 +3,6 @@
 use crate::{Outcome, report, ui};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
-use fastlgs_core::scene_folder::is_held_out;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
@@ -26,7 +25,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             let folder = SceneFolder::open(root)?;
             let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
             let objects = fastlgs_grid::Grid::load(&folder).map(|g| g.objects.len()).ok();
-            let held_out = (0..cameras.len()).filter(|&i| is_held_out(i, manifest.holdout)).count();
+            let held_out = manifest.held_out(&cameras).len();
             let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
             serde_json::json!({
                 "scene": root,

@@ -4,7 +4,6 @@ use super::objects;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::{Grid, consensus, whole};
@@ -30,7 +29,7 @@ pub struct Args {
     /// How their number is controlled: `classic` (clone, split, prune, opacity reset) or `mcmc` (relocation and noise).
     #[arg(long, default_value = "classic", value_parser = ["classic", "mcmc"])]
     strategy: String,
-    /// Highest spherical-harmonic degree of colour, 0 to 3; by default the preset's.
+    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init-ply, else the preset's.
     #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3))]
     sh_degree: Option<u32>,
     /// Anti-aliasing by the 2-D Mip filter.
@@ -103,8 +102,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     };
     let codes = paper.as_ref().filter(|_| by_descent).map(|p| &p.grid);
     let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
-    let held_out: Vec<&Camera> = cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, manifest.holdout)).map(|c| c.1).collect();
-    let held_out = held_out.into_iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
+    let held_out = manifest.held_out(&cameras).iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
     let (preset, preset_degree, preset_most) = match args.preset.as_str() {
         "quick" => (2_000, 2, 100_000),
         "standard" => (7_000, 2, 300_000),
@@ -127,7 +125,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         budget,
         strategy: if args.strategy == "mcmc" { Strategy::Mcmc } else { Strategy::Classic },
         channels,
-        sh_degree: args.sh_degree.unwrap_or(if args.freeze { first.sh_degree } else { preset_degree }),
+        sh_degree: args.sh_degree.unwrap_or(if args.init_ply.is_some() { first.sh_degree } else { preset_degree }),
+        first_degree: first.sh_degree,
         feature_weight: args.feature_weight,
         antialias: args.antialias,
         background: args.background.color,

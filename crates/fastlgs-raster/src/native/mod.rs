@@ -74,8 +74,8 @@ pub struct CpuEngine {
     profile: Option<BTreeMap<&'static str, f64>>,
 }
 
-/// Rows `[n][channels]` from columns `[channels][n]`.
-fn rows_of(columns: &[f32], n: usize) -> Vec<f32> {
+/// `[n][channels]` from `[channels][n]`, or with the roles changed the other way round.
+fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
     let channels = columns.len() / n.max(1);
     (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
 }
@@ -225,9 +225,9 @@ impl Engine for CpuEngine {
     fn set_state(&mut self, state: &State) -> Result<()> {
         self.n = state.len();
         self.sh_degree = state.sh_degree;
-        self.params = rows_of(&state.params, self.n);
-        self.moment1 = rows_of(&state.moment1, self.n);
-        self.moment2 = rows_of(&state.moment2, self.n);
+        self.params = transposed(&state.params, self.n);
+        self.moment1 = transposed(&state.moment1, self.n);
+        self.moment2 = transposed(&state.moment2, self.n);
         self.gradients = vec![0.0; self.params.len()];
         self.stats = vec![0.0; 2 * self.n];
         self.cached.clear();
@@ -235,7 +235,7 @@ impl Engine for CpuEngine {
     }
 
     fn state(&self) -> Result<State> {
-        let columns = |rows: &[f32]| rows_of(rows, channels_of(self.sh_degree));
+        let columns = |rows: &[f32]| transposed(rows, channels_of(self.sh_degree));
         let (params, moment1, moment2) = (columns(&self.params), columns(&self.moment1), columns(&self.moment2));
         Ok(State { sh_degree: self.sh_degree, params, moment1, moment2 })
     }
@@ -250,7 +250,7 @@ impl Engine for CpuEngine {
     }
 
     fn gradients(&self) -> Result<Vec<f32>> {
-        Ok(rows_of(&self.gradients, channels_of(self.sh_degree)))
+        Ok(transposed(&self.gradients, channels_of(self.sh_degree)))
     }
 
     fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
