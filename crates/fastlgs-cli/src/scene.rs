@@ -30,7 +30,7 @@ impl Scene {
     pub fn open(root: &Path, device: &str) -> Result<Self> {
         let folder = SceneFolder::open(root)?;
         let mut gaussians = folder.gaussians()?;
-        if folder.is_compressed() {
+        if folder.is_compact() {
             Grid::load(&folder).context("the object grid cannot be read; export the scene again")?.set_codes(&mut gaussians);
         }
         let mut engine = fastlgs_raster::open_engine(device)?;
@@ -95,8 +95,8 @@ impl Scene {
 
 /// Bytes of everything that a query needs.
 pub fn bytes(root: &Path) -> u64 {
-    let model = if root.join("scene.ply").is_file() { ["scene.ply", ""] } else { ["scene.spz", "object_ids.bin"] };
-    let files = model.into_iter().filter(|f| !f.is_empty()).chain(["grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"]);
+    let model = if root.join("scene.ply").is_file() { "scene.ply" } else { "scene.safetensors" };
+    let files = [model, "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"].into_iter();
     files.filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
 }
 

@@ -34,6 +34,15 @@ fn partial_name(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
+/// The user's cache folder of this project: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else `~/.cache/fastlgs`.
+pub fn cache_dir() -> PathBuf {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    variable("FASTLGS_CACHE")
+        .or_else(|| variable("XDG_CACHE_HOME").map(|p| p.join("fastlgs")))
+        .or_else(|| variable("HOME").map(|p| p.join(".cache/fastlgs")))
+        .unwrap_or_else(|| std::env::temp_dir().join("fastlgs"))
+}
+
 /// Reads a whole file.
 ///
 /// # Errors

@@ -8,6 +8,7 @@
 
 pub mod camera;
 pub mod color;
+pub mod compact;
 pub mod dataset;
 pub mod error;
 pub mod exr_image;

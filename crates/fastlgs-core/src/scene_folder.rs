@@ -1,7 +1,7 @@
 //! The scene folder: one place for everything a stage leaves for the next.
 
 use crate::dataset::SfmPoint;
-use crate::{Camera, Error, Gaussians, LabelMap, Result, fs, image_io, ply, spz};
+use crate::{Camera, Error, Gaussians, LabelMap, Result, compact, fs, image_io, ply};
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -103,27 +103,14 @@ impl SceneFolder {
         fs::write_json(&self.manifest_path(), manifest)
     }
 
-    fn spz_path(&self) -> PathBuf {
-        self.root.join("scene.spz")
+    /// The trained scene in compact form.
+    pub fn compact_path(&self) -> PathBuf {
+        self.root.join("scene.safetensors")
     }
 
-    fn ids_path(&self) -> PathBuf {
-        self.root.join("object_ids.bin")
-    }
-
-    /// Whether the scene is there in compressed form only: features are then those of the objects' codes.
-    pub fn is_compressed(&self) -> bool {
-        !self.ply_path().is_file() && self.spz_path().is_file()
-    }
-
-    /// Writes the compressed form: `scene.spz`, and 16 bits (little-endian) of object id for each Gaussian.
-    ///
-    /// # Errors
-    /// The system's refusal.
-    pub fn save_compressed(&self, scene: &Gaussians) -> Result<()> {
-        spz::write(&self.spz_path(), scene)?;
-        let ids: Vec<u8> = scene.object_ids.iter().flat_map(|id| id.to_le_bytes()).collect();
-        fs::write_atomic(&self.ids_path(), |file| std::io::Write::write_all(file, &ids))
+    /// Whether the scene is there in compact form only: features are then those of the objects' codes.
+    pub fn is_compact(&self) -> bool {
+        !self.ply_path().is_file() && self.compact_path().is_file()
     }
 
     /// The trained Gaussians.
@@ -131,15 +118,8 @@ impl SceneFolder {
     /// # Errors
     /// When the scene was never trained or its file is damaged.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        if self.is_compressed() {
-            let mut scene = spz::read(&self.spz_path())?;
-            let ids = fs::read(&self.ids_path())?;
-            if ids.len() != 2 * scene.len() {
-                let reason = format!("{} bytes for {} Gaussians; export the scene again", ids.len(), scene.len());
-                return Err(Error::format(self.ids_path(), reason));
-            }
-            scene.object_ids = ids.chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
-            return Ok(scene);
+        if self.is_compact() {
+            return compact::read(&self.compact_path());
         }
         let path = self.ply_path();
         if !path.is_file() {

@@ -201,7 +201,7 @@ pub fn open_engine(device: &str) -> Result<Box<dyn Engine>> {
         return Ok(Box::new(CpuEngine::new()));
     }
     let gpu = crate::Gpu::open(device)?;
-    if gpu.shape == crate::gpu::Shape::Wide {
+    if gpu.software {
         tracing::info!("'{}' is a software device; --device cpu does the same about twice as fast", gpu.name);
     }
     Ok(Box::new(GpuEngine::new(gpu)))

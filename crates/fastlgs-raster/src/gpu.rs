@@ -1,11 +1,13 @@
 //! Adapters, the device, and buffers.
 
 use crate::profile::Profile;
-use crate::{Error, Result};
+use crate::{Error, Result, tuning};
+use serde::{Deserialize, Serialize};
 use std::sync::{Arc, Mutex};
 
 /// How the blending kernels divide an 8x8 tile; `shaders/shared/lane.wgsl`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Shape {
     /// Eight invocations a tile, which add up their gradients in shared memory.
     Shared,
@@ -39,8 +41,14 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name of the adapter.
     pub name: String,
-    /// How the blending kernels divide a tile.
+    /// How the blending kernels divide a tile: what was measured to be fastest ([`crate::tuning`]), else a guess.
     pub shape: Shape,
+    /// Shapes that the adapter can run.
+    pub shapes: Vec<Shape>,
+    /// The adapter with its driver's version: what measurements hold for.
+    pub identity: String,
+    /// Whether it is a software rasteriser.
+    pub software: bool,
     /// Largest storage binding in bytes.
     pub max_binding: u64,
     /// Times of the passes, where asked for.
@@ -91,11 +99,14 @@ impl Gpu {
         let info = adapter.get_info();
         let limits = adapter.limits();
         let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && info.subgroup_min_size >= 8;
-        let shape = match (info.device_type, subgroups) {
-            (wgpu::DeviceType::Cpu, _) => Shape::Wide,
-            (_, true) => Shape::Subgroups,
-            _ => Shape::Shared,
-        };
+        let software = info.device_type == wgpu::DeviceType::Cpu;
+        let mut shapes = vec![Shape::Wide, Shape::Shared];
+        if subgroups {
+            shapes.push(Shape::Subgroups);
+        }
+        let guess = if software { Shape::Wide } else { shapes[shapes.len() - 1] };
+        let identity = format!("{} ({} {})", info.name, info.driver, info.driver_info);
+        let shape = tuning::remembered(&identity).filter(|s| shapes.contains(s)).unwrap_or(guess);
         let mut features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         features.set(wgpu::Features::SUBGROUP, subgroups);
         let descriptor = wgpu::DeviceDescriptor {
@@ -121,7 +132,18 @@ impl Gpu {
             };
             slot.lock().expect("no panic while holding the lock").get_or_insert(reason);
         }));
-        Ok(Self { device, queue, name: info.name, shape, max_binding: limits.max_storage_buffer_binding_size, profile: None, failure })
+        Ok(Self {
+            device,
+            queue,
+            name: info.name,
+            shape,
+            shapes,
+            identity,
+            software,
+            max_binding: limits.max_storage_buffer_binding_size,
+            profile: None,
+            failure,
+        })
     }
 
     /// An uninitialised storage buffer of `bytes` (at least 16).

@@ -22,13 +22,14 @@ mod pass;
 mod profile;
 mod schedule;
 mod trainer;
+pub mod tuning;
 mod view;
 
 #[cfg(test)]
 mod tests;
 
 pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, open_engine, pack};
-pub use gpu::{Gpu, adapters};
+pub use gpu::{Gpu, Shape, adapters};
 pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
 pub use pass::Channels;

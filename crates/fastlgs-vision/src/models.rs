@@ -1,6 +1,7 @@
 //! Where weights live, and how the offline ones get there.
 
 use crate::{Error, Result};
+use fastlgs_core::fs::cache_dir;
 use fastlgs_core::synth::{PICTURES, TEXTURES};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -21,15 +22,6 @@ const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==
 pub const OFFLINE_FILES: [&str; 5] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json"];
 
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
-
-/// The user's cache folder of this project: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else `~/.cache/fastlgs`.
-pub fn cache_dir() -> PathBuf {
-    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-    variable("FASTLGS_CACHE")
-        .or_else(|| variable("XDG_CACHE_HOME").map(|p| p.join("fastlgs")))
-        .or_else(|| variable("HOME").map(|p| p.join(".cache/fastlgs")))
-        .unwrap_or_else(|| std::env::temp_dir().join("fastlgs"))
-}
 
 /// Folder of the converted offline models.
 pub fn offline_dir() -> PathBuf {

@@ -3,8 +3,9 @@
 use crate::scene::Scene;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
+use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::{Camera, SceneFolder, image_io, ply, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply, spz};
 use fastlgs_raster::density::State;
 use std::path::{Path, PathBuf};
 
@@ -20,26 +21,34 @@ pub struct Args {
     sh_degree: Option<u32>,
 }
 
+/// Training views that the precision of the small folder is tried on.
+const PRECISION_VIEWS: usize = 4;
+/// What each group of values may lose there, in dB.
+const PRECISION_LOSS: f64 = 0.01;
+
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut scene = Scene::open(&args.scene, &common.device)?;
-    let before = pictures(&mut scene)?;
+    let held_out = held_out(&scene);
+    let before = pictures(&mut scene, &held_out)?;
     let degree = args.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
     scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
     let ending = args.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    let written = match ending {
+    let (written, precision) = match ending {
         "ply" => {
             ply::write(&args.output, &scene.gaussians)?;
-            ply::read(&args.output)?
+            (ply::read(&args.output)?, None)
         }
         "spz" => {
             spz::write(&args.output, &scene.gaussians)?;
-            spz::read(&args.output)?
+            (spz::read(&args.output)?, None)
         }
-        _ => small_folder(&scene, &args.output)?,
+        _ => {
+            let (written, precision) = small_folder(&mut scene, &args.output)?;
+            (written, Some(precision.by_group()))
+        }
     };
-    scene.engine.set_state(&State::of(&written))?;
-    scene.gaussians = written;
-    let after = pictures(&mut scene)?;
+    show(&mut scene, &written)?;
+    let after = pictures(&mut scene, &held_out)?;
     // Both against each other, not against photos: an exported scene may have none.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
     let value = serde_json::json!({
@@ -49,7 +58,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "bytes_before": crate::scene::bytes(&args.scene),
         "gaussians": scene.gaussians.len(),
         "sh_degree": scene.gaussians.sh_degree,
-        "psnr_held_out": { "before": against_photos(&scene, &before), "after": against_photos(&scene, &after) },
+        "bytes_a_value": precision,
+        "psnr_held_out": { "before": against_photos(&scene, &held_out, &before), "after": against_photos(&scene, &held_out, &after) },
         "psnr_against_original": same.iter().sum::<f64>() / same.len().max(1) as f64,
         "adapter": scene.engine.name(),
     });
@@ -58,7 +68,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 }
 
 /// The held-out views, or the first one where none is.
-fn views(scene: &Scene) -> Vec<Camera> {
+fn held_out(scene: &Scene) -> Vec<Camera> {
     let mut views = scene.manifest.held_out(&scene.cameras);
     if views.is_empty() {
         views.extend(scene.cameras.first().cloned());
@@ -66,14 +76,21 @@ fn views(scene: &Scene) -> Vec<Camera> {
     views
 }
 
+/// Puts other Gaussians on the scene's device.
+fn show(scene: &mut Scene, gaussians: &Gaussians) -> Result<()> {
+    scene.engine.set_state(&State::of(gaussians))?;
+    scene.gaussians = gaussians.clone();
+    Ok(())
+}
+
 /// Colours of these views.
-fn pictures(scene: &mut Scene) -> Result<Vec<Vec<f32>>> {
-    views(scene).iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
+fn pictures(scene: &mut Scene, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
+    views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
 }
 
 /// Mean PSNR against the photos, where the scene still has them all.
-fn against_photos(scene: &Scene, pictures: &[Vec<f32>]) -> Option<f64> {
-    let each = views(scene).into_iter().zip(pictures).map(|(camera, picture)| {
+fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Option<f64> {
+    let each = views.iter().zip(pictures).map(|(camera, picture)| {
         let photo = scene.folder.photo(&camera.name).ok().map(|photo| image_io::to_planar(&photo));
         photo.filter(|photo| photo.len() == picture.len()).map(|photo| psnr(picture, &photo))
     });
@@ -81,8 +98,25 @@ fn against_photos(scene: &Scene, pictures: &[Vec<f32>]) -> Option<f64> {
     Some(each.iter().sum::<f64>() / each.len().max(1) as f64)
 }
 
-/// Writes what queries need: the compressed scene, object ids, grid, cameras and manifest. Returns the scene as it reads.
-fn small_folder(scene: &Scene, root: &Path) -> Result<fastlgs_core::Gaussians> {
+/// The precision that some training views show to be enough; the default where they have no photos.
+fn precision(scene: &mut Scene) -> Result<Precision> {
+    let training = scene.manifest.training(&scene.cameras);
+    let views: Vec<Camera> = training.iter().step_by(training.len().div_ceil(PRECISION_VIEWS).max(1)).cloned().collect();
+    let original = scene.gaussians.clone();
+    if views.iter().any(|v| !scene.folder.photo_path(&v.name).is_file()) {
+        return Ok(Precision::default());
+    }
+    let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
+        show(scene, gaussians)?;
+        let pictures = pictures(scene, &views)?;
+        against_photos(scene, &views, &pictures).context("a photo of the scene cannot be read; run 'fastlgs preprocess' again")
+    })?;
+    show(scene, &original)?;
+    Ok(chosen)
+}
+
+/// Writes what queries need: the compact scene, grid, cameras and manifest. Returns the scene as it reads.
+fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)> {
     if root.exists() && !root.join("scene.json").is_file() && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
         bail!("{}: not empty and not a scene; name a new folder", root.display());
     }
@@ -94,13 +128,14 @@ fn small_folder(scene: &Scene, root: &Path) -> Result<fastlgs_core::Gaussians> {
     if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
         bail!("the scene's features were trained by descent, which a small folder cannot hold; export FILE.ply instead");
     }
-    folder.save_compressed(&scene.gaussians)?;
+    let precision = precision(scene)?;
+    compact::write(&folder.compact_path(), &scene.gaussians, &precision)?;
     grid.save(&folder)?;
     folder.save_cameras(&scene.cameras)?;
     folder.save_manifest(&scene.manifest).context("the manifest cannot be written")?;
     let mut written = folder.gaussians()?;
     grid.set_codes(&mut written);
-    Ok(written)
+    Ok((written, precision))
 }
 
 fn bytes_of(path: &Path) -> u64 {

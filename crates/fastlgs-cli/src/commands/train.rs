@@ -85,6 +85,9 @@ pub struct Args {
 /// Fewest triangulated points worth starting from.
 const FEW_POINTS: usize = 500;
 
+/// Iterations from which it pays to find out first which kernels the device is fastest with.
+const WORTH_TUNING: u32 = 500;
+
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let by_descent = args.feature_mode == "train";
     if by_descent && args.mapping == "global" {
@@ -134,6 +137,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         exposure: args.exposure,
         ..TrainConfig::default()
     };
+    if config.iterations >= WORTH_TUNING {
+        fastlgs_raster::tuning::tune(&common.device, false)?;
+    }
     let engine = fastlgs_raster::open_engine(&common.device)?;
     let bar = ui::bar(common, u64::from(config.iterations), "training");
     let mut trainer = Trainer::new(engine, &first, targets, config.clone())?;

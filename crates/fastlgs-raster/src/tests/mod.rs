@@ -11,7 +11,7 @@ use fastlgs_core::{Camera, Gaussians};
 use glam::Vec3;
 
 /// The adapter, or a loud skip. FASTLGS_REQUIRE_GPU=1 turns the skip into a failure (set by test.sh).
-fn gpu() -> Option<Gpu> {
+pub(crate) fn gpu() -> Option<Gpu> {
     match Gpu::open("auto") {
         Ok(gpu) => Some(gpu),
         Err(e) if std::env::var_os("FASTLGS_REQUIRE_GPU").is_some() => panic!("{e}"),

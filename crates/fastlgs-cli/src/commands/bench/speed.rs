@@ -66,6 +66,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let stride = cameras.len().div_ceil(VIEWS);
     let (mut tables, mut lines) = (Vec::new(), Vec::new());
     for device in &devices {
+        let tuning = fastlgs_raster::tuning::tune(device, true)?;
         let mut engine = fastlgs_raster::open_engine(device)?;
         let ceiling = engine.ceiling()?;
         let mut settings = Vec::new();
@@ -85,6 +86,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         }
         tables.push(json!({
             "adapter": engine.name(),
+            "kernel_shapes": tuning,
             "ceiling_gflops": ceiling / 1e9,
             "growth": growth(&settings),
             "settings": settings.into_iter().map(|s| s.row).collect::<Vec<_>>(),
