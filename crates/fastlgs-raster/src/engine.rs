@@ -15,13 +15,26 @@ pub struct Frame {
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
-    /// `[8][h][w]`: r, g, b, f0, f1, f2, transmittance left, pairs walked. Channels that were not asked for hold anything.
+    /// `[8][h][w]`: r, g, b, f0, f1, f2, transmittance left, pairs walked. Channels that were not asked for are zero.
     pub data: Vec<f32>,
     /// (tile, Gaussian) pairs of the frame.
     pub pairs: u32,
 }
 
 impl Frame {
+    /// The frame of a view from rows (of a channel and y) that begin at its left border; only what was rendered is copied.
+    pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32]) -> Self {
+        let [w, h] = view.size.map(|s| s as usize);
+        let mut data = vec![0.0; 8 * w * h];
+        let rendered = |c: &usize| (*c >= 3 || channels.color()) && (!(3..6).contains(c) || channels.feature());
+        for channel in (0..8).filter(rendered) {
+            for (y, out) in data[channel * w * h..][..w * h].chunks_exact_mut(w).enumerate() {
+                out.copy_from_slice(&row(channel, y as u32)[..w]);
+            }
+        }
+        Self { width: view.size[0], height: view.size[1], data, pairs: view.pairs }
+    }
+
     /// Channels `from..to` as one planar slice.
     pub fn channels(&self, from: usize, to: usize) -> &[f32] {
         let n = (self.width * self.height) as usize;

@@ -53,6 +53,8 @@ pub struct Gpu {
     pub max_binding: u64,
     /// Times of the passes, where asked for.
     pub(crate) profile: Option<Profile>,
+    /// Where the last reading went through.
+    staging: Mutex<Option<wgpu::Buffer>>,
     /// First error that no one caught (out of memory, lost device).
     failure: Arc<Mutex<Option<String>>>,
 }
@@ -142,6 +144,7 @@ impl Gpu {
             software,
             max_binding: limits.max_storage_buffer_binding_size,
             profile: None,
+            staging: Mutex::new(None),
             failure,
         })
     }
@@ -207,12 +210,24 @@ impl Gpu {
     /// # Errors
     /// When the device failed since the last call.
     pub fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, count: usize) -> Result<Vec<T>> {
-        let bytes = ((count * size_of::<T>()) as u64).next_multiple_of(4);
-        let staging = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("read"),
-            size: bytes.max(4),
-            usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
+        self.read_with(buffer, count, <[T]>::to_vec)
+    }
+
+    /// The same, handing the values to `take` where the device left them.
+    ///
+    /// # Errors
+    /// When the device failed since the last call.
+    pub fn read_with<T: bytemuck::Pod, R>(&self, buffer: &wgpu::Buffer, count: usize, take: impl FnOnce(&[T]) -> R) -> Result<R> {
+        let bytes = ((count * size_of::<T>()) as u64).next_multiple_of(8).min(buffer.size());
+        // Kept between calls: fresh memory costs more than the copy.
+        let mut kept = self.staging.lock().expect("no panic while holding the lock");
+        let staging = kept.take().filter(|b| b.size() >= bytes).unwrap_or_else(|| {
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some("read"),
+                size: bytes.max(8),
+                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
         });
         let mut encoder = self.encoder();
         encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
@@ -224,7 +239,11 @@ impl Gpu {
         if let Some(reason) = self.failure.lock().expect("no panic while holding the lock").take() {
             return Err(failed(reason));
         }
-        let view = staging.get_mapped_range(..).map_err(|e| failed(e.to_string()))?;
-        Ok(view[..count * size_of::<T>()].chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned).collect())
+        let view = staging.get_mapped_range(..bytes).map_err(|e| failed(e.to_string()))?;
+        let taken = take(&bytemuck::cast_slice(&view)[..count]);
+        drop(view);
+        staging.unmap();
+        *kept = Some(staging);
+        Ok(taken)
     }
 }

@@ -519,8 +519,10 @@ impl Engine for GpuEngine {
         let mut on_cpu = self.passes_on_cpu;
         let view = self.forward(view, channels, None, false, &mut on_cpu)?.view;
         let frame = self.frame.as_ref().expect("made by forward");
-        let data = view.cropped(&self.gpu.read(&frame.frame, 8 * view.padded_pixels())?);
-        Ok(Frame { width: view.size[0], height: view.size[1], data, pairs: view.pairs })
+        let plane = view.padded_pixels();
+        self.gpu.read_with(&frame.frame, 8 * plane, |planes: &[f32]| {
+            Frame::gathered(&view, channels, |channel, y| &planes[channel * plane + view.at(0, y)..])
+        })
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

@@ -89,14 +89,7 @@ impl View {
         (y * self.tiles[0] * TILE + x) as usize
     }
 
-    /// Planes as they lie on the device, without the padding.
-    pub(crate) fn cropped<T: Copy>(&self, planes: &[T]) -> Vec<T> {
-        let [w, h] = self.size;
-        let rows = planes.chunks_exact(self.padded_pixels()).flat_map(|plane| (0..h).map(move |y| &plane[self.at(0, y)..][..w as usize]));
-        rows.flatten().copied().collect()
-    }
-
-    /// The inverse of [`Self::cropped`]; the padding is zero.
+    /// Planes as they lie on the device; the padding is zero.
     pub(crate) fn padded<T: Copy + Default>(&self, planes: &[T]) -> Vec<T> {
         let [w, h] = self.size.map(|s| s as usize);
         let mut out = vec![T::default(); planes.len() / (w * h) * self.padded_pixels()];

@@ -4,7 +4,7 @@
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, TextEncoder, normalise};
 use crate::exposure;
-use crate::runtime::{Input, Model};
+use crate::runtime::{Array, Model};
 use crate::{MiniLm, Result, models};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{LabelMap, fs};
@@ -63,8 +63,8 @@ impl Conse {
         let mut out = Vec::with_capacity(crops.len());
         for batch in crops.chunks(BATCH) {
             let data = batch.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
-            let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![batch.len(), 3, SIZE, SIZE], data))], "logits")?;
-            out.extend(logits.chunks_exact(shape[1]).map(softmax));
+            let logits = self.classifier.run(vec![("image", Array::new([batch.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0);
+            out.extend(logits.values.chunks_exact(logits.shape[1]).map(softmax));
         }
         Ok(out)
     }
@@ -93,7 +93,7 @@ impl Conse {
         for (i, pixel) in photo.pixels().enumerate() {
             (0..3).for_each(|k| data[k * w * h + i] = (f32::from(pixel[k]) - 127.0) / 128.0);
         }
-        let (shape, logits) = self.classifier.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "dense")?;
+        let Array { shape, values: logits } = self.classifier.run(vec![("image", Array::new([1, 3, h, w], data))], &["dense"])?.remove(0);
         let (classes, rows, columns) = (shape[1], shape[2], shape[3]);
         let cells = rows * columns;
         let mut values = vec![0.0; cells * classes];

@@ -1,6 +1,6 @@
 //! Learned edges: HED (Xie & Tu 2015).
 
-use crate::runtime::{Input, Model};
+use crate::runtime::{Array, Model};
 use crate::{Result, models};
 use image::RgbImage;
 
@@ -31,6 +31,6 @@ impl Hed {
                 data[k * w * h + i] = f32::from(pixel[2 - k]) - MEAN_BGR[k];
             }
         }
-        Ok(self.0.run(vec![("image", Input::Float(vec![1, 3, h, w], data))], "edge")?.1)
+        Ok(self.0.run(vec![("image", Array::new([1, 3, h, w], data))], &["edge"])?.remove(0).values)
     }
 }

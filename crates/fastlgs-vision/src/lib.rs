@@ -9,17 +9,20 @@ pub mod encoder;
 pub mod exposure;
 pub mod histogram;
 pub mod keypoints;
+pub mod masks;
 pub mod models;
 pub mod pose_check;
 pub mod regions;
 mod runtime;
+pub mod sam;
 pub mod segmenter;
 pub mod text;
 pub mod triangulate;
 
 pub use conse::Conse;
 pub use encoder::{Encoder, TextEncoder};
-pub use segmenter::{OfflineSegmenter, Segmentation, Segmenter};
+pub use sam::Sam;
+pub use segmenter::{Level, OfflineSegmenter, Segmentation, Segmenter};
 pub use text::MiniLm;
 
 /// Errors of the vision crate.

@@ -3,7 +3,7 @@
 use crate::{Error, Result, models};
 use ort::environment::Environment;
 use ort::session::Session;
-use ort::value::Tensor;
+use ort::value::{DynValue, Tensor, TensorElementType, ValueType};
 use std::path::Path;
 use std::sync::Mutex;
 
@@ -21,52 +21,121 @@ fn environment() -> Result<Environment> {
     Ok(slot.insert(environment).clone())
 }
 
+/// Values of a tensor with their shape, row-major. Whole numbers are held as floats, which is exact up to 2^24.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Array {
+    /// Length of each dimension.
+    pub shape: Vec<usize>,
+    /// Row-major values.
+    pub values: Vec<f32>,
+}
+
+impl Array {
+    /// An array of `shape`.
+    pub fn new(shape: impl Into<Vec<usize>>, values: Vec<f32>) -> Self {
+        Self { shape: shape.into(), values }
+    }
+}
+
+/// What a model takes under a name.
+#[derive(Clone, Debug)]
+pub struct Slot {
+    /// Name of the input.
+    pub name: String,
+    /// Length of each dimension; `None` where any is fine.
+    pub shape: Vec<Option<usize>>,
+    kind: TensorElementType,
+}
+
 /// A loaded model.
+#[derive(Debug)]
 pub struct Model {
     name: String,
+    /// Its inputs.
+    pub inputs: Vec<Slot>,
+    /// Names of its outputs.
+    pub outputs: Vec<String>,
     session: Mutex<Session>,
 }
 
 impl Model {
     /// Loads an ONNX file; it uses as many threads as the machine has cores.
+    ///
+    /// # Errors
+    /// When the file or ONNX Runtime is missing, or it is no model.
     pub fn load(path: &Path) -> Result<Self> {
         let name = path.display().to_string();
         if !path.is_file() {
-            return Err(Error::Missing(format!("{name}: the model is not installed; run 'fastlgs models install-offline'")));
+            let mend = "'fastlgs models install-offline' gets the offline models, 'fastlgs models pull NAME' the others";
+            return Err(Error::Missing(format!("{name}: no such model; {mend}")));
         }
         let failed = |e: &dyn std::fmt::Display| Error::Inference { model: name.clone(), reason: e.to_string() };
         let environment = environment()?;
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let mut builder = Session::builder(&environment).map_err(|e| failed(&e))?.with_intra_threads(threads).map_err(|e| failed(&e))?;
         let session = builder.commit_from_file(path).map_err(|e| failed(&e))?;
-        Ok(Self { name, session: Mutex::new(session) })
+        let slot = |outlet: &ort::value::Outlet| match outlet.dtype() {
+            ValueType::Tensor { ty, shape, .. } => {
+                let shape = shape.iter().map(|d| usize::try_from(*d).ok().filter(|d| *d > 0)).collect();
+                Ok(Slot { name: outlet.name().to_owned(), shape, kind: *ty })
+            }
+            _ => Err(failed(&format!("its input '{}' is no tensor", outlet.name()))),
+        };
+        let inputs = session.inputs().iter().map(slot).collect::<Result<Vec<_>>>()?;
+        let outputs = session.outputs().iter().map(|o| o.name().to_owned()).collect();
+        Ok(Self { inputs, outputs, session: Mutex::new(session), name })
     }
 
-    /// Runs on float or integer inputs; returns the first output's shape and values.
-    pub fn run(&self, inputs: Vec<(&str, Input)>, output: &str) -> Result<(Vec<usize>, Vec<f32>)> {
-        let failed = |e: ort::Error| Error::Inference { model: self.name.clone(), reason: e.to_string() };
+    /// The input of one of these names.
+    pub fn input(&self, names: &[&str]) -> Option<&Slot> {
+        self.inputs.iter().find(|slot| names.contains(&slot.name.as_str()))
+    }
+
+    /// The output of one of these names, earlier names first.
+    pub fn output(&self, names: &[&str]) -> Option<&str> {
+        names.iter().find_map(|name| self.outputs.iter().find(|o| o == name)).map(String::as_str)
+    }
+
+    /// That this model cannot be used, and why.
+    pub fn refuse(&self, reason: impl Into<String>) -> Error {
+        Error::Inference { model: self.name.clone(), reason: reason.into() }
+    }
+
+    /// Runs on inputs, which are converted to the types that the model wants; returns the named outputs as floats.
+    ///
+    /// # Errors
+    /// When ONNX Runtime refuses, or a name or type is unknown.
+    pub fn run(&self, inputs: Vec<(&str, Array)>, outputs: &[&str]) -> Result<Vec<Array>> {
+        let failed = |e: ort::Error| self.refuse(e.to_string());
         let mut values = Vec::new();
-        for (name, input) in inputs {
-            let value = match input {
-                Input::Float(shape, data) => Tensor::from_array((shape, data)).map_err(failed)?.into_dyn(),
-                Input::Int(shape, data) => Tensor::from_array((shape, data)).map_err(failed)?.into_dyn(),
-            };
-            values.push((name.to_owned(), value));
+        for (name, array) in inputs {
+            let slot = self.input(&[name]).ok_or_else(|| self.refuse(format!("it has no input '{name}'")))?;
+            values.push((name.to_owned(), self.tensor(slot, array)?));
         }
         let mut session = self.session.lock().expect("no panic while holding the lock");
-        let outputs = session.run(values).map_err(failed)?;
-        let value = outputs
-            .get(output)
-            .ok_or_else(|| Error::Inference { model: self.name.clone(), reason: format!("it has no output '{output}'") })?;
-        let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
-        Ok((shape.iter().map(|d| *d as usize).collect(), data.to_vec()))
+        let found = session.run(values).map_err(failed)?;
+        let array = |name: &&str| {
+            let value = found.get(*name).ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;
+            let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
+            Ok(Array::new(shape.iter().map(|d| *d as usize).collect::<Vec<_>>(), data.to_vec()))
+        };
+        outputs.iter().map(array).collect()
     }
-}
 
-/// A named input: shape and row-major values.
-pub enum Input {
-    /// 32-bit floats.
-    Float(Vec<usize>, Vec<f32>),
-    /// 64-bit integers.
-    Int(Vec<usize>, Vec<i64>),
+    fn tensor(&self, slot: &Slot, Array { shape, values }: Array) -> Result<DynValue> {
+        let value = match slot.kind {
+            TensorElementType::Float32 => Tensor::from_array((shape, values)).map(Tensor::into_dyn),
+            TensorElementType::Int64 => {
+                Tensor::from_array((shape, values.iter().map(|v| *v as i64).collect::<Vec<_>>())).map(Tensor::into_dyn)
+            }
+            TensorElementType::Int32 => {
+                Tensor::from_array((shape, values.iter().map(|v| *v as i32).collect::<Vec<_>>())).map(Tensor::into_dyn)
+            }
+            TensorElementType::Uint8 => {
+                Tensor::from_array((shape, values.iter().map(|v| *v as u8).collect::<Vec<_>>())).map(Tensor::into_dyn)
+            }
+            other => return Err(self.refuse(format!("its input '{}' has the type {other}, which is not supported", slot.name))),
+        };
+        value.map_err(|e| self.refuse(e.to_string()))
+    }
 }

@@ -9,12 +9,31 @@ use fastlgs_core::color::lab;
 use fastlgs_core::{LabelMap, image_io};
 use image::RgbImage;
 
-/// Masks of one photo, coarse to fine.
-pub struct Segmentation {
+/// How large a thing a mask stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Level {
     /// Objects (the paper's *whole* level).
-    pub whole: LabelMap,
+    Whole,
     /// Their parts.
-    pub part: LabelMap,
+    Part,
+    /// Parts of parts.
+    Subpart,
+}
+
+impl Level {
+    /// Coarse to fine.
+    pub const ALL: [Self; 3] = [Self::Whole, Self::Part, Self::Subpart];
+
+    /// Name of its folder and in options.
+    pub fn name(self) -> &'static str {
+        ["whole", "part", "subpart"][self as usize]
+    }
+}
+
+/// Masks of one photo.
+pub struct Segmentation {
+    /// One map a level, coarse to fine.
+    pub levels: [LabelMap; 3],
 }
 
 /// Finds masks.
@@ -47,6 +66,8 @@ const FEATURES: usize = 3 + DENSE_SIDES.len() * DENSE;
 const WHOLE_HEIGHTS: [f32; 2] = [0.25, 0.45];
 /// The same for parts.
 const PART_HEIGHTS: [f32; 2] = [0.08, 0.20];
+/// The same for parts of parts.
+const SUBPART_HEIGHTS: [f32; 2] = [0.03, 0.09];
 
 impl OfflineSegmenter {
     /// Loads edge detector and classifier.
@@ -106,7 +127,7 @@ impl Segmenter for OfflineSegmenter {
             let cut = tree.best_cut(|i| standing(&tree, i, low, high));
             label_map(&tree, &cut, &basins, w, h).resized(photo.width(), photo.height())
         };
-        Ok(Segmentation { whole: paint(WHOLE_HEIGHTS), part: paint(PART_HEIGHTS) })
+        Ok(Segmentation { levels: [WHOLE_HEIGHTS, PART_HEIGHTS, SUBPART_HEIGHTS].map(paint) })
     }
 }
 

@@ -1,7 +1,7 @@
 //! The offline text tower: all-MiniLM-L6-v2.
 
 use crate::encoder::TextEncoder;
-use crate::runtime::{Input, Model};
+use crate::runtime::{Array, Model};
 use crate::{Error, Result, models};
 use tokenizers::Tokenizer;
 
@@ -43,13 +43,13 @@ impl TextEncoder for MiniLm {
             let (mut ids, mut mask) = (Vec::new(), Vec::new());
             for e in &encoded {
                 let row = e.get_ids();
-                ids.extend((0..length).map(|k| row.get(k).map_or(0, |v| i64::from(*v))));
-                mask.extend((0..length).map(|k| i64::from(k < row.len())));
+                ids.extend((0..length).map(|k| row.get(k).map_or(0.0, |v| *v as f32)));
+                mask.extend((0..length).map(|k| f32::from(u8::from(k < row.len()))));
             }
-            let shape = vec![batch.len(), length];
-            let (shape, values) =
-                self.model.run(vec![("ids", Input::Int(shape.clone(), ids)), ("mask", Input::Int(shape, mask))], "embedding")?;
-            out.extend(values.chunks_exact(shape[1]).map(<[f32]>::to_vec));
+            let shape = [batch.len(), length];
+            let inputs = vec![("ids", Array::new(shape, ids)), ("mask", Array::new(shape, mask))];
+            let embeddings = self.model.run(inputs, &["embedding"])?.remove(0);
+            out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(<[f32]>::to_vec));
         }
         Ok(out)
     }

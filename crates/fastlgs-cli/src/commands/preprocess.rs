@@ -206,8 +206,10 @@ fn segment(args: &Args, training: &[Photo], folder: &SceneFolder, common: &ui::C
         let labels = match &segmenter {
             Some(segmenter) => {
                 let found = segmenter.segment(&photo.pixels).with_context(|| format!("segmenting {name}"))?;
-                found.part.save(&folder.masks_path("part", name))?;
-                found.whole
+                let [whole, part, subpart] = found.levels;
+                part.save(&folder.masks_path("part", name))?;
+                subpart.save(&folder.masks_path("subpart", name))?;
+                whole
             }
             None => import_masks(args, photo)?,
         };

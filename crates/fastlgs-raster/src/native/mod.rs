@@ -264,11 +264,8 @@ impl Engine for CpuEngine {
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
         self.forward(&view, channels, None)?;
-        let [w, h] = view.size.map(|s| s as usize);
-        let rows = (0..8).flat_map(|c| (0..h).map(move |y| (c, y)));
-        let data = rows.flat_map(|(c, y)| &self.frame.row(c, y)[..w]).copied().collect();
         let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len()) as u32;
-        Ok(Frame { width: view.size[0], height: view.size[1], data, pairs })
+        Ok(Frame::gathered(&View { pairs, ..view }, channels, |channel, y| self.frame.row(channel, y as usize)))
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

@@ -1,0 +1,128 @@
+//! Stand-ins for SAM and CLIP with the signatures of their exports and known answers.
+
+use super::onnx::{Attribute, Graph, Kind};
+use std::path::Path;
+
+/// Which exporter's signature.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SamExport {
+    /// `point_coords` and its companions; free or single prompts.
+    Official { batched: bool },
+    /// `batched_point_coords`.
+    Efficient,
+    /// `input_points`.
+    Transformers,
+}
+
+/// Side of the stand-in's picture and masks.
+const SIDE: i64 = 256;
+/// Squared colour distances, in standard deviations, below which a pixel belongs to the subpart, part and whole of the
+/// prompted colour.
+pub const REACH: [f32; 3] = [0.02, 0.5, 3.0];
+
+/// An encoder whose embedding is the photo itself in small, and a decoder whose masks are the pixels of the prompted
+/// colour: exactly, roughly, and very roughly the same.
+pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
+    let mut g = Graph::default();
+    let (input, shape) = match export {
+        SamExport::Official { .. } => ("image", [1, 3, 1024, 1024]),
+        SamExport::Efficient => ("batched_images", [-1, 3, -1, -1]),
+        SamExport::Transformers => ("pixel_values", [-1, 3, 1024, 1024]),
+    };
+    let photo = g.input(input, Kind::Float, &shape);
+    let sizes = g.ints(&[1, 3, SIDE, SIDE]);
+    let small = g.op("Resize", &[&photo, "", "", &sizes], &[Attribute::Text("mode", "nearest")]);
+    g.output(&small, "image_embeddings", &[1, 3, SIDE, SIDE]);
+    if export == SamExport::Transformers {
+        let nothing = g.op("Sub", &[&small, &small], &[]);
+        g.output(&nothing, "image_positional_embeddings", &[1, 3, SIDE, SIDE]);
+    }
+    g.save(encoder);
+
+    let mut g = Graph::default();
+    let embedding = g.input("image_embeddings", Kind::Float, &[1, 3, SIDE, SIDE]);
+    // Points as cells of the embedding.
+    let points = match export {
+        SamExport::Official { batched } => {
+            let n = if batched { -1 } else { 1 };
+            let points = g.input("point_coords", Kind::Float, &[n, -1, 2]);
+            g.input("point_labels", Kind::Float, &[n, -1]);
+            g.input("mask_input", Kind::Float, &[1, 1, SIDE, SIDE]);
+            g.input("has_mask_input", Kind::Float, &[1]);
+            g.input("orig_im_size", Kind::Float, &[2]);
+            let first = g.ints(&[0]);
+            let point = g.op("Gather", &[&points, &first], &[Attribute::Int("axis", 1)]);
+            let ratio = g.floats(&[1], &[SIDE as f32 / 1024.0]);
+            g.op("Mul", &[&point, &ratio], &[])
+        }
+        SamExport::Efficient => {
+            let points = g.input("batched_point_coords", Kind::Float, &[1, -1, -1, 2]);
+            g.input("batched_point_labels", Kind::Float, &[1, -1, -1]);
+            let size = g.input("orig_im_size", Kind::Int, &[2]);
+            let order = g.ints(&[1, 0]);
+            let size = g.op("Gather", &[&size, &order], &[]);
+            let size = g.op("Cast", &[&size], &[Attribute::Int("to", Kind::Float as i64)]);
+            let share = g.op("Div", &[&points, &size], &[]);
+            let side = g.floats(&[1], &[SIDE as f32]);
+            g.op("Mul", &[&share, &side], &[])
+        }
+        SamExport::Transformers => {
+            let points = g.input("input_points", Kind::Float, &[1, -1, -1, 2]);
+            g.input("input_labels", Kind::Int, &[1, -1, -1]);
+            g.input("image_positional_embeddings", Kind::Float, &[1, 3, SIDE, SIDE]);
+            let ratio = g.floats(&[1], &[SIDE as f32 / 1024.0]);
+            g.op("Mul", &[&points, &ratio], &[])
+        }
+    };
+    let rows = g.ints(&[-1, 2]);
+    let points = g.op("Reshape", &[&points, &rows], &[]);
+    let cells = g.op("Floor", &[&points], &[]);
+    let strides = g.floats(&[2, 1], &[1.0, SIDE as f32]);
+    let flat = g.op("MatMul", &[&cells, &strides], &[]);
+    let one = g.ints(&[-1]);
+    let flat = g.op("Reshape", &[&flat, &one], &[]);
+    let flat = g.op("Cast", &[&flat], &[Attribute::Int("to", Kind::Int as i64)]);
+    let plane = g.ints(&[3, SIDE * SIDE]);
+    let colors = g.op("Reshape", &[&embedding, &plane], &[]);
+    let color = g.op("Gather", &[&colors, &flat], &[Attribute::Int("axis", 1)]);
+    let color = g.op("Transpose", &[&color], &[Attribute::Ints("perm", &[1, 0])]);
+    let column = g.ints(&[-1, 3, 1, 1]);
+    let color = g.op("Reshape", &[&color, &column], &[]);
+    let difference = g.op("Sub", &[&embedding, &color], &[]);
+    let squared = g.op("Mul", &[&difference, &difference], &[]);
+    let axis = g.ints(&[1]);
+    let distance = g.op("ReduceSum", &[&squared, &axis], &[Attribute::Int("keepdims", 1)]);
+    // The official decoder gives four masks; the first is for prompts of several points, and wrong here.
+    // EfficientSAM takes colours from 0 to 1, the others in standard deviations of about 58 of 255.
+    let unit = if export == SamExport::Efficient { 0.052 } else { 1.0 };
+    let mut reach = REACH.map(|r| unit * r).to_vec();
+    if matches!(export, SamExport::Official { .. }) {
+        reach.insert(0, 1e6);
+    }
+    let m = reach.len() as i64;
+    let reach = g.floats(&[1, m, 1, 1], &reach);
+    let inside = g.op("Sub", &[&reach, &distance], &[]);
+    let steep = g.floats(&[1], &[1e4]);
+    let logits = g.op("Mul", &[&inside, &steep], &[]);
+    let highest = g.op("ReduceMax", &[&logits], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
+    let zero = g.op("Sub", &[&highest, &highest], &[]);
+    let score = g.floats(&[1], &[0.95]);
+    let scores = g.op("Add", &[&zero, &score], &[]);
+    match export {
+        SamExport::Official { .. } => {
+            g.output(&logits, "low_res_masks", &[-1, m, SIDE, SIDE]);
+            g.output(&scores, "iou_predictions", &[-1, m]);
+        }
+        SamExport::Efficient | SamExport::Transformers => {
+            let (masks, ious) =
+                if export == SamExport::Efficient { ("output_masks", "iou_predictions") } else { ("pred_masks", "iou_scores") };
+            let shape = g.ints(&[1, -1, m, SIDE, SIDE]);
+            let logits = g.op("Reshape", &[&logits, &shape], &[]);
+            let shape = g.ints(&[1, -1, m]);
+            let scores = g.op("Reshape", &[&scores, &shape], &[]);
+            g.output(&logits, masks, &[1, -1, m, SIDE, SIDE]);
+            g.output(&scores, ious, &[1, -1, m]);
+        }
+    }
+    g.save(decoder);
+}
