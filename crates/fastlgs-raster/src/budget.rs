@@ -61,6 +61,10 @@ pub struct Removal {
     pub before: usize,
     /// Gaussians after it.
     pub after: usize,
+    /// PSNR in dB of the watched views before it; none where no view is watched.
+    pub psnr_before: Option<f64>,
+    /// The same right after it, before what is left was refined.
+    pub psnr_after: Option<f64>,
 }
 
 /// Places of the Gaussians that some view sees with at least `threshold`.

@@ -247,11 +247,14 @@ impl Trainer {
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let cameras: Vec<Camera> = self.targets.iter().map(|t| t.camera.clone()).collect();
         let kept = budget::seen(&scene, &cameras, budget::MIN_WEIGHT);
-        let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: kept.len() };
-        tracing::info!(?removal, "unseen Gaussians removed");
+        let psnr_before = self.quality(&self.watched(), None)?;
         state.keep(&kept);
+        self.replace(&state)?;
+        let psnr_after = self.quality(&self.watched(), None)?;
+        let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: kept.len(), psnr_before, psnr_after };
+        tracing::info!(?removal, "unseen Gaussians removed");
         self.course.removals.push(removal);
-        self.replace(&state)
+        Ok(())
     }
 
     /// Looks at the watched views and decides whether the scene may grow on.

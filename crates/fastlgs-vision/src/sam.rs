@@ -181,7 +181,8 @@ impl Sam {
             ]),
         }
         inputs.retain(|(name, _)| self.decoder.input(&[name]).is_some());
-        let find = |names: &[&str], what: &str| self.decoder.output(names).ok_or_else(|| self.decoder.refuse(format!("it gives no {what}")));
+        let find =
+            |names: &[&str], what: &str| self.decoder.output(names).ok_or_else(|| self.decoder.refuse(format!("it gives no {what}")));
         let masks = find(&["low_res_masks", "pred_masks", "output_masks", "masks"], "masks")?;
         let scores = find(&["iou_predictions", "iou_scores"], "predicted IoU")?;
         let mut found = self.decoder.run(inputs, &[masks, scores])?;
