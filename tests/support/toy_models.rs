@@ -126,3 +126,31 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     }
     g.save(decoder);
 }
+
+/// Token of each colour's name in CLIP's published vocabulary.
+pub const COLOR_TOKENS: [i64; 3] = [736, 1901, 1746];
+
+/// CLIP's towers in small: the image tower gives the mean red, green and blue above CLIP's own mean, the text tower what of
+/// "red", "green" and "blue" occurs among the tokens. Masked crops are neutral around the mask, so that colours compare.
+pub fn clip(image: &Path, text: &Path, size: i64) {
+    let mut g = Graph::default();
+    let pixels = g.input("pixel_values", Kind::Float, &[-1, 3, size, size]);
+    let mean = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
+    let overall = g.op("ReduceMean", &[&mean], &[Attribute::Ints("axes", &[1]), Attribute::Int("keepdims", 1)]);
+    let color = g.op("Sub", &[&mean, &overall], &[]);
+    g.output(&color, "image_embeds", &[-1, 3]);
+    g.save(image);
+
+    let mut g = Graph::default();
+    let ids = g.input("input_ids", Kind::Int, &[-1, 77]);
+    let axes = g.ints(&[2]);
+    let column = g.op("Unsqueeze", &[&ids, &axes], &[]);
+    let colors = g.ints(&COLOR_TOKENS);
+    let same = g.op("Equal", &[&column, &colors], &[]);
+    let same = g.op("Cast", &[&same], &[Attribute::Int("to", Kind::Float as i64)]);
+    let found = g.op("ReduceMax", &[&same], &[Attribute::Ints("axes", &[1]), Attribute::Int("keepdims", 0)]);
+    let overall = g.op("ReduceMean", &[&found], &[Attribute::Ints("axes", &[1]), Attribute::Int("keepdims", 1)]);
+    let centred = g.op("Sub", &[&found, &overall], &[]);
+    g.output(&centred, "text_embeds", &[-1, 3]);
+    g.save(text);
+}

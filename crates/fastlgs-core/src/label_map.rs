@@ -1,6 +1,8 @@
 //! Label maps: one 16-bit label a pixel, 0 for "no mask".
 
-use crate::{Error, Result, fs, image_io};
+use crate::undistort::Distortion;
+use crate::{Camera, Error, Result, fs, image_io};
+use glam::Vec2;
 use image::{DynamicImage, ImageBuffer, ImageReader, Luma};
 use std::io::Cursor;
 use std::path::Path;
@@ -64,6 +66,21 @@ impl LabelMap {
         let labels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
         let labels = labels.map(|(x, y)| self.at(pick(x, self.width, width), pick(y, self.height, height))).collect();
         Self { width, height, labels }
+    }
+
+    /// The map as the ideal pinhole `camera` of its size would have seen it, nearest neighbour; what the lens did not see is
+    /// unlabelled.
+    pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
+        let mut out = Self::new(self.width, self.height);
+        for (i, label) in out.labels.iter_mut().enumerate() {
+            let (x, y) = (i as u32 % self.width, i as u32 / self.width);
+            let d = distortion.distort(camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).truncate());
+            let (u, v) = ((camera.fx * d.x + camera.cx).floor(), (camera.fy * d.y + camera.cy).floor());
+            if u >= 0.0 && v >= 0.0 && u < self.width as f32 && v < self.height as f32 {
+                *label = self.at(u as u32, v as u32);
+            }
+        }
+        out
     }
 
     /// Writes a 16-bit grey PNG, atomically.

@@ -141,7 +141,7 @@ impl Encoder for Conse {
         "offline"
     }
 
-    fn embed_masks(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+    fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let dimension = self.class_embeddings[0].len();
         let embed = |p: &Vec<f32>| if p.is_empty() { vec![0.0; dimension] } else { self.embedding(p) };
         Ok(self.mask_probabilities(photo, masks)?.iter().map(embed).collect())

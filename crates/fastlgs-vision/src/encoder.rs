@@ -8,11 +8,11 @@ use image::RgbImage;
 pub trait Encoder {
     /// Name recorded in the scene; a query must use the text tower of the same encoder.
     fn name(&self) -> &'static str;
-    /// One L2-normalised embedding for each label 1..=max of the map, in order; zeros for labels that do not occur.
+    /// One L2-normalised embedding for each label 1..=max of the map of a view, in order; zeros for labels that do not occur.
     ///
     /// # Errors
-    /// When inference fails.
-    fn embed_masks(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>>;
+    /// When inference fails, or embeddings that were made elsewhere are missing.
+    fn embed_masks(&self, view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>>;
 }
 
 /// Embeds texts.

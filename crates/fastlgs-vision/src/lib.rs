@@ -2,25 +2,38 @@
 //!
 //! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
 
+pub mod clip;
+pub mod clip_tokens;
 pub mod conse;
 pub mod crops;
 pub mod edges;
 pub mod encoder;
 pub mod exposure;
 pub mod histogram;
+pub mod import;
 pub mod keypoints;
 pub mod masks;
 pub mod models;
+pub mod npy;
 pub mod pose_check;
 pub mod regions;
-mod runtime;
+pub mod runtime;
 pub mod sam;
 pub mod segmenter;
 pub mod text;
 pub mod triangulate;
 
+#[cfg(test)]
+#[path = "../../../tests/support/onnx.rs"]
+mod onnx;
+#[cfg(test)]
+#[path = "../../../tests/support/toy_models.rs"]
+mod toy_models;
+
+pub use clip::{ClipImage, ClipText};
 pub use conse::Conse;
 pub use encoder::{Encoder, TextEncoder};
+pub use import::Import;
 pub use sam::Sam;
 pub use segmenter::{Level, OfflineSegmenter, Segmentation, Segmenter};
 pub use text::MiniLm;

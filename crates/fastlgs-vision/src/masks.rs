@@ -65,7 +65,7 @@ impl Mask {
         for filled in [false, true] {
             for part in components(&self.bits, width, filled) {
                 // What touches the box's border is the surroundings, not a hole.
-                let border = |i: &usize| i % width == 0 || i % width == width - 1 || i / width == 0 || i / width == height - 1;
+                let border = |i: &usize| [0, width - 1].contains(&(i % width)) || [0, height - 1].contains(&(i / width));
                 if part.len() < least && (filled || !part.iter().any(border)) {
                     part.iter().for_each(|i| self.bits[*i] = !filled);
                 }

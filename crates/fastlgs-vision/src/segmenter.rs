@@ -40,11 +40,11 @@ pub struct Segmentation {
 pub trait Segmenter {
     /// Name recorded in the scene.
     fn name(&self) -> &'static str;
-    /// Segments one photo; the label maps have its size.
+    /// Segments the photo of the view of that name; the label maps have its size.
     ///
     /// # Errors
-    /// When inference fails.
-    fn segment(&self, photo: &RgbImage) -> Result<Segmentation>;
+    /// When inference fails, or masks that were made elsewhere are missing.
+    fn segment(&self, view: &str, photo: &RgbImage) -> Result<Segmentation>;
 }
 
 /// Learned edges (HED), colour and the classifier's dense opinion, turned into a region hierarchy whose most lasting
@@ -115,7 +115,7 @@ impl Segmenter for OfflineSegmenter {
         "offline"
     }
 
-    fn segment(&self, photo: &RgbImage) -> Result<Segmentation> {
+    fn segment(&self, _view: &str, photo: &RgbImage) -> Result<Segmentation> {
         let photo = &exposure::lifted(photo);
         let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));
         let (w, h) = (small.width() as usize, small.height() as usize);

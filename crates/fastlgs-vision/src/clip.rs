@@ -1,0 +1,251 @@
+//! CLIP (Radford et al. 2021) from ONNX exports of its two towers.
+
+use crate::clip_tokens::{CONTEXT, ClipTokens};
+use crate::crops::{self, Surround};
+use crate::encoder::{Encoder, TextEncoder, normalise};
+use crate::runtime::{Array, Model};
+use crate::{Error, Result};
+use fastlgs_core::{LabelMap, fs};
+use image::RgbImage;
+use std::path::Path;
+
+/// Mean and standard deviation of CLIP's training pictures, RGB in [0, 1]; a configuration beside the model overrides them.
+const MEAN: [f32; 3] = [0.481_454_66, 0.457_827_5, 0.408_210_73];
+const DEVIATION: [f32; 3] = [0.268_629_54, 0.261_302_58, 0.275_777_11];
+/// Side of the input where neither the model nor a configuration tells.
+const SIZE: usize = 224;
+/// Crops or texts in one inference.
+const BATCH: usize = 8;
+/// A text is embedded in each of these sentences, and the embeddings are averaged.
+const TEMPLATES: [&str; 4] = ["{}", "a photo of a {}.", "a photo of the {}.", "a close-up photo of a {}."];
+
+/// Names under which exporters give the embedding, best first.
+const IMAGE_OUTPUTS: [&str; 4] = ["image_embeds", "image_features", "image_embedding", "embeddings"];
+const TEXT_OUTPUTS: [&str; 4] = ["text_embeds", "text_features", "text_embedding", "embeddings"];
+
+/// The image tower.
+pub struct ClipImage {
+    model: Model,
+    input: String,
+    output: String,
+    size: usize,
+    mean: [f32; 3],
+    deviation: [f32; 3],
+}
+
+/// The text tower.
+pub struct ClipText {
+    model: Model,
+    tokens: ClipTokens,
+    ids: String,
+    mask: Option<String>,
+    output: String,
+    context: usize,
+}
+
+/// The output of one of these names, else the only one.
+fn embedding_output(model: &Model, names: &[&str]) -> Result<String> {
+    let only = || model.outputs.first().filter(|_| model.outputs.len() == 1).map(String::as_str);
+    let found = model.output(names).or_else(only);
+    found.map(str::to_owned).ok_or_else(|| model.refuse(format!("none of its outputs is an embedding: {}", model.outputs.join(", "))))
+}
+
+impl ClipImage {
+    /// Loads the tower. Size and normalisation are those of `preprocessor_config.json` in its folder or the one above, as
+    /// far as there is one; a size that the model fixes goes first.
+    ///
+    /// # Errors
+    /// When the file is missing or no image tower.
+    pub fn load(path: &Path) -> Result<Self> {
+        let model = Model::load(path)?;
+        let [slot] = &model.inputs[..] else {
+            let names: Vec<&str> = model.inputs.iter().map(|i| i.name.as_str()).collect();
+            return Err(model.refuse(format!("no image tower alone: its inputs are {}", names.join(", "))));
+        };
+        if slot.shape.len() != 4 {
+            return Err(model.refuse(format!("its input '{}' takes no pictures", slot.name)));
+        }
+        let (fixed, input) = (slot.shape[2], slot.name.clone());
+        let configuration = path.ancestors().skip(1).take(2).map(|f| f.join("preprocessor_config.json")).find(|f| f.is_file());
+        let configuration: serde_json::Value = configuration.map(|f| fs::read_json(&f)).transpose()?.unwrap_or_default();
+        let triple = |name: &str, otherwise: [f32; 3]| {
+            let values = configuration[name].as_array().filter(|a| a.len() == 3);
+            values.map_or(otherwise, |a| std::array::from_fn(|k| a[k].as_f64().unwrap_or(f64::from(otherwise[k])) as f32))
+        };
+        let side = |v: &serde_json::Value| v.as_u64().or_else(|| v["height"].as_u64()).or_else(|| v["shortest_edge"].as_u64());
+        let told = side(&configuration["crop_size"]).or_else(|| side(&configuration["size"])).map(|s| s as usize);
+        let output = embedding_output(&model, &IMAGE_OUTPUTS)?;
+        let (mean, deviation) = (triple("image_mean", MEAN), triple("image_std", DEVIATION));
+        Ok(Self { size: fixed.or(told).unwrap_or(SIZE), mean, deviation, input, output, model })
+    }
+}
+
+impl Encoder for ClipImage {
+    fn name(&self) -> &'static str {
+        "clip"
+    }
+
+    fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+        let boxes = masks.boxes();
+        let present: Vec<u16> = (1..=masks.max()).filter(|l| boxes[usize::from(*l)].is_some()).collect();
+        let plane = self.size * self.size;
+        let mut out = vec![Vec::new(); usize::from(masks.max())];
+        let mut dimension = 0;
+        // A model that fixes its batch takes crops one by one.
+        let fixed = self.model.input(&[&self.input]).and_then(|s| s.shape[0]);
+        for batch in present.chunks(fixed.map_or(BATCH, |_| 1)) {
+            let mut values = Vec::with_capacity(batch.len() * 3 * plane);
+            for &label in batch {
+                let bounds = boxes[usize::from(label)].expect("filtered above");
+                let crop = crops::crop(photo, masks, label, bounds, self.size, Surround::Neutral);
+                values.extend(crop.planar.iter().enumerate().map(|(i, v)| (v / 255.0 - self.mean[i / plane]) / self.deviation[i / plane]));
+            }
+            let input = Array::new([batch.len(), 3, self.size, self.size], values);
+            let embeddings = self.model.run(vec![(&self.input, input)], &[&self.output])?.remove(0);
+            if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
+                return Err(self.model.refuse(format!("{} crops gave embeddings of shape {:?}", batch.len(), embeddings.shape)));
+            }
+            dimension = embeddings.shape[1];
+            for (label, row) in batch.iter().zip(embeddings.values.chunks_exact(dimension)) {
+                let mut row = row.to_vec();
+                normalise(&mut row);
+                out[usize::from(*label) - 1] = row;
+            }
+        }
+        out.iter_mut().filter(|e| e.is_empty()).for_each(|e| e.resize(dimension, 0.0));
+        Ok(out)
+    }
+}
+
+impl ClipText {
+    /// Loads the tower and its tokenizer.
+    ///
+    /// # Errors
+    /// When a file is missing or no text tower.
+    pub fn load(path: &Path) -> Result<Self> {
+        let model = Model::load(path)?;
+        let ids = model.input(&["input_ids", "text", "tokens", "input"]).map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
+        let (ids, context) = ids.ok_or_else(|| model.refuse("no text tower: it takes no token ids"))?;
+        let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
+        let output = embedding_output(&model, &TEXT_OUTPUTS)?;
+        Ok(Self { tokens: ClipTokens::beside(path)?, context: context.unwrap_or(CONTEXT), ids, mask, output, model })
+    }
+
+    /// L2-normalised embeddings of whole sentences.
+    fn sentences(&self, sentences: &[String]) -> Result<Vec<Vec<f32>>> {
+        let mut out = Vec::with_capacity(sentences.len());
+        let fixed = self.model.input(&[&self.ids]).and_then(|s| s.shape[0]);
+        for batch in sentences.chunks(fixed.map_or(BATCH, |_| 1)) {
+            let (mut ids, mut mask) = (Vec::new(), Vec::new());
+            for sentence in batch {
+                let row = self.tokens.encode(sentence, self.context)?;
+                // OpenAI's models are padded with zeros; those that take a mask with the end token, as their tokenizers do.
+                let padding = if self.mask.is_some() { self.tokens.end() } else { 0 };
+                ids.extend((0..self.context).map(|k| row.get(k).copied().unwrap_or(padding) as f32));
+                mask.extend((0..self.context).map(|k| f32::from(u8::from(k < row.len()))));
+            }
+            let shape = [batch.len(), self.context];
+            let mut inputs = vec![(self.ids.as_str(), Array::new(shape, ids))];
+            if let Some(name) = &self.mask {
+                inputs.push((name, Array::new(shape, mask)));
+            }
+            let embeddings = self.model.run(inputs, &[&self.output])?.remove(0);
+            if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
+                return Err(self.model.refuse(format!("{} texts gave embeddings of shape {:?}", batch.len(), embeddings.shape)));
+            }
+            out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(|row| {
+                let mut row = row.to_vec();
+                normalise(&mut row);
+                row
+            }));
+        }
+        Ok(out)
+    }
+}
+
+impl TextEncoder for ClipText {
+    fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        let fill = |text: &&str| TEMPLATES.map(|t| t.replace("{}", text));
+        let sentences: Vec<String> = texts.iter().flat_map(fill).collect();
+        let embeddings = self.sentences(&sentences)?;
+        let mean = |rows: &[Vec<f32>]| {
+            let mut sum: Vec<f32> = (0..rows[0].len()).map(|k| rows.iter().map(|r| r[k]).sum()).collect();
+            normalise(&mut sum);
+            sum
+        };
+        Ok(embeddings.chunks_exact(TEMPLATES.len()).map(mean).collect())
+    }
+}
+
+/// That the two towers belong together: their embeddings are of one length.
+///
+/// # Errors
+/// When they are not, naming both lengths.
+pub fn check_pair(image: &ClipImage, text: &ClipText) -> Result<()> {
+    let gray = RgbImage::from_pixel(8, 8, image::Rgb([127; 3]));
+    let pixel = LabelMap { width: 8, height: 8, labels: vec![1; 64] };
+    let (a, b) = (image.embed_masks("", &gray, &pixel)?[0].len(), text.sentences(&["object".to_owned()])?[0].len());
+    if a == b {
+        return Ok(());
+    }
+    Err(Error::Invalid(format!("the CLIP towers do not belong together: the image tower gives {a} numbers, the text tower {b}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::toy_models;
+    use image::Rgb;
+
+    #[test]
+    fn crops_and_texts_meet_in_one_space() {
+        let dir = tempfile::tempdir().unwrap();
+        let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
+        toy_models::clip(&image, &text, 32);
+        if let Err(e) = crate::models::runtime_library() {
+            assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
+            eprintln!("SKIPPED: {e}");
+            return;
+        }
+        let (image, text) = (ClipImage::load(&image).unwrap(), ClipText::load(&text).unwrap());
+        assert_eq!(image.size, 32);
+        check_pair(&image, &text).unwrap();
+        // Label 1 red, 2 absent, 3 blue with green around it, which the mask hides.
+        let photo = RgbImage::from_fn(60, 40, |x, _| {
+            Rgb(if x < 20 {
+                [220, 30, 30]
+            } else if x < 40 {
+                [30, 220, 30]
+            } else {
+                [30, 30, 220]
+            })
+        });
+        let labels = (0..2400).map(|i| match i % 60 {
+            0..20 => 1,
+            40..60 => 3,
+            _ => 0,
+        });
+        let masks = LabelMap { width: 60, height: 40, labels: labels.collect() };
+        let crops = image.embed_masks("", &photo, &masks).unwrap();
+        let texts = text.embed(&["red", "green", "blue"]).unwrap();
+        let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
+        for (crop, own) in [(0, 0), (2, 2)] {
+            let best = (0..3).max_by(|a, b| cosine(&crops[crop], &texts[*a]).total_cmp(&cosine(&crops[crop], &texts[*b])));
+            assert_eq!(best, Some(own));
+            assert!(cosine(&crops[crop], &texts[own]) > 0.9);
+        }
+        assert_eq!(crops[1], vec![0.0; 3]);
+    }
+
+    #[test]
+    fn the_wrong_tower_is_refused_by_name() {
+        let dir = tempfile::tempdir().unwrap();
+        let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
+        toy_models::clip(&image, &text, 32);
+        if crate::models::runtime_library().is_err() {
+            return;
+        }
+        assert!(ClipImage::load(&text).err().unwrap().to_string().contains("text.onnx"));
+        assert!(ClipText::load(&image).err().unwrap().to_string().contains("image.onnx"));
+    }
+}
