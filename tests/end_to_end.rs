@@ -3,6 +3,11 @@
 //! Needs the offline models ('fastlgs models install-offline') and any Vulkan device; skips loudly without them
 //! unless FASTLGS_REQUIRE_GPU is set, which makes them a must.
 
+#[path = "support/onnx.rs"]
+mod onnx;
+#[path = "support/toy_models.rs"]
+mod toy_models;
+
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::ply;
 use serde_json::Value;
@@ -144,6 +149,45 @@ fn exports_keep_what_queries_need() {
     let whole = std::fs::read(&model).expect("the model");
     std::fs::write(&model, &whole[..whole.len() / 2]).expect("a file");
     fails(&["query", text(&small), "coffee"], &["scene.safetensors", "export the scene again"]);
+}
+
+/// Stand-ins for SAM (masks of like colour) and CLIP (names of colours) take the whole way from photos to answers.
+#[test]
+fn onnx_exports_of_sam_and_clip() {
+    let Some(f) = fixture() else { return };
+    let folder = f.dir.path().join("toy");
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let file = |name: &str| folder.join(name);
+    let [encoder, decoder, image, words] = ["encoder", "decoder", "image", "text"].map(|n| file(&format!("{n}.onnx")));
+    toy_models::sam(toy_models::SamExport::Official { batched: true }, &encoder, &decoder);
+    toy_models::clip(&image, &words, 32);
+    let scene = file("scene");
+    let sam = ["--segmenter", "sam", "--sam-encoder", text(&encoder), "--sam-decoder", text(&decoder), "--sam-points", "8"];
+    let clip = ["--encoder", "clip", "--clip-image", text(&image), "--clip-text", text(&words)];
+    let mut args = vec!["preprocess", text(&f.photos), "-o", text(&scene), "--max-side", "160", "--levels", "whole,part"];
+    args.extend(sam.iter().chain(&clip));
+    let report = json(&args);
+    let masks = &report["masks_per_photo"];
+    assert!(masks["whole"].as_f64().is_some_and(|n| n > 1.0) && masks["subpart"].is_null(), "{report}");
+    json(&["train", text(&scene), "--init-ply", text(&f.scene.join("scene.ply")), "--iterations", "0"]);
+    // The answer to a colour's name has more of that colour than the answer to another's.
+    let amount = |color: &str, channel: usize| {
+        let out = file("out");
+        let answer = json(&["query", text(&scene), color, "--view", "008", "--min-score", "0.5", "--top-k", "1", "-o", text(&out)]);
+        assert_eq!(answer["found"], true, "{answer}");
+        let mask = image::open(answer["mask"].as_str().expect("a path")).expect("the mask").into_luma8();
+        let photo = image::open(scene.join("photos/008.png.png")).expect("the photo").into_rgb8();
+        let inside: Vec<_> = photo.pixels().zip(mask.pixels()).filter(|(_, m)| m[0] > 0).map(|(p, _)| p.0.map(f64::from)).collect();
+        inside.iter().map(|p| p[channel] - (p[0] + p[1] + p[2]) / 3.0).sum::<f64>() / inside.len() as f64
+    };
+    assert!(amount("red", 0) > amount("blue", 0) && amount("blue", 2) > amount("red", 2));
+    // A scene remembers its models; other files in their place are noticed.
+    std::fs::write(&words, b"short").expect("a file");
+    fails(&["query", text(&scene), "red"], &["text.onnx", "made with"]);
+    fails(&["preprocess", text(&f.photos), "-o", text(&file("x")), "--segmenter", "sam", "--sam", "sam9"], &["sam9", "slimsam"]);
+    args[3] = "unused";
+    *args.last_mut().expect("options") = text(&image);
+    fails(&args, &["image.onnx", "no text tower"]);
 }
 
 #[test]

@@ -18,7 +18,7 @@ pub enum SamExport {
 const SIDE: i64 = 256;
 /// Squared colour distances, in standard deviations, below which a pixel belongs to the subpart, part and whole of the
 /// prompted colour.
-pub const REACH: [f32; 3] = [0.02, 0.5, 3.0];
+pub const REACH: [f32; 3] = [0.02, 0.4, 1.6];
 
 /// An encoder whose embedding is the photo itself in small, and a decoder whose masks are the pixels of the prompted
 /// colour: exactly, roughly, and very roughly the same.

@@ -1,6 +1,7 @@
 //! The `fastlgs` binary: wiring of the stages, progress, logging and exit codes.
 
 mod commands;
+mod eyes;
 mod report;
 mod scene;
 mod ui;

@@ -1,14 +1,16 @@
 //! An opened, trained scene: what `render`, `query` and `eval` share.
 
+use crate::eyes;
 use anyhow::{Context, Result, bail};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
-use fastlgs_grid::query::Decision;
+use fastlgs_grid::query::{self, Decision};
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
-use fastlgs_vision::{MiniLm, TextEncoder};
+use fastlgs_vision::TextEncoder;
+use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 
 /// A trained scene on a device.
@@ -23,6 +25,15 @@ pub struct Scene {
     pub gaussians: Gaussians,
     /// The device, holding the Gaussians.
     pub engine: Box<dyn Engine>,
+    /// A CLIP text tower that is used instead of the one the scene remembers.
+    pub clip_text: Option<PathBuf>,
+    texts: OnceCell<Texts>,
+}
+
+/// A loaded text tower.
+struct Texts {
+    encoder: Box<dyn TextEncoder>,
+    canonical: Vec<Vec<f32>>,
 }
 
 impl Scene {
@@ -35,7 +46,8 @@ impl Scene {
         }
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
-        Ok(Self { manifest: folder.manifest()?, cameras: folder.cameras()?, folder, gaussians, engine })
+        let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
+        Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, texts: OnceCell::new() })
     }
 
     /// The object table.
@@ -77,19 +89,20 @@ impl Scene {
         }
     }
 
-    /// Prepares a text with the encoder that made the scene's embeddings.
-    pub fn text_query(&self, encoder: &mut Option<MiniLm>, text: &str) -> Result<TextQuery> {
-        if self.manifest.encoder != "offline" {
-            bail!("the scene's embeddings were made by the encoder '{}', which this program cannot load", self.manifest.encoder);
+    /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.
+    pub fn text_query(&self, text: &str) -> Result<TextQuery> {
+        if self.texts.get().is_none() {
+            let encoder = eyes::text_encoder_of(&self.manifest, self.clip_text.as_deref())?;
+            let canonical = encoder.embed(&CANONICAL)?;
+            let _ = self.texts.set(Texts { encoder, canonical });
         }
-        if encoder.is_none() {
-            *encoder = Some(MiniLm::load()?);
-        }
-        let mut texts = vec![text];
-        texts.extend(CANONICAL);
-        let mut embeddings = encoder.as_ref().expect("loaded above").embed(&texts)?;
-        let canonical = embeddings.split_off(1);
-        Ok(TextQuery { text: embeddings.remove(0), canonical })
+        let texts = self.texts.get().expect("set above");
+        Ok(TextQuery { text: texts.encoder.embed(&[text])?.remove(0), canonical: texts.canonical.clone() })
+    }
+
+    /// Relevancy from which an object counts as found, with the scene's encoder.
+    pub fn min_score(&self) -> f32 {
+        if self.manifest.encoder == "offline" { query::MIN_SCORE } else { query::CLIP_MIN_SCORE }
     }
 }
 

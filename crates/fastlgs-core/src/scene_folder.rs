@@ -8,6 +8,17 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// A model file that took part in making a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ModelFile {
+    /// Where it lay.
+    pub path: PathBuf,
+    /// Its length.
+    pub bytes: u64,
+    /// Its SHA-256 in hexadecimal digits.
+    pub sha256: String,
+}
+
 /// What made a scene folder; `scene.json`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Manifest {
@@ -21,6 +32,9 @@ pub struct Manifest {
     pub segmenter: String,
     /// Encoder that made the embeddings; queries must use the same.
     pub encoder: String,
+    /// Model files by their role (`clip_image`, `clip_text`, `sam_encoder`, `sam_decoder`).
+    #[serde(default)]
+    pub models: BTreeMap<String, ModelFile>,
     /// Seed of all randomness.
     pub seed: u64,
     /// What was survivable but wrong in the input.

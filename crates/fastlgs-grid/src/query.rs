@@ -20,6 +20,9 @@ pub struct QueryConfig {
 /// Calibrated on the offline encoder: see `docs/evaluation.md`.
 pub const MIN_SCORE: f32 = 0.9;
 
+/// The same for CLIP, whose cosines lie closer together: nearer to the text than to anything. Not calibrated.
+pub const CLIP_MIN_SCORE: f32 = 0.55;
+
 /// Share of an object's area, over its views, that decides its score.
 pub const BEST_SHARE: f32 = 0.3;
 

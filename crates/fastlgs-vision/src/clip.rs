@@ -11,7 +11,7 @@ use std::path::Path;
 
 /// Mean and standard deviation of CLIP's training pictures, RGB in [0, 1]; a configuration beside the model overrides them.
 const MEAN: [f32; 3] = [0.481_454_66, 0.457_827_5, 0.408_210_73];
-const DEVIATION: [f32; 3] = [0.268_629_54, 0.261_302_58, 0.275_777_11];
+const DEVIATION: [f32; 3] = [0.268_629_54, 0.261_302_6, 0.275_777_1];
 /// Side of the input where neither the model nor a configuration tells.
 const SIZE: usize = 224;
 /// Crops or texts in one inference.

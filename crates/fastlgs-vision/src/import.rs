@@ -241,27 +241,33 @@ impl Encoder for Import {
         if usize::from(whole.max()) > rows.shape[0] {
             return Err(Error::Invalid(format!("'{view}' has masks up to label {} but {} embeddings", whole.max(), rows.shape[0])));
         }
-        let (imported, own) = (whole.resized(masks.width, masks.height), masks);
-        let mut common: BTreeMap<(u16, u16), usize> = BTreeMap::new();
-        own.labels.iter().zip(&imported.labels).for_each(|pair| *common.entry((*pair.0, *pair.1)).or_default() += 1);
-        let (own_areas, areas) = (own.areas(), imported.areas());
-        let best = |label: u16| {
-            let overlaps = common.range((label, 1)..=(label, u16::MAX)).map(|(&(_, other), &n)| {
-                let either = own_areas[usize::from(label)] + areas[usize::from(other)] - n;
-                (n as f32 / either as f32, other)
-            });
-            overlaps.filter(|(iou, _)| *iou >= SAME).max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)))
-        };
-        let embedding = |label: u16| match best(label) {
-            Some((_, other)) => {
-                let mut row = rows.values[(usize::from(other) - 1) * dimension..][..dimension].to_vec();
+        let embedding = |label: Option<u16>| match label {
+            Some(label) => {
+                let mut row = rows.values[(usize::from(label) - 1) * dimension..][..dimension].to_vec();
                 encoder::normalise(&mut row);
                 row
             }
             None => vec![0.0; dimension],
         };
-        Ok((1..=own.max()).map(embedding).collect())
+        Ok(fitting(masks, &whole).into_iter().map(embedding).collect())
     }
+}
+
+/// For each label 1..=max of `masks` the label of `others`, which may be of another size, whose mask fits best, if it fits.
+pub fn fitting(masks: &LabelMap, others: &LabelMap) -> Vec<Option<u16>> {
+    let others = others.resized(masks.width, masks.height);
+    let mut common: BTreeMap<(u16, u16), usize> = BTreeMap::new();
+    masks.labels.iter().zip(&others.labels).for_each(|pair| *common.entry((*pair.0, *pair.1)).or_default() += 1);
+    let (areas, other_areas) = (masks.areas(), others.areas());
+    let best = |label: u16| {
+        let overlaps = common.range((label, 1)..=(label, u16::MAX)).map(|(&(_, other), &n)| {
+            let either = areas[usize::from(label)] + other_areas[usize::from(other)] - n;
+            (n as f32 / either as f32, other)
+        });
+        let best = overlaps.filter(|(iou, _)| *iou >= SAME).max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
+        best.map(|(_, other)| other)
+    };
+    (1..=masks.max()).map(best).collect()
 }
 
 #[cfg(test)]

@@ -16,6 +16,7 @@ pub mod masks;
 pub mod models;
 pub mod npy;
 pub mod pose_check;
+pub mod pull;
 pub mod regions;
 pub mod runtime;
 pub mod sam;

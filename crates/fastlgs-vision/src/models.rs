@@ -1,8 +1,10 @@
 //! Where weights live, and how the offline ones get there.
 
+use crate::pull::Named;
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
 use fastlgs_core::synth::{PICTURES, TEXTURES};
+use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -92,6 +94,39 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let _ = std::fs::remove_dir_all(&venv);
     say(&format!("installed in {}", cache.display()));
     Ok(())
+}
+
+/// The two files of a named model that was pulled.
+///
+/// # Errors
+/// When the name is unknown or it was not pulled.
+pub fn pair(name: &str) -> Result<[PathBuf; 2]> {
+    Named::find(name)?.pair()
+}
+
+/// Length and SHA-256 (hexadecimal) of a file.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn digest(path: &Path) -> Result<(u64, String)> {
+    let mut hash = Sha256::new();
+    let file = std::fs::File::open(path).map_err(fastlgs_core::Error::io(path))?;
+    let bytes = std::io::copy(&mut std::io::BufReader::with_capacity(1 << 16, file), &mut HashWriter(&mut hash));
+    let bytes = bytes.map_err(fastlgs_core::Error::io(path))?;
+    Ok((bytes, hash.finalize().iter().map(|b| format!("{b:02x}")).collect()))
+}
+
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl std::io::Write for HashWriter<'_> {
+    fn write(&mut self, data: &[u8]) -> std::io::Result<usize> {
+        self.0.update(data);
+        Ok(data.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
 }
 
 fn run(command: &mut Command, what: &str) -> Result<()> {

@@ -97,7 +97,6 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let views = args.labels.as_deref().map(labels::load).transpose()?.unwrap_or_default();
     let total: usize = views.iter().map(|v| v.labels.len()).sum();
     let mut sums = Sums::default();
-    let mut encoder = None;
     for view in &views {
         let index = scene.cameras.iter().position(|c| c.name == view.name);
         let index = index.with_context(|| format!("the label file of '{}' names no view of {}", view.name, args.scene.display()))?;
@@ -111,11 +110,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         let ids = query::restore_objects(&grid, frame.channels(3, 6), scene.decision(None));
         for (k, label) in view.labels.iter().enumerate() {
-            let ms = score_label(&scene, &grid, &mut encoder, view, label, &frame, &ids, &mut sums)?;
+            let ms = score_label(&scene, &grid, view, label, &frame, &ids, &mut sums)?;
             if k == 0 { sums.first_ms.push(render_ms + ms) } else { sums.next_ms.push(ms) }
         }
     }
-    let absent = absent_scores(args, &scene, &grid, &mut encoder, &views)?;
+    let absent = absent_scores(args, &scene, &grid, &views)?;
     let rejected = absent.iter().filter(|a| a.1 < f64::from(query::MIN_SCORE)).count();
     let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
     let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
@@ -169,28 +168,16 @@ fn color_quality(scene: &mut Scene) -> Result<(Option<f64>, Option<f64>)> {
 }
 
 /// Scores one label; returns the milliseconds of the query beyond rendering.
-fn score_label(
-    scene: &Scene,
-    grid: &Grid,
-    encoder: &mut Option<fastlgs_vision::MiniLm>,
-    view: &LabelledView,
-    label: &Label,
-    frame: &Frame,
-    ids: &[u16],
-    sums: &mut Sums,
-) -> Result<f64> {
+fn score_label(scene: &Scene, grid: &Grid, view: &LabelledView, label: &Label, frame: &Frame, ids: &[u16], sums: &mut Sums) -> Result<f64> {
     let (w, h) = (frame.width, frame.height);
     let truth = view.mask(label, w, h);
     if !truth.contains(&true) {
         bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
     }
-    if encoder.is_none() {
-        scene.text_query(encoder, "warm up")?;
-    }
     let started = Instant::now();
-    let text_query = scene.text_query(encoder, &label.category)?;
+    let text_query = scene.text_query(&label.category)?;
     let ranked = query::rank(grid, &text_query);
-    let targets = query::select(&ranked, &QueryConfig::default());
+    let targets = query::select(&ranked, &QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() });
     let mask = query::mask(grid, &targets, frame.channels(3, 6), scene.decision(None));
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
@@ -228,13 +215,7 @@ fn polygon_box(polygon: &[[f64; 2]], sx: f64, sy: f64) -> [f64; 4] {
 }
 
 /// Best scores of texts that name nothing in the scene.
-fn absent_scores(
-    args: &Args,
-    scene: &Scene,
-    grid: &Grid,
-    encoder: &mut Option<fastlgs_vision::MiniLm>,
-    views: &[LabelledView],
-) -> Result<Vec<(String, f64)>> {
+fn absent_scores(args: &Args, scene: &Scene, grid: &Grid, views: &[LabelledView]) -> Result<Vec<(String, f64)>> {
     let texts: Vec<String> = match &args.absent {
         Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
         None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
@@ -247,7 +228,7 @@ fn absent_scores(
         .iter()
         .filter(|t| !t.trim().is_empty() && !named(t))
         .map(|text| {
-            let ranked = query::rank(grid, &scene.text_query(encoder, text)?);
+            let ranked = query::rank(grid, &scene.text_query(text)?);
             Ok((text.clone(), f64::from(ranked.first().map_or(0.0, |h| h.score))))
         })
         .collect()

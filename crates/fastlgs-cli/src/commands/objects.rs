@@ -1,6 +1,6 @@
 //! From masks to objects, for `train`: Algorithm 1 before training, or the views' consensus after it.
 
-use crate::ui;
+use crate::{eyes, ui};
 use anyhow::{Result, bail};
 use fastlgs_core::color::lab;
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
@@ -94,7 +94,8 @@ pub fn by_consensus(
     let regions = consensus::regions(seen, &lift::neighbours(scene, NEIGHBOURS), pixels, &config.consensus);
     tracing::debug!(seconds = clock.elapsed().as_secs_f64(), regions = regions.seen.len(), "consensus");
 
-    let encoder = Conse::load()?;
+    let manifest = folder.manifest()?;
+    let encoder = eyes::encoder_of(folder, &manifest)?;
     let mut engine = fastlgs_raster::open_engine(&common.device)?;
     let mut paint = |scene: &mut Gaussians, count: u16| -> Result<Vec<LabelMap>> {
         let codes = Grid::build(&[], &[], count, common.seed);
@@ -109,9 +110,9 @@ pub fn by_consensus(
     };
     scene.object_ids = regions.of.clone();
     let mut count = regions.seen.len() as u16;
-    if folder.manifest()?.segmenter == "offline" {
+    if manifest.segmenter == "offline" {
         let maps = paint(scene, count)?;
-        let looks = looks(folder, training, &maps, count, &encoder, common)?;
+        let looks = looks(folder, training, &maps, count, &Conse::load()?, common)?;
         let (object, objects) = whole::join(&regions, looks, config.likeness);
         scene.object_ids = regions.of.iter().map(|r| if *r > 0 { object[usize::from(*r) - 1] } else { 0 }).collect();
         count = objects;
@@ -124,7 +125,7 @@ pub fn by_consensus(
     for (view, (camera, mut map)) in training.iter().zip(maps).enumerate() {
         map.save(&folder.objects_path(&camera.name))?;
         map.labels.iter_mut().filter(|l| **l > 0 && !chosen[usize::from(**l) - 1].contains(&view)).for_each(|l| *l = 0);
-        let found = masks_of(&folder.photo(&camera.name)?, view, &map, &encoder)?;
+        let found = masks_of(&camera.name, &folder.photo(&camera.name)?, view, &map, encoder.as_ref())?;
         object_of.extend(found.iter().map(|m| m.label));
         masks.extend(found);
         bar.inc(1);
@@ -150,8 +151,8 @@ fn best_views(maps: &[LabelMap], count: u16) -> Vec<Vec<usize>> {
 }
 
 /// Embedding and colour distribution of every mask of a photo, by label.
-pub fn masks_of(photo: &RgbImage, view: usize, map: &LabelMap, encoder: &dyn Encoder) -> Result<Vec<Mask>> {
-    let embeddings = encoder.embed_masks(photo, map)?;
+pub fn masks_of(name: &str, photo: &RgbImage, view: usize, map: &LabelMap, encoder: &dyn Encoder) -> Result<Vec<Mask>> {
+    let embeddings = encoder.embed_masks(name, photo, map)?;
     let histograms = histogram::histograms(photo, map);
     let areas = map.areas();
     let masks = embeddings.into_iter().zip(histograms).enumerate().map(|(k, (embedding, histogram))| {

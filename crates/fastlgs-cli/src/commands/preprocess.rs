@@ -1,6 +1,7 @@
 //! `fastlgs preprocess`: everything that is done once, before training.
 
 use super::objects;
+use crate::eyes::Eyes;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
@@ -9,16 +10,16 @@ use fastlgs_core::undistort::{undistort, undistort_gray};
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
+use fastlgs_vision::import::Lens;
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::pose_check;
 use fastlgs_vision::triangulate::{self, PairMatches};
-use fastlgs_vision::{Conse, OfflineSegmenter, Segmenter};
+use fastlgs_vision::{Encoder, Level, Segmenter};
 use image::{GrayImage, RgbImage};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
 pub struct Args {
@@ -33,12 +34,8 @@ pub struct Args {
     /// Every N-th photo (by sorted name) is kept out of training and mapping; 0 for none.
     #[arg(long, default_value_t = 8)]
     holdout: usize,
-    /// What finds masks: `offline` (learned edges) or `import` (PHOTOS/masks/NAME.png, 16-bit labels).
-    #[arg(long, default_value = "offline", value_parser = ["offline", "import"])]
-    segmenter: String,
-    /// What embeds masks.
-    #[arg(long, default_value = "offline", value_parser = ["offline"])]
-    encoder: String,
+    #[command(flatten)]
+    eyes: Eyes,
     /// Photos that each photo's key points are matched with.
     #[arg(long, default_value_t = 10)]
     neighbours: usize,
@@ -73,6 +70,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         bail!("--max-side {} is too small: 64 pixels are the least", args.max_side);
     }
     let dataset = dataset::load(&args.photos)?;
+    let lenses: BTreeMap<String, Lens> = dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect();
+    // Opened first: a missing model should not cost the minutes before.
+    let segmenter = args.eyes.segmenter(&args.photos, &lenses)?;
+    let encoder = args.eyes.encoder(&args.photos, &lenses)?;
     for warning in &dataset.warnings {
         tracing::warn!("{warning}");
     }
@@ -95,9 +96,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
     lap("pose_check");
 
-    let segmented = segment(args, &training, &folder, common)?;
+    let (segmented, mask_counts) = segment(args, segmenter.as_ref(), &training, &folder, common)?;
+    drop(segmenter);
     lap("masks");
-    let masks = describe(&training, &segmented, common)?;
+    let masks = describe(encoder.as_ref(), &training, &segmented, common)?;
+    drop(encoder);
     lap("embeddings");
     let matches = match_photos(&training, &keypoints, args.neighbours, common);
     lap("matches");
@@ -123,8 +126,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         photos: args.photos.clone(),
         holdout: args.holdout,
-        segmenter: args.segmenter.clone(),
-        encoder: args.encoder.clone(),
+        segmenter: args.eyes.segmenter.clone(),
+        encoder: args.eyes.encoder.clone(),
+        models: args.eyes.files()?,
         seed: common.seed,
         warnings: warnings.clone(),
         excluded,
@@ -139,6 +143,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "held_out": cameras.len() - training.len(),
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
         "masks": masks.len(),
+        "masks_per_photo": mask_counts,
         "objects_by_algorithm_1": mapped.grid.objects.len(),
         "key_point_matches": matched,
         "points": points.len(),
@@ -197,47 +202,45 @@ fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
 }
 
-fn segment(args: &Args, training: &[Photo], folder: &SceneFolder, common: &ui::Common) -> Result<Vec<ViewMasks>> {
+/// Masks of every training photo; returns the whole ones, and the mean number of masks a photo by level.
+fn segment(
+    args: &Args,
+    segmenter: &dyn Segmenter,
+    training: &[Photo],
+    folder: &SceneFolder,
+    common: &ui::Common,
+) -> Result<(Vec<ViewMasks>, BTreeMap<&'static str, f64>)> {
     let bar = ui::bar(common, training.len() as u64, "masks");
-    let segmenter = if args.segmenter == "offline" { Some(OfflineSegmenter::load()?) } else { None };
     let mut out = Vec::new();
+    let mut counts = BTreeMap::new();
     for (view, photo) in training.iter().enumerate() {
         let name = &photo.camera.name;
-        let labels = match &segmenter {
-            Some(segmenter) => {
-                let found = segmenter.segment(&photo.pixels).with_context(|| format!("segmenting {name}"))?;
-                let [whole, part, subpart] = found.levels;
-                part.save(&folder.masks_path("part", name))?;
-                subpart.save(&folder.masks_path("subpart", name))?;
-                whole
+        let found = segmenter.segment(name, &photo.pixels).with_context(|| format!("segmenting {name}"))?;
+        for (level, map) in Level::ALL.into_iter().zip(&found.levels) {
+            let path = folder.masks_path(level.name(), name);
+            if args.eyes.keeps(level) {
+                let masks = map.areas().iter().skip(1).filter(|a| **a > 0).count();
+                *counts.entry(level.name()).or_default() += masks as f64 / training.len() as f64;
+                map.save(&path)?;
+            } else if path.is_file() {
+                std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
             }
-            None => import_masks(args, photo)?,
-        };
-        labels.save(&folder.masks_path("whole", name))?;
+        }
+        let [labels, ..] = found.levels;
         out.push(ViewMasks { view, labels });
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok(out)
-}
-
-/// `PHOTOS/masks/NAME.png`: labels made elsewhere, at any size with the photo's proportions.
-fn import_masks(args: &Args, photo: &Photo) -> Result<LabelMap> {
-    let path = args.photos.join("masks").join(format!("{}.png", photo.camera.name));
-    let map = LabelMap::load(&path)?;
-    if map.max() == 0 {
-        tracing::warn!("{}: the label map is empty", path.display());
-    }
-    Ok(map.resized(photo.camera.width, photo.camera.height))
+    Ok((out, counts))
 }
 
 /// Embedding and colour distribution of every mask, sorted by view and label.
-fn describe(training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) -> Result<Vec<Mask>> {
-    let encoder = Conse::load()?;
+fn describe(encoder: &dyn Encoder, training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) -> Result<Vec<Mask>> {
     let bar = ui::bar(common, training.len() as u64, "embeddings");
     let mut masks = Vec::new();
     for ViewMasks { view, labels } in segmented {
-        masks.extend(objects::masks_of(&training[*view].pixels, *view, labels, &encoder)?);
+        let photo = &training[*view];
+        masks.extend(objects::masks_of(&photo.camera.name, &photo.pixels, *view, labels, encoder)?);
         bar.inc(1);
     }
     bar.finish_and_clear();

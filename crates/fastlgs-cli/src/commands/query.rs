@@ -30,9 +30,12 @@ pub struct Args {
     /// Most objects that together form the answer.
     #[arg(long, default_value_t = QueryConfig::default().top_k)]
     top_k: usize,
-    /// Relevancy from which an object counts as found.
-    #[arg(long, default_value_t = QueryConfig::default().min_score)]
-    min_score: f32,
+    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.9 offline, 0.55 CLIP).
+    #[arg(long)]
+    min_score: Option<f32>,
+    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[arg(long, value_name = "FILE")]
+    clip_text: Option<PathBuf>,
     /// Further objects must score within this of the best.
     #[arg(long, default_value_t = QueryConfig::default().margin)]
     margin: f32,
@@ -49,9 +52,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut scene = Scene::open(&args.scene, &common.device)?;
     let grid = scene.grid()?;
     let cameras = args.views.cameras(&scene)?;
-    let mut encoder = None;
+    scene.clip_text.clone_from(&args.clip_text);
+    let min_score = args.min_score.unwrap_or(scene.min_score());
     // The text encoder is loaded once, before the first query is timed.
-    scene.text_query(&mut encoder, "warm up")?;
+    scene.text_query("warm up")?;
     let mut answers = Vec::new();
     let mut found_any = false;
     for camera in &cameras {
@@ -60,11 +64,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         for text in &args.text {
             let started = Instant::now();
-            let text_query = scene.text_query(&mut encoder, text)?;
+            let text_query = scene.text_query(text)?;
             let encode_ms = started.elapsed().as_secs_f64() * 1e3;
             let started = Instant::now();
             let ranked = query::rank(&grid, &text_query);
-            let targets = query::select(&ranked, &QueryConfig { min_score: args.min_score, top_k: args.top_k, margin: args.margin });
+            let targets = query::select(&ranked, &QueryConfig { min_score, top_k: args.top_k, margin: args.margin });
             let answer = Answer { grid: &grid, frame: &frame, ranked: &ranked, targets: &targets, decision: scene.decision(args.tau_ac) };
             let mask = answer.mask();
             let restore_ms = started.elapsed().as_secs_f64() * 1e3;
