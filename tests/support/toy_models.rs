@@ -104,10 +104,15 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     let inside = g.op("Sub", &[&reach, &distance], &[]);
     let steep = g.floats(&[1], &[1e4]);
     let logits = g.op("Mul", &[&inside, &steep], &[]);
-    let highest = g.op("ReduceMax", &[&logits], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
-    let zero = g.op("Sub", &[&highest, &highest], &[]);
-    let score = g.floats(&[1], &[0.95]);
-    let scores = g.op("Add", &[&zero, &score], &[]);
+    // Larger masks are better ones: borders of blended colours should not win over what they surround.
+    let zero = g.floats(&[1], &[0.0]);
+    let positive = g.op("Greater", &[&logits, &zero], &[]);
+    let positive = g.op("Cast", &[&positive], &[Attribute::Int("to", Kind::Float as i64)]);
+    let share = g.op("ReduceMean", &[&positive], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
+    let range = g.floats(&[1], &[0.05]);
+    let bonus = g.op("Mul", &[&share, &range], &[]);
+    let least = g.floats(&[1], &[0.9]);
+    let scores = g.op("Add", &[&bonus, &least], &[]);
     match export {
         SamExport::Official { .. } => {
             g.output(&logits, "low_res_masks", &[-1, m, SIDE, SIDE]);
