@@ -98,6 +98,16 @@ impl Eyes {
         })
     }
 
+    /// The text tower that belongs to the image encoder.
+    pub fn text_encoder(&self) -> Result<Box<dyn TextEncoder>> {
+        Ok(match (self.encoder.as_str(), &self.clip_text) {
+            ("clip", _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
+            ("import", Some(text)) => Box::new(ClipText::load(text)?),
+            ("import", None) => bail!("imported embeddings need the text tower that belongs to them: --clip-text FILE"),
+            _ => Box::new(MiniLm::load()?),
+        })
+    }
+
     /// The files of the models, for the record.
     pub fn files(&self) -> Result<BTreeMap<String, ModelFile>> {
         let mut files = BTreeMap::new();

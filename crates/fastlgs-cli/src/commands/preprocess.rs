@@ -42,9 +42,9 @@ pub struct Args {
 }
 
 /// A working photo: undistorted and scaled.
-struct Photo {
-    camera: Camera,
-    pixels: RgbImage,
+pub struct Photo {
+    pub camera: Camera,
+    pub pixels: RgbImage,
     /// Coverage of photos with an alpha channel.
     alpha: Option<GrayImage>,
     /// Black where nothing counts.
@@ -180,7 +180,7 @@ fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &
 }
 
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
-fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
+pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path)?;
     // The file decides the true size; some tools scale photos and leave the poses' file as it was.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);

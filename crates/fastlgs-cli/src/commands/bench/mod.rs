@@ -2,6 +2,7 @@
 
 mod chart;
 mod speed;
+mod vision;
 
 use crate::{Outcome, ui};
 use anyhow::Result;
@@ -17,10 +18,13 @@ pub struct Args {
 enum What {
     /// Milliseconds of every pass, frames and training iterations a second.
     Speed(speed::Args),
+    /// Masks and embeddings alone, on labelled photos.
+    Vision(vision::Args),
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     match &args.what {
         What::Speed(args) => speed::run(args, common),
+        What::Vision(args) => vision::run(args, common),
     }
 }
