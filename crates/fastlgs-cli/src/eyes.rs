@@ -7,7 +7,7 @@ use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::sam::{self, Sam};
-use fastlgs_vision::{ClipImage, ClipText, Conse, Encoder, Level, MiniLm, OfflineSegmenter, Segmenter, TextEncoder, clip, models};
+use fastlgs_vision::{ClipImage, ClipText, Conse, Encoder, Level, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, models};
 use image::RgbImage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -104,7 +104,7 @@ impl Eyes {
             ("clip", _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
             ("import", Some(text)) => Box::new(ClipText::load(text)?),
             ("import", None) => bail!("imported embeddings need the text tower that belongs to them: --clip-text FILE"),
-            _ => Box::new(MiniLm::load()?),
+            _ => Box::new(OfflineText::load()?),
         })
     }
 
@@ -164,7 +164,7 @@ pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn E
 /// The text tower of the encoder that made a scene's embeddings; `clip_text` stands in for a CLIP tower.
 pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<Box<dyn TextEncoder>> {
     Ok(match (manifest.encoder.as_str(), clip_text) {
-        ("offline", _) => Box::new(MiniLm::load()?),
+        ("offline", _) => Box::new(OfflineText::load()?),
         (_, Some(path)) => Box::new(ClipText::load(path)?),
         ("clip", None) => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
         ("import", None) if manifest.models.contains_key("clip_text") => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),

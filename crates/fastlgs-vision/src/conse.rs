@@ -1,6 +1,7 @@
 //! The offline joint space: ConSE (Norouzi et al. 2014). An image's embedding is the probability-weighted mean of the
 //! text embeddings of its ten most likely ImageNet class names. A zero-shot encoder with the limits of 1,000 concepts.
 
+use crate::attributes;
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, TextEncoder, normalise};
 use crate::exposure;
@@ -16,6 +17,10 @@ const TOP: usize = 10;
 const SIZE: usize = 260;
 /// Dimensions of the dense embedding.
 pub const DENSE: usize = 32;
+/// Names of a class that describe it: the later ones are rarer, at last Latin.
+const SYNONYMS: usize = 3;
+/// Weight of what surrounds a mask, for masks that fill their box.
+const CONTEXT: f32 = 0.25;
 /// Crops in one inference.
 const BATCH: usize = 8;
 
@@ -50,11 +55,9 @@ impl Conse {
         let folder = models::offline_dir();
         let classifier = Model::load(&folder.join("classifier.onnx"))?;
         let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
-        let names: Vec<String> = lists.into_iter().map(|n| n.into_iter().next().unwrap_or_default()).collect();
-        let texts: Vec<&str> = names.iter().map(String::as_str).collect();
-        let class_embeddings = MiniLm::load()?.embed(&texts)?;
+        let class_embeddings = class_embeddings(&lists)?;
         let mut rng = Rng::new(0, "dense projection");
-        let projection = names.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
+        let projection = lists.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
         Ok(Self { classifier, class_embeddings, projection })
     }
 
@@ -129,7 +132,7 @@ impl Conse {
         let box_area = |[x0, y0, x1, y1]: [u32; 4]| ((x1 - x0) * (y1 - y0)).max(1) as f32;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         for ((label, bounds), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {
-            let context = 0.5 * areas[usize::from(*label)] as f32 / box_area(*bounds);
+            let context = CONTEXT * areas[usize::from(*label)] as f32 / box_area(*bounds);
             out[usize::from(*label) - 1] = pair[0].iter().zip(&pair[1]).map(|(a, b)| (1.0 - context) * a + context * b).collect();
         }
         Ok(out)
@@ -142,10 +145,29 @@ impl Encoder for Conse {
     }
 
     fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let dimension = self.class_embeddings[0].len();
-        let embed = |p: &Vec<f32>| if p.is_empty() { vec![0.0; dimension] } else { self.embedding(p) };
-        Ok(self.mask_probabilities(photo, masks)?.iter().map(embed).collect())
+        let dimension = self.class_embeddings[0].len() + attributes::COUNT;
+        let colors = attributes::of_masks(&exposure::lifted(photo), masks);
+        let embed = |(p, colors): (&Vec<f32>, [f32; attributes::COUNT])| {
+            if p.is_empty() { vec![0.0; dimension] } else { [self.embedding(p).as_slice(), &colors].concat() }
+        };
+        Ok(self.mask_probabilities(photo, masks)?.iter().zip(colors).map(embed).collect())
     }
+}
+
+/// For each class the mean embedding of its first names.
+fn class_embeddings(lists: &[Vec<String>]) -> Result<Vec<Vec<f32>>> {
+    let names = |list: &'_ [String]| list.len().min(SYNONYMS);
+    let mut texts: Vec<(usize, &str)> =
+        lists.iter().enumerate().flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str()))).collect();
+    // Texts of like length waste no padding.
+    texts.sort_by_key(|(k, name)| (name.len(), *k));
+    let embeddings = MiniLm::load()?.embed(&texts.iter().map(|t| t.1).collect::<Vec<_>>())?;
+    let mut means = vec![vec![0.0; embeddings.first().map_or(0, Vec::len)]; lists.len()];
+    for ((class, _), embedding) in texts.iter().zip(embeddings) {
+        means[*class].iter_mut().zip(embedding).for_each(|(m, e)| *m += e);
+    }
+    means.iter_mut().for_each(|m| normalise(m));
+    Ok(means)
 }
 
 fn softmax(logits: &[f32]) -> Vec<f32> {

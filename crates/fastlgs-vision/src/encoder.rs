@@ -17,7 +17,7 @@ pub trait Encoder {
 
 /// Embeds texts.
 pub trait TextEncoder {
-    /// One L2-normalised embedding a text.
+    /// One embedding a text, to be multiplied with those of masks.
     ///
     /// # Errors
     /// When inference fails.

@@ -2,6 +2,7 @@
 //!
 //! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
 
+pub mod attributes;
 pub mod clip;
 pub mod clip_tokens;
 pub mod conse;
@@ -37,7 +38,7 @@ pub use encoder::{Encoder, TextEncoder};
 pub use import::Import;
 pub use sam::Sam;
 pub use segmenter::{Level, OfflineSegmenter, Segmentation, Segmenter};
-pub use text::MiniLm;
+pub use text::{MiniLm, OfflineText};
 
 /// Errors of the vision crate.
 #[derive(Debug, thiserror::Error)]

@@ -1,5 +1,6 @@
 //! The offline text tower: all-MiniLM-L6-v2.
 
+use crate::attributes;
 use crate::encoder::TextEncoder;
 use crate::runtime::{Array, Model};
 use crate::{Error, Result, models};
@@ -52,5 +53,26 @@ impl TextEncoder for MiniLm {
             out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(<[f32]>::to_vec));
         }
         Ok(out)
+    }
+}
+
+/// Texts of the offline encoder: what they mean by MiniLM, and the colours and materials that they name.
+pub struct OfflineText(MiniLm);
+
+impl OfflineText {
+    /// Loads MiniLM from the cache folder.
+    ///
+    /// # Errors
+    /// When it is not installed.
+    pub fn load() -> Result<Self> {
+        Ok(Self(MiniLm::load()?))
+    }
+}
+
+impl TextEncoder for OfflineText {
+    fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        let (named, rest): (Vec<_>, Vec<String>) = texts.iter().map(|t| attributes::of_text(t)).unzip();
+        let meanings = self.0.embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
+        Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named].concat()).collect())
     }
 }

@@ -1,0 +1,116 @@
+//! Colours and materials by name: what a classifier of things does not tell, a mask's own pixels do.
+//!
+//! Embeddings of the offline encoder end with one number an attribute: for a mask how much of it has that colour, for a text
+//! whether it names it. Their product adds to the cosine of what the rest of the text means.
+
+use fastlgs_core::LabelMap;
+use fastlgs_core::color::lab;
+use image::RgbImage;
+
+/// An attribute: the words that name it, and the CIE Lab colours that have it.
+struct Attribute {
+    words: &'static [&'static str],
+    colors: &'static [[f32; 3]],
+}
+
+/// Basic colour terms (Berlin & Kay 1969) with focal colours, and wood, which is known by its colours too.
+const ATTRIBUTES: [Attribute; 12] = [
+    Attribute { words: &["red", "crimson", "scarlet"], colors: &[[45.0, 65.0, 45.0], [35.0, 50.0, 30.0], [25.0, 38.0, 20.0]] },
+    Attribute { words: &["orange"], colors: &[[65.0, 42.0, 65.0]] },
+    Attribute { words: &["yellow", "golden"], colors: &[[85.0, 0.0, 75.0], [70.0, 5.0, 60.0]] },
+    Attribute { words: &["green"], colors: &[[50.0, -45.0, 35.0], [35.0, -20.0, 22.0], [65.0, -25.0, 35.0]] },
+    Attribute { words: &["blue"], colors: &[[35.0, 15.0, -50.0], [55.0, -5.0, -35.0], [25.0, 5.0, -25.0]] },
+    Attribute { words: &["purple", "violet"], colors: &[[35.0, 35.0, -35.0], [40.0, 20.0, -20.0], [25.0, 22.0, -18.0]] },
+    Attribute { words: &["pink"], colors: &[[70.0, 40.0, 5.0], [82.0, 20.0, 5.0]] },
+    Attribute { words: &["brown"], colors: &[[35.0, 15.0, 22.0], [25.0, 10.0, 14.0], [48.0, 17.0, 28.0]] },
+    Attribute { words: &["black"], colors: &[[6.0, 0.0, 0.0], [16.0, 0.0, 0.0]] },
+    Attribute { words: &["white"], colors: &[[97.0, 0.0, 0.0], [88.0, 0.0, 4.0]] },
+    Attribute { words: &["gray", "grey", "silver"], colors: &[[52.0, 0.0, 0.0], [36.0, 0.0, 0.0], [70.0, 0.0, 0.0]] },
+    Attribute { words: &["wooden", "wood"], colors: &[[35.0, 15.0, 22.0], [48.0, 17.0, 28.0], [62.0, 12.0, 30.0], [25.0, 10.0, 14.0]] },
+];
+
+/// Numbers at the end of an embedding.
+pub const COUNT: usize = ATTRIBUTES.len();
+/// Share of a mask that makes a colour neither its own nor foreign to it.
+const NEUTRAL: f32 = 0.25;
+/// Weight of the attributes in embeddings of masks: small, so that they hardly count between masks.
+const MASK_WEIGHT: f32 = 0.1;
+/// Weight of a mask's attribute against the cosine of meanings, when a text names it.
+const WEIGHT: f32 = 0.25;
+
+/// For each basic colour, whether a Lab colour is nearest to one of its focal colours.
+fn nearest(color: [f32; 3]) -> usize {
+    let distance = |focal: &[f32; 3]| {
+        // Hue tells colours apart more than lightness does.
+        let [l, a, b] = [0, 1, 2].map(|k| color[k] - focal[k]);
+        0.5 * l * l + a * a + b * b
+    };
+    let basic = ATTRIBUTES[..COUNT - 1].iter().enumerate();
+    let best = basic.map(|(k, attribute)| (attribute.colors.iter().map(distance).fold(f32::INFINITY, f32::min), k));
+    best.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |b| b.1)
+}
+
+/// Whether a colour may be that of wood.
+fn wooden(color: [f32; 3]) -> bool {
+    let near = |focal: &[f32; 3]| (0..3).map(|k| (color[k] - focal[k]).powi(2)).sum::<f32>() < 18.0 * 18.0;
+    ATTRIBUTES[COUNT - 1].colors.iter().any(near)
+}
+
+/// Attributes of each label 1..=max, by the photo's pixels.
+pub fn of_masks(photo: &RgbImage, masks: &LabelMap) -> Vec<[f32; COUNT]> {
+    let mut counts = vec![[0.0f32; COUNT]; usize::from(masks.max())];
+    let mut areas = vec![0.0f32; usize::from(masks.max())];
+    for (x, y) in (0..masks.height).flat_map(|y| (0..masks.width).map(move |x| (x, y))) {
+        let label = usize::from(masks.at(x, y));
+        if label == 0 {
+            continue;
+        }
+        let color = lab(photo.get_pixel(x * photo.width() / masks.width, y * photo.height() / masks.height).0);
+        counts[label - 1][nearest(color)] += 1.0;
+        counts[label - 1][COUNT - 1] += f32::from(u8::from(wooden(color)));
+        areas[label - 1] += 1.0;
+    }
+    let share = |(counts, area): ([f32; COUNT], f32)| counts.map(|n| MASK_WEIGHT * (n / area.max(1.0) - NEUTRAL));
+    counts.into_iter().zip(areas).map(share).collect()
+}
+
+/// Attributes that a text names, and the text without them; the whole text where nothing else is left.
+pub fn of_text(text: &str) -> ([f32; COUNT], String) {
+    let mut named = [0.0; COUNT];
+    let mut rest = Vec::new();
+    for word in text.split_whitespace() {
+        let plain = word.to_lowercase();
+        match ATTRIBUTES.iter().position(|a| a.words.contains(&plain.as_str())) {
+            Some(k) => named[k] = 1.0,
+            None => rest.push(word),
+        }
+    }
+    let count = named.iter().sum::<f32>().max(1.0);
+    let named = named.map(|n: f32| n / count * WEIGHT / MASK_WEIGHT);
+    (named, if rest.is_empty() { text.to_owned() } else { rest.join(" ") })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dot(a: &[f32; COUNT], b: &[f32; COUNT]) -> f32 {
+        a.iter().zip(b).map(|(x, y)| x * y).sum()
+    }
+
+    #[test]
+    fn colours_are_found_and_taken_from_the_text() {
+        let photo = RgbImage::from_fn(4, 1, |x, _| image::Rgb([[200, 20, 30], [90, 60, 130], [110, 75, 45], [10, 10, 12]][x as usize]));
+        let masks = LabelMap { width: 4, height: 1, labels: vec![1, 2, 3, 4] };
+        let attributes = of_masks(&photo, &masks);
+        for (k, text) in ["red curtain", "purple cloth", "wooden shield", "black pot"].into_iter().enumerate() {
+            let (named, rest) = of_text(text);
+            assert_eq!(Some(rest.as_str()), text.split(' ').nth(1));
+            let best = (0..4).max_by(|a, b| dot(&attributes[*a], &named).total_cmp(&dot(&attributes[*b], &named)));
+            assert_eq!(best, Some(k), "{text}");
+            assert!((dot(&attributes[k], &named) - WEIGHT * (1.0 - NEUTRAL)).abs() < 1e-5);
+        }
+        assert_eq!(of_text("fox"), ([0.0; COUNT], "fox".to_owned()));
+        assert_eq!(of_text("Red").1, "Red");
+    }
+}
