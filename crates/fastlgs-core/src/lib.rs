@@ -18,6 +18,7 @@ pub mod image_io;
 pub mod label_map;
 pub mod labels;
 pub mod metrics;
+pub mod npy;
 pub mod ply;
 pub mod rng;
 pub mod scene_folder;

@@ -3,7 +3,8 @@
 use crate::masks::{Mask, paint};
 use crate::runtime::Array;
 use crate::segmenter::{Level, Segmentation, Segmenter};
-use crate::{Encoder, Error, Result, encoder, npy};
+use crate::{Encoder, Error, Result, encoder};
+use fastlgs_core::npy::{self, Npy};
 use fastlgs_core::scene_folder::load_tensors;
 use fastlgs_core::undistort::Distortion;
 use fastlgs_core::{Camera, LabelMap, image_io};
@@ -111,7 +112,7 @@ impl Import {
             }
             Layout::LangSplat => {
                 let path = self.find(view, &[self.photos.join(format!("language_features/{stem}_s.npy"))])?;
-                let Array { shape, values } = npy::read(&path)?;
+                let Npy { shape, values } = npy::read(&path)?;
                 let [levels @ (1 | 4), rows, columns] = shape[..] else {
                     return Err(Error::Invalid(format!(
                         "{}: shape {shape:?}; LangSplat's segmentations are (4, rows, columns)",
@@ -157,12 +158,12 @@ impl Import {
     fn rows(&self, view: &str) -> Result<Option<Array>> {
         let stem = stem(view);
         let rows = if self.layout == Layout::LangSplat {
-            npy::read(&self.photos.join(format!("language_features/{stem}_f.npy")))?
+            array(npy::read(&self.photos.join(format!("language_features/{stem}_f.npy")))?)
         } else {
             let at =
                 |ending: &str| [view, stem].map(|n| self.photos.join(format!("embeddings/{n}.{ending}"))).into_iter().find(|p| p.is_file());
             if let Some(path) = at("npy") {
-                npy::read(&path)?
+                array(npy::read(&path)?)
             } else if let Some(path) = at("safetensors") {
                 let mut tensors = load_tensors(&path)?;
                 let (shape, values) =
@@ -177,6 +178,10 @@ impl Import {
         }
         Ok(Some(rows))
     }
+}
+
+fn array(npy: Npy) -> Array {
+    Array::new(npy.shape, npy.values.into_iter().map(|v| v as f32).collect())
 }
 
 /// The folder of SPIn-NeRF's labels: the finest of `label`, `images_N/label`.

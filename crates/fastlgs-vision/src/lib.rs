@@ -15,7 +15,6 @@ pub mod import;
 pub mod keypoints;
 pub mod masks;
 pub mod models;
-pub mod npy;
 pub mod pose_check;
 pub mod pull;
 pub mod regions;

@@ -1,6 +1,7 @@
 //! Posed photos from other programs' folders.
 
 pub mod colmap;
+pub mod llff;
 pub mod transforms;
 
 use crate::undistort::Distortion;
@@ -41,7 +42,14 @@ pub struct Dataset {
     pub warnings: Vec<String>,
 }
 
-/// Loads PHOTOS, with the masks in `ignore/`: `sparse/0` or `sparse` (COLMAP, binary or text) or `transforms.json` (nerfstudio, instant-ngp).
+/// Whether PHOTOS has poses of a kind that [`load`] reads.
+pub fn has_poses(photos: &Path) -> bool {
+    let model = ["sparse/0", "sparse"].iter().any(|s| colmap::is_model(&photos.join(s)));
+    model || photos.join("transforms.json").is_file() || photos.join(llff::FILE).is_file()
+}
+
+/// Loads PHOTOS, with the masks in `ignore/`: `sparse/0` or `sparse` (COLMAP, binary or text) `transforms.json` (nerfstudio, instant-ngp) or
+/// `poses_bounds.npy` (LLFF).
 ///
 /// # Errors
 /// When no poses are found, a file is damaged, a pose is not finite, or no posed photo is left.
@@ -54,9 +62,11 @@ pub fn load(photos: &Path) -> Result<Dataset> {
         colmap::load(photos, &folder)?
     } else if photos.join("transforms.json").is_file() {
         transforms::load(photos)?
+    } else if photos.join(llff::FILE).is_file() {
+        llff::load(photos)?
     } else {
         return Err(Error::Invalid(format!(
-            "{}: no poses found; expected sparse/0/cameras.bin (or .txt) of COLMAP, or transforms.json, beside images/",
+            "{}: no poses found; expected sparse/0/cameras.bin (or .txt) of COLMAP, transforms.json or poses_bounds.npy beside images/",
             photos.display()
         )));
     };

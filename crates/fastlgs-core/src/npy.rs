@@ -1,19 +1,27 @@
 //! NumPy's array files.
 
-use crate::runtime::Array;
 use crate::{Error, Result};
 use npyz::{NpyFile, Order};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
+/// Numbers with their shape.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Npy {
+    /// Length of each dimension.
+    pub shape: Vec<usize>,
+    /// Row-major values.
+    pub values: Vec<f64>,
+}
+
 /// Reads a `.npy` file of numbers or truth values in C order.
 ///
 /// # Errors
 /// When the file is missing, cut off, or of another kind.
-pub fn read(path: &Path) -> Result<Array> {
-    let bad = |reason: String| Error::Invalid(format!("{}: {reason}; save it with numpy.save in C order", path.display()));
-    let file = File::open(path).map_err(fastlgs_core::Error::io(path))?;
+pub fn read(path: &Path) -> Result<Npy> {
+    let bad = |reason: String| Error::format(path, format!("{reason}; save it with numpy.save in C order"));
+    let file = File::open(path).map_err(Error::io(path))?;
     let mut file = NpyFile::new(BufReader::new(file)).map_err(|e| bad(format!("not a whole .npy file ({e})")))?;
     if file.order() != Order::C && file.shape().len() > 1 {
         return Err(bad("its columns come first (Fortran order)".to_owned()));
@@ -24,15 +32,15 @@ pub fn read(path: &Path) -> Result<Array> {
         ($($t:ty => $convert:expr),*) => {$(
             file = match file.try_data::<$t>() {
                 Ok(data) => {
-                    let values = data.map(|v| v.map($convert)).collect::<Result<Vec<f32>, _>>();
-                    return Ok(Array::new(shape, values.map_err(|e| bad(format!("it is cut off ({e})")))?));
+                    let values = data.map(|v| v.map($convert)).collect::<Result<Vec<f64>, _>>();
+                    return Ok(Npy { shape, values: values.map_err(|e| bad(format!("it is cut off ({e})")))? });
                 }
                 Err(other) => other,
             };
         )*};
     }
-    try_kinds!(f32 => |v| v, f64 => |v| v as f32, i32 => |v| v as f32, i64 => |v| v as f32, u8 => f32::from, u16 => f32::from,
-        i16 => f32::from, u32 => |v| v as f32, bool => |v| f32::from(u8::from(v)));
+    try_kinds!(f32 => f64::from, f64 => |v| v, i32 => f64::from, i64 => |v| v as f64, u8 => f64::from, u16 => f64::from,
+        i16 => f64::from, u32 => f64::from, bool => f64::from);
     let _ = file;
     Err(bad(format!("its values are of the kind {kind}, which is not supported")))
 }
@@ -51,7 +59,7 @@ mod tests {
         writer.extend([-1i32, 0, 7, 300]).unwrap();
         writer.finish().unwrap();
         std::fs::write(&path, &bytes).unwrap();
-        assert_eq!(read(&path).unwrap(), Array::new([2, 2], vec![-1.0, 0.0, 7.0, 300.0]));
+        assert_eq!(read(&path).unwrap(), Npy { shape: vec![2, 2], values: vec![-1.0, 0.0, 7.0, 300.0] });
         std::fs::write(&path, &bytes[..bytes.len() - 3]).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("a.npy"));
         std::fs::write(&path, b"no").unwrap();

@@ -1,0 +1,93 @@
+//! LLFF's `poses_bounds.npy`: a row of 17 numbers for each photo, in the order of their names: a 3x5 matrix (camera-to-world
+//! rotation with the axes down, right, back; position; height, width, focal length), then the nearest and farthest depth.
+
+use super::{Dataset, PosedPhoto, is_photo};
+use crate::undistort::Distortion;
+use crate::{Camera, Error, Result, npy};
+use glam::{Mat4, Vec3};
+use std::path::{Path, PathBuf};
+
+/// Name of the file.
+pub const FILE: &str = "poses_bounds.npy";
+
+/// Reads `PHOTOS/poses_bounds.npy`; photos lie in `PHOTOS/images`.
+///
+/// # Errors
+/// A damaged file, or another number of photos than rows.
+pub fn load(photos: &Path) -> Result<Dataset> {
+    let path = photos.join(FILE);
+    let table = npy::read(&path)?;
+    let [rows, 17] = table.shape[..] else {
+        return Err(Error::format(&path, format!("shape {:?}; LLFF's poses are (photos, 17)", table.shape)));
+    };
+    let folder = photos.join("images");
+    let entries = std::fs::read_dir(&folder).map_err(Error::io(&folder))?;
+    let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
+    files.sort();
+    if files.len() != rows {
+        let count = files.len();
+        return Err(Error::format(
+            &path,
+            format!("{rows} poses for {count} photos in images/; they belong together by the order of names"),
+        ));
+    }
+    let posed = |(file, row): (PathBuf, &[f64])| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
+            return Err(Error::format(&path, format!("the pose of '{name}' holds {bad}; mend that row")));
+        }
+        let column = |k: usize| Vec3::new(row[k] as f32, row[5 + k] as f32, row[10 + k] as f32);
+        let (down, right, back, position) = (column(0), column(1), column(2), column(3));
+        let [height, width, focal] = [row[4], row[9], row[14]].map(|v| v as f32);
+        let camera_to_world = Mat4::from_cols(right.extend(0.0), down.extend(0.0), (-back).extend(0.0), position.extend(1.0));
+        let camera = Camera {
+            name,
+            width: width as u32,
+            height: height as u32,
+            fx: focal,
+            fy: focal,
+            cx: width / 2.0,
+            cy: height / 2.0,
+            world_to_camera: camera_to_world.inverse(),
+        };
+        Ok(PosedPhoto { path: file, camera, distortion: Distortion::default(), ignore: None })
+    };
+    let photos = files.into_iter().zip(table.values.chunks_exact(17)).map(posed).collect::<Result<_>>()?;
+    Ok(Dataset { photos, ..Dataset::default() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use npyz::WriterBuilder;
+
+    #[test]
+    fn axes_are_down_right_back() {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        image::RgbImage::new(8, 6).save(dir.path().join("images/a.png")).unwrap();
+        // A camera at (1, 2, 3) that looks along world -z with y up: down is -y, right is x, back is z.
+        let row = [0.0, 1.0, 0.0, 1.0, 6.0, -1.0, 0.0, 0.0, 2.0, 8.0, 0.0, 0.0, 1.0, 3.0, 5.0, 0.1, 9.0];
+        let write = |rows: u64, values: &[f64]| {
+            let mut bytes = Vec::new();
+            let mut writer = npyz::WriteOptions::new().default_dtype().shape(&[rows, 17]).writer(&mut bytes).begin_nd().unwrap();
+            writer.extend(values.iter().copied()).unwrap();
+            writer.finish().unwrap();
+            std::fs::write(dir.path().join(FILE), bytes).unwrap();
+        };
+        write(1, &row);
+        let dataset = super::super::load(dir.path()).unwrap();
+        let camera = &dataset.photos[0].camera;
+        assert_eq!((camera.width, camera.height, camera.fx), (8, 6, 5.0));
+        assert!(camera.centre().distance(Vec3::new(1.0, 2.0, 3.0)) < 1e-5);
+        assert!(camera.forward().distance(-Vec3::Z) < 1e-6);
+        let above = camera.world_to_camera.transform_point3(Vec3::new(1.0, 3.0, -3.0));
+        assert!(above.y < 0.0 && above.z > 0.0, "what is above is further up in the picture");
+        write(2, &[row, row].concat());
+        assert!(super::super::load(dir.path()).unwrap_err().to_string().contains("2 poses for 1 photos"));
+        let mut bad = row;
+        bad[3] = f64::NAN;
+        write(1, &bad);
+        assert!(super::super::load(dir.path()).unwrap_err().to_string().contains("a.png"));
+    }
+}
