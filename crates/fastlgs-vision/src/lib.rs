@@ -15,12 +15,14 @@ pub mod import;
 pub mod keypoints;
 pub mod masks;
 pub mod models;
+pub mod photo_quality;
 pub mod pose_check;
 pub mod pull;
 pub mod regions;
 pub mod runtime;
 pub mod sam;
 pub mod segmenter;
+pub mod structure;
 pub mod text;
 pub mod triangulate;
 

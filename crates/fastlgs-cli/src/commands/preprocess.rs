@@ -12,18 +12,19 @@ use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
 use fastlgs_vision::import::Lens;
 use fastlgs_vision::keypoints::{self, Keypoints};
-use fastlgs_vision::pose_check;
+use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Encoder, Level, Segmenter};
+use fastlgs_vision::{pose_check, structure};
 use image::{GrayImage, RgbImage};
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
 pub struct Args {
-    /// Folder with images/ and poses: sparse/0 (COLMAP) or transforms.json.
+    /// Folder with images/ and poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses COLMAP finds them.
     photos: PathBuf,
     /// Scene folder to write.
     #[arg(short, long)]
@@ -69,6 +70,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if args.max_side < 64 {
         bail!("--max-side {} is too small: 64 pixels are the least", args.max_side);
     }
+    if args.photos.join("images").is_dir() && !dataset::has_poses(&args.photos) {
+        find_poses(&args.photos, common)?;
+        lap("poses");
+    }
     let dataset = dataset::load(&args.photos)?;
     let lenses: BTreeMap<String, Lens> = dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect();
     // Opened first: a missing model should not cost the minutes before.
@@ -83,6 +88,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut keypoints = detect(&photos, common)?;
     lap("key_points");
     let mut warnings = dataset.warnings.clone();
+    warn_of_bad_photos(&photos, &mut warnings);
     let checked = check_poses(&mut photos, &keypoints, common, &mut warnings)?;
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
@@ -155,6 +161,35 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     });
     report::give(common, &value)?;
     Ok(Outcome::Done)
+}
+
+/// Structure from motion for photos without poses.
+fn find_poses(photos: &Path, common: &ui::Common) -> Result<()> {
+    let tool = structure::Tool::find()?;
+    let bar = ui::bar(common, 0, "poses");
+    tracing::warn!("{}: no poses; COLMAP looks for them, which takes minutes", photos.display());
+    structure::reconstruct(&tool, photos, |stage, line| {
+        bar.set_message(format!("{stage}: {line}"));
+        bar.tick();
+        tracing::debug!(stage, line, "COLMAP");
+    })?;
+    bar.finish_and_clear();
+    Ok(())
+}
+
+/// Blurred and repeated photos are used all the same, but the user hears of them.
+fn warn_of_bad_photos(photos: &[Photo], warnings: &mut Vec<String>) {
+    let seen: Vec<Impression> = photos.iter().map(|p| Impression::of(&p.pixels)).collect();
+    for (list, what) in
+        [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "show the same as the photo before them")]
+    {
+        if !list.is_empty() {
+            let names: Vec<&str> = list.iter().map(|&i| photos[i].camera.name.as_str()).collect();
+            let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), names.join(", "));
+            tracing::warn!("{warning}");
+            warnings.push(warning);
+        }
+    }
 }
 
 fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &ui::Common) -> Result<Vec<Photo>> {

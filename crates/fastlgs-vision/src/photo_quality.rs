@@ -1,0 +1,70 @@
+//! Photos that harm a scene more than they help: blurred ones, and those that repeat their neighbour.
+
+use image::RgbImage;
+use image::imageops::{FilterType, grayscale, resize};
+
+/// A photo this much less sharp than the middle one is called blurred.
+const BLURRED: f32 = 0.2;
+/// Mean difference of grey values, 0 to 255, below which two photos are the same.
+const SAME: f32 = 1.0;
+/// Side of the pictures in which sameness is looked for.
+const THUMB: u32 = 32;
+
+/// What a photo looks like, in a few numbers.
+pub struct Impression {
+    sharpness: f32,
+    thumb: Vec<u8>,
+}
+
+impl Impression {
+    /// Looks at a photo. Sharpness is the mean square of the Laplacian over that of the grey values' spread, so that plain
+    /// and dark photos are not called blurred.
+    pub fn of(photo: &RgbImage) -> Self {
+        let gray = grayscale(photo);
+        let (w, h) = gray.dimensions();
+        let at = |x: u32, y: u32| f32::from(gray.get_pixel(x, y)[0]);
+        let (mut edges, mut sum, mut squares, mut count) = (0.0f64, 0.0f64, 0.0f64, 1e-6f64);
+        for (x, y) in (1..h.saturating_sub(1)).flat_map(|y| (1..w.saturating_sub(1)).map(move |x| (x, y))) {
+            let laplacian = 4.0 * at(x, y) - at(x - 1, y) - at(x + 1, y) - at(x, y - 1) - at(x, y + 1);
+            edges += f64::from(laplacian * laplacian);
+            sum += f64::from(at(x, y));
+            squares += f64::from(at(x, y) * at(x, y));
+            count += 1.0;
+        }
+        let spread = squares / count - (sum / count).powi(2);
+        let thumb = resize(&gray, THUMB, THUMB, FilterType::Triangle).into_raw();
+        Self { sharpness: (edges / count / spread.max(1.0)) as f32, thumb }
+    }
+}
+
+/// Which photos are blurred, by index.
+pub fn blurred(photos: &[Impression]) -> Vec<usize> {
+    let mut all: Vec<f32> = photos.iter().map(|p| p.sharpness).collect();
+    all.sort_by(f32::total_cmp);
+    let middle = all.get(all.len() / 2).copied().unwrap_or(0.0);
+    (0..photos.len()).filter(|&i| photos[i].sharpness < BLURRED * middle).collect()
+}
+
+/// Photos that show the same as the one before them.
+pub fn repeated(photos: &[Impression]) -> Vec<usize> {
+    let difference = |a: &[u8], b: &[u8]| a.iter().zip(b).map(|(x, y)| f32::from(x.abs_diff(*y))).sum::<f32>() / a.len() as f32;
+    (1..photos.len()).filter(|&i| difference(&photos[i - 1].thumb, &photos[i].thumb) < SAME).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Rgb;
+
+    #[test]
+    fn the_blurred_and_the_repeated_one_are_found() {
+        let photo = |shift: u32| RgbImage::from_fn(96, 64, |x, y| Rgb([if ((x + 5 * shift) / 9 + y / 7).is_multiple_of(2) { 30 } else { 220 }; 3]));
+        let mut photos: Vec<RgbImage> = (0..5).map(photo).collect();
+        photos[2] = image::imageops::blur(&photos[2], 3.0);
+        photos.push(photos[4].clone());
+        let seen: Vec<Impression> = photos.iter().map(Impression::of).collect();
+        assert_eq!(blurred(&seen), [2]);
+        assert_eq!(repeated(&seen), [5]);
+        assert!(blurred(&[]).is_empty() && repeated(&[]).is_empty());
+    }
+}
