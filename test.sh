@@ -5,6 +5,7 @@ cd "$(dirname "$0")"
 ./setup.sh
 export NODEVICE_SELECT=1          # Mesa's device chooser complains where there is no desktop session
 export FASTLGS_REQUIRE_GPU=1      # a missing device is a failure here, not a skip
+export FASTLGS_REQUIRE_MODELS=1   # and so are missing models, which setup.sh installs
 cargo fmt --all --check
 cargo clippy --release --locked --all-targets --features fastlgs-cli/opencv --quiet -- -D warnings
 RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps --features fastlgs-cli/opencv --quiet
