@@ -8,7 +8,12 @@ import pycolmap
 images, work, camera_model = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), sys.argv[3]
 database = work / "database.db"
 print("features", flush=True)
-pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, camera_model=camera_model)
+if hasattr(pycolmap, "ImageReaderOptions"):
+    how = {"reader_options": pycolmap.ImageReaderOptions(camera_model=camera_model)}
+else:
+    # Versions before 0.5 take the model itself.
+    how = {"camera_model": camera_model}
+pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, **how)
 print("matches", flush=True)
 pycolmap.match_exhaustive(database)
 print("mapping", flush=True)
