@@ -58,7 +58,8 @@ mod tests {
 
     #[test]
     fn the_blurred_and_the_repeated_one_are_found() {
-        let photo = |shift: u32| RgbImage::from_fn(96, 64, |x, y| Rgb([if ((x + 5 * shift) / 9 + y / 7).is_multiple_of(2) { 30 } else { 220 }; 3]));
+        let photo =
+            |shift: u32| RgbImage::from_fn(96, 64, |x, y| Rgb([if ((x + 5 * shift) / 9 + y / 7).is_multiple_of(2) { 30 } else { 220 }; 3]));
         let mut photos: Vec<RgbImage> = (0..5).map(photo).collect();
         photos[2] = image::imageops::blur(&photos[2], 3.0);
         photos.push(photos[4].clone());
