@@ -182,6 +182,11 @@ fn onnx_exports_of_sam_and_clip() {
     let inside: Vec<_> = photo.pixels().zip(mask.pixels()).filter(|(_, m)| m[0] > 0).map(|(p, _)| p.0.map(f64::from)).collect();
     let redness = inside.iter().map(|p| p[0] - (p[1] + p[2]) / 2.0).sum::<f64>() / inside.len() as f64;
     assert!(redness > 20.0, "{redness} over {} pixels", inside.len());
+    // Embeddings of another encoder are not compared.
+    let manifest = std::fs::read_to_string(scene.join("scene.json")).expect("the manifest");
+    std::fs::write(scene.join("scene.json"), manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\"")).expect("a file");
+    fails(&["query", text(&scene), "red"], &["3 numbers", "another encoder"]);
+    std::fs::write(scene.join("scene.json"), manifest).expect("a file");
     // A scene remembers its models; other files in their place are noticed.
     std::fs::write(&words, b"short").expect("a file");
     fails(&["query", text(&scene), "red"], &["text.onnx", "made with"]);

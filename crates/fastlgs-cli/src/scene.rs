@@ -94,6 +94,14 @@ impl Scene {
         if self.texts.get().is_none() {
             let encoder = eyes::text_encoder_of(&self.manifest, self.clip_text.as_deref())?;
             let canonical = encoder.embed(&CANONICAL)?;
+            let grid = self.grid()?;
+            let (own, text) = (grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next(), canonical[0].len());
+            if let Some(own) = own.filter(|own| *own != text) {
+                let root = self.folder.root.display();
+                bail!(
+                    "{root}: its embeddings have {own} numbers, those of texts {text}; they are of another encoder or version: run 'fastlgs train {root}' again, or name the right tower with --clip-text"
+                );
+            }
             let _ = self.texts.set(Texts { encoder, canonical });
         }
         let texts = self.texts.get().expect("set above");
