@@ -99,7 +99,8 @@ impl Scene {
             if let Some(own) = own.filter(|own| *own != text) {
                 let root = self.folder.root.display();
                 bail!(
-                    "{root}: its embeddings have {own} numbers, those of texts {text}; they are of another encoder or version: run 'fastlgs train {root}' again, or name the right tower with --clip-text"
+                    "{root}: its embeddings have {own} numbers, those of texts {text}; they are of another encoder or version: \
+                     run 'fastlgs train {root}' again, or name the right tower with --clip-text"
                 );
             }
             let _ = self.texts.set(Texts { encoder, canonical });

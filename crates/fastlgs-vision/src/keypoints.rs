@@ -20,12 +20,19 @@ pub const MAX_KEYPOINTS: usize = 2500;
 /// Lowe's ratio of the best to the second-best distance.
 const RATIO: f32 = 0.8;
 
-/// Detects and describes key points with OpenCV.
+/// Detects and describes key points: with OpenCV where this build has it, else in pure Rust.
 ///
 /// # Errors
-/// When OpenCV refuses the picture.
-#[cfg(feature = "opencv")]
+/// When the picture is refused.
 pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
+    #[cfg(feature = "opencv")]
+    return detect_with_opencv(photo);
+    #[cfg(not(feature = "opencv"))]
+    detect_in_rust(photo)
+}
+
+#[cfg(feature = "opencv")]
+fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
     use opencv::core::{KeyPoint, Mat, MatTraitConst, MatTraitConstManual, Vector, no_array};
     use opencv::prelude::{Feature2DTrait, KeyPointTraitConst};
     let failed = |e: opencv::Error| Error::Invalid(format!("SIFT failed: {e}"));
@@ -44,12 +51,8 @@ pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
     Ok(out)
 }
 
-/// Detects and describes key points in pure Rust.
-///
-/// # Errors
-/// Never; the signature is that of the OpenCV version.
-#[cfg(not(feature = "opencv"))]
-pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
+#[cfg(any(test, not(feature = "opencv")))]
+fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
     let found = sift_features::sift(photo, Some(MAX_KEYPOINTS));
     let descriptors = found.descriptors.rows().into_iter().map(|row| std::array::from_fn(|k| row[k])).collect::<Vec<[u8; 128]>>();
     if descriptors.len() != found.keypoints.len() {
@@ -138,6 +141,32 @@ mod tests {
         assert!(pairs.len() > 20, "{} matches", pairs.len());
         let right = pairs.iter().filter(|(i, j)| (ka.positions[*i] - kb.positions[*j] - Vec2::new(8.0, -5.0)).length() < 1.5).count();
         assert!(right * 10 >= pairs.len() * 8, "{right} of {}", pairs.len());
+    }
+
+    /// Both implementations tell the same of two neighbouring photos of fox.
+    #[cfg(feature = "opencv")]
+    #[test]
+    fn opencv_and_rust_find_the_same_correspondences() {
+        let images = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox/images");
+        let photo = |name: &str| {
+            let photo = fastlgs_core::image_io::load_rgb(&images.join(name)).unwrap();
+            image::imageops::grayscale(&fastlgs_core::image_io::resize(&photo, 270, 480))
+        };
+        if !images.is_dir() {
+            eprintln!("SKIPPED: {} is not there", images.display());
+            return;
+        }
+        let (a, b) = (photo("0001.jpg"), photo("0002.jpg"));
+        let flow = |detect: fn(&GrayImage) -> Result<Keypoints>| {
+            let (a, b) = (detect(&a).unwrap(), detect(&b).unwrap());
+            matches(&a, &b).into_iter().map(|(i, j)| (a.positions[i], b.positions[j])).collect::<Vec<_>>()
+        };
+        let (opencv, rust) = (flow(detect_with_opencv), flow(detect_in_rust));
+        let again = |(p, q): &&(Vec2, Vec2)| rust.iter().any(|(r, s)| r.distance(*p) < 2.0 && s.distance(*q) < 2.0);
+        let shared = opencv.iter().filter(again).count();
+        println!("correspondences of OpenCV {}, Rust {}; {shared} of OpenCV's found by both", opencv.len(), rust.len());
+        assert!(opencv.len() > 100 && rust.len() > 100);
+        assert!(2 * shared > opencv.len().min(rust.len()), "{shared} of {} and {}", opencv.len(), rust.len());
     }
 
     #[test]
