@@ -4,6 +4,7 @@ use crate::masks::{Mask, paint};
 use crate::runtime::Array;
 use crate::segmenter::{Level, Segmentation, Segmenter};
 use crate::{Encoder, Error, Result, encoder};
+use fastlgs_core::dataset::Dataset;
 use fastlgs_core::npy::{self, Npy};
 use fastlgs_core::scene_folder::load_tensors;
 use fastlgs_core::undistort::Distortion;
@@ -29,6 +30,11 @@ pub enum Layout {
 
 /// The camera of a photo, at any size, and the distortion of its lens: imported masks were drawn on the distorted photo.
 pub type Lens = (Camera, Distortion);
+
+/// The lens of each photo, by name.
+pub fn lenses(dataset: &Dataset) -> BTreeMap<String, Lens> {
+    dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect()
+}
 
 /// Imported masks and embeddings.
 pub struct Import {

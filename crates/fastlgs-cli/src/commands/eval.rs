@@ -174,6 +174,8 @@ fn score_label(scene: &Scene, grid: &Grid, view: &LabelledView, label: &Label, f
     if !truth.contains(&true) {
         bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
     }
+    // The text encoder is loaded once, before the first query is timed.
+    scene.text_query("warm up")?;
     let started = Instant::now();
     let text_query = scene.text_query(&label.category)?;
     let ranked = query::rank(grid, &text_query);

@@ -10,11 +10,10 @@ use fastlgs_core::undistort::{undistort, undistort_gray};
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
-use fastlgs_vision::import::Lens;
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::triangulate::{self, PairMatches};
-use fastlgs_vision::{Encoder, Level, Segmenter};
+use fastlgs_vision::{Encoder, Level, Segmenter, import};
 use fastlgs_vision::{pose_check, structure};
 use image::{GrayImage, RgbImage};
 use std::collections::BTreeMap;
@@ -75,7 +74,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         lap("poses");
     }
     let dataset = dataset::load(&args.photos)?;
-    let lenses: BTreeMap<String, Lens> = dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect();
+    let lenses = import::lenses(&dataset);
     // Opened first: a missing model should not cost the minutes before.
     let segmenter = args.eyes.segmenter(&args.photos, &lenses)?;
     let encoder = args.eyes.encoder(&args.photos, &lenses)?;

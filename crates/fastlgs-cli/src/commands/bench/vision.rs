@@ -8,8 +8,7 @@ use crate::eyes::Eyes;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::{LabelMap, dataset, labels, metrics};
-use fastlgs_vision::Level;
-use fastlgs_vision::import::Lens;
+use fastlgs_vision::{Level, import};
 use serde_json::json;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -49,8 +48,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut photos = 0;
     for folder in &args.photos {
         let dataset = dataset::load(folder)?;
-        let lenses: BTreeMap<String, Lens> =
-            dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect();
+        let lenses = import::lenses(&dataset);
         let segmenter = args.eyes.segmenter(folder, &lenses)?;
         let encoder = args.eyes.encoder(folder, &lenses)?;
         for view in labels::load(&folder.join("labels"))? {
