@@ -5,7 +5,8 @@ use crate::density::State;
 use crate::native::CpuEngine;
 use crate::pass::Channels;
 use crate::view::{Plane, Step, View};
-use crate::{GpuEngine, Result};
+use crate::{Error, GpuEngine, Result};
+use fastlgs_core::Shares;
 use std::collections::BTreeMap;
 
 /// A rendered frame, planar.
@@ -158,6 +159,11 @@ pub trait Engine {
     /// # Errors
     /// When it does not fit or the device failed.
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame>;
+    /// Blending weights of a frame summed by the Gaussians' object ids; `view.gaussians` must equal [`Self::len`].
+    ///
+    /// # Errors
+    /// As [`Self::render`], and when there is not one id a Gaussian.
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares>;
     /// One training step towards target `id`: forward, loss, backward, Adam. With [`Channels::Feature`] geometry must
     /// stay as it was since the last [`Self::set_state`].
     ///
@@ -188,6 +194,15 @@ pub trait Engine {
     /// # Errors
     /// When the device failed.
     fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>>;
+}
+
+/// Refuses ids that do not belong to the Gaussians of the view.
+pub(crate) fn check_ids(view: &View, ids: &[u16], n: usize) -> Result<()> {
+    if view.gaussians as usize != n || ids.len() != n || n == 0 {
+        let reason = format!("the view was made for {} Gaussians, there are {} ids, the device holds {n}", view.gaussians, ids.len());
+        return Err(Error::Invalid(reason));
+    }
+    Ok(())
 }
 
 /// Bytes that an engine holds.

@@ -2,12 +2,14 @@
 
 use crate::cpu::{CHAINS, CHUNKS, RUN};
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, losses_of, planes, tile_bits};
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, losses_of, planes, tile_bits};
 use crate::pass::{Channels, Pass, Recorder, Shader, shaders};
 use crate::profile::Profile;
 use crate::view::{Ceiling, Job, Perturb, Step, View, stride};
 use crate::{Error, Gpu, Result};
+use fastlgs_core::Shares;
 use fastlgs_core::gaussians::channels as channels_of;
+use fastlgs_core::shares::KEPT;
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 use wgpu::Buffer;
@@ -27,6 +29,7 @@ struct Passes {
     emit: Pass,
     tile_ranges: Pass,
     tile_load: Pass,
+    blend_ids: Pass,
     ssim_rows: Pass,
     ssim_columns: Pass,
     ssim_backward_rows: Pass,
@@ -164,6 +167,7 @@ impl GpuEngine {
             emit: pass(&shaders::EMIT),
             tile_ranges: pass(&shaders::TILE_RANGES),
             tile_load: pass(&shaders::TILE_LOAD),
+            blend_ids: pass(&shaders::BLEND_IDS),
             ssim_rows: pass(&shaders::SSIM_ROWS),
             ssim_columns: pass(&shaders::SSIM_COLUMNS),
             ssim_backward_rows: pass(&shaders::SSIM_BACKWARD_ROWS),
@@ -523,6 +527,30 @@ impl Engine for GpuEngine {
         self.gpu.read_with(&frame.frame, 8 * plane, |planes: &[f32]| {
             Frame::gathered(&view, channels, |channel, y| &planes[channel * plane + view.at(0, y)..])
         })
+    }
+
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
+        check_ids(&view, ids, self.len())?;
+        let channels = Channels::Feature;
+        let mut on_cpu = self.passes_on_cpu;
+        self.prepare_blending(kind(&view, channels));
+        self.prepare_frame(&view, false)?;
+        let lists = self.lists(view, channels, &mut on_cpu)?;
+        let words: Vec<u32> = ids.iter().map(|id| u32::from(*id)).collect();
+        let ids = self.gpu.storage_with("object ids", &words)?;
+        let (g, frame) = (self.gaussians.as_ref().expect("n > 0"), self.frame.as_ref().expect("prepared"));
+        let mut r = Recorder::new(&self.gpu, on_cpu);
+        // The frame has room for eight words a pixel, shares need four.
+        let buffers = [&lists.ranges, &lists.sorted_pairs, &lists.pair_gaussians, &g.splats, &ids, &frame.frame];
+        r.run(&self.passes.blend_ids, &lists.view, &buffers, view.tile_count())?;
+        r.submit();
+        let [width, height] = view.size;
+        let plane = view.padded_pixels();
+        let gather = |slots: &[u32]| {
+            let pixel = |(x, y)| std::array::from_fn(|k| slots[k * plane + view.at(x, y)]);
+            (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(pixel).collect()
+        };
+        Ok(Shares { width, height, pixels: self.gpu.read_with(&frame.frame, KEPT * plane, gather)? })
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

@@ -6,6 +6,7 @@
 mod adam;
 mod blend;
 mod blend_backward;
+mod blend_ids;
 mod ceiling;
 mod covariance;
 mod emit;
@@ -32,6 +33,7 @@ pub(crate) use adam::adam_one;
 pub use blend::blend;
 pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;
+pub use blend_ids::blend_ids;
 pub(crate) use ceiling::CHAINS;
 pub use ceiling::ceiling;
 pub use emit::emit;

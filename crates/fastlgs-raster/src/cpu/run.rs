@@ -35,6 +35,9 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
             let order = &order[..view().tile_count() as usize];
             blend(&view(), channels, ranges, order, sorted, gaussians, read(splats), write(frame));
         }
+        ("blend_ids", [ranges, sorted, gaussians, splats, ids, shares]) => {
+            blend_ids(&view(), ranges, sorted, gaussians, read(splats), ids, shares);
+        }
         ("ssim_rows", [frame, targets, rows]) => ssim_rows(&plane(), read(frame), targets, write(rows)),
         ("ssim_columns", [rows, partials, sums]) => ssim_columns(&plane(), read(rows), write(partials), write(sums)),
         ("ssim_backward_rows", [partials, rows]) => ssim_backward_rows(&plane(), read(partials), write(rows)),

@@ -134,6 +134,39 @@ fn forward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool>(job: &J
     }
 }
 
+vectorised! {
+    /// Blending weights of a tile's Gaussians, summed by their ids: those that occur, in the order of the list.
+    /// `transmittance` must hold 1 for pixels of the picture and 0 for others.
+    fn by_id(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) = by_id_body
+}
+
+#[inline(always)]
+fn by_id_body<const FMA: bool>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) {
+    sums.clear();
+    for batch in job.gaussians.chunks(BATCH) {
+        for &g in batch {
+            let (splat, id) = (&job.splats[g as usize], ids[g as usize]);
+            let place = sums.iter().position(|s| s.0 == id).unwrap_or_else(|| {
+                sums.push((id, Tile::default()));
+                sums.len() - 1
+            });
+            let dx = offsets(job.x - splat[0][0]);
+            for j in rows_of(splat, job.y) {
+                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
+                let (transmittance, sum) = (&mut transmittance[j], &mut sums[place].1[j]);
+                for i in 0..LANES {
+                    let w = alpha[i] * transmittance[i];
+                    transmittance[i] -= w;
+                    sum[i] += w;
+                }
+            }
+        }
+        if transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+            break;
+        }
+    }
+}
+
 /// What the backward pass starts from.
 pub struct Given {
     /// dL/d(colour, feature).

@@ -8,12 +8,14 @@ mod simd;
 
 use crate::cpu::{self, perturb_one};
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, planes};
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
 use crate::pass::Channels;
 use crate::view::{Perturb, Step, TILE, View};
 use crate::{Error, Result};
 use blend::{Blended, Given, Job, Tile};
+use fastlgs_core::Shares;
 use fastlgs_core::gaussians::channels as channels_of;
+use fastlgs_core::shares::{KEPT, pack};
 pub(crate) use lists::Lists;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap};
@@ -78,6 +80,19 @@ pub struct CpuEngine {
 fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
     let channels = columns.len() / n.max(1);
     (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
+}
+
+/// The heaviest ids, heavier ones first.
+fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
+    let mut best = [(0, 0.0); KEPT];
+    for (id, weight) in weights {
+        let place = best.iter().position(|b| weight > b.1);
+        if let Some(place) = place {
+            best[place..].rotate_right(1);
+            best[place] = (id, weight);
+        }
+    }
+    best.map(|(id, weight)| pack(id, weight))
 }
 
 impl CpuEngine {
@@ -266,6 +281,29 @@ impl Engine for CpuEngine {
         self.forward(&view, channels, None)?;
         let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len()) as u32;
         Ok(Frame::gathered(&View { pairs, ..view }, channels, |channel, y| self.frame.row(channel, y as usize)))
+    }
+
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
+        check_ids(&view, ids, self.n)?;
+        let (params, channels) = (&self.params, channels_of(self.sh_degree));
+        let lists = Lists::new(&view, |i, c| params[i * channels + c]);
+        let [width, height] = view.size;
+        let mut pixels = vec![[0; KEPT]; view.pixels()];
+        const EDGE: usize = TILE as usize;
+        pixels.par_chunks_mut(EDGE * width as usize).enumerate().for_each_init(Vec::new, |sums, (row, band)| {
+            for tile in row * view.tiles[0] as usize..(row + 1) * view.tiles[0] as usize {
+                let [start, end] = lists.ranges[tile].map(|p| p as usize);
+                let job = Job::new(&view, tile, &lists.gaussians[start..end], &lists.splats);
+                blend::by_id(&job, ids, &mut blend::shown(&view, &job), sums);
+                for (y, line) in band.chunks_exact_mut(width as usize).enumerate() {
+                    for (x, pixel) in line[job.x as usize..].iter_mut().take(EDGE).enumerate() {
+                        let at = |tile: &Tile| tile[y / 2][y % 2 * EDGE + x];
+                        *pixel = heaviest(sums.iter().map(|(id, tile)| (*id, at(tile))));
+                    }
+                }
+            }
+        });
+        Ok(Shares { width, height, pixels })
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

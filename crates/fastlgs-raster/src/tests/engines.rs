@@ -135,3 +135,24 @@ fn the_gpu_repeats_itself_to_the_byte() {
     };
     assert_eq!(run(), run());
 }
+
+#[test]
+fn gpu_and_cpu_agree_on_objects() {
+    let Some(gpu) = gpu() else { return };
+    let mut device = GpuEngine::new(gpu);
+    let mut cpu = CpuEngine::new();
+    for (n, w, h) in [(300, 17, 13), (5000, 270, 479), (20_000, 1440, 1080)] {
+        let scene = cloud(n, 5, 0, true);
+        let view = View::new(&camera(w, h), scene.len(), 0);
+        // Objects are patches of space, as in scenes, so that few meet in a pixel.
+        let ids: Vec<u16> = scene.means.iter().map(|m| u16::from(m.x > 0.0) + 2 * u16::from(m.y > 0.0)).collect();
+        let both = [&mut device as &mut dyn Engine, &mut cpu].map(|engine| {
+            engine.set_state(&State::of(&scene)).unwrap();
+            assert!(engine.render_ids(view, &ids[1..]).unwrap_err().to_string().contains("ids"));
+            engine.render_ids(view, &ids).unwrap().winners()
+        });
+        let off = both[0].labels.iter().zip(&both[1].labels).filter(|(a, b)| a != b).count();
+        assert!(off as f64 <= 0.002 * view.pixels() as f64, "{off} of {} pixels differ", view.pixels());
+        assert!((1..4).all(|id| both[0].labels.contains(&id)));
+    }
+}

@@ -239,6 +239,34 @@ fn blending_and_its_gradients() {
     }
 }
 
+/// Shares of the same pixel agree whatever their order: the weight of each id to a thousandth, but for a few pixels.
+fn assert_same_shares(what: &str, a: impl Iterator<Item = [u32; 4]>, b: impl Iterator<Item = [u32; 4]>, flips: f64) {
+    let weight = |pixel: &[u32; 4], id: u32| pixel.iter().filter(|s| *s >> 16 == id).map(|s| s & 0xffff).sum::<u32>();
+    let agree = |a: &[u32; 4], b: &[u32; 4]| a.iter().chain(b).all(|s| weight(a, s >> 16).abs_diff(weight(b, s >> 16)) <= 66);
+    let pairs: Vec<_> = a.zip(b).collect();
+    let off = pairs.iter().filter(|(a, b)| !agree(a, b)).count();
+    assert!(off as f64 <= flips * pairs.len() as f64, "{what}: {off} of {} pixels differ", pairs.len());
+    assert!(pairs.iter().any(|(a, _)| a.iter().filter(|s| **s & 0xffff > 655).count() > 1), "{what}: no pixel shows two objects");
+}
+
+#[test]
+fn blending_ids() {
+    let Some(gpu) = gpu() else { return };
+    for (n, w, h) in SIZES.into_iter().skip(1) {
+        let l = lists(n, w, h, 0, false);
+        let b = |name: &str| &l.buffers[name][..];
+        let pixels = l.view.padded_pixels();
+        // With three objects nothing is ever dropped; with forty, where many Gaussians overlap, the lightest are.
+        for (objects, flips) in [(3, 0.002), (40, 0.01)] {
+            let ids: Vec<u32> = (0..l.view.gaussians).map(|g| g % objects).collect();
+            let buffers = [b("ranges"), b("sorted"), b("gaussians"), b("splats"), &ids, &zeros(4 * pixels)];
+            let [device, twin] = both(&gpu, &shaders::BLEND_IDS, Channels::Both, false, &l.view, &buffers, l.view.tile_count());
+            let shares = |all: &[Vec<u32>]| (0..pixels).map(|p| [0, 1, 2, 3].map(|k| all[5][k * pixels + p])).collect::<Vec<_>>();
+            assert_same_shares(&format!("{objects} objects of {n}"), shares(&device).into_iter(), shares(&twin).into_iter(), flips);
+        }
+    }
+}
+
 #[test]
 fn loss() {
     let Some(gpu) = gpu() else { return };

@@ -1,0 +1,60 @@
+use super::{BATCH, Splat, TRANSMITTANCE_MIN, alpha, pixels_of, shown};
+use crate::View;
+use fastlgs_core::shares::{KEPT, pack};
+use rayon::prelude::*;
+
+/// What no object is called.
+const NO_ID: u32 = 0x1_0000;
+
+/// Adds to the id's slot, or takes the first of the lightest ones where the weight is larger.
+fn put(slots: &mut [(u32, f32); KEPT], id: u32, weight: f32) {
+    if let Some(slot) = slots.iter_mut().find(|s| s.0 == id) {
+        slot.1 += weight;
+        return;
+    }
+    let least = slots.iter().fold(f32::INFINITY, |m, s| m.min(s.1));
+    if let Some(slot) = slots.iter_mut().find(|s| s.1 == least).filter(|_| weight > least) {
+        *slot = (id, weight);
+    }
+}
+
+/// Twin of `shaders/blend_ids.wgsl`.
+pub fn blend_ids(
+    view: &View,
+    ranges: &[u32],
+    sorted_pairs: &[u32],
+    pair_gaussians: &[u32],
+    splats: &[Splat],
+    ids: &[u32],
+    shares: &mut [u32],
+) {
+    let n = view.padded_pixels();
+    let tiles: Vec<Vec<(usize, [u32; KEPT])>> = (0..view.tile_count())
+        .into_par_iter()
+        .map(|tile| {
+            let pairs = &sorted_pairs[ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
+            let mut pixels: Vec<_> = pixels_of(tile, view).map(|(x, y)| ((x, y), shown(x, y, view), [(NO_ID, 0.0); KEPT])).collect();
+            for batch in pairs.chunks(BATCH) {
+                for &e in batch {
+                    let g = pair_gaussians[e as usize] as usize;
+                    for ((x, y), transmittance, slots) in &mut pixels {
+                        let (dx, dy) = (*x as f32 + 0.5 - splats[g][0][0], *y as f32 + 0.5 - splats[g][0][1]);
+                        let weight = alpha(&splats[g], dx, dy) * *transmittance;
+                        *transmittance -= weight;
+                        put(slots, ids[g], weight);
+                    }
+                }
+                // The invocations of a tile stop on their own; what they walk beyond that weighs next to nothing.
+                if pixels.iter().all(|p| p.1 < TRANSMITTANCE_MIN) {
+                    break;
+                }
+            }
+            pixels.into_iter().map(|((x, y), _, slots)| (view.at(x, y), slots.map(|(id, weight)| pack(id as u16, weight)))).collect()
+        })
+        .collect();
+    for (at, slots) in tiles.into_iter().flatten() {
+        for (k, slot) in slots.into_iter().enumerate() {
+            shares[k * n + at] = slot;
+        }
+    }
+}
