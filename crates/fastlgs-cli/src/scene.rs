@@ -4,7 +4,7 @@ use crate::eyes;
 use anyhow::{Context, Result, bail};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
-use fastlgs_grid::query::{self, Decision};
+use fastlgs_grid::query::{self, Field};
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::density::State;
@@ -79,14 +79,15 @@ impl Scene {
         Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
     }
 
-    /// How the scene's rendered features become objects: as it was trained, unless `tau_ac` asks for the paper's way.
-    pub fn decision(&self, tau_ac: Option<f32>) -> Decision {
+    /// What a view tells about objects, in the way the scene was trained, unless `tau_ac` asks for the paper's.
+    pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.manifest.notes.get("train").is_some_and(|t| t["feature_mode"] == "lift");
-        match tau_ac {
-            Some(tau) => Decision::Within(tau),
-            None if lifted => Decision::Nearest,
-            None => Decision::Within(codes::TAU_AC),
+        if lifted && tau_ac.is_none() {
+            return Ok(Field::Shares(self.engine.render_ids(self.view(camera), &self.gaussians.object_ids)?));
         }
+        let frame = self.engine.render(self.view(camera), Channels::Feature)?;
+        let (width, height, values) = (frame.width, frame.height, frame.channels(3, 6).to_vec());
+        Ok(Field::Features { width, height, values, tau_ac: tau_ac.unwrap_or(codes::TAU_AC) })
     }
 
     /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.

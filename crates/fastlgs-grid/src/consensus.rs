@@ -13,17 +13,17 @@ pub type Seen = Vec<((u16, u16), f32)>;
 /// Constants of the consensus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
-    /// Agreement from which two regions are one object.
+    /// Agreement from which neighbours are one region.
     pub agreement: f32,
-    /// Fewest views that must show an object.
+    /// Fewest views that must show a region.
     pub min_views: usize,
-    /// Smallest object: mean share of the pixels of the views that show it.
+    /// Smallest region: mean share of the pixels of the views that show it.
     pub min_share: f32,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { agreement: 0.5, min_views: 3, min_share: 0.0015 }
+        Self { agreement: 0.5, min_views: 3, min_share: 0.0005 }
     }
 }
 

@@ -12,6 +12,10 @@ use serde::{Deserialize, Serialize};
 pub struct Object {
     /// Number, 1..=K.
     pub id: u16,
+    /// Object that contains it; 0 for none.
+    pub parent: u16,
+    /// Mean IoU with the best mask of each view; 1 where masks were taken as they are.
+    pub support: f32,
     /// Code in (0, 1)^3.
     pub code: Vec3,
     /// Embeddings of its masks, each L2-normalised.
@@ -32,6 +36,10 @@ pub struct Grid {
 #[derive(Serialize, Deserialize)]
 struct Row {
     id: u16,
+    #[serde(default)]
+    parent: u16,
+    #[serde(default)]
+    support: f32,
     code: [f32; 3],
     views: usize,
     /// Rows of the embedding table: first and number.
@@ -50,6 +58,8 @@ impl Grid {
                 let seen: Vec<&Mask> = own.into_iter().filter(|m| m.embedding.iter().any(|v| *v != 0.0)).collect();
                 Object {
                     id,
+                    parent: 0,
+                    support: 1.0,
                     code: codes[usize::from(id) - 1],
                     embeddings: seen.iter().map(|m| m.embedding.clone()).collect(),
                     areas: seen.iter().map(|m| m.area).collect(),
@@ -64,6 +74,20 @@ impl Grid {
     pub fn nearest(&self, feature: Vec3) -> Option<(u16, f32)> {
         let distances = self.objects.iter().map(|o| (o.id, codes::distance(feature, o.code)));
         distances.min_by(|a, b| a.1.total_cmp(&b.1))
+    }
+
+    /// The objects that contain an object, from small to large, itself first.
+    pub fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
+        let known = |id: &u16| (1..=self.objects.len()).contains(&usize::from(*id));
+        // A damaged file might go in circles: no chain is longer than there are objects.
+        let up = move |id: &u16| Some(self.objects[usize::from(*id) - 1].parent).filter(known);
+        std::iter::successors(Some(id).filter(known), up).take(self.objects.len())
+    }
+
+    /// For each id 0..=K whether the object belongs to one of `targets`: is one, or lies inside one.
+    pub fn members(&self, targets: &[u16]) -> Vec<bool> {
+        let inside = |id: u16| self.chain(id).any(|above| targets.contains(&above));
+        (0..=self.objects.len() as u16).map(inside).collect()
     }
 
     /// Code of an object; zero for object 0 and unknown ones.
@@ -84,7 +108,7 @@ impl Grid {
         let dimension = self.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next().unwrap_or(0);
         let (mut embeddings, mut areas, mut rows) = (Vec::new(), Vec::new(), Vec::new());
         for o in &self.objects {
-            rows.push(Row { id: o.id, code: o.code.to_array(), views: o.views, first: areas.len(), count: o.areas.len() });
+            rows.push(Row { id: o.id, parent: o.parent, support: o.support, code: o.code.to_array(), views: o.views, first: areas.len(), count: o.areas.len() });
             embeddings.extend(o.embeddings.iter().flatten().copied());
             areas.extend(&o.areas);
         }
@@ -117,6 +141,8 @@ impl Grid {
                 let own = &embeddings.1[range.start * dimension..range.end * dimension];
                 Ok(Object {
                     id: r.id,
+                    parent: r.parent,
+                    support: r.support,
                     code: Vec3::from(r.code),
                     embeddings: own.chunks_exact(dimension.max(1)).map(<[f32]>::to_vec).collect(),
                     areas: areas.1[range].to_vec(),

@@ -8,7 +8,7 @@ pub mod grid;
 pub mod mapping;
 pub mod query;
 pub mod relevancy;
-pub mod whole;
+pub mod tree;
 
 pub use grid::{Grid, Object};
 

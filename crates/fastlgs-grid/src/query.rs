@@ -3,6 +3,7 @@
 use crate::codes;
 use crate::grid::{Grid, Object};
 use crate::relevancy::TextQuery;
+use fastlgs_core::{LabelMap, Shares};
 use glam::Vec3;
 use serde::Serialize;
 
@@ -65,85 +66,146 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     hits
 }
 
-/// The target objects; empty means "not found".
-pub fn select(ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
+/// The target objects; empty means "not found". Of things that lie in each other one is taken: the best, or the largest
+/// around it that is hardly less relevant.
+pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     let Some(best) = ranked.first() else { return Vec::new() };
     let floor = config.min_score.max(best.score - config.margin);
-    ranked.iter().take(config.top_k).filter(|h| h.score >= floor).copied().collect()
+    let mut score = vec![0.0; grid.objects.len() + 1];
+    ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
+    let mut chosen: Vec<Hit> = Vec::new();
+    for hit in ranked.iter().take_while(|h| h.score >= floor) {
+        let around = grid.chain(hit.id).filter(|id| score[usize::from(*id)] >= floor.max(hit.score - config.margin)).last();
+        let id = around.unwrap_or(hit.id);
+        let nested = |other: &Hit| grid.chain(id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == id);
+        if chosen.len() < config.top_k && !chosen.iter().any(nested) {
+            chosen.push(Hit { id, score: score[usize::from(id)] });
+        }
+    }
+    chosen
 }
 
-/// How a rendered feature becomes an object.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Decision {
-    /// The paper's: the feature lies within this distance (0..255 scale) of the code.
-    Within(f32),
-    /// The nearest code, or none where "no object" (the zero code) is nearer: the strongest share of the blend wins.
-    Nearest,
+/// What a rendered view tells about objects.
+pub enum Field {
+    /// Blending weights by id, of lifted scenes.
+    Shares(Shares),
+    /// Blended codes, of scenes whose features were trained (the paper's way).
+    Features {
+        /// Pixels along x.
+        width: u32,
+        /// Pixels along y.
+        height: u32,
+        /// `[3][h][w]`.
+        values: Vec<f32>,
+        /// Largest distance of a feature to its object's code, on the 0..255 scale.
+        tau_ac: f32,
+    },
 }
 
-/// Object of each pixel from rendered features `[3][h][w]`; 0 for none.
-pub fn restore_objects(grid: &Grid, features: &[f32], decision: Decision) -> Vec<u16> {
-    let n = features.len() / 3;
-    let decide = |feature: Vec3| {
-        let limit = match decision {
-            Decision::Within(tau_ac) => tau_ac,
-            Decision::Nearest => codes::SCALE * feature.length(),
-        };
-        grid.nearest(feature).filter(|(_, d)| *d < limit).map_or(0, |(id, _)| id)
-    };
-    (0..n).map(|p| decide(Vec3::new(features[p], features[n + p], features[2 * n + p]))).collect()
+impl Field {
+    /// The smallest object that each pixel shows; 0 for none.
+    pub fn owners(&self, grid: &Grid) -> LabelMap {
+        match self {
+            Self::Shares(shares) => shares.winners(),
+            Self::Features { width, height, values, tau_ac } => {
+                let nearest = |feature: Vec3| grid.nearest(feature).filter(|(_, d)| d < tau_ac).map_or(0, |(id, _)| id);
+                LabelMap { width: *width, height: *height, labels: features(values).map(nearest).collect() }
+            }
+        }
+    }
+
+    /// The mask of some objects. Each target's code is compared on its own, as in the paper.
+    pub fn mask(&self, grid: &Grid, targets: &[Hit]) -> Vec<bool> {
+        let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
+        let members = grid.members(&ids);
+        match self {
+            Self::Shares(shares) => shares.mask(&members),
+            Self::Features { values, tau_ac, .. } => {
+                let codes: Vec<Vec3> = grid.objects.iter().filter(|o| members[usize::from(o.id)]).map(|o| o.code).collect();
+                features(values).map(|f| codes.iter().any(|c| codes::distance(f, *c) < *tau_ac)).collect()
+            }
+        }
+    }
+
+    /// Relevancy of each pixel: the highest of the objects that it belongs to.
+    pub fn relevancy(&self, grid: &Grid, ranked: &[Hit]) -> Vec<f32> {
+        let mut own = vec![0.0f32; grid.objects.len() + 1];
+        ranked.iter().for_each(|h| own[usize::from(h.id)] = h.score);
+        let highest = |id| grid.chain(id).fold(0.0, |score: f32, above| score.max(own[usize::from(above)]));
+        let score: Vec<f32> = (0..=grid.objects.len() as u16).map(highest).collect();
+        self.owners(grid).labels.iter().map(|id| score.get(usize::from(*id)).copied().unwrap_or(0.0)).collect()
+    }
 }
 
-/// The target mask: pixels that belong to one of the targets.
-///
-/// With [`Decision::Within`] each target's code is compared on its own, as in the paper.
-pub fn mask(grid: &Grid, targets: &[Hit], features: &[f32], decision: Decision) -> Vec<bool> {
-    let Decision::Within(tau_ac) = decision else {
-        return restore_objects(grid, features, decision).iter().map(|id| targets.iter().any(|t| t.id == *id)).collect();
-    };
-    let n = features.len() / 3;
-    let codes: Vec<Vec3> = grid.objects.iter().filter(|o| targets.iter().any(|t| t.id == o.id)).map(|o| o.code).collect();
-    (0..n)
-        .map(|p| {
-            let feature = Vec3::new(features[p], features[n + p], features[2 * n + p]);
-            codes.iter().any(|c| codes::distance(feature, *c) < tau_ac)
-        })
-        .collect()
+/// Pixels of a planar feature picture.
+fn features(values: &[f32]) -> impl Iterator<Item = Vec3> {
+    let n = values.len() / 3;
+    (0..n).map(move |p| Vec3::new(values[p], values[n + p], values[2 * n + p]))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::shares::pack;
 
+    /// Object 2 lies in object 1; 3 is elsewhere.
     fn grid() -> Grid {
-        let object = |id: u16, e: [f32; 2]| Object {
+        let object = |id: u16, parent: u16, e: [f32; 2]| Object {
             id,
+            parent,
+            support: 1.0,
             code: Vec3::splat(0.25 * f32::from(id)),
             embeddings: vec![e.to_vec()],
             areas: vec![0.1],
             views: 1,
         };
-        Grid { objects: vec![object(1, [1.0, 0.0]), object(2, [0.0, 1.0])] }
+        Grid { objects: vec![object(1, 0, [1.0, 0.0]), object(2, 1, [0.8, 0.6]), object(3, 0, [0.0, 1.0])] }
+    }
+
+    fn ids(hits: &[Hit]) -> Vec<u16> {
+        hits.iter().map(|h| h.id).collect()
     }
 
     #[test]
     fn the_right_object_is_found_and_absence_is_said() {
-        let query = TextQuery { text: vec![1.0, 0.0], canonical: vec![vec![0.1, 0.1]] };
-        let hits = select(&rank(&grid(), &query), &QueryConfig::default());
-        assert_eq!(hits.iter().map(|h| h.id).collect::<Vec<_>>(), [1]);
-        let absent = TextQuery { text: vec![-1.0, 0.0], canonical: vec![vec![0.1, 0.1]] };
-        assert!(select(&rank(&grid(), &absent), &QueryConfig::default()).is_empty());
+        let find = |text: [f32; 2], config: &QueryConfig| {
+            let query = TextQuery { text: text.to_vec(), canonical: vec![vec![0.1, 0.1]] };
+            ids(&select(&grid(), &rank(&grid(), &query), config))
+        };
+        let config = QueryConfig::default();
+        assert_eq!(find([1.0, 0.0], &config), [1]);
+        assert_eq!(find([-0.5, 1.0], &config), [3]);
+        assert!(find([-1.0, 0.0], &config).is_empty());
+        // The part is a little more relevant than the whole: it takes more than that to be meant.
+        assert_eq!(find([0.9, 0.3], &config), [1]);
+        assert_eq!(find([0.9, 0.3], &QueryConfig { margin: 0.0, ..config }), [2]);
+    }
+
+    #[test]
+    fn several_of_a_kind_are_found_together() {
+        let hit = |id, score| Hit { id, score };
+        let ranked = [hit(2, 0.97), hit(3, 0.96), hit(1, 0.2)];
+        assert_eq!(ids(&select(&grid(), &ranked, &QueryConfig::default())), [2, 3]);
+        assert_eq!(ids(&select(&grid(), &ranked, &QueryConfig { top_k: 1, ..QueryConfig::default() })), [2]);
     }
 
     #[test]
     fn masks_follow_tau_ac() {
-        // Features: on code 1, within 5/255 of it, midway between both codes, on code 2.
-        let x = [0.25, 0.26, 0.375, 0.5];
-        let features: Vec<f32> = x.iter().chain(&x).chain(&x).copied().collect();
-        let targets = [Hit { id: 1, score: 1.0 }];
-        let paper = Decision::Within(codes::TAU_AC);
-        assert_eq!(mask(&grid(), &targets, &features, paper), [true, true, false, false]);
-        assert_eq!(restore_objects(&grid(), &features, paper), [1, 1, 0, 2]);
-        assert_eq!(restore_objects(&grid(), &[0.1, 0.2, 0.1, 0.2, 0.1, 0.2], Decision::Nearest), [0, 1]);
+        // Features: on code 1, within 5/255 of it, midway between codes 1 and 2, on code 3.
+        let x = [0.25, 0.26, 0.375, 0.75];
+        let values: Vec<f32> = x.iter().chain(&x).chain(&x).copied().collect();
+        let field = Field::Features { width: 4, height: 1, values, tau_ac: codes::TAU_AC };
+        assert_eq!(field.mask(&grid(), &[Hit { id: 1, score: 1.0 }]), [true, true, false, false]);
+        assert_eq!(field.owners(&grid()).labels, [1, 1, 0, 3]);
+    }
+
+    #[test]
+    fn an_object_is_shown_by_its_parts_as_well() {
+        let pixels = vec![[pack(1, 0.4), pack(2, 0.2), pack(3, 0.4), 0], [pack(2, 0.9), 0, 0, 0], [pack(3, 1.0), 0, 0, 0]];
+        let field = Field::Shares(Shares { width: 3, height: 1, pixels });
+        let mask = |id| field.mask(&grid(), &[Hit { id, score: 1.0 }]);
+        assert_eq!((mask(1), mask(2)), (vec![true, true, false], vec![false, true, false]));
+        let ranked = [Hit { id: 1, score: 0.8 }, Hit { id: 2, score: 0.5 }, Hit { id: 3, score: 0.1 }];
+        assert_eq!(field.relevancy(&grid(), &ranked), [0.8, 0.8, 0.1]);
     }
 }

@@ -5,10 +5,9 @@ use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::scene_folder::is_held_out;
-use fastlgs_core::{image_io, labels, metrics};
+use fastlgs_core::{Camera, image_io, labels, metrics};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::{self, Decision, QueryConfig};
-use fastlgs_raster::Frame;
+use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -104,13 +103,12 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             bail!("'{}' is labelled but was trained on; preprocess with --holdout so that it is held out", view.name);
         }
         let camera = scene.cameras[index].clone();
-        scene.render(&camera)?; // compiles the kernels
+        scene.field(&camera, None)?; // compiles the kernels
         let started = Instant::now();
-        let frame = scene.render(&camera)?;
+        let field = scene.field(&camera, None)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
-        let ids = query::restore_objects(&grid, frame.channels(3, 6), scene.decision(None));
         for (k, label) in view.labels.iter().enumerate() {
-            let ms = score_label(&scene, &grid, view, label, &frame, &ids, &mut sums)?;
+            let ms = score_label(&scene, &grid, view, label, &camera, &field, &mut sums)?;
             if k == 0 { sums.first_ms.push(render_ms + ms) } else { sums.next_ms.push(ms) }
         }
     }
@@ -168,8 +166,16 @@ fn color_quality(scene: &mut Scene) -> Result<(Option<f64>, Option<f64>)> {
 }
 
 /// Scores one label; returns the milliseconds of the query beyond rendering.
-fn score_label(scene: &Scene, grid: &Grid, view: &LabelledView, label: &Label, frame: &Frame, ids: &[u16], sums: &mut Sums) -> Result<f64> {
-    let (w, h) = (frame.width, frame.height);
+fn score_label(
+    scene: &Scene,
+    grid: &Grid,
+    view: &LabelledView,
+    label: &Label,
+    camera: &Camera,
+    field: &Field,
+    sums: &mut Sums,
+) -> Result<f64> {
+    let (w, h) = (camera.width, camera.height);
     let truth = view.mask(label, w, h);
     if !truth.contains(&true) {
         bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
@@ -179,8 +185,8 @@ fn score_label(scene: &Scene, grid: &Grid, view: &LabelledView, label: &Label, f
     let started = Instant::now();
     let text_query = scene.text_query(&label.category)?;
     let ranked = query::rank(grid, &text_query);
-    let targets = query::select(&ranked, &QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() });
-    let mask = query::mask(grid, &targets, frame.channels(3, 6), scene.decision(None));
+    let targets = query::select(grid, &ranked, &QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() });
+    let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
     sums.iou.push(iou);
@@ -189,25 +195,42 @@ fn score_label(scene: &Scene, grid: &Grid, view: &LabelledView, label: &Label, f
     // 2 % of the diagonal, as Cheng et al. propose.
     let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
     sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
-    let mut score = vec![0.0; grid.objects.len() + 1];
-    ranked.iter().for_each(|r| score[usize::from(r.id)] = r.score);
-    let nearest = query::restore_objects(grid, frame.channels(3, 6), Decision::Nearest);
-    let relevancy: Vec<f32> = nearest.iter().map(|id| score[usize::from(*id)]).collect();
+    let relevancy = field.relevancy(grid, &ranked);
     let (sx, sy) = (f64::from(w) / f64::from(view.width), f64::from(h) / f64::from(view.height));
     let boxes: Vec<[f64; 4]> = label.polygons.iter().map(|p| polygon_box(p, sx, sy)).collect();
     sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &boxes))));
     sums.labels.push(label.category.clone());
     sums.present.push(f64::from(ranked.first().map_or(0.0, |r| r.score)));
-    // Oracle: the best single object. Text top-1: is the first-ranked object one that mostly lies in the label?
-    let present: std::collections::BTreeSet<u16> = ids.iter().copied().filter(|id| *id > 0).collect();
-    let object_iou = |id: u16| metrics::iou(&ids.iter().map(|i| *i == id).collect::<Vec<_>>(), &truth);
-    sums.oracle.push(present.iter().map(|id| object_iou(*id)).fold(0.0, f64::max));
-    let inside = |id: u16| {
-        let (hit, all) = ids.iter().zip(&truth).filter(|(i, _)| **i == id).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+    // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
+    let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
+    sums.oracle.push(candidates(grid, field, &truth).into_iter().map(|id| metrics::iou(&object_mask(id), &truth)).fold(0.0, f64::max));
+    let inside = |mask: Vec<bool>| {
+        let (hit, all) = mask.iter().zip(&truth).filter(|(m, _)| **m).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
         all > 0 && 2 * hit > all
     };
-    sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(r.id)))));
+    sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(object_mask(r.id))))));
     Ok(ms)
+}
+
+/// The objects that come nearest to a mask by their owned pixels: one of them is the best.
+fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
+    const MOST: usize = 5;
+    let owners = field.owners(grid).labels;
+    let mut counts = vec![[0usize; 2]; grid.objects.len() + 1];
+    for (owner, inside) in owners.iter().zip(truth) {
+        for id in grid.chain(*owner) {
+            counts[usize::from(id)][usize::from(*inside)] += 1;
+        }
+    }
+    let all = truth.iter().filter(|t| **t).count();
+    let iou = |id: &u16| {
+        let [outside, inside] = counts[usize::from(*id)];
+        inside as f64 / (all + outside) as f64
+    };
+    let mut ids: Vec<u16> = (1..=grid.objects.len() as u16).collect();
+    ids.sort_by(|a, b| iou(b).total_cmp(&iou(a)).then(a.cmp(b)));
+    ids.truncate(MOST);
+    ids
 }
 
 fn polygon_box(polygon: &[[f64; 2]], sx: f64, sy: f64) -> [f64; 4] {

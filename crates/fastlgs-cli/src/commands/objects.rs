@@ -1,18 +1,17 @@
 //! From masks to objects, for `train`: Algorithm 1 before training, or the views' consensus after it.
 
 use crate::{eyes, ui};
-use anyhow::{Result, bail};
-use fastlgs_core::color::lab;
+use anyhow::{Context, Result, bail};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
+use fastlgs_grid::consensus::{self, Seen};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
-use fastlgs_grid::query::{self, Decision};
-use fastlgs_grid::whole::{self, Look};
-use fastlgs_grid::{Grid, consensus, evidence};
+use fastlgs_grid::tree::{self, Tree};
+use fastlgs_grid::{Grid, evidence};
 use fastlgs_raster::density::State;
-use fastlgs_raster::{Channels, View, lift};
-use fastlgs_vision::{Conse, Encoder, exposure, histogram, segmenter};
+use fastlgs_raster::{View, lift};
+use fastlgs_vision::{Encoder, Level, histogram};
 use image::RgbImage;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Objects of a scene with the object map of each training view.
 pub struct Objects {
@@ -22,19 +21,16 @@ pub struct Objects {
 
 /// Constants of global mapping.
 pub struct Config {
+    /// When Gaussians form a region.
     pub consensus: consensus::Config,
-    /// Likeness from which touching regions are one object.
-    pub likeness: f32,
+    /// When a node of the tree is an object.
+    pub objects: tree::Config,
 }
 
 /// Neighbours of each Gaussian in the consensus graph.
 const NEIGHBOURS: usize = 10;
-/// Longer side of the photos whose meaning is taken: the encoder's objects fill some cells there.
-const MEANING_SIDE: u32 = 480;
 /// Views in which an object is embedded: those that show most of it.
-const EMBEDDED_VIEWS: usize = 10;
-/// Smallest part of a photo, in pixels, that is worth embedding.
-const MIN_PIXELS: usize = 60;
+const EMBEDDED_VIEWS: usize = 8;
 
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
 pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Objects> {
@@ -69,85 +65,146 @@ pub fn lift(scene: &mut Gaussians, training: &[Camera], maps: &[LabelMap], grid:
     grid.set_codes(scene);
 }
 
-/// Global mapping: the views vote over the trained Gaussians which of them form regions, regions of like meaning become
-/// objects where the segmenter knows none, and the objects are rendered into every training view and embedded from
-/// those clean masks.
+/// Global mapping: the views vote over the trained Gaussians which of them form regions and parts of regions, a tree grows
+/// over these, its nodes that masks bear out become the objects, and each is embedded as the views show it.
 pub fn by_consensus(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
     config: &Config,
     common: &ui::Common,
-) -> Result<Grid> {
+) -> Result<(Grid, Summary)> {
+    let pixels = (training[0].width * training[0].height) as usize;
     let clock = std::time::Instant::now();
-    let bar = ui::bar(common, training.len() as u64, "votes");
-    let mut seen: Vec<consensus::Seen> = vec![Vec::new(); scene.len()];
+    let told = |what: &str, count: usize| tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}");
+    let [whole, part] = votes(scene, folder, training, common)?;
+    told("votes", training.len());
+    let near = lift::neighbours(scene, NEIGHBOURS);
+    let regions = consensus::regions(whole, &near, pixels, &config.consensus);
+    told("regions", regions.seen.len());
+    let inside: Vec<(u32, u32)> = near.into_iter().filter(|&(a, b)| regions.of[a as usize] == regions.of[b as usize]).collect();
+    let parts = consensus::regions(part, &inside, pixels, &config.consensus);
+    told("parts", parts.seen.len());
+    let tree = Tree::grow(&regions, &parts);
+
+    let mut engine = fastlgs_raster::open_engine(&common.device)?;
+    engine.set_state(&State::of(scene))?;
+    let bar = ui::bar(common, training.len() as u64, "objects");
+    for camera in training {
+        let shares = engine.render_ids(View::new(camera, scene.len(), 0), &tree.of)?;
+        shares.winners().save(&folder.objects_path(&camera.name))?;
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let load = |view: usize| -> Result<(LabelMap, Vec<LabelMap>)> {
+        let camera = &training[view];
+        let levels = Level::ALL.iter().filter_map(|level| masks(folder, camera, *level).transpose()).collect::<Result<_>>()?;
+        Ok((folder.objects(&camera.name)?, levels))
+    };
+    let support = tree::support(&tree, training.len(), load)?;
+    let chosen = tree::choose(&tree, &support, pixels, &config.objects);
+    told("objects", chosen.nodes.len());
+    let object = |node: u16| if node > 0 { chosen.object_of[usize::from(node) - 1] } else { 0 };
+    scene.object_ids = tree.of.iter().map(|node| object(*node)).collect();
+
+    let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
+    let areas: Vec<&[(u32, usize)]> = chosen.nodes.iter().map(|n| support[*n].areas.as_slice()).collect();
+    let shown = best_views(&areas);
+    let layers = layers(&chosen.parents);
+    let bar = ui::bar(common, training.len() as u64, "embeddings");
+    let (mut found, mut object_of) = (Vec::new(), Vec::new());
     for (view, camera) in training.iter().enumerate() {
-        for vote in lift::votes(scene, camera, &whole_masks(folder, camera)?) {
-            seen[vote.gaussian as usize].push(((view as u16, vote.label), vote.weight));
+        let mut map = folder.objects(&camera.name)?;
+        map.labels.iter_mut().for_each(|l| *l = object(*l));
+        map.save(&folder.objects_path(&camera.name))?;
+        let photo = folder.photo(&camera.name)?;
+        for layer in &layers {
+            let on_layer = ancestors_on(layer, &chosen.parents, |id| shown[usize::from(id) - 1].contains(&view));
+            let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
+            let masks = masks_of(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
+            object_of.extend(masks.iter().map(|m| m.label));
+            found.extend(masks);
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), "votes");
-    let pixels = (training[0].width * training[0].height) as usize;
-    let regions = consensus::regions(seen, &lift::neighbours(scene, NEIGHBOURS), pixels, &config.consensus);
-    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), regions = regions.seen.len(), "consensus");
-
-    let manifest = folder.manifest()?;
-    let encoder = eyes::encoder_of(folder, &manifest)?;
-    let mut engine = fastlgs_raster::open_engine(&common.device)?;
-    let mut paint = |scene: &mut Gaussians, count: u16| -> Result<Vec<LabelMap>> {
-        let codes = Grid::build(&[], &[], count, common.seed);
-        codes.set_codes(scene);
-        engine.set_state(&State::of(scene))?;
-        let map = |camera: &Camera| {
-            let frame = engine.render(View::new(camera, scene.len(), 0), Channels::Feature)?;
-            let labels = query::restore_objects(&codes, frame.channels(3, 6), Decision::Nearest);
-            Ok(LabelMap { width: camera.width, height: camera.height, labels })
-        };
-        training.iter().map(map).collect()
-    };
-    scene.object_ids = regions.of.clone();
-    let mut count = regions.seen.len() as u16;
-    if manifest.segmenter == "offline" {
-        let maps = paint(scene, count)?;
-        let looks = looks(folder, training, &maps, count, &Conse::load()?, common)?;
-        let (object, objects) = whole::join(&regions, looks, config.likeness);
-        scene.object_ids = regions.of.iter().map(|r| if *r > 0 { object[usize::from(*r) - 1] } else { 0 }).collect();
-        count = objects;
-        tracing::debug!(seconds = clock.elapsed().as_secs_f64(), objects, "whole objects");
+    told("embeddings", found.len());
+    let mut grid = Grid::build(&found, &object_of, chosen.nodes.len() as u16, common.seed);
+    for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
+        (object.parent, object.support, object.views) = (*parent, support[*node].iou, support[*node].areas.len());
     }
-    let maps = paint(scene, count)?;
-    let bar = ui::bar(common, training.len() as u64, "embeddings");
-    let chosen = best_views(&maps, count);
-    let (mut masks, mut object_of) = (Vec::new(), Vec::new());
-    for (view, (camera, mut map)) in training.iter().zip(maps).enumerate() {
-        map.save(&folder.objects_path(&camera.name))?;
-        map.labels.iter_mut().filter(|l| **l > 0 && !chosen[usize::from(**l) - 1].contains(&view)).for_each(|l| *l = 0);
-        let found = masks_of(&camera.name, &folder.photo(&camera.name)?, view, &map, encoder.as_ref())?;
-        object_of.extend(found.iter().map(|m| m.label));
-        masks.extend(found);
+    grid.set_codes(scene);
+    let [few_views, small, unsupported, same] = chosen.dropped;
+    Ok((grid, Summary { regions: regions.seen.len(), parts: parts.seen.len(), few_views, small, unsupported, same }))
+}
+
+/// What global mapping found, and why nodes of the tree are no objects.
+#[derive(serde::Serialize)]
+pub struct Summary {
+    regions: usize,
+    parts: usize,
+    few_views: usize,
+    small: usize,
+    unsupported: usize,
+    same: usize,
+}
+
+/// What each Gaussian sees of the whole masks and of the parts, in one pass over the views.
+fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], common: &ui::Common) -> Result<[Vec<Seen>; 2]> {
+    let mut seen = [vec![Seen::new(); scene.len()], vec![Seen::new(); scene.len()]];
+    let bar = ui::bar(common, training.len() as u64, "votes");
+    for (view, camera) in training.iter().enumerate() {
+        let whole = whole_masks(folder, camera)?;
+        let part = masks(folder, camera, Level::Part)?.unwrap_or_else(|| whole.clone());
+        // Every pair of labels that occurs is a label of its own.
+        let pairs: BTreeSet<(u16, u16)> = whole.labels.iter().copied().zip(part.labels.iter().copied()).collect();
+        let pairs: Vec<(u16, u16)> = pairs.into_iter().collect();
+        let number = |pair: (u16, u16)| pairs.binary_search(&pair).unwrap_or(0) as u16;
+        let labels = whole.labels.iter().copied().zip(part.labels.iter().copied()).map(number).collect();
+        for vote in lift::votes(scene, camera, &LabelMap { labels, ..whole }) {
+            let (whole, part) = pairs[usize::from(vote.label)];
+            for (seen, label) in seen.iter_mut().zip([whole, part]) {
+                let own = &mut seen[vote.gaussian as usize];
+                let key = (view as u16, label);
+                match own.binary_search_by_key(&key, |s| s.0) {
+                    Ok(place) => own[place].1 += vote.weight,
+                    Err(place) => own.insert(place, (key, vote.weight)),
+                }
+            }
+        }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    tracing::debug!(seconds = clock.elapsed().as_secs_f64(), "embeddings");
-    Ok(Grid::build(&masks, &object_of, count, common.seed))
+    Ok(seen)
 }
 
 /// The views that show most of each object.
-fn best_views(maps: &[LabelMap], count: u16) -> Vec<Vec<usize>> {
-    let mut seen: Vec<Vec<(usize, usize)>> = vec![Vec::new(); usize::from(count)];
-    for (view, map) in maps.iter().enumerate() {
-        for (label, area) in map.areas().into_iter().enumerate().skip(1).filter(|a| a.1 >= MIN_PIXELS) {
-            seen[label - 1].push((area, view));
-        }
+fn best_views(areas: &[&[(u32, usize)]]) -> Vec<Vec<usize>> {
+    let best = |areas: &&[(u32, usize)]| {
+        let mut areas = areas.to_vec();
+        areas.sort_by_key(|&(area, view)| (std::cmp::Reverse(area), view));
+        areas.into_iter().take(EMBEDDED_VIEWS).map(|a| a.1).collect()
+    };
+    areas.iter().map(best).collect()
+}
+
+/// Objects none of which lies in another one of the same layer: by the number of objects around them.
+fn layers(parents: &[u16]) -> Vec<BTreeSet<u16>> {
+    let mut layers: Vec<BTreeSet<u16>> = Vec::new();
+    for id in 1..=parents.len() as u16 {
+        let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|p| *p > 0);
+        let depth = std::iter::successors(up(&id), up).count();
+        layers.resize(layers.len().max(depth + 1), BTreeSet::new());
+        layers[depth].insert(id);
     }
-    for views in &mut seen {
-        views.sort_by_key(|&(area, view)| (std::cmp::Reverse(area), view));
-        views.truncate(EMBEDDED_VIEWS);
-    }
-    seen.into_iter().map(|views| views.into_iter().map(|v| v.1).collect()).collect()
+    layers
+}
+
+/// For each id 0..=K the object of `layer` that it is or lies in, where `wanted`; 0 for none.
+fn ancestors_on(layer: &BTreeSet<u16>, parents: &[u16], wanted: impl Fn(u16) -> bool) -> Vec<u16> {
+    let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|p| *p > 0);
+    let on_layer = |id: u16| std::iter::successors(Some(id), up).find(|a| layer.contains(a)).filter(|a| wanted(*a));
+    std::iter::once(0).chain((1..=parents.len() as u16).map(|id| on_layer(id).unwrap_or(0))).collect()
 }
 
 /// Embedding and colour distribution of every mask of a photo, by label.
@@ -162,47 +219,36 @@ pub fn masks_of(name: &str, photo: &RgbImage, view: usize, map: &LabelMap, encod
     Ok(masks.filter(|m| m.area > 0.0).collect())
 }
 
-/// Colour and meaning of each region over all pixels of all views.
-fn looks(
-    folder: &SceneFolder,
-    training: &[Camera],
-    maps: &[LabelMap],
-    count: u16,
-    encoder: &Conse,
-    common: &ui::Common,
-) -> Result<Vec<Look>> {
-    let bar = ui::bar(common, training.len() as u64, "meanings");
-    let mut looks = vec![Look::default(); usize::from(count)];
-    for (camera, map) in training.iter().zip(maps) {
-        let photo = exposure::lifted(&folder.photo(&camera.name)?);
-        let dense = encoder.dense(&segmenter::at_side(&photo, MEANING_SIDE))?;
-        // How many pixels of a region each cell holds.
-        let mut shares: BTreeMap<(u16, usize), f32> = BTreeMap::new();
-        for ((p, label), pixel) in map.labels.iter().enumerate().zip(photo.pixels()).filter(|((_, l), _)| **l > 0) {
-            let (x, y) = (p % map.width as usize, p / map.width as usize);
-            let cell = y * dense.rows / map.height as usize * dense.columns + x * dense.columns / map.width as usize;
-            *shares.entry((*label, cell)).or_default() += 1.0;
-            let look = &mut looks[usize::from(*label) - 1];
-            look.pixels += 1.0;
-            look.color.iter_mut().zip(lab(pixel.0)).for_each(|(sum, v)| *sum += v);
-        }
-        for ((label, cell), share) in shares {
-            let sum = &mut looks[usize::from(label) - 1].meaning;
-            sum.resize(dense.channels, 0.0);
-            sum.iter_mut().zip(&dense.values[cell * dense.channels..]).for_each(|(s, v)| *s += share * v);
-        }
-        bar.inc(1);
+/// The masks of a level, which must fit the view's camera; nothing where the level was not kept.
+fn masks(folder: &SceneFolder, camera: &Camera, level: Level) -> Result<Option<LabelMap>> {
+    let path = folder.masks_path(level.name(), &camera.name);
+    if !path.is_file() {
+        return Ok(None);
     }
-    bar.finish_and_clear();
-    Ok(looks)
-}
-
-/// The segmenter's masks of a view, which must fit its camera.
-fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
-    let path = folder.masks_path("whole", &camera.name);
     let map = LabelMap::load(&path)?;
     if (map.width, map.height) != (camera.width, camera.height) {
         bail!("{}: it does not fit the view's camera; run 'fastlgs preprocess' again", path.display());
     }
-    Ok(map)
+    Ok(Some(map))
+}
+
+/// The masks from which objects are made.
+fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
+    let path = folder.masks_path(Level::Whole.name(), &camera.name);
+    masks(folder, camera, Level::Whole)?.with_context(|| format!("{} is missing; run 'fastlgs preprocess' again", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn layers_hold_no_object_inside_another() {
+        // 2 and 3 lie in 1, 4 in 2.
+        let parents = [0, 1, 1, 2, 0];
+        let layers = layers(&parents);
+        assert_eq!(layers, [BTreeSet::from([1, 5]), BTreeSet::from([2, 3]), BTreeSet::from([4])]);
+        assert_eq!(ancestors_on(&layers[0], &parents, |_| true), [0, 1, 1, 1, 1, 5]);
+        assert_eq!(ancestors_on(&layers[1], &parents, |id| id != 3), [0, 0, 2, 0, 2, 0]);
+    }
 }

@@ -5,7 +5,7 @@ use crate::{Outcome, report, ui};
 use anyhow::Result;
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::{self, Decision, Hit, QueryConfig};
+use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
 use fastlgs_raster::Frame;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::{Value, json};
@@ -40,7 +40,7 @@ pub struct Args {
     #[arg(long, default_value_t = QueryConfig::default().margin)]
     margin: f32,
     /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
-    /// Without it, lifted scenes take the nearest code.
+    /// Without it, lifted scenes take the objects that have most of a pixel's weight.
     #[arg(long)]
     tau_ac: Option<f32>,
     /// Also write the relevancy of every pixel in turbo colours.
@@ -60,24 +60,25 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut found_any = false;
     for camera in &cameras {
         let started = Instant::now();
-        let frame = scene.render(camera)?;
+        let field = scene.field(camera, args.tau_ac)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        let color = args.output.as_ref().map(|_| scene.render(camera)).transpose()?;
         for text in &args.text {
             let started = Instant::now();
             let text_query = scene.text_query(text)?;
             let encode_ms = started.elapsed().as_secs_f64() * 1e3;
             let started = Instant::now();
             let ranked = query::rank(&grid, &text_query);
-            let targets = query::select(&ranked, &QueryConfig { min_score, top_k: args.top_k, margin: args.margin });
-            let answer = Answer { grid: &grid, frame: &frame, ranked: &ranked, targets: &targets, decision: scene.decision(args.tau_ac) };
-            let mask = answer.mask();
+            let targets = query::select(&grid, &ranked, &QueryConfig { min_score, top_k: args.top_k, margin: args.margin });
+            let answer = Answer { grid: &grid, field: &field, ranked: &ranked, targets: &targets };
+            let mask = field.mask(&grid, &targets);
             let restore_ms = started.elapsed().as_secs_f64() * 1e3;
             found_any |= !targets.is_empty();
             let mut value = answer.report(&scene, &mask, text, camera);
             let total = encode_ms + render_ms + restore_ms;
             value["ms"] = json!({ "encode": encode_ms, "render": render_ms, "restore": restore_ms, "total": total });
-            if let Some(folder) = &args.output {
-                answer.write(folder, &mask, text, camera, args.heatmap, &mut value)?;
+            if let (Some(folder), Some(color)) = (&args.output, &color) {
+                answer.write(folder, color, &mask, &camera.name, args.heatmap, &mut value)?;
             }
             answers.push(value);
         }
@@ -100,24 +101,18 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 /// One text in one view.
 struct Answer<'a> {
     grid: &'a Grid,
-    frame: &'a Frame,
+    field: &'a Field,
     ranked: &'a [Hit],
     targets: &'a [Hit],
-    decision: Decision,
 }
 
 impl Answer<'_> {
-    fn mask(&self) -> Vec<bool> {
-        query::mask(self.grid, self.targets, self.frame.channels(3, 6), self.decision)
-    }
-
     fn report(&self, scene: &Scene, mask: &[bool], text: &str, camera: &Camera) -> Value {
-        let ids = query::restore_objects(self.grid, self.frame.channels(3, 6), self.decision);
-        let objects: Vec<Value> = self.targets.iter().map(|t| object_report(scene, &ids, self.frame.width, t)).collect();
+        let objects: Vec<Value> = self.targets.iter().map(|t| self.object(scene, camera.width, t)).collect();
         json!({
             "text": text,
             "view": camera.name,
-            "size": format!("{}x{}", self.frame.width, self.frame.height),
+            "size": format!("{}x{}", camera.width, camera.height),
             "found": !self.targets.is_empty(),
             "score": self.ranked.first().map_or(0.0, |h| h.score),
             "objects": objects,
@@ -129,19 +124,36 @@ impl Answer<'_> {
         })
     }
 
-    /// Relevancy of each pixel: that of its object.
-    fn relevancy(&self) -> Vec<f32> {
-        let mut score = vec![0.0; self.grid.objects.len() + 1];
-        self.ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
-        query::restore_objects(self.grid, self.frame.channels(3, 6), Decision::Nearest).iter().map(|id| score[usize::from(*id)]).collect()
+    /// Box and size of one object in this view and in the world.
+    fn object(&self, scene: &Scene, width: u32, hit: &Hit) -> Value {
+        let mut bounds: Option<[u32; 4]> = None;
+        let mask = self.field.mask(self.grid, &[*hit]);
+        for p in (0..mask.len() as u32).filter(|p| mask[*p as usize]) {
+            let (x, y) = (p % width, p / width);
+            let b = bounds.get_or_insert([x, y, x + 1, y + 1]);
+            *b = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
+        }
+        let members = self.grid.members(&[hit.id]);
+        let is_member = |id: u16| members.get(usize::from(id)) == Some(&true);
+        let own: Vec<usize> = (0..scene.gaussians.len()).filter(|&i| is_member(scene.gaussians.object_ids[i])).collect();
+        json!({
+            "id": hit.id,
+            "parent": self.grid.objects[usize::from(hit.id) - 1].parent,
+            "score": hit.score,
+            "bbox2d": bounds,
+            "bbox3d": robust_box(scene, &own),
+            "pixels": mask.iter().filter(|m| **m).count(),
+            "gaussians": own.len(),
+        })
     }
 
-    fn write(&self, folder: &Path, mask: &[bool], text: &str, camera: &Camera, heatmap: bool, value: &mut Value) -> Result<()> {
-        let (w, h) = (self.frame.width, self.frame.height);
+    fn write(&self, folder: &Path, frame: &Frame, mask: &[bool], view: &str, heatmap: bool, value: &mut Value) -> Result<()> {
+        let (w, h) = (frame.width, frame.height);
+        let text = value["text"].as_str().unwrap_or_default();
         let safe: String = text.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect();
-        let path = |what: &str| folder.join(format!("{}.{safe}.{what}.png", camera.name));
+        let path = |what: &str| folder.join(format!("{view}.{safe}.{what}.png"));
         let at = |x: u32, y: u32| (y * w + x) as usize;
-        let color = image_io::from_planar(self.frame.channels(0, 3), w, h);
+        let color = image_io::from_planar(frame.channels(0, 3), w, h);
         if self.targets.is_empty() {
             // A mask of an earlier run would contradict the answer.
             for what in ["mask", "overlay"] {
@@ -157,7 +169,7 @@ impl Answer<'_> {
             value["mask"] = json!(path("mask"));
         }
         if heatmap {
-            let relevancy = self.relevancy();
+            let relevancy = self.field.relevancy(self.grid, self.ranked);
             let picture = RgbImage::from_fn(w, h, |x, y| {
                 let heat = turbo::turbo(relevancy[at(x, y)]);
                 let c = color.get_pixel(x, y).0;
@@ -168,27 +180,6 @@ impl Answer<'_> {
         }
         Ok(())
     }
-}
-
-/// Box and size of one object in this view and in the world.
-fn object_report(scene: &Scene, ids: &[u16], width: u32, hit: &Hit) -> Value {
-    let mut pixels = 0;
-    let mut bounds: Option<[u32; 4]> = None;
-    for (p, _) in ids.iter().enumerate().filter(|(_, id)| **id == hit.id) {
-        let (x, y) = (p as u32 % width, p as u32 / width);
-        let b = bounds.get_or_insert([x, y, x + 1, y + 1]);
-        *b = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
-        pixels += 1;
-    }
-    let own: Vec<usize> = (0..scene.gaussians.len()).filter(|&i| scene.gaussians.object_ids[i] == hit.id).collect();
-    json!({
-        "id": hit.id,
-        "score": hit.score,
-        "bbox2d": bounds,
-        "bbox3d": robust_box(scene, &own),
-        "pixels": pixels,
-        "gaussians": own.len(),
-    })
 }
 
 /// World box [min, max] between the 2nd and 98th percentile of the Gaussians' centres: a few floaters do not stretch it.

@@ -4,7 +4,6 @@ use crate::scene::{Scene, ViewChoice};
 use crate::{Outcome, report, ui};
 use anyhow::{Result, bail};
 use fastlgs_core::{exr_image, image_io, turbo};
-use fastlgs_grid::query;
 use image::{Rgb, RgbImage};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -54,8 +53,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             files.push(path("depth", "exr"));
         }
         if wants("objects") {
-            let ids = query::restore_objects(&scene.grid()?, frame.channels(3, 6), scene.decision(None));
-            let picture = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(ids[(y * frame.width + x) as usize])));
+            let ids = scene.field(camera, None)?.owners(&scene.grid()?);
+            let picture = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
             image_io::save_png(&path("objects", "png"), picture)?;
             files.push(path("objects", "png"));
         }

@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::mapping::PaperConfig;
-use fastlgs_grid::{Grid, consensus, whole};
+use fastlgs_grid::{Grid, consensus, tree};
 use fastlgs_raster::{Budget, Channels, Strategy, Target, TargetImage, TrainConfig, Trainer, init, pack};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -65,9 +65,9 @@ pub struct Args {
     /// Global mapping: share of the views that must show two regions in one mask to join them.
     #[arg(long, default_value_t = consensus::Config::default().agreement)]
     agreement: f32,
-    /// Global mapping, offline segmenter: likeness of meaning and masks, 0 to 1, from which touching regions are one object.
-    #[arg(long, default_value_t = whole::LIKENESS)]
-    likeness: f32,
+    /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
+    #[arg(long, default_value_t = tree::Config::default().min_support)]
+    support: f32,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     curve: Option<u32>,
@@ -168,6 +168,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let psnr = trainer.quality(&held_out, Some(degree))?;
     let mut scene = trainer.gaussians()?.with_sh_degree(degree);
     let started = Instant::now();
+    let mut summary = None;
     let grid = match paper {
         Some(found) if by_descent => {
             for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
@@ -181,8 +182,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         }
         None => {
             let consensus = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
-            let config = objects::Config { consensus, likeness: args.likeness };
-            objects::by_consensus(&mut scene, &folder, &training, &config, common)?
+            let config = objects::Config { consensus, objects: tree::Config { min_support: args.support, ..tree::Config::default() } };
+            let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, &config, common)?;
+            summary = Some(found);
+            grid
         }
     };
     let mapping_seconds = started.elapsed().as_secs_f64();
@@ -195,6 +198,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "feature_mode": args.feature_mode,
         "objects": grid.objects.len(),
         "mapping_seconds": mapping_seconds,
+        "mapping_summary": summary,
         "iterations": result.iterations,
         "seconds": result.seconds,
         "iterations_per_second": result.iterations_per_second,
