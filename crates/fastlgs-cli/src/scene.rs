@@ -5,7 +5,7 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_grid::query::{self, Field};
-use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
+use fastlgs_grid::relevancy::{CANONICAL, OFFLINE_ANYTHING, TextQuery};
 use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
@@ -34,6 +34,7 @@ pub struct Scene {
 struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
+    anything: f32,
 }
 
 impl Scene {
@@ -94,20 +95,23 @@ impl Scene {
     pub fn text_query(&self, text: &str) -> Result<TextQuery> {
         if self.texts.get().is_none() {
             let encoder = eyes::text_encoder_of(&self.manifest, self.clip_text.as_deref())?;
-            let canonical = encoder.embed(&CANONICAL)?;
+            let offline = self.manifest.encoder == "offline";
+            let canonical = if offline { Vec::new() } else { encoder.embed(&CANONICAL)? };
+            let anything = if offline { OFFLINE_ANYTHING } else { -1.0 };
+            let length = encoder.embed(&CANONICAL[..1])?[0].len();
             let grid = self.grid()?;
-            let (own, text) = (grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next(), canonical[0].len());
-            if let Some(own) = own.filter(|own| *own != text) {
+            let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
+            if let Some(own) = own.filter(|own| *own != length) {
                 let root = self.folder.root.display();
                 bail!(
-                    "{root}: its embeddings have {own} numbers, those of texts {text}; they are of another encoder or version: \
+                    "{root}: its embeddings have {own} numbers, those of texts {length}; they are of another encoder or version: \
                      run 'fastlgs train {root}' again, or name the right tower with --clip-text"
                 );
             }
-            let _ = self.texts.set(Texts { encoder, canonical });
+            let _ = self.texts.set(Texts { encoder, canonical, anything });
         }
         let texts = self.texts.get().expect("set above");
-        Ok(TextQuery { text: texts.encoder.embed(&[text])?.remove(0), canonical: texts.canonical.clone() })
+        Ok(TextQuery { text: texts.encoder.embed(&[text])?.remove(0), canonical: texts.canonical.clone(), anything: texts.anything })
     }
 
     /// Relevancy from which an object counts as found, with the scene's encoder.

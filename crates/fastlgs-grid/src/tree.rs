@@ -168,7 +168,7 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { min_views: 3, min_share: 0.001, min_support: 0.3, same: 0.85 }
+        Self { min_views: 3, min_share: 0.002, min_support: 0.4, same: 0.85 }
     }
 }
 

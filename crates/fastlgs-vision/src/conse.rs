@@ -3,12 +3,12 @@
 
 use crate::attributes;
 use crate::crops::{self, Surround};
-use crate::encoder::{Encoder, TextEncoder, normalise};
+use crate::encoder::{Encoder, normalise};
 use crate::exposure;
 use crate::runtime::{Array, Model};
-use crate::{MiniLm, Result, models};
+use crate::{Result, models, names};
+use fastlgs_core::LabelMap;
 use fastlgs_core::rng::Rng;
-use fastlgs_core::{LabelMap, fs};
 use image::RgbImage;
 
 /// Classes that take part in an embedding.
@@ -17,8 +17,6 @@ const TOP: usize = 10;
 const SIZE: usize = 260;
 /// Dimensions of the dense embedding.
 pub const DENSE: usize = 32;
-/// Names of a class that describe it: the later ones are rarer, at last Latin.
-const SYNONYMS: usize = 3;
 /// Weight of what surrounds a mask, for masks that fill their box.
 const CONTEXT: f32 = 0.25;
 /// Crops in one inference.
@@ -54,10 +52,9 @@ impl Conse {
     pub fn load() -> Result<Self> {
         let folder = models::offline_dir();
         let classifier = Model::load(&folder.join("classifier.onnx"))?;
-        let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
-        let class_embeddings = class_embeddings(&lists)?;
+        let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
-        let projection = lists.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
+        let projection = class_embeddings.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
         Ok(Self { classifier, class_embeddings, projection })
     }
 
@@ -152,22 +149,6 @@ impl Encoder for Conse {
         };
         Ok(self.mask_probabilities(photo, masks)?.iter().zip(colors).map(embed).collect())
     }
-}
-
-/// For each class the mean embedding of its first names.
-fn class_embeddings(lists: &[Vec<String>]) -> Result<Vec<Vec<f32>>> {
-    let names = |list: &'_ [String]| list.len().min(SYNONYMS);
-    let mut texts: Vec<(usize, &str)> =
-        lists.iter().enumerate().flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str()))).collect();
-    // Texts of like length waste no padding.
-    texts.sort_by_key(|(k, name)| (name.len(), *k));
-    let embeddings = MiniLm::load()?.embed(&texts.iter().map(|t| t.1).collect::<Vec<_>>())?;
-    let mut means = vec![vec![0.0; embeddings.first().map_or(0, Vec::len)]; lists.len()];
-    for ((class, _), embedding) in texts.iter().zip(embeddings) {
-        means[*class].iter_mut().zip(embedding).for_each(|(m, e)| *m += e);
-    }
-    means.iter_mut().for_each(|m| normalise(m));
-    Ok(means)
 }
 
 fn softmax(logits: &[f32]) -> Vec<f32> {

@@ -15,6 +15,7 @@ pub mod import;
 pub mod keypoints;
 pub mod masks;
 pub mod models;
+pub mod names;
 pub mod photo_quality;
 pub mod pose_check;
 pub mod pull;

@@ -87,6 +87,8 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     for file in PICTURES.iter().map(|p| p.1).chain(TEXTURES) {
         install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
     }
+    // What was made from older weights must be made again.
+    let _ = std::fs::remove_file(offline_dir().join(crate::names::FILE));
     install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
     let library = find_runtime(&packages).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
     install_file(&library, &cache.join("libonnxruntime.so"))?;

@@ -30,7 +30,7 @@ pub struct Config {
 /// Neighbours of each Gaussian in the consensus graph.
 const NEIGHBOURS: usize = 10;
 /// Views in which an object is embedded: those that show most of it.
-const EMBEDDED_VIEWS: usize = 8;
+const EMBEDDED_VIEWS: usize = 5;
 
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
 pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Objects> {

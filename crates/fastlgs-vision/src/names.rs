@@ -1,0 +1,48 @@
+//! What the classifier's 1,000 things are called, as MiniLM understands it: embedded once and kept beside the models.
+
+use crate::encoder::{TextEncoder, normalise};
+use crate::{MiniLm, Result, models};
+use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use fastlgs_core::fs;
+
+/// Names of a class that describe it: the later ones are rarer, at last Latin.
+const SYNONYMS: usize = 3;
+/// What was computed once, beside the models.
+pub(crate) const FILE: &str = "names.safetensors";
+
+/// Embeddings of the class names `[1000][384]`, L2-normalised.
+///
+/// # Errors
+/// When the offline models are not installed.
+pub fn embeddings() -> Result<Vec<Vec<f32>>> {
+    let folder = models::offline_dir();
+    let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
+    let path = folder.join(FILE);
+    let known = load_tensors(&path).ok().and_then(|mut t| t.remove("names"));
+    if let Some((shape, values)) = known.filter(|(shape, _)| shape.len() == 2 && shape[0] == lists.len() && shape[1] > 0) {
+        return Ok(values.chunks_exact(shape[1]).map(<[f32]>::to_vec).collect());
+    }
+    let embeddings = embed(&lists)?;
+    let shape = vec![lists.len(), embeddings.first().map_or(0, Vec::len)];
+    // A cache folder that cannot be written only costs the time again.
+    if let Err(e) = save_tensors(&path, &[("names", shape, &embeddings.concat())]) {
+        tracing::debug!("the names are not kept: {e}");
+    }
+    Ok(embeddings)
+}
+
+/// For each class the mean embedding of its first names.
+fn embed(lists: &[Vec<String>]) -> Result<Vec<Vec<f32>>> {
+    let names = |list: &[String]| list.len().min(SYNONYMS);
+    let mut texts: Vec<(usize, &str)> =
+        lists.iter().enumerate().flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str()))).collect();
+    // Texts of like length waste no padding.
+    texts.sort_by_key(|(k, name)| (name.len(), *k));
+    let embeddings = MiniLm::load()?.embed(&texts.iter().map(|t| t.1).collect::<Vec<_>>())?;
+    let mut means = vec![vec![0.0; embeddings.first().map_or(0, Vec::len)]; lists.len()];
+    for ((class, _), embedding) in texts.iter().zip(embeddings) {
+        means[*class].iter_mut().zip(embedding).for_each(|(m, e)| *m += e);
+    }
+    means.iter_mut().for_each(|m| normalise(m));
+    Ok(means)
+}
