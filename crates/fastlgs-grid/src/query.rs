@@ -177,8 +177,8 @@ mod tests {
         assert_eq!(find([-0.5, 1.0], &config), [3]);
         assert!(find([-1.0, 0.0], &config).is_empty());
         // The part is a little more relevant than the whole: it takes more than that to be meant.
-        assert_eq!(find([0.88, 0.32], &config), [1]);
-        assert_eq!(find([0.88, 0.32], &QueryConfig { margin: 0.0, ..config }), [2]);
+        assert_eq!(find([0.8, 0.6], &config), [1]);
+        assert_eq!(find([0.8, 0.6], &QueryConfig { margin: 0.0, ..config }), [2]);
     }
 
     #[test]
