@@ -9,7 +9,7 @@ use fastlgs_grid::relevancy::{CANONICAL, OFFLINE_ANYTHING, TextQuery};
 use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
-use fastlgs_vision::TextEncoder;
+use fastlgs_vision::{Encoder, TextEncoder};
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 
@@ -112,6 +112,11 @@ impl Scene {
         }
         let texts = self.texts.get().expect("set above");
         Ok(TextQuery { text: texts.encoder.embed(&[text])?.remove(0), canonical: texts.canonical.clone(), anything: texts.anything })
+    }
+
+    /// The image tower that made the scene's embeddings.
+    pub fn image_encoder(&self) -> Result<Box<dyn Encoder>> {
+        eyes::encoder_of(&self.folder, &self.manifest)
     }
 
     /// Relevancy from which an object counts as found, with the scene's encoder.

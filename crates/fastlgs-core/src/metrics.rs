@@ -36,23 +36,30 @@ fn inner_band(mask: &[bool], width: u32, height: u32, distance: u32) -> Vec<bool
 /// Pixels whose whole square neighbourhood of radius `r` lies in the mask; outside the picture counts as outside.
 pub fn erode(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
     let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
-    dilated(&outside, width, height, r).into_iter().map(|m| !m).collect()
+    dilated(&outside, width, height, [r, r], true).into_iter().map(|m| !m).collect()
 }
 
-/// Pixels with a mask pixel in their square neighbourhood of radius `r`; beyond the border all is mask.
-fn dilated(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
-    let (w, h, r) = (width as i64, height as i64, i64::from(r));
-    let line = |n: i64, len: i64, get: &dyn Fn(i64) -> bool| (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { true });
+/// Pixels with a mask pixel in their neighbourhood of `rx` pixels to both sides and `ry` up and down.
+pub fn dilate(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2]) -> Vec<bool> {
+    dilated(mask, width, height, [rx, ry], false)
+}
+
+/// `beyond`: whether what lies beyond the picture is mask.
+fn dilated(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2], beyond: bool) -> Vec<bool> {
+    let (w, h, rx, ry) = (width as i64, height as i64, i64::from(rx), i64::from(ry));
+    let line = |n: i64, r: i64, len: i64, get: &dyn Fn(i64) -> bool| {
+        (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { beyond })
+    };
     let mut rows = vec![false; mask.len()];
     for y in 0..h {
         for x in 0..w {
-            rows[(y * w + x) as usize] = line(x, w, &|k| mask[(y * w + k) as usize]);
+            rows[(y * w + x) as usize] = line(x, rx, w, &|k| mask[(y * w + k) as usize]);
         }
     }
     let mut out = vec![false; mask.len()];
     for y in 0..h {
         for x in 0..w {
-            out[(y * w + x) as usize] = line(y, h, &|k| rows[(k * w + x) as usize]);
+            out[(y * w + x) as usize] = line(y, ry, h, &|k| rows[(k * w + x) as usize]);
         }
     }
     out
@@ -181,6 +188,14 @@ mod tests {
         assert_eq!(inner_band(&square(4, 12), 20, 20, 1).iter().filter(|b| **b).count(), 28);
         assert_eq!(boundary_iou(&square(4, 12), &square(4, 12), 20, 20, 1), 1.0);
         assert_eq!(boundary_iou(&square(4, 12), &square(5, 11), 20, 20, 1), 0.0);
+    }
+
+    #[test]
+    fn dilation_stays_in_the_picture() {
+        let mut mask = vec![false; 7 * 5];
+        mask[2 * 7 + 3] = true;
+        let count = |r: [u32; 2]| dilate(&mask, 7, 5, r).iter().filter(|m| **m).count();
+        assert_eq!((count([0, 0]), count([1, 1]), count([2, 0]), count([10, 1])), (1, 9, 5, 21));
     }
 
     #[test]

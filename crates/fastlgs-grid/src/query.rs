@@ -66,8 +66,11 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     hits
 }
 
-/// The target objects; empty means "not found". Of things that lie in each other one is taken: the best, or the largest
-/// around it that is hardly less relevant.
+/// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
+const BORNE_OUT: f32 = 0.8;
+
+/// The target objects; empty means "not found". Of things that lie in each other one is taken: of the best and what around
+/// it is hardly less relevant, the largest that the masks bear out about as well as any of them.
 pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     let Some(best) = ranked.first() else { return Vec::new() };
     let floor = config.min_score.max(best.score - config.margin);
@@ -75,14 +78,33 @@ pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
     let mut chosen: Vec<Hit> = Vec::new();
     for hit in ranked.iter().take_while(|h| h.score >= floor) {
-        let around = grid.chain(hit.id).filter(|id| score[usize::from(*id)] >= floor.max(hit.score - config.margin)).last();
-        let id = around.unwrap_or(hit.id);
+        let around: Vec<u16> = grid.chain(hit.id).filter(|id| score[usize::from(*id)] >= floor.max(hit.score - config.margin)).collect();
+        let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
+        let best = around.iter().map(support).fold(0.0, f32::max);
+        let id = around.iter().rev().find(|id| support(id) >= BORNE_OUT * best).copied().unwrap_or(hit.id);
         let nested = |other: &Hit| grid.chain(id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == id);
         if chosen.len() < config.top_k && !chosen.iter().any(nested) {
             chosen.push(Hit { id, score: score[usize::from(id)] });
         }
     }
     chosen
+}
+
+/// The part of the `targets` that is meant, going down their trees; the targets themselves where no part is relevant.
+pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Found {
+    let inside = |id: u16| grid.chain(id).skip(1).any(|above| targets.iter().any(|t| t.id == above));
+    let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside(h.id)).collect();
+    let parts = select(grid, &below, config);
+    if parts.is_empty() { Found { ranked: targets.to_vec(), targets: targets.to_vec() } } else { Found { ranked: below, targets: parts } }
+}
+
+/// The objects of an answer.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Found {
+    /// What was considered, best first.
+    pub ranked: Vec<Hit>,
+    /// The answer; empty means "not found".
+    pub targets: Vec<Hit>,
 }
 
 /// What a rendered view tells about objects.
@@ -177,8 +199,26 @@ mod tests {
         assert_eq!(find([-0.5, 1.0], &config), [3]);
         assert!(find([-1.0, 0.0], &config).is_empty());
         // The part is a little more relevant than the whole: it takes more than that to be meant.
-        assert_eq!(find([0.8, 0.6], &config), [1]);
+        assert_eq!(find([0.8, 0.6], &QueryConfig { top_k: 1, ..config }), [1]);
         assert_eq!(find([0.8, 0.6], &QueryConfig { margin: 0.0, ..config }), [2]);
+    }
+
+    #[test]
+    fn parts_are_looked_for_inside_their_object() {
+        let query = |text: [f32; 2]| TextQuery { text: text.to_vec(), canonical: Vec::new(), anything: 0.0 };
+        let targets = [Hit { id: 1, score: 0.9 }];
+        let ask = |text| ids(&part(&grid(), &targets, &query(text), &QueryConfig::default()).targets);
+        assert_eq!(ask([0.0, 1.0]), [2], "3 is nearer but lies elsewhere");
+        assert_eq!(ask([0.0, -1.0]), [1], "no such part");
+    }
+
+    #[test]
+    fn a_whole_that_no_mask_shows_is_not_taken_for_its_part() {
+        let mut grid = grid();
+        let ranked = [Hit { id: 2, score: 0.9 }, Hit { id: 1, score: 0.89 }];
+        assert_eq!(ids(&select(&grid, &ranked, &QueryConfig::default())), [1]);
+        grid.objects[0].support = 0.5;
+        assert_eq!(ids(&select(&grid, &ranked, &QueryConfig::default())), [2]);
     }
 
     #[test]

@@ -1,0 +1,121 @@
+//! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
+
+use crate::scene::Scene;
+use anyhow::{Context, Result, bail};
+use fastlgs_core::{Camera, LabelMap, image_io};
+use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
+use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_grid::{Grid, relevancy};
+use std::path::{Path, PathBuf};
+
+/// One question.
+#[derive(Clone, Debug)]
+pub enum Ask {
+    /// Words; "A of B" means the part A of B where there is one.
+    Text(String),
+    /// A picture of the thing.
+    Image(PathBuf),
+    /// A pixel of the view.
+    Point(u32, u32),
+}
+
+/// What a question means, before any view is looked at.
+pub enum Meaning {
+    /// Embedded words or pictures: first what is looked for; then, for "A of B", A.
+    Embedded(TextQuery, Option<TextQuery>),
+    /// A pixel of the view.
+    Point(u32, u32),
+}
+
+impl Ask {
+    /// What reports and file names call it.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Text(text) => text.clone(),
+            Self::Image(path) => path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            Self::Point(x, y) => format!("{x},{y}"),
+        }
+    }
+
+    /// Embeds what needs embedding; `negatives` are texts that the object must not be nearer to.
+    pub fn meaning(&self, scene: &Scene, negatives: &[String]) -> Result<Meaning> {
+        let with_negatives = |mut query: TextQuery| -> Result<TextQuery> {
+            for text in negatives {
+                query.canonical.push(scene.text_query(text)?.text);
+            }
+            Ok(query)
+        };
+        Ok(match self {
+            Self::Point(x, y) => Meaning::Point(*x, *y),
+            Self::Image(path) => Meaning::Embedded(with_negatives(picture(scene, path)?)?, None),
+            Self::Text(text) => {
+                let whole = |text: &str| with_negatives(scene.text_query(text)?);
+                match part_of(text) {
+                    Some((part, object)) => Meaning::Embedded(whole(object)?, Some(whole(part)?)),
+                    None => Meaning::Embedded(whole(text)?, None),
+                }
+            }
+        })
+    }
+}
+
+/// "flower pot of the bonsai" is the part "flower pot" of "bonsai".
+fn part_of(text: &str) -> Option<(&str, &str)> {
+    let (part, object) = text.split_once(" of ")?;
+    let object = ["the ", "a ", "an "].iter().find_map(|article| object.strip_prefix(article)).unwrap_or(object);
+    let (part, object) = (part.trim(), object.trim());
+    (!part.is_empty() && !object.is_empty()).then_some((part, object))
+}
+
+/// A picture as a query: the whole of it is embedded like a mask.
+fn picture(scene: &Scene, path: &Path) -> Result<TextQuery> {
+    let photo = image_io::load_rgb(path)?;
+    let (width, height) = photo.dimensions();
+    let everything = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
+    let name = path.to_string_lossy();
+    let encoder = scene.image_encoder()?;
+    let embedding = encoder.embed_masks(&name, &photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
+    let embedding = embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
+    Ok(TextQuery { text: embedding, canonical: Vec::new(), anything: relevancy::IMAGE_ANYTHING })
+}
+
+impl Meaning {
+    /// The objects that are meant.
+    pub fn find(&self, grid: &Grid, field: &Field, camera: &Camera, config: &QueryConfig) -> Result<Found> {
+        match self {
+            Self::Embedded(query, None) => {
+                let ranked = query::rank(grid, query);
+                Ok(Found { targets: query::select(grid, &ranked, config), ranked })
+            }
+            Self::Embedded(object, Some(part)) => {
+                let targets = query::select(grid, &query::rank(grid, object), config);
+                Ok(query::part(grid, &targets, part, config))
+            }
+            Self::Point(x, y) => {
+                if *x >= camera.width || *y >= camera.height {
+                    bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
+                }
+                let owner = field.owners(grid).at(*x, *y);
+                let best = grid.chain(owner).map(|id| Hit { id, score: grid.objects[usize::from(id) - 1].support });
+                // Of all that contains the pixel, what the masks bear out best; the larger of equals.
+                let mut ranked: Vec<Hit> = best.collect();
+                ranked.reverse();
+                ranked.sort_by(|a, b| b.score.total_cmp(&a.score));
+                Ok(Found { targets: ranked.first().copied().into_iter().collect(), ranked })
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_named_by_of() {
+        assert_eq!(part_of("flower pot of the bonsai"), Some(("flower pot", "bonsai")));
+        assert_eq!(part_of("wheel of a bicycle"), Some(("wheel", "bicycle")));
+        assert_eq!(part_of("fox"), None);
+        assert_eq!(part_of("top of "), None);
+    }
+}

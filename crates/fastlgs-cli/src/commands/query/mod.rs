@@ -1,0 +1,216 @@
+//! `fastlgs query`: what a text, a picture or a point names, as masks and as Gaussians (paper, querying features).
+
+mod answer;
+mod ask;
+mod selection;
+
+use crate::scene::{Scene, ViewChoice, parse_size};
+use crate::{Outcome, report, ui};
+use anyhow::{Result, bail};
+use answer::Answer;
+use ask::Ask;
+use fastlgs_core::{Camera, metrics};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{Field, QueryConfig};
+use fastlgs_raster::Frame;
+use serde_json::{Value, json};
+use std::io::{BufRead, Write};
+use std::path::PathBuf;
+use std::time::Instant;
+
+#[derive(clap::Args)]
+#[command(
+    after_help = "Example: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n\nExit code 3 means that nothing in the scene matches."
+)]
+pub struct Args {
+    /// Trained scene folder.
+    scene: PathBuf,
+    /// What to look for; several texts are answered one after the other. "wheel of the bicycle" asks for a part. `-` reads
+    /// texts from standard input and answers each line at once with a line of JSON.
+    #[arg(required_unless_present_any = ["image", "point"])]
+    text: Vec<String>,
+    /// A picture of what to look for.
+    #[arg(long, value_name = "FILE")]
+    image: Vec<PathBuf>,
+    /// A pixel of the view: the object that it shows.
+    #[arg(long, value_name = "X,Y", value_parser = parse_point)]
+    point: Vec<(u32, u32)>,
+    /// A text that the object must not be nearer to than to what is looked for; may be given several times.
+    #[arg(long, value_name = "TEXT")]
+    negative: Vec<String>,
+    #[command(flatten)]
+    views: ViewChoice,
+    /// Folder for mask, overlay and heat map; without it only the report is given.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// Most objects that together form the answer.
+    #[arg(long, default_value_t = QueryConfig::default().top_k, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
+    top_k: usize,
+    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.65 offline, 0.55 CLIP).
+    #[arg(long)]
+    min_score: Option<f32>,
+    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[arg(long, value_name = "FILE")]
+    clip_text: Option<PathBuf>,
+    /// Further objects must score within this of the best, and a part by more than this above the whole.
+    #[arg(long, default_value_t = QueryConfig::default().margin)]
+    margin: f32,
+    /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
+    /// Without it, lifted scenes take the objects that have most of a pixel's weight.
+    #[arg(long)]
+    tau_ac: Option<f32>,
+    /// Also write the relevancy of every pixel in turbo colours.
+    #[arg(long)]
+    heatmap: bool,
+    /// Widen the masks by a kernel, as inpainting wants them.
+    #[arg(long, value_name = "WxH", num_args = 0..=1, default_missing_value = "5x5", value_parser = parse_size)]
+    dilate: Option<(u32, u32)>,
+    /// How often the kernel of --dilate is applied.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    dilate_times: u32,
+    /// Write the selected Gaussians as a scene of their own.
+    #[arg(long, value_name = "FILE")]
+    export_ply: Option<PathBuf>,
+    /// Write the scene without the selected Gaussians.
+    #[arg(long, value_name = "FILE")]
+    remove_ply: Option<PathBuf>,
+}
+
+/// Parses `120,45`.
+fn parse_point(text: &str) -> Result<(u32, u32), String> {
+    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+    numbers.ok_or_else(|| format!("'{text}' is not a pixel like 120,45"))
+}
+
+/// A view as it was last rendered.
+struct Shown {
+    place: usize,
+    field: Field,
+    color: Option<Frame>,
+}
+
+/// Everything that questions are put to.
+struct Session<'a> {
+    args: &'a Args,
+    scene: Scene,
+    grid: Grid,
+    cameras: Vec<Camera>,
+    config: QueryConfig,
+    shown: Option<Shown>,
+}
+
+pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    let lines = args.text.iter().any(|t| t == "-");
+    if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {
+        bail!("'-' reads all questions from standard input: leave out other texts, --image and --point");
+    }
+    let mut scene = Scene::open(&args.scene, &common.device)?;
+    let grid = scene.grid()?;
+    let cameras = args.views.cameras(&scene)?;
+    scene.clip_text.clone_from(&args.clip_text);
+    let config = QueryConfig { min_score: args.min_score.unwrap_or(scene.min_score()), top_k: args.top_k, margin: args.margin };
+    if !args.text.is_empty() || !args.negative.is_empty() {
+        // The text encoder is loaded once, before the first query is timed.
+        scene.text_query("warm up")?;
+    }
+    let mut session = Session { args, scene, grid, cameras, config, shown: None };
+    if lines { session.answer_lines() } else { session.answer_arguments(common) }
+}
+
+impl Session<'_> {
+    fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
+        let texts = self.args.text.iter().cloned().map(Ask::Text);
+        let pictures = self.args.image.iter().cloned().map(Ask::Image);
+        let points = self.args.point.iter().map(|&(x, y)| Ask::Point(x, y));
+        let asks: Vec<Ask> = texts.chain(pictures).chain(points).collect();
+        if asks.len() > 1 && (self.args.export_ply.is_some() || self.args.remove_ply.is_some()) {
+            bail!("--export-ply and --remove-ply write the answer to one question: ask only one");
+        }
+        let mut answers = Vec::new();
+        for place in 0..self.cameras.len() {
+            for ask in &asks {
+                answers.push(self.answer(ask, place)?);
+            }
+        }
+        let found = answers.iter().any(|a| a["found"] == true);
+        let single = answers.len() == 1;
+        if single || common.json.is_some() {
+            report::give(common, &if single { answers.remove(0) } else { Value::Array(answers) })?;
+        } else {
+            answers.iter().try_for_each(|answer| report::give(common, answer))?;
+        }
+        if !found && !common.quiet {
+            let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
+            eprintln!("nothing in this scene matches {}", names.join(", "));
+        }
+        Ok(if found { Outcome::Done } else { Outcome::NotFound })
+    }
+
+    /// Each line of standard input is a text; each answer a line of JSON, also where something is wrong with the question.
+    fn answer_lines(&mut self) -> Result<Outcome> {
+        let mut out = std::io::stdout();
+        for line in std::io::stdin().lock().lines() {
+            let line = line?;
+            let text = line.trim();
+            if text.is_empty() {
+                continue;
+            }
+            for place in 0..self.cameras.len() {
+                let answer = self.answer(&Ask::Text(text.to_owned()), place);
+                let answer = answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
+                writeln!(out, "{answer}")?;
+            }
+            out.flush()?;
+        }
+        Ok(Outcome::Done)
+    }
+
+    /// Renders a view unless it is the one that was rendered last; milliseconds, 0 where nothing was to do.
+    fn show(&mut self, place: usize) -> Result<f64> {
+        if self.shown.as_ref().is_some_and(|s| s.place == place) {
+            return Ok(0.0);
+        }
+        let started = Instant::now();
+        let field = self.scene.field(&self.cameras[place], self.args.tau_ac)?;
+        let ms = started.elapsed().as_secs_f64() * 1e3;
+        let color = self.args.output.as_ref().map(|_| self.scene.render(&self.cameras[place])).transpose()?;
+        self.shown = Some(Shown { place, field, color });
+        Ok(ms)
+    }
+
+    /// One question in one view.
+    fn answer(&mut self, ask: &Ask, place: usize) -> Result<Value> {
+        let render_ms = self.show(place)?;
+        let Some(Shown { field, color, .. }) = &self.shown else { bail!("no view was rendered") };
+        let (args, scene, grid, camera) = (self.args, &self.scene, &self.grid, &self.cameras[place]);
+        let started = Instant::now();
+        let meaning = ask.meaning(scene, &args.negative)?;
+        let encode_ms = started.elapsed().as_secs_f64() * 1e3;
+        let started = Instant::now();
+        let found = meaning.find(grid, field, camera, &self.config)?;
+        let select_ms = started.elapsed().as_secs_f64() * 1e3;
+        let started = Instant::now();
+        let mut mask = field.mask(grid, &found.targets);
+        let restore_ms = started.elapsed().as_secs_f64() * 1e3;
+        if let Some((kw, kh)) = args.dilate {
+            let radius = [kw / 2 * args.dilate_times, kh / 2 * args.dilate_times];
+            mask = metrics::dilate(&mask, camera.width, camera.height, radius);
+        }
+        let answer = Answer { grid, field, found: &found, mask: &mask };
+        let mut value = answer.report(scene, &ask.name(), camera);
+        let total = encode_ms + render_ms + select_ms + restore_ms;
+        value["ms"] = json!({ "encode": encode_ms, "render": render_ms, "select": select_ms, "restore": restore_ms, "total": total });
+        if let (Some(folder), Some(color)) = (&args.output, color) {
+            answer.write(folder, color, &ask.name(), &camera.name, args.heatmap, &mut value)?;
+        }
+        if !found.targets.is_empty() {
+            let selected = selection::gaussians(scene, grid, &found.targets);
+            for (path, keep) in [(&args.export_ply, true), (&args.remove_ply, false)] {
+                if let Some(path) = path {
+                    selection::export(path, scene, &selected, keep)?;
+                }
+            }
+        }
+        Ok(value)
+    }
+}

@@ -1,0 +1,41 @@
+//! The three-dimensional side of an answer: which Gaussians belong to it.
+
+use crate::scene::Scene;
+use anyhow::{Context, Result, bail};
+use fastlgs_core::ply;
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::Hit;
+use std::path::Path;
+
+/// Places of the Gaussians of some objects.
+pub fn gaussians(scene: &Scene, grid: &Grid, targets: &[Hit]) -> Vec<usize> {
+    let members = grid.members(&targets.iter().map(|t| t.id).collect::<Vec<_>>());
+    let ids = scene.gaussians.object_ids.iter().enumerate();
+    ids.filter(|(_, id)| members.get(usize::from(**id)) == Some(&true)).map(|(i, _)| i).collect()
+}
+
+/// Writes the selection (`keep`), or the scene without it.
+pub fn export(path: &Path, scene: &Scene, selected: &[usize], keep: bool) -> Result<()> {
+    let mut inside = vec![false; scene.gaussians.len()];
+    selected.iter().for_each(|&i| inside[i] = true);
+    let places: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
+    if places.is_empty() {
+        bail!("{}: nothing would be left to write", path.display());
+    }
+    ply::write(path, &scene.gaussians.select(&places)).context("the selection cannot be written")
+}
+
+/// World box [min, max] between the 2nd and 98th percentile of the Gaussians' centres: a few floaters do not stretch it.
+pub fn robust_box(scene: &Scene, own: &[usize]) -> Option<[[f32; 3]; 2]> {
+    if own.is_empty() {
+        return None;
+    }
+    let mut out = [[0.0; 3]; 2];
+    for k in 0..3 {
+        let mut values: Vec<f32> = own.iter().map(|&i| scene.gaussians.means[i][k]).collect();
+        values.sort_by(f32::total_cmp);
+        out[0][k] = values[values.len() * 2 / 100];
+        out[1][k] = values[(values.len() - 1) * 98 / 100];
+    }
+    Some(out)
+}
