@@ -19,7 +19,7 @@ pub struct QueryConfig {
 }
 
 /// Calibrated on the offline encoder: see `docs/evaluation.md`.
-pub const MIN_SCORE: f32 = 0.65;
+pub const MIN_SCORE: f32 = 0.6;
 
 /// The same for CLIP, whose cosines lie closer together: nearer to the text than to anything. Not calibrated.
 pub const CLIP_MIN_SCORE: f32 = 0.55;
@@ -59,25 +59,27 @@ pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
     if weight > 0.0 { sum / weight } else { 0.0 }
 }
 
-/// All objects, best first.
+/// All objects, best first: by their score, and the less the worse the masks bear them out. A union of two things is often
+/// as relevant as the one that is meant.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
-    let mut hits: Vec<Hit> = grid.objects.iter().map(|o| Hit { id: o.id, score: object_score(o, query) }).collect();
-    hits.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.id.cmp(&b.id)));
-    hits
+    let hits = grid.objects.iter().map(|o| (object_score(o, query), o));
+    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (score * o.support.sqrt(), Hit { id: o.id, score })).collect();
+    hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
+    hits.into_iter().map(|h| h.1).collect()
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
-const BORNE_OUT: f32 = 0.8;
+const BORNE_OUT: f32 = 0.9;
 
 /// The target objects; empty means "not found". Of things that lie in each other one is taken: of the best and what around
 /// it is hardly less relevant, the largest that the masks bear out about as well as any of them.
 pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
-    let Some(best) = ranked.first() else { return Vec::new() };
+    let Some(best) = ranked.iter().find(|h| h.score >= config.min_score) else { return Vec::new() };
     let floor = config.min_score.max(best.score - config.margin);
     let mut score = vec![0.0; grid.objects.len() + 1];
     ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
     let mut chosen: Vec<Hit> = Vec::new();
-    for hit in ranked.iter().take_while(|h| h.score >= floor) {
+    for hit in ranked.iter().filter(|h| h.score >= floor) {
         let around: Vec<u16> = grid.chain(hit.id).filter(|id| score[usize::from(*id)] >= floor.max(hit.score - config.margin)).collect();
         let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
         let best = around.iter().map(support).fold(0.0, f32::max);

@@ -11,6 +11,9 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::{Value, json};
 use std::path::Path;
 
+/// Objects that a report lists with their scores, chosen or not.
+const CANDIDATES: usize = 8;
+
 /// What was found, in a view.
 pub struct Answer<'a> {
     pub grid: &'a Grid,
@@ -31,6 +34,7 @@ impl Answer<'_> {
             "found": !self.found.targets.is_empty(),
             "score": self.found.targets.first().or(self.found.ranked.first()).map_or(0.0, |h| h.score),
             "objects": objects,
+            "candidates": &self.found.ranked[..self.found.ranked.len().min(CANDIDATES)],
             "pixels": self.mask.iter().filter(|m| **m).count(),
             "mask": Value::Null,
             "heatmap": Value::Null,

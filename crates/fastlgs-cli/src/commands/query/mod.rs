@@ -46,7 +46,7 @@ pub struct Args {
     /// Most objects that together form the answer.
     #[arg(long, default_value_t = QueryConfig::default().top_k, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
     top_k: usize,
-    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.65 offline, 0.55 CLIP).
+    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.6 offline, 0.55 CLIP).
     #[arg(long)]
     min_score: Option<f32>,
     /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
