@@ -47,9 +47,8 @@ pub fn dilate(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2]) -> Vec
 /// `beyond`: whether what lies beyond the picture is mask.
 fn dilated(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2], beyond: bool) -> Vec<bool> {
     let (w, h, rx, ry) = (width as i64, height as i64, i64::from(rx), i64::from(ry));
-    let line = |n: i64, r: i64, len: i64, get: &dyn Fn(i64) -> bool| {
-        (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { beyond })
-    };
+    let line =
+        |n: i64, r: i64, len: i64, get: &dyn Fn(i64) -> bool| (n - r..=n + r).any(|k| if (0..len).contains(&k) { get(k) } else { beyond });
     let mut rows = vec![false; mask.len()];
     for y in 0..h {
         for x in 0..w {

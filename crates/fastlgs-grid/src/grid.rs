@@ -108,7 +108,15 @@ impl Grid {
         let dimension = self.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next().unwrap_or(0);
         let (mut embeddings, mut areas, mut rows) = (Vec::new(), Vec::new(), Vec::new());
         for o in &self.objects {
-            rows.push(Row { id: o.id, parent: o.parent, support: o.support, code: o.code.to_array(), views: o.views, first: areas.len(), count: o.areas.len() });
+            rows.push(Row {
+                id: o.id,
+                parent: o.parent,
+                support: o.support,
+                code: o.code.to_array(),
+                views: o.views,
+                first: areas.len(),
+                count: o.areas.len(),
+            });
             embeddings.extend(o.embeddings.iter().flatten().copied());
             areas.extend(&o.areas);
         }

@@ -24,13 +24,15 @@ pub struct PaperConfig {
     pub tau: u32,
     /// Least similarity that makes two masks one object (theta).
     pub theta: f32,
-    /// Weight of colour against the embedding (alpha).
+    /// Weight of colour against the embedding (alpha); 0 leaves colour out.
     pub alpha: f32,
+    /// Whether key points count.
+    pub key_points: bool,
 }
 
 impl Default for PaperConfig {
     fn default() -> Self {
-        Self { tau: 4, theta: 0.95, alpha: 0.3 }
+        Self { tau: 4, theta: 0.95, alpha: 0.3, key_points: true }
     }
 }
 
@@ -46,29 +48,58 @@ pub fn similarity(a: &Mask, b: &Mask, alpha: f32) -> f32 {
     alpha * color + (1.0 - alpha) * cosine
 }
 
-/// Algorithm 1. `masks` are sorted by view; returns the object of each mask, 1..=K, and K.
+/// Masks of an object that are more alike than this stand for each other.
+const ALIKE: f32 = 0.98;
+
+/// What Algorithm 1 made of the masks.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Mapped {
+    /// Object of each mask, 1..=count.
+    pub object_of: Vec<u16>,
+    /// Number of objects K.
+    pub count: u16,
+    /// Similarities that were computed.
+    pub comparisons: usize,
+}
+
+/// Algorithm 1. `masks` are sorted by view.
 ///
-/// Photos are taken in sequence; masks of the first photo are objects of their own.
-pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> (Vec<u16>, u16) {
-    let mut object: Vec<u16> = Vec::with_capacity(masks.len());
-    let mut count = 0u16;
+/// Photos are taken in sequence; masks of the first photo are objects of their own. A mask is compared not with every
+/// earlier one but with each object's representatives: masks of which none is more than [`ALIKE`] another one. An object that
+/// is seen for the hundredth time adds none, so that the work grows with the photos, not with their square.
+///
+/// # Panics
+/// If there are more than 65,535 objects.
+pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Mapped {
+    let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
+    let mut representatives: Vec<usize> = Vec::new();
+    // Those of the photo at hand are not yet to be compared with.
+    let mut fresh: Vec<usize> = Vec::new();
     for (j, mask) in masks.iter().enumerate() {
+        if fresh.first().is_some_and(|k| masks[*k].view < mask.view) {
+            representatives.append(&mut fresh);
+        }
         let earlier = masks.partition_point(|m| m.view < mask.view);
         let most_corresponding = pairs.range((j, 0)..(j, earlier)).map(|(&(_, k), &n)| (n, std::cmp::Reverse(k))).max();
-        let by_key_points = most_corresponding.filter(|(n, _)| *n >= config.tau).map(|(_, k)| k.0);
-        let same = by_key_points.or_else(|| {
-            let sims = (0..earlier).map(|k| (similarity(mask, &masks[k], config.alpha), k));
-            sims.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))).filter(|(sim, _)| *sim >= config.theta).map(|(_, k)| k)
-        });
-        object.push(match same {
-            Some(k) => object[k],
-            None => {
-                count += 1;
-                count
-            }
-        });
+        let by_key_points = most_corresponding.filter(|(n, _)| config.key_points && *n >= config.tau).map(|(_, k)| k.0);
+        mapped.comparisons += representatives.len();
+        let sims = representatives.iter().map(|&k| (similarity(mask, &masks[k], config.alpha), k));
+        let most_alike = sims.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
+        let same = by_key_points.or(most_alike.filter(|(sim, _)| *sim >= config.theta).map(|(_, k)| k));
+        let object = same.map_or_else(
+            || {
+                mapped.count = mapped.count.checked_add(1).expect("at most 65,535 objects");
+                mapped.count
+            },
+            |k| mapped.object_of[k],
+        );
+        // One of the same object that is as good as the mask itself makes it superfluous.
+        if most_alike.is_none_or(|(sim, k)| sim < ALIKE || mapped.object_of[k] != object) {
+            fresh.push(j);
+        }
+        mapped.object_of.push(object);
     }
-    (object, count)
+    mapped
 }
 
 #[cfg(test)]
@@ -92,10 +123,46 @@ mod tests {
             mask(2, 1, [0.8, -0.6], [0.2, 0.8]),
         ];
         let pairs = Correspondences::from([((2, 0), 4), ((2, 1), 2), ((5, 0), 3)]);
-        let (object, count) = paper(&masks, &pairs, &PaperConfig::default());
-        assert_eq!((object, count), (vec![1, 2, 1, 2, 3, 4], 4));
-        let (object, _) = paper(&masks, &pairs, &PaperConfig { tau: 3, ..PaperConfig::default() });
-        assert_eq!(object[5], 1, "tau is an option");
+        let map = |config: PaperConfig| paper(&masks, &pairs, &config);
+        let found = map(PaperConfig::default());
+        assert_eq!((found.object_of, found.count), (vec![1, 2, 1, 2, 3, 4], 4));
+        assert_eq!(map(PaperConfig { tau: 3, ..PaperConfig::default() }).object_of[5], 1, "tau is an option");
+        assert_eq!(map(PaperConfig { key_points: false, ..PaperConfig::default() }).object_of, [1, 2, 3, 2, 4, 5], "so are key points");
         assert!((similarity(&masks[1], &masks[3], 0.3) - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
+    }
+
+    /// `views` photos of 40 things, of which each shows ten; how a thing looks wavers from photo to photo.
+    fn walk(views: usize) -> Vec<Mask> {
+        let mut rng = fastlgs_core::rng::Rng::new(2, "walk");
+        let looks: Vec<Vec<f32>> = (0..40).map(|_| unit((0..16).map(|_| rng.normal()).collect())).collect();
+        let mut wavering = |look: &[f32]| unit(look.iter().map(|v| v + 0.03 * rng.normal()).collect());
+        let mask = |view: usize, label: usize, embedding| Mask { view, label: label as u16, area: 0.1, embedding, histogram: vec![1.0] };
+        (0..views).flat_map(|v| (0..10).map(move |k| (v, (v + k) % 40))).map(|(v, thing)| mask(v, thing, wavering(&looks[thing]))).collect()
+    }
+
+    fn unit(mut v: Vec<f32>) -> Vec<f32> {
+        let length = v.iter().map(|x| x * x).sum::<f32>().sqrt();
+        v.iter_mut().for_each(|x| *x /= length);
+        v
+    }
+
+    #[test]
+    fn work_grows_with_the_photos_and_not_with_their_square() {
+        let [few, many] = [250, 1000].map(|views| {
+            let masks = walk(views);
+            let mapped = paper(&masks, &Correspondences::new(), &PaperConfig { theta: 0.9, ..PaperConfig::default() });
+            assert_eq!(mapped.count, 40, "every thing is one object");
+            assert!(
+                masks.iter().zip(&mapped.object_of).all(|(m, o)| masks
+                    .iter()
+                    .zip(&mapped.object_of)
+                    .find(|(n, _)| n.label == m.label)
+                    .is_some_and(|f| f.1 == o))
+            );
+            mapped.comparisons as f64
+        });
+        let exponent = (many / few).ln() / 4f64.ln();
+        println!("comparisons grow with the {exponent:.2}th power of the number of photos, up to 1,000");
+        assert!(exponent < 1.3, "{exponent}");
     }
 }

@@ -62,10 +62,8 @@ fn join(regions: &Regions, mut sizes: Vec<u32>, parents: &mut Vec<u16>) {
         let touch = n as f32 >= TOUCH * sizes[a].min(sizes[b]) as f32;
         if touch { agreement(&seen[a], &seen[b]) } else { 0.0 }
     };
-    let mut scores: BTreeMap<(usize, usize), f32> =
-        contacts.iter().map(|(pair, n)| (*pair, score(&seen, &sizes, *pair, *n))).collect();
-    while let Some((&(a, b), _)) =
-        scores.iter().filter(|s| *s.1 >= LEAST_AGREEMENT).max_by(|x, y| x.1.total_cmp(y.1).then(y.0.cmp(x.0)))
+    let mut scores: BTreeMap<(usize, usize), f32> = contacts.iter().map(|(pair, n)| (*pair, score(&seen, &sizes, *pair, *n))).collect();
+    while let Some((&(a, b), _)) = scores.iter().filter(|s| *s.1 >= LEAST_AGREEMENT).max_by(|x, y| x.1.total_cmp(y.1).then(y.0.cmp(x.0)))
         && parents.len() < usize::from(u16::MAX)
     {
         let union = sizes.len();

@@ -2,8 +2,8 @@
 
 use crate::encoder::{TextEncoder, normalise};
 use crate::{MiniLm, Result, models};
-use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 use fastlgs_core::fs;
+use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 
 /// Names of a class that describe it: the later ones are rarer, at last Latin.
 const SYNONYMS: usize = 3;

@@ -62,6 +62,9 @@ pub struct Args {
     /// Paper mapping: weight of colour in the similarity.
     #[arg(long, default_value_t = PaperConfig::default().alpha)]
     alpha: f32,
+    /// Paper mapping: what is compared beside the embeddings, separated by commas (the paper's ablation).
+    #[arg(long, value_delimiter = ',', default_value = "keypoints,color", value_parser = ["keypoints", "color", "none"])]
+    cues: Vec<String>,
     /// Global mapping: share of the views that must show two regions in one mask to join them.
     #[arg(long, default_value_t = consensus::Config::default().agreement)]
     agreement: f32,
@@ -98,7 +101,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let cameras = folder.cameras()?;
     let training = manifest.training(&cameras);
     let paper = if args.mapping == "paper" {
-        let config = PaperConfig { tau: args.tau, theta: args.theta, alpha: args.alpha };
+        let cue = |name: &str| args.cues.iter().any(|c| c == name);
+        let alpha = if cue("color") { args.alpha } else { 0.0 };
+        let config = PaperConfig { tau: args.tau, theta: args.theta, alpha, key_points: cue("keypoints") };
         Some(objects::by_algorithm_1(&folder, &training, &config, common.seed)?)
     } else {
         None

@@ -1,7 +1,9 @@
 //! `fastlgs bench`: what the program costs and what it gives.
 
 mod chart;
+mod plot;
 mod speed;
+mod trial;
 mod vision;
 
 use crate::{Outcome, ui};
@@ -18,6 +20,8 @@ pub struct Args {
 enum What {
     /// Milliseconds of every pass, frames and training iterations a second.
     Speed(speed::Args),
+    /// Accuracy against time, for the ways from masks to a field that answers.
+    Chart(chart::Args),
     /// Masks and embeddings alone, on labelled photos.
     Vision(vision::Args),
 }
@@ -25,6 +29,7 @@ enum What {
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     match &args.what {
         What::Speed(args) => speed::run(args, common),
+        What::Chart(args) => chart::run(args, common),
         What::Vision(args) => vision::run(args, common),
     }
 }

@@ -3,7 +3,7 @@
 //! Every setting renders and trains the same views of the scene with learning rates of zero, so that all steps cost the
 //! same; kernels are compiled before the clock starts.
 
-use super::chart;
+use super::plot;
 use crate::scene::parse_size;
 use crate::{Outcome, report, ui};
 use anyhow::{Result, bail};
@@ -82,7 +82,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         for &(w, h) in &sizes {
             let points =
                 settings.iter().filter(|s| s.size == (w, h)).map(|s| (s.gaussians as f64, s.number("train_iterations_per_second")));
-            lines.push(chart::Line { name: format!("{}, {w}x{h}", engine.name()), points: points.collect() });
+            lines.push(plot::Line { name: format!("{}, {w}x{h}", engine.name()), points: points.collect() });
         }
         tables.push(json!({
             "adapter": engine.name(),
@@ -101,8 +101,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     });
     if let Some(folder) = &args.output {
         fastlgs_core::fs::write_json(&folder.join("speed.json"), &value)?;
-        let axes = chart::Axes { title: "Training: colour + features + D-SSIM", x: "Gaussians", y: "iterations a second" };
-        chart::write(&folder.join("speed.svg"), &axes, &lines)?;
+        let axes = plot::Axes { title: "Training: colour + features + D-SSIM", x: "Gaussians", y: "iterations a second" };
+        plot::write(&folder.join("speed.svg"), &axes, &lines)?;
     }
     report::give(common, &value)?;
     Ok(Outcome::Done)

@@ -75,7 +75,8 @@ fn picture(scene: &Scene, path: &Path) -> Result<TextQuery> {
     let name = path.to_string_lossy();
     let encoder = scene.image_encoder()?;
     let embedding = encoder.embed_masks(&name, &photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
-    let embedding = embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
+    let embedding =
+        embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
     Ok(TextQuery { text: embedding, canonical: Vec::new(), anything: relevancy::IMAGE_ANYTHING })
 }
 

@@ -6,8 +6,8 @@ mod selection;
 
 use crate::scene::{Scene, ViewChoice, parse_size};
 use crate::{Outcome, report, ui};
-use anyhow::{Result, bail};
 use answer::Answer;
+use anyhow::{Result, bail};
 use ask::Ask;
 use fastlgs_core::{Camera, metrics};
 use fastlgs_grid::Grid;
