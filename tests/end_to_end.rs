@@ -270,6 +270,87 @@ fn absent_things_are_not_found() {
 }
 
 #[test]
+fn every_way_to_ask_ends_in_the_same_object() {
+    let Some(f) = fixture() else { return };
+    let file = |name: &str| f.dir.path().join("asked").join(name);
+    let ask = |args: &[&str]| json(&[&["query", text(&f.scene)], args, &["--view", "008"]].concat());
+    let cat = ask(&["cat", "--export-ply", text(&file("cat.ply")), "--remove-ply", text(&file("rest.ply")), "-o", text(&file("out"))]);
+    assert_eq!(cat["found"], true, "{cat}");
+    let object = &cat["objects"][0];
+    let [id, pixels] = ["id", "pixels"].map(|k| object[k].as_u64().expect("a number"));
+
+    // The selection and the rest are the scene.
+    let [all, selected, rest] = [f.scene.join("scene.ply"), file("cat.ply"), file("rest.ply")].map(|p| ply::read(&p).expect("a scene"));
+    assert_eq!(selected.len() as u64, object["gaussians"].as_u64().expect("a number"));
+    assert_eq!(selected.len() + rest.len(), all.len());
+    let [low, high] = [0, 1].map(|k| object["bbox3d"][k][0].as_f64().expect("a number") as f32);
+    let inside = selected.means.iter().filter(|m| (low..=high).contains(&m.x)).count();
+    assert!(inside * 10 > selected.len() * 9, "the box holds nearly all of it");
+
+    // A pixel of its mask, and a picture of it.
+    let mask = LabelMap::load(Path::new(cat["mask"].as_str().expect("a path"))).expect("the mask");
+    let middle = mask.boxes()[255].expect("a box");
+    let on_mask = (middle[0]..middle[2]).map(|x| (x, (middle[1] + middle[3]) / 2)).find(|(x, y)| mask.at(*x, *y) > 0).expect("a pixel");
+    let point = ask(&["--point", &format!("{},{}", on_mask.0, on_mask.1)]);
+    assert_eq!(point["objects"][0]["id"], id, "{point}");
+    let photo = fastlgs_core::image_io::load_rgb(&f.photos.join("images/008.png")).expect("the photo");
+    let crop = image::imageops::crop_imm(&photo, middle[0], middle[1], middle[2] - middle[0], middle[3] - middle[1]).to_image();
+    fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");
+    let picture = ask(&["--image", text(&file("crop.png")), "--min-score", "0.3"]);
+    assert_eq!(picture["objects"][0]["id"], id, "{picture}");
+
+    // Wider masks, and a text that is ruled out by another one.
+    let wide = ask(&["cat", "--dilate", "3x3", "--dilate-times", "2"]);
+    let grown = wide["pixels"].as_u64().expect("a number");
+    assert!(grown > pixels && grown < 2 * pixels, "{grown} of {pixels}");
+    let ruled_out = fastlgs(&["query", text(&f.scene), "cat", "--negative", "cat", "--negative", "kitten"]);
+    assert_eq!(ruled_out.status.code(), Some(3));
+    fails(&["query", text(&f.scene), "--point", "4000,1"], &["4000,1", "outside"]);
+    fails(&["query", text(&f.scene), "--image", "nowhere.png"], &["nowhere.png"]);
+    fails(&["query", text(&f.scene), "-", "cat"], &["standard input"]);
+}
+
+#[test]
+fn texts_are_answered_line_by_line() {
+    let Some(f) = fixture() else { return };
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+        .args(["query", text(&f.scene), "-", "--view", "008", "--device", "cpu"])
+        .stdin(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .expect("the binary starts");
+    std::io::Write::write_all(&mut child.stdin.take().expect("piped"), b"cat\n\nsubmarine\nwhiskers of the cat\n").expect("a reader");
+    let output = child.wait_with_output().expect("an end");
+    assert!(output.status.success());
+    let answers: Vec<Value> = String::from_utf8_lossy(&output.stdout).lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
+    let found: Vec<_> = answers.iter().map(|a| (a["text"].as_str().expect("a text"), a["found"] == true)).collect();
+    assert_eq!(found, [("cat", true), ("submarine", false), ("whiskers of the cat", true)]);
+    assert!(answers[0]["ms"]["render"].as_f64() > Some(0.0) && answers[1]["ms"]["render"] == 0.0, "the view is rendered once");
+}
+
+#[test]
+fn ways_from_masks_to_a_field_are_charted() {
+    let Some(f) = fixture() else { return };
+    let out = f.dir.path().join("chart");
+    let report = json(&["bench", "chart", text(&f.scene), "--quick", "--device", "cpu", "-o", text(&out)]);
+    let rows = report["rows"].as_array().expect("rows");
+    let oracle = |way: &str| rows.iter().find(|r| r["way"] == way).and_then(|r| r["oracle_miou"].as_f64()).expect("a figure");
+    assert_eq!(rows.len(), 5);
+    assert!(oracle("global") > 0.6 && oracle("global") >= oracle("+ colour (paper)"), "{report}");
+    assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| r["seconds"].as_f64() > Some(0.0)));
+    for file in ["chart.svg", "chart.md", "chart.csv", "chart.json"] {
+        assert!(std::fs::metadata(out.join(file)).expect("a file").len() > 100, "{file}");
+    }
+    assert!(
+        !std::fs::read_dir(f.dir.path()).expect("a folder").any(|e| e
+            .expect("an entry")
+            .file_name()
+            .to_string_lossy()
+            .starts_with(".trial"))
+    );
+}
+
+#[test]
 fn renders_every_kind_of_picture_and_any_camera() {
     let Some(f) = fixture() else { return };
     let out = f.dir.path().join("pictures");

@@ -90,9 +90,11 @@ fn draw_spots(svg: &mut String, axes: &Axes, spots: &[Spot]) -> Result<(), Box<d
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
         let line = chart.draw_series(LineSeries::new(front, color.stroke_width(1)))?.label(name);
         line.legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], color.stroke_width(2)));
-        chart.draw_series(own.iter().map(|s| {
+        chart.draw_series(own.iter().enumerate().map(|(k, s)| {
             let style = if s.front { color.filled() } else { color.stroke_width(1) };
-            EmptyElement::at((s.x, s.y)) + Circle::new((0, 0), 4, style) + Text::new(s.name.clone(), (7, -6), ("sans-serif", 12))
+            // Names of spots that lie close together stay apart.
+            let beside = (7, 12 * (k as i32 % 3) - 18);
+            EmptyElement::at((s.x, s.y)) + Circle::new((0, 0), 4, style) + Text::new(s.name.clone(), beside, ("sans-serif", 12))
         }))?;
     }
     chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
