@@ -51,6 +51,14 @@ impl Scene {
         Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, texts: OnceCell::new() })
     }
 
+    /// Renders once in passing: drivers compile kernels when they first run, which no query should wait for.
+    pub fn warm_up(&mut self) -> Result<()> {
+        match self.cameras.first().map(|c| c.resized(16, 16)) {
+            Some(small) => self.field(&small, None).map(|_| ()),
+            None => Ok(()),
+        }
+    }
+
     /// The object table.
     pub fn grid(&self) -> Result<Grid> {
         Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")

@@ -2,7 +2,8 @@
 
 use crate::cpu;
 use crate::native::Lists;
-use crate::view::View;
+use crate::native::blend::{self, Job, Tile};
+use crate::view::{TILE, View};
 use fastlgs_core::{Camera, Gaussians, LabelMap};
 use kiddo::{KdTree, SquaredEuclidean};
 use rayon::prelude::*;
@@ -30,38 +31,20 @@ pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote>
     assert_eq!((camera.width, camera.height), (labels.width, labels.height), "the label map has the view's size");
     let lists = lists_of(scene, camera);
     let view = View::new(camera, scene.len(), 0);
-    let mut all: Vec<Vote> = (0..view.tile_count())
-        .into_par_iter()
-        .flat_map_iter(|tile| {
-            let [start, end] = lists.ranges[tile as usize].map(|p| p as usize);
-            let shown = cpu::pixels_of(tile, &view).filter(|(x, y)| cpu::shown(*x, *y, &view) > 0.0);
-            let mut pixels: Vec<_> = shown.map(|(x, y)| (x, y, labels.at(x, y), 1.0f32)).collect();
-            let mut out = Vec::new();
-            for &gaussian in &lists.gaussians[start..end] {
-                let splat = &lists.splats[gaussian as usize];
-                let first = out.len();
-                let mut open = false;
-                for (x, y, label, transmittance) in &mut pixels {
-                    let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
-                    let weight = cpu::alpha(splat, dx, dy) * *transmittance;
-                    *transmittance -= weight;
-                    open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
-                    if weight > 0.0 {
-                        match out[first..].iter_mut().find(|v: &&mut Vote| v.label == *label) {
-                            Some(vote) => vote.weight += weight,
-                            None => out.push(Vote { gaussian, label: *label, weight }),
-                        }
-                    }
-                }
-                if !open {
-                    break;
-                }
-            }
-            out
-        })
-        .collect();
+    let of_tile = |sums: &mut Vec<f32>, tile: usize| {
+        let [start, end] = lists.ranges[tile].map(|p| p as usize);
+        let job = Job::new(&view, tile, &lists.gaussians[start..end], &lists.splats);
+        let mut shown = blend::shown(&view, &job);
+        let (names, masks) = masks_of(labels, &job);
+        blend::by_mask(&job, &masks, &mut shown, sums);
+        let rows = job.gaussians.iter().zip(sums.chunks_exact(names.len()));
+        let votes = rows.flat_map(|(&gaussian, row)| names.iter().zip(row).map(move |(&label, &weight)| Vote { gaussian, label, weight }));
+        votes.filter(|v| v.weight > 0.0).collect::<Vec<_>>()
+    };
+    let tiles: Vec<Vec<Vote>> = (0..view.tile_count() as usize).into_par_iter().map_init(Vec::new, of_tile).collect();
+    let mut all = tiles.concat();
     // A stable sort keeps the tiles' order, so that sums are the same in every run.
-    all.sort_by_key(|v| (v.gaussian, v.label));
+    all.par_sort_by_key(|v| (v.gaussian, v.label));
     all.dedup_by(|next, kept| {
         let same = (next.gaussian, next.label) == (kept.gaussian, kept.label);
         kept.weight += if same { next.weight } else { 0.0 };
@@ -69,6 +52,24 @@ pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote>
     });
     all.retain(|v| v.weight >= MIN_WEIGHT);
     all
+}
+
+/// The labels that a tile's pixels have, and where each of them lies. Pixels of the padding repeat the border.
+fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
+    let (mut names, mut masks): (Vec<u16>, Vec<Tile>) = Default::default();
+    for j in 0..Tile::default().len() {
+        for i in 0..Tile::default()[0].len() {
+            let (x, y) = (job.x as u32 + i as u32 % TILE, job.y as u32 + 2 * j as u32 + i as u32 / TILE);
+            let label = labels.at(x.min(labels.width - 1), y.min(labels.height - 1));
+            let place = names.iter().position(|n| *n == label).unwrap_or_else(|| {
+                names.push(label);
+                masks.push(Tile::default());
+                names.len() - 1
+            });
+            masks[place][j][i] = 1.0;
+        }
+    }
+    (names, masks)
 }
 
 /// Tile lists of a view; what depends on the viewing direction is left out.

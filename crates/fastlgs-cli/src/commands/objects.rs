@@ -157,11 +157,17 @@ fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], common: &
     for (view, camera) in training.iter().enumerate() {
         let whole = whole_masks(folder, camera)?;
         let part = masks(folder, camera, Level::Part)?.unwrap_or_else(|| whole.clone());
-        // Every pair of labels that occurs is a label of its own.
-        let pairs: BTreeSet<(u16, u16)> = whole.labels.iter().copied().zip(part.labels.iter().copied()).collect();
-        let pairs: Vec<(u16, u16)> = pairs.into_iter().collect();
-        let number = |pair: (u16, u16)| pairs.binary_search(&pair).unwrap_or(0) as u16;
-        let labels = whole.labels.iter().copied().zip(part.labels.iter().copied()).map(number).collect();
+        // Every pair of labels that occurs is a label of its own; numbered in order, so that votes stay sorted by whole mask.
+        let width = usize::from(part.max()) + 1;
+        let place = |(whole, part): (&u16, &u16)| usize::from(*whole) * width + usize::from(*part);
+        let mut number = vec![None; (usize::from(whole.max()) + 1) * width];
+        whole.labels.iter().zip(&part.labels).for_each(|pair| number[place(pair)] = Some(0));
+        let mut pairs = Vec::new();
+        for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
+            *number = Some(pairs.len() as u16);
+            pairs.push(((place / width) as u16, (place % width) as u16));
+        }
+        let labels = whole.labels.iter().zip(&part.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
         for vote in lift::votes(scene, camera, &LabelMap { labels, ..whole }) {
             let (whole, part) = pairs[usize::from(vote.label)];
             for (seen, label) in seen.iter_mut().zip([whole, part]) {

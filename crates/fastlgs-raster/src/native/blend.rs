@@ -167,6 +167,44 @@ fn by_id_body<const FMA: bool>(job: &Job<'_>, ids: &[u16], transmittance: &mut T
     }
 }
 
+vectorised! {
+    /// Blending weights of each Gaussian of a tile, summed over the pixels of each of `masks` (1 inside, 0 outside):
+    /// `[Gaussian of the list][mask]`, as far as the list is walked.
+    fn by_mask(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) = by_mask_body
+}
+
+#[inline(always)]
+fn by_mask_body<const FMA: bool>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) {
+    sums.clear();
+    for batch in job.gaussians.chunks(BATCH) {
+        for &g in batch {
+            let splat = &job.splats[g as usize];
+            let first = sums.len();
+            sums.resize(first + masks.len(), 0.0);
+            let dx = offsets(job.x - splat[0][0]);
+            for j in rows_of(splat, job.y) {
+                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
+                let transmittance = &mut transmittance[j];
+                let mut w = [0.0; LANES];
+                for i in 0..LANES {
+                    w[i] = alpha[i] * transmittance[i];
+                    transmittance[i] -= w[i];
+                }
+                for (sum, mask) in sums[first..].iter_mut().zip(masks) {
+                    let mut inside = [0.0; LANES];
+                    for i in 0..LANES {
+                        inside[i] = w[i] * mask[j][i];
+                    }
+                    *sum += inside.iter().sum::<f32>();
+                }
+            }
+        }
+        if transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+            break;
+        }
+    }
+}
+
 /// What the backward pass starts from.
 pub struct Given {
     /// dL/d(colour, feature).

@@ -1,6 +1,6 @@
 //! The fast CPU backend: the same frames and gradients as the shaders', with vectors and all cores.
 
-mod blend;
+pub(crate) mod blend;
 mod ceiling;
 mod lists;
 mod loss;

@@ -113,6 +113,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         // The text encoder is loaded once, before the first query is timed.
         scene.text_query("warm up")?;
     }
+    scene.warm_up()?;
     let mut session = Session { args, scene, grid, cameras, config, shown: None };
     if lines { session.answer_lines() } else { session.answer_arguments(common) }
 }
