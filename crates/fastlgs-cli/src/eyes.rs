@@ -134,6 +134,28 @@ impl Eyes {
         Ok(files)
     }
 
+    /// What masks depend on beside the photo; nothing where they come from files that may change unseen.
+    pub fn segmenter_identity(&self) -> Result<Option<String>> {
+        Ok(match self.segmenter.as_str() {
+            "import" => None,
+            "sam" => {
+                let files = self.files()?;
+                let sums: Vec<&str> = files.values().map(|f| f.sha256.as_str()).collect();
+                Some(format!("sam {} {} {} {}", self.sam_points, self.sam_iou, self.sam_stability, sums.join(" ")))
+            }
+            _ => Some(format!("offline {}", models::offline_stamp())),
+        })
+    }
+
+    /// What embeddings depend on beside photo and masks.
+    pub fn encoder_identity(&self) -> Result<Option<String>> {
+        Ok(match self.encoder.as_str() {
+            "import" => None,
+            "clip" => Some(self.files()?.values().map(|f| f.sha256.clone()).collect::<Vec<_>>().join(" ")),
+            _ => Some(format!("offline {}", models::offline_stamp())),
+        })
+    }
+
     /// Whether masks of a level are kept.
     pub fn keeps(&self, level: Level) -> bool {
         level == Level::Whole || self.levels.iter().any(|l| l == level.name())

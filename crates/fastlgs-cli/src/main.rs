@@ -1,5 +1,6 @@
 //! The `fastlgs` binary: wiring of the stages, progress, logging and exit codes.
 
+mod cache;
 mod commands;
 mod eyes;
 mod report;

@@ -8,7 +8,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 /// Non-overlapping masks of one view and level; label 0 is unlabelled.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LabelMap {
     /// Width in pixels.
     pub width: u32,

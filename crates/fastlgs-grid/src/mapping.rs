@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 /// One mask of one photo.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
 pub struct Mask {
     /// Index of the photo in the sequence.
     pub view: usize,

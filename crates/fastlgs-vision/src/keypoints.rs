@@ -7,12 +7,26 @@ use image::GrayImage;
 use rayon::prelude::*;
 
 /// Key points of one photo.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
 pub struct Keypoints {
     /// Positions in pixels.
     pub positions: Vec<Vec2>,
     /// 128-byte descriptors.
+    #[serde(with = "descriptors")]
     pub descriptors: Vec<[u8; 128]>,
+}
+
+/// Serde has no arrays of 128: descriptors one after the other.
+mod descriptors {
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    pub fn serialize<S: Serializer>(all: &[[u8; 128]], to: S) -> Result<S::Ok, S::Error> {
+        to.serialize_bytes(all.as_flattened())
+    }
+
+    pub fn deserialize<'d, D: Deserializer<'d>>(from: D) -> Result<Vec<[u8; 128]>, D::Error> {
+        Ok(Vec::<u8>::deserialize(from)?.as_chunks().0.to_vec())
+    }
 }
 
 /// Most key points kept a photo, strongest first.

@@ -34,6 +34,16 @@ pub fn offline_dir() -> PathBuf {
     cache_dir().join("offline")
 }
 
+/// Changes when the offline models are installed anew: their files' lengths and dates.
+pub fn offline_stamp() -> String {
+    let stamp = |file: &&str| {
+        let known = std::fs::metadata(offline_dir().join(file)).ok()?;
+        let date = known.modified().ok()?.duration_since(std::time::UNIX_EPOCH).ok()?;
+        Some(format!("{}:{}", known.len(), date.as_secs()))
+    };
+    OFFLINE_FILES.iter().filter_map(stamp).collect::<Vec<_>>().join(" ")
+}
+
 /// Folder of the pictures that generated scenes show.
 pub fn pictures_dir() -> PathBuf {
     cache_dir().join("pictures")

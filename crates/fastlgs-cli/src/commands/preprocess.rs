@@ -1,6 +1,7 @@
 //! `fastlgs preprocess`: everything that is done once, before training.
 
 use super::objects;
+use crate::cache::{self, Cache, Key};
 use crate::eyes::Eyes;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
@@ -16,6 +17,7 @@ use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Encoder, Level, Segmenter, import};
 use fastlgs_vision::{pose_check, structure};
 use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -39,6 +41,23 @@ pub struct Args {
     /// Photos that each photo's key points are matched with.
     #[arg(long, default_value_t = 10)]
     neighbours: usize,
+    /// How much memory photos may take while they are read, such as 500M or 4G.
+    #[arg(long, default_value = "4G", value_name = "BYTES", value_parser = parse_bytes)]
+    memory: u64,
+}
+
+/// Parses `500M`.
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    let (number, unit) = text.split_at(text.trim_end_matches(char::is_alphabetic).len());
+    let factor = match unit.to_uppercase().as_str() {
+        "" => 1.0,
+        "K" | "KB" => 1e3,
+        "M" | "MB" => 1e6,
+        "G" | "GB" => 1e9,
+        _ => return Err(format!("'{unit}' is none of K, M and G")),
+    };
+    let bytes = number.parse::<f64>().ok().filter(|n| *n > 0.0).ok_or_else(|| format!("'{text}' is not a size like 4G"))?;
+    Ok((bytes * factor) as u64)
 }
 
 /// A working photo: undistorted and scaled.
@@ -49,6 +68,8 @@ pub struct Photo {
     alpha: Option<GrayImage>,
     /// Black where nothing counts.
     ignore: Option<GrayImage>,
+    /// Fingerprint of the pixels.
+    key: Key,
 }
 
 /// Masks of one training view.
@@ -82,13 +103,14 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         tracing::warn!("{warning}");
     }
     let folder = SceneFolder::new(&args.output);
-    let mut photos = load_photos(&dataset, args.max_side, &folder, common)?;
+    let cache = Cache::new(&folder);
+    let mut photos = load_photos(&dataset, args, &folder, common)?;
     lap("photos");
-    let mut keypoints = detect(&photos, common)?;
+    let mut keypoints = detect(&photos, &cache, common)?;
     lap("key_points");
     let mut warnings = dataset.warnings.clone();
     warn_of_bad_photos(&photos, &mut warnings);
-    let checked = check_poses(&mut photos, &keypoints, common, &mut warnings)?;
+    let checked = check_poses(&mut photos, &keypoints, &cache, common, &mut warnings)?;
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
@@ -101,13 +123,13 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
     lap("pose_check");
 
-    let (segmented, mask_counts) = segment(args, segmenter.as_ref(), &training, &folder, common)?;
+    let (segmented, mask_counts) = segment(args, segmenter.as_ref(), &training, &folder, &cache, common)?;
     drop(segmenter);
     lap("masks");
-    let masks = describe(encoder.as_ref(), &training, &segmented, common)?;
+    let masks = describe(args, encoder.as_ref(), &training, &segmented, &cache, common)?;
     drop(encoder);
     lap("embeddings");
-    let matches = match_photos(&training, &keypoints, args.neighbours, common);
+    let matches = match_photos(&training, &keypoints, args.neighbours, &cache, common)?;
     lap("matches");
 
     // Points of moved cameras lie where those cameras were.
@@ -141,6 +163,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         notes: BTreeMap::new(),
     };
     folder.save_manifest(&manifest)?;
+    cache.tidy();
     let value = serde_json::json!({
         "scene": args.output,
         "photos": cameras.len(),
@@ -155,6 +178,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "sift": keypoints::backend(),
         "moved_cameras": checked.moved.len(),
         "warnings": warnings,
+        "cached": cache.counts(),
         "seconds": seconds,
         "seconds_total": started.elapsed().as_secs_f64(),
     });
@@ -191,26 +215,45 @@ fn warn_of_bad_photos(photos: &[Photo], warnings: &mut Vec<String>) {
     }
 }
 
-fn load_photos(dataset: &Dataset, max_side: u32, folder: &SceneFolder, common: &ui::Common) -> Result<Vec<Photo>> {
+/// Bytes that a photo takes while it is read, for each of its file's pixels: decoded, shrunk, undistorted, encoded again.
+const BYTES_A_PIXEL: u64 = 12;
+
+fn load_photos(dataset: &Dataset, args: &Args, folder: &SceneFolder, common: &ui::Common) -> Result<Vec<Photo>> {
     let bar = ui::bar(common, dataset.photos.len() as u64, "photos");
-    let mut photos = Vec::new();
-    for posed in &dataset.photos {
-        let photo = load_photo(posed, max_side)?;
-        let name = &photo.camera.name;
-        image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
-        for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
-            match mask {
-                Some(mask) => image_io::save_png(&path, mask.clone())?,
-                // A mask that an earlier run left would now be wrong.
-                None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
-                None => {}
-            }
+    let largest = dataset.photos.iter().map(|p| u64::from(p.camera.width) * u64::from(p.camera.height)).max().unwrap_or(1);
+    let together = (args.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
+    let mut photos = Vec::with_capacity(dataset.photos.len());
+    for some in dataset.photos.chunks(together) {
+        let loaded: Vec<Result<Photo>> = some
+            .par_iter()
+            .map(|posed| {
+                let photo = load_photo(posed, args.max_side)?;
+                save_photo(&photo, folder)?;
+                bar.inc(1);
+                Ok(photo)
+            })
+            .collect();
+        for photo in loaded {
+            photos.push(photo?);
         }
-        photos.push(photo);
-        bar.inc(1);
     }
     bar.finish_and_clear();
     Ok(photos)
+}
+
+/// Writes a working photo with its masks into the scene folder.
+fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
+    let name = &photo.camera.name;
+    image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
+    for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
+        match mask {
+            Some(mask) => image_io::save_png(&path, mask.clone())?,
+            // A mask that an earlier run left would now be wrong.
+            None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
+            None => {}
+        }
+    }
+    Ok(())
 }
 
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
@@ -233,7 +276,8 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
     let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
     let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
-    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
+    let key = cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()]);
+    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera, key })
 }
 
 /// Masks of every training photo; returns the whole ones, and the mean number of masks a photo by level.
@@ -242,15 +286,23 @@ fn segment(
     segmenter: &dyn Segmenter,
     training: &[Photo],
     folder: &SceneFolder,
+    cache: &Cache,
     common: &ui::Common,
 ) -> Result<(Vec<ViewMasks>, BTreeMap<&'static str, f64>)> {
     let bar = ui::bar(common, training.len() as u64, "masks");
     let mut out = Vec::new();
     let mut counts = BTreeMap::new();
+    let identity = args.eyes.segmenter_identity()?;
     for (view, photo) in training.iter().enumerate() {
         let name = &photo.camera.name;
-        let found = segmenter.segment(name, &photo.pixels).with_context(|| format!("segmenting {name}"))?;
-        for (level, map) in Level::ALL.into_iter().zip(&found.levels) {
+        let make = || -> Result<[LabelMap; 3]> {
+            Ok(segmenter.segment(name, &photo.pixels).with_context(|| format!("segmenting {name}"))?.levels)
+        };
+        let levels = match &identity {
+            Some(identity) => cache.get("masks", &cache::key(&[&photo.key, identity.as_bytes()]), make)?,
+            None => make()?,
+        };
+        for (level, map) in Level::ALL.into_iter().zip(&levels) {
             let path = folder.masks_path(level.name(), name);
             if args.eyes.keeps(level) {
                 let masks = map.areas().iter().skip(1).filter(|a| **a > 0).count();
@@ -260,7 +312,7 @@ fn segment(
                 std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
             }
         }
-        let [labels, ..] = found.levels;
+        let [labels, ..] = levels;
         out.push(ViewMasks { view, labels });
         bar.inc(1);
     }
@@ -269,27 +321,45 @@ fn segment(
 }
 
 /// Embedding and colour distribution of every mask, sorted by view and label.
-fn describe(encoder: &dyn Encoder, training: &[Photo], segmented: &[ViewMasks], common: &ui::Common) -> Result<Vec<Mask>> {
+fn describe(
+    args: &Args,
+    encoder: &dyn Encoder,
+    training: &[Photo],
+    segmented: &[ViewMasks],
+    cache: &Cache,
+    common: &ui::Common,
+) -> Result<Vec<Mask>> {
     let bar = ui::bar(common, training.len() as u64, "embeddings");
     let mut masks = Vec::new();
+    let identity = args.eyes.encoder_identity()?;
     for ViewMasks { view, labels } in segmented {
         let photo = &training[*view];
-        masks.extend(objects::masks_of(&photo.camera.name, &photo.pixels, *view, labels, encoder)?);
+        let make = || objects::masks_of(&photo.camera.name, &photo.pixels, *view, labels, encoder);
+        let of_view = match &identity {
+            Some(identity) => {
+                let inputs = [&photo.key, bytemuck::cast_slice(&labels.labels), &view.to_le_bytes(), identity.as_bytes()];
+                cache.get("embeddings", &cache::key(&inputs), make)?
+            }
+            None => make()?,
+        };
+        masks.extend(of_view);
         bar.inc(1);
     }
     bar.finish_and_clear();
     Ok(masks)
 }
 
-fn detect(photos: &[Photo], common: &ui::Common) -> Result<Vec<Keypoints>> {
+/// Key points of each photo.
+fn detect(photos: &[Photo], cache: &Cache, common: &ui::Common) -> Result<Vec<Keypoints>> {
     let bar = ui::bar(common, photos.len() as u64, "key points");
-    let mut points = Vec::new();
-    for photo in photos {
-        points.push(keypoints::detect(&image::imageops::grayscale(&photo.pixels))?);
+    let found = photos.par_iter().map(|photo| {
         bar.inc(1);
-    }
+        let inputs = cache::key(&[&photo.key, keypoints::backend().as_bytes()]);
+        cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&photo.pixels))?))
+    });
+    let found = found.collect();
     bar.finish_and_clear();
-    Ok(points)
+    found
 }
 
 /// Longer side of the pictures on which poses are checked. Its tolerances are pixels, and the coarser key points of small
@@ -300,14 +370,22 @@ const CHECK_SIDE: u32 = 480;
 fn check_poses(
     photos: &mut [Photo],
     keypoints: &[Keypoints],
+    cache: &Cache,
     common: &ui::Common,
     warnings: &mut Vec<String>,
 ) -> Result<pose_check::Report> {
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
-    let small = photos.iter().zip(&cameras).any(|(p, c)| p.camera.width != c.width);
-    let detected = if small { Some(detect_small(photos, &cameras, common)?) } else { None };
-    let report = pose_check::repair(&mut cameras, detected.as_deref().unwrap_or(keypoints), common.seed);
-    let names = |list: &[usize]| list.iter().map(|&i| cameras[i].name.as_str()).collect::<Vec<_>>().join(", ");
+    let given = serde_json::to_vec(&cameras)?;
+    let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
+    let seed = common.seed.to_le_bytes();
+    inputs.extend([given.as_slice(), &seed, keypoints::backend().as_bytes()]);
+    let (report, poses) = cache.get("poses", &cache::key(&inputs), || {
+        let small = photos.iter().zip(&cameras).any(|(p, c)| p.camera.width != c.width);
+        let detected = if small { Some(detect_small(photos, &cameras, common)?) } else { None };
+        let report = pose_check::repair(&mut cameras, detected.as_deref().unwrap_or(keypoints), common.seed);
+        Ok((report, cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>()))
+    })?;
+    let names = |list: &[usize]| list.iter().map(|&i| photos[i].camera.name.as_str()).collect::<Vec<_>>().join(", ");
     for (list, what) in [
         (&report.moved, "contradicted the photos and were moved to where the key points match"),
         (&report.contradictory, "contradict the photos and could not be mended; these views are not trained on"),
@@ -318,9 +396,7 @@ fn check_poses(
             warnings.push(warning);
         }
     }
-    for (photo, camera) in photos.iter_mut().zip(cameras) {
-        photo.camera.world_to_camera = camera.world_to_camera;
-    }
+    photos.iter_mut().zip(poses).for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
     Ok(report)
 }
 
@@ -337,17 +413,27 @@ fn detect_small(photos: &[Photo], cameras: &[Camera], common: &ui::Common) -> Re
     Ok(points)
 }
 
-fn match_photos(training: &[Photo], points: &[Keypoints], neighbours: usize, common: &ui::Common) -> Vec<PairMatches> {
+fn match_photos(
+    training: &[Photo],
+    points: &[Keypoints],
+    neighbours: usize,
+    cache: &Cache,
+    common: &ui::Common,
+) -> Result<Vec<PairMatches>> {
     let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let described = cameras.iter().map(serde_json::to_vec).collect::<Result<Vec<_>, _>>()?;
     let chosen = triangulate::overlapping_pairs(&cameras, neighbours);
     let bar = ui::bar(common, chosen.len() as u64, "matches");
-    let mut matches = Vec::new();
-    for (a, b) in chosen {
-        let pairs = keypoints::matches(&points[a], &points[b]);
-        let pairs = triangulate::epipolar_filter((&cameras[a], &points[a]), (&cameras[b], &points[b]), &pairs);
-        matches.push(PairMatches { a, b, pairs });
+    let match_pair = |(a, b): (usize, usize)| {
+        let inputs = [&training[a].key, &training[b].key, described[a].as_slice(), &described[b], keypoints::backend().as_bytes()];
+        let pairs = cache.get("matches", &cache::key(&inputs), || {
+            let pairs = keypoints::matches(&points[a], &points[b]);
+            Ok(triangulate::epipolar_filter((&cameras[a], &points[a]), (&cameras[b], &points[b]), &pairs))
+        })?;
         bar.inc(1);
-    }
+        Ok(PairMatches { a, b, pairs })
+    };
+    let matches = chosen.into_par_iter().map(match_pair).collect();
     bar.finish_and_clear();
     matches
 }
