@@ -1,20 +1,43 @@
-//! Removal of lens distortion (Brown-Conrady with two radial and two tangential terms, as OpenCV and COLMAP define it).
+//! Removal of lens distortion, for all of COLMAP's camera models: first the lens bends the ray (fisheyes), then come the
+//! rational radial, tangential and thin-prism terms of Brown and Conrady, as OpenCV and COLMAP define them.
 
 use crate::Camera;
 use glam::Vec2;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 
+/// How far from the centre a lens images a ray at the angle theta to its axis.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Bend {
+    /// tan(theta): a pinhole.
+    #[default]
+    None,
+    /// theta: an equidistant fisheye.
+    Fisheye,
+    /// atan(2 tan(theta) tan(omega / 2)) / omega (Devernay & Faugeras 2001).
+    Fov(f32),
+}
+
 /// Distortion coefficients; all zero means an ideal pinhole.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
+    /// What the lens does before the terms below.
+    pub bend: Bend,
     /// Radial, r^2.
     pub k1: f32,
     /// Radial, r^4.
     pub k2: f32,
+    /// Radial, r^6.
+    pub k3: f32,
+    /// Radial, r^8.
+    pub k4: f32,
+    /// Radial, in the denominator: r^2, r^4, r^6.
+    pub below: [f32; 3],
     /// Tangential.
     pub p1: f32,
     /// Tangential.
     pub p2: f32,
+    /// Thin prism: what r^2 adds to x and y.
+    pub prism: [f32; 2],
 }
 
 impl Distortion {
@@ -24,13 +47,21 @@ impl Distortion {
     }
 
     /// Where the ideal ray (x/z, y/z) lands on the distorted image plane.
-    pub fn distort(&self, p: Vec2) -> Vec2 {
+    pub fn distort(&self, ray: Vec2) -> Vec2 {
+        let r = ray.length();
+        let bent = match self.bend {
+            Bend::None => r,
+            Bend::Fisheye => r.atan(),
+            Bend::Fov(omega) => (2.0 * r * (omega / 2.0).tan()).atan() / omega,
+        };
+        let p = if r > 1e-9 { ray * (bent / r) } else { ray };
         let r2 = p.length_squared();
-        let radial = 1.0 + r2 * (self.k1 + r2 * self.k2);
+        let above = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * (self.k3 + r2 * self.k4)));
+        let radial = above / (1.0 + r2 * (self.below[0] + r2 * (self.below[1] + r2 * self.below[2])));
         let Vec2 { x, y } = p;
         Vec2::new(
-            x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x),
-            y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y,
+            x * radial + 2.0 * self.p1 * x * y + self.p2 * (r2 + 2.0 * x * x) + self.prism[0] * r2,
+            y * radial + self.p1 * (r2 + 2.0 * y * y) + 2.0 * self.p2 * x * y + self.prism[1] * r2,
         )
     }
 }
@@ -75,7 +106,7 @@ mod tests {
     #[test]
     fn straight_lines_become_straight() {
         let camera = Camera::look_at("a", Vec3::Z, Vec3::ZERO, Vec3::Y, 200, 200, 0.9);
-        let lens = Distortion { k1: 0.2, k2: 0.0, p1: 0.0, p2: 0.0 };
+        let lens = Distortion { k1: 0.2, ..Distortion::default() };
         // A world line seen by the real lens: x = 0.3 on the ideal plane, so curved in the photo.
         let mut photo = RgbImage::new(200, 200);
         for t in 0..4000 {
@@ -93,5 +124,27 @@ mod tests {
         assert!(columns.len() > 100, "the line is seen in most rows");
         let (low, high) = (columns.iter().min().unwrap(), columns.iter().max().unwrap());
         assert!(high - low <= 2, "columns {low} to {high}");
+    }
+
+    /// By hand, for the ray (0.3, 0.4): r = 0.5, theta = atan(0.5) = 0.463648.
+    #[test]
+    fn lens_models_by_hand() {
+        let ray = Vec2::new(0.3, 0.4);
+        let none = Distortion::default();
+        let near = |lens: Distortion, x: f32, y: f32| {
+            let d = lens.distort(ray);
+            assert!(d.distance(Vec2::new(x, y)) < 1e-5, "{lens:?}: {d}");
+        };
+        near(Distortion { bend: Bend::Fisheye, ..none }, 0.278_189, 0.370_918);
+        // theta (1 + 0.1 theta^2 - 0.2 theta^4 + 0.3 theta^6 + 0.4 theta^8) = 0.463648 * 1.016089
+        near(Distortion { bend: Bend::Fisheye, k1: 0.1, k2: -0.2, k3: 0.3, k4: 0.4, ..none }, 0.282_664, 0.376_886);
+        // A ray of length 1: atan(2 tan(0.45)) / 0.9 = 0.853514.
+        let fov = Distortion { bend: Bend::Fov(0.9), ..none };
+        assert!(fov.distort(2.0 * ray).distance(Vec2::new(0.512109, 0.682811)) < 1e-5);
+        // 1 + 0.1 / 4 over 1 + 0.2 / 4
+        near(Distortion { k1: 0.1, below: [0.2, 0.0, 0.0], ..none }, 0.3 * 1.025 / 1.05, 0.4 * 1.025 / 1.05);
+        // r^2 = 0.25: x + 2 p1 xy + p2 (r^2 + 2 x^2) + sx r^2
+        near(Distortion { p1: 0.1, p2: 0.2, prism: [0.04, -0.04], ..none }, 0.3 + 0.024 + 0.086 + 0.01, 0.4 + 0.057 + 0.048 - 0.01);
+        assert_eq!(none.distort(Vec2::ZERO), Vec2::ZERO);
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{Dataset, PosedPhoto, SfmPoint, first_few};
 use crate::fs::{self, Bytes};
-use crate::undistort::Distortion;
+use crate::undistort::{Bend, Distortion};
 use crate::{Camera, Error, Result};
 use glam::{DMat3, DQuat, DVec3, Mat4, Vec3};
 use std::collections::HashMap;
@@ -48,7 +48,7 @@ const MODELS: [(&str, usize); 11] = [
 /// Reads the model in `folder`; photos are looked for in `PHOTOS/images`, then in PHOTOS itself.
 ///
 /// # Errors
-/// Missing or truncated files, camera models with fisheye lenses, numbers that do not parse.
+/// Missing or truncated files, unknown camera models, numbers that do not parse.
 pub fn load(photos: &Path, folder: &Path) -> Result<Dataset> {
     let binary = folder.join("cameras.bin").is_file();
     let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
@@ -110,7 +110,21 @@ fn lens(path: &Path, model: &str, width: u64, height: u64, p: &[f64]) -> Result<
         "PINHOLE" => ([p[0], p[1]], [p[2], p[3]], none),
         "SIMPLE_RADIAL" => ([p[0], p[0]], [p[1], p[2]], Distortion { k1: d(3), ..none }),
         "RADIAL" => ([p[0], p[0]], [p[1], p[2]], Distortion { k1: d(3), k2: d(4), ..none }),
-        "OPENCV" => ([p[0], p[1]], [p[2], p[3]], Distortion { k1: d(4), k2: d(5), p1: d(6), p2: d(7) }),
+        "OPENCV" => ([p[0], p[1]], [p[2], p[3]], Distortion { k1: d(4), k2: d(5), p1: d(6), p2: d(7), ..none }),
+        "FULL_OPENCV" => {
+            let (tangential, below) = ((d(6), d(7)), [d(9), d(10), d(11)]);
+            ([p[0], p[1]], [p[2], p[3]], Distortion { k1: d(4), k2: d(5), k3: d(8), p1: tangential.0, p2: tangential.1, below, ..none })
+        }
+        "OPENCV_FISHEYE" => {
+            ([p[0], p[1]], [p[2], p[3]], Distortion { bend: Bend::Fisheye, k1: d(4), k2: d(5), k3: d(6), k4: d(7), ..none })
+        }
+        "SIMPLE_RADIAL_FISHEYE" => ([p[0], p[0]], [p[1], p[2]], Distortion { bend: Bend::Fisheye, k1: d(3), ..none }),
+        "RADIAL_FISHEYE" => ([p[0], p[0]], [p[1], p[2]], Distortion { bend: Bend::Fisheye, k1: d(3), k2: d(4), ..none }),
+        "FOV" => ([p[0], p[1]], [p[2], p[3]], if p[4] == 0.0 { none } else { Distortion { bend: Bend::Fov(d(4)), ..none } }),
+        "THIN_PRISM_FISHEYE" => {
+            let radial = Distortion { bend: Bend::Fisheye, k1: d(4), k2: d(5), k3: d(8), k4: d(9), ..none };
+            ([p[0], p[1]], [p[2], p[3]], Distortion { p1: d(6), p2: d(7), prism: [d(10), d(11)], ..radial })
+        }
         other => {
             return Err(Error::format(
                 path,

@@ -1,7 +1,7 @@
 //! `transforms.json` of instant-ngp and nerfstudio: camera-to-world matrices in OpenGL axes (y up, looking along -z).
 
 use super::{Dataset, PosedPhoto, first_few};
-use crate::undistort::Distortion;
+use crate::undistort::{Bend, Distortion};
 use crate::{Camera, Error, Result, fs};
 use glam::{Mat4, Vec4};
 use serde::Deserialize;
@@ -18,8 +18,12 @@ struct Lens {
     camera_angle_x: Option<f64>,
     k1: Option<f64>,
     k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
+    /// nerfstudio's; pinholes with or without distortion where it is left out.
+    camera_model: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -95,6 +99,14 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
             })? as f32;
         }
     }
+    let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
+    let bend = match frame.lens.camera_model.as_deref().or(shared.camera_model.as_deref()) {
+        None | Some("PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE") => Bend::None,
+        Some("OPENCV_FISHEYE") => Bend::Fisheye,
+        Some(other) => {
+            return Err(Error::format(file, format!("the camera_model '{other}' is not supported; undistort the photos first")));
+        }
+    };
     let camera_to_world = Mat4::from_cols_array_2d(&rows.map(|r| r.to_array())).transpose();
     let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
     let ignore = frame.mask_path.as_ref().map(|mask| file.with_file_name(mask));
@@ -114,10 +126,14 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
             world_to_camera: (camera_to_world * flip).inverse(),
         },
         distortion: Distortion {
-            k1: either(|l| l.k1).unwrap_or(0.0) as f32,
-            k2: either(|l| l.k2).unwrap_or(0.0) as f32,
-            p1: either(|l| l.p1).unwrap_or(0.0) as f32,
-            p2: either(|l| l.p2).unwrap_or(0.0) as f32,
+            bend,
+            k1: coefficient(|l| l.k1),
+            k2: coefficient(|l| l.k2),
+            k3: coefficient(|l| l.k3),
+            k4: coefficient(|l| l.k4),
+            p1: coefficient(|l| l.p1),
+            p2: coefficient(|l| l.p2),
+            ..Distortion::default()
         },
         ignore,
     })
