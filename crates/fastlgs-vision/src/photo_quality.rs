@@ -5,6 +5,8 @@ use image::imageops::{FilterType, grayscale, resize};
 
 /// A photo this much less sharp than the middle one is called blurred.
 const BLURRED: f32 = 0.2;
+/// What the most blurred photo still counts.
+const LEAST_WEIGHT: f32 = 0.1;
 /// Mean difference of grey values, 0 to 255, below which two photos are the same.
 const SAME: f32 = 1.0;
 /// Side of the pictures in which sameness is looked for.
@@ -37,12 +39,22 @@ impl Impression {
     }
 }
 
-/// Which photos are blurred, by index.
-pub fn blurred(photos: &[Impression]) -> Vec<usize> {
+/// Sharpness of each photo, the middle one's being 1.
+fn relative(photos: &[Impression]) -> impl Iterator<Item = f32> {
     let mut all: Vec<f32> = photos.iter().map(|p| p.sharpness).collect();
     all.sort_by(f32::total_cmp);
-    let middle = all.get(all.len() / 2).copied().unwrap_or(0.0);
-    (0..photos.len()).filter(|&i| photos[i].sharpness < BLURRED * middle).collect()
+    let middle = all.get(all.len() / 2).copied().unwrap_or(0.0).max(1e-12);
+    photos.iter().map(move |p| p.sharpness / middle)
+}
+
+/// Which photos are blurred, by index.
+pub fn blurred(photos: &[Impression]) -> Vec<usize> {
+    relative(photos).enumerate().filter(|s| s.1 < BLURRED).map(|s| s.0).collect()
+}
+
+/// How much what each photo shows should count: 1 for the middle one and all that are sharper.
+pub fn weights(photos: &[Impression]) -> Vec<f32> {
+    relative(photos).map(|sharpness| sharpness.clamp(LEAST_WEIGHT, 1.0)).collect()
 }
 
 /// Photos that show the same as the one before them.
@@ -66,6 +78,8 @@ mod tests {
         let seen: Vec<Impression> = photos.iter().map(Impression::of).collect();
         assert_eq!(blurred(&seen), [2]);
         assert_eq!(repeated(&seen), [5]);
+        let weights = weights(&seen);
+        assert!(weights[2] < BLURRED && [0, 1, 3, 4].iter().all(|&i| weights[i] > 0.9), "{weights:?}");
         assert!(blurred(&[]).is_empty() && repeated(&[]).is_empty());
     }
 }

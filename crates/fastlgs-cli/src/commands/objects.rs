@@ -9,6 +9,7 @@ use fastlgs_grid::tree::{self, Tree};
 use fastlgs_grid::{Grid, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
+use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::{Encoder, Level, histogram};
 use image::RgbImage;
 use std::collections::{BTreeMap, BTreeSet};
@@ -108,27 +109,8 @@ pub fn by_consensus(
     let object = |node: u16| if node > 0 { chosen.object_of[usize::from(node) - 1] } else { 0 };
     scene.object_ids = tree.of.iter().map(|node| object(*node)).collect();
 
-    let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
     let areas: Vec<&[(u32, usize)]> = chosen.nodes.iter().map(|n| support[*n].areas.as_slice()).collect();
-    let shown = best_views(&areas);
-    let layers = layers(&chosen.parents);
-    let bar = ui::bar(common, training.len() as u64, "embeddings");
-    let (mut found, mut object_of) = (Vec::new(), Vec::new());
-    for (view, camera) in training.iter().enumerate() {
-        let mut map = folder.objects(&camera.name)?;
-        map.labels.iter_mut().for_each(|l| *l = object(*l));
-        map.save(&folder.objects_path(&camera.name))?;
-        let photo = folder.photo(&camera.name)?;
-        for layer in &layers {
-            let on_layer = ancestors_on(layer, &chosen.parents, |id| shown[usize::from(id) - 1].contains(&view));
-            let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
-            let masks = masks_of(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
-            object_of.extend(masks.iter().map(|m| m.label));
-            found.extend(masks);
-        }
-        bar.inc(1);
-    }
-    bar.finish_and_clear();
+    let (found, object_of) = embed(folder, training, object, &chosen.parents, &best_views(&areas), common)?;
     told("embeddings", found.len());
     let mut grid = Grid::build(&found, &object_of, chosen.nodes.len() as u16, common.seed);
     for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
@@ -137,6 +119,40 @@ pub fn by_consensus(
     grid.set_codes(scene);
     let [few_views, small, unsupported, same] = chosen.dropped;
     Ok((grid, Summary { regions: regions.seen.len(), parts: parts.seen.len(), few_views, small, unsupported, same }))
+}
+
+/// Embeds every object as its best views show it; also writes the object maps of all views. `object` gives a node's object.
+fn embed(
+    folder: &SceneFolder,
+    training: &[Camera],
+    object: impl Fn(u16) -> u16,
+    parents: &[u16],
+    shown: &[Vec<usize>],
+    common: &ui::Common,
+) -> Result<(Vec<Mask>, Vec<u16>)> {
+    let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
+    let layers = layers(parents);
+    let bar = ui::bar(common, training.len() as u64, "embeddings");
+    let (mut found, mut object_of, mut impressions) = (Vec::new(), Vec::new(), Vec::new());
+    for (view, camera) in training.iter().enumerate() {
+        let mut map = folder.objects(&camera.name)?;
+        map.labels.iter_mut().for_each(|l| *l = object(*l));
+        map.save(&folder.objects_path(&camera.name))?;
+        let photo = folder.photo(&camera.name)?;
+        for layer in &layers {
+            let on_layer = ancestors_on(layer, parents, |id| shown[usize::from(id) - 1].contains(&view));
+            let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
+            let masks = masks_of(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
+            object_of.extend(masks.iter().map(|m| m.label));
+            found.extend(masks);
+        }
+        impressions.push(Impression::of(&photo));
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    let sharpness = photo_quality::weights(&impressions);
+    found.iter_mut().for_each(|mask: &mut Mask| mask.area *= sharpness[mask.view]);
+    Ok((found, object_of))
 }
 
 /// What global mapping found, and why nodes of the tree are no objects.
