@@ -60,6 +60,19 @@ impl LabelMap {
         self.labels.iter().map(|&l| l == label).collect()
     }
 
+    /// The same masks numbered 1, 2, ... without gaps, in the order of their labels; and the label of each number, 0 first.
+    pub fn dense(&self) -> (Self, Vec<u16>) {
+        let mut number = vec![0u16; usize::from(self.max()) + 1];
+        self.labels.iter().for_each(|l| number[usize::from(*l)] = 1);
+        let mut names = vec![0];
+        for (label, number) in number.iter_mut().enumerate().skip(1).filter(|n| *n.1 > 0) {
+            *number = names.len() as u16;
+            names.push(label as u16);
+        }
+        number[0] = 0;
+        (Self { labels: self.labels.iter().map(|l| number[usize::from(*l)]).collect(), ..*self }, names)
+    }
+
     /// The same map at another size, nearest neighbour.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let pick = |n: u32, from: u32, to: u32| ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32;
@@ -125,5 +138,13 @@ mod tests {
         assert_eq!(map.areas()[2], 2);
         let double = map.resized(6, 4);
         assert_eq!((double.at(4, 1), double.at(0, 2), double.at(2, 3)), (300, 65535, 2));
+    }
+
+    #[test]
+    fn dense_numbers_have_no_gaps() {
+        let map = LabelMap { width: 5, height: 1, labels: vec![60_000, 0, 7, 60_000, 9] };
+        let (dense, names) = map.dense();
+        assert_eq!((dense.labels, names), (vec![3, 0, 1, 3, 2], vec![0, 7, 9, 60_000]));
+        assert_eq!(LabelMap::new(2, 2).dense().1, [0]);
     }
 }

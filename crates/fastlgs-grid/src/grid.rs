@@ -38,13 +38,18 @@ struct Row {
     id: u16,
     #[serde(default)]
     parent: u16,
-    #[serde(default)]
+    #[serde(default = "full")]
     support: f32,
     code: [f32; 3],
     views: usize,
     /// Rows of the embedding table: first and number.
     first: usize,
     count: usize,
+}
+
+/// Support of objects in grids that earlier versions wrote.
+fn full() -> f32 {
+    1.0
 }
 
 impl Grid {

@@ -65,7 +65,7 @@ pub struct Mapped {
 /// Algorithm 1. `masks` are sorted by view.
 ///
 /// Photos are taken in sequence; masks of the first photo are objects of their own. A mask is compared not with every
-/// earlier one but with each object's representatives: masks of which none is more than [`ALIKE`] another one. An object that
+/// earlier one but with each object's representatives, of which none is more than 0.98 like another one. An object that
 /// is seen for the hundredth time adds none, so that the work grows with the photos, not with their square.
 ///
 /// # Panics

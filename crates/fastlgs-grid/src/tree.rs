@@ -121,6 +121,7 @@ pub fn support<E: Send>(
         let mut best = vec![0.0f32; tree.parents.len()];
         let mut areas = Vec::new();
         for masks in &levels {
+            let (masks, _) = masks.dense();
             let width = usize::from(masks.max()) + 1;
             let mut common = vec![0u32; (tree.parents.len() + 1) * width];
             nodes.labels.iter().zip(&masks.labels).for_each(|(n, m)| common[usize::from(*n) * width + usize::from(*m)] += 1);

@@ -171,8 +171,8 @@ fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], common: &
     let mut seen = [vec![Seen::new(); scene.len()], vec![Seen::new(); scene.len()]];
     let bar = ui::bar(common, training.len() as u64, "votes");
     for (view, camera) in training.iter().enumerate() {
-        let whole = whole_masks(folder, camera)?;
-        let part = masks(folder, camera, Level::Part)?.unwrap_or_else(|| whole.clone());
+        let (whole, names) = whole_masks(folder, camera)?.dense();
+        let (part, part_names) = masks(folder, camera, Level::Part)?.map_or_else(|| (whole.clone(), names.clone()), |map| map.dense());
         // Every pair of labels that occurs is a label of its own; numbered in order, so that votes stay sorted by whole mask.
         let width = usize::from(part.max()) + 1;
         let place = |(whole, part): (&u16, &u16)| usize::from(*whole) * width + usize::from(*part);
@@ -181,7 +181,7 @@ fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], common: &
         let mut pairs = Vec::new();
         for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
             *number = Some(pairs.len() as u16);
-            pairs.push(((place / width) as u16, (place % width) as u16));
+            pairs.push((names[place / width], part_names[place % width]));
         }
         let labels = whole.labels.iter().zip(&part.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
         for vote in lift::votes(scene, camera, &LabelMap { labels, ..whole }) {
