@@ -53,11 +53,11 @@ fn full() -> f32 {
 }
 
 impl Grid {
-    /// Gathers the masks of each object.
-    pub fn build(masks: &[Mask], object_of: &[u16], count: u16, seed: u64) -> Self {
-        let codes = codes::lattice(usize::from(count), seed);
-        let objects = (1..=count)
-            .map(|id| {
+    /// Gathers the masks of each object; there are as many objects as `codes`.
+    pub fn build(masks: &[Mask], object_of: &[u16], codes: Vec<Vec3>) -> Self {
+        let objects = (1u16..)
+            .zip(codes)
+            .map(|(id, code)| {
                 let own: Vec<&Mask> = masks.iter().zip(object_of).filter(|(_, o)| **o == id).map(|(m, _)| m).collect();
                 let views = own.iter().map(|m| m.view).collect::<std::collections::BTreeSet<_>>().len();
                 let seen: Vec<&Mask> = own.into_iter().filter(|m| m.embedding.iter().any(|v| *v != 0.0)).collect();
@@ -65,7 +65,7 @@ impl Grid {
                     id,
                     parent: 0,
                     support: 1.0,
-                    code: codes[usize::from(id) - 1],
+                    code,
                     embeddings: seen.iter().map(|m| m.embedding.clone()).collect(),
                     areas: seen.iter().map(|m| m.area).collect(),
                     views,

@@ -6,7 +6,7 @@ use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::consensus::{self, Seen};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::tree::{self, Tree};
-use fastlgs_grid::{Grid, evidence};
+use fastlgs_grid::{Grid, codes, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
@@ -51,7 +51,26 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         map.save(&folder.objects_path(&camera.name))?;
         maps.push(map);
     }
-    Ok(Objects { grid: Grid::build(&masks, &object_of, count, seed), maps })
+    let codes = codes::separated(usize::from(count), &touching(&maps), seed);
+    Ok(Objects { grid: Grid::build(&masks, &object_of, codes), maps })
+}
+
+/// Pairs of objects (a < b) that touch in some view.
+fn touching(maps: &[LabelMap]) -> BTreeSet<(u16, u16)> {
+    let mut pairs = BTreeSet::new();
+    for map in maps {
+        let (w, n) = (map.width as usize, map.labels.len());
+        for p in 0..n {
+            let beside = [(p % w + 1 < w).then_some(p + 1), (p + w < n).then_some(p + w)];
+            for q in beside.into_iter().flatten() {
+                let (a, b) = (map.labels[p], map.labels[q]);
+                if a != b && a.min(b) > 0 {
+                    pairs.insert((a.min(b), a.max(b)));
+                }
+            }
+        }
+    }
+    pairs
 }
 
 /// Gives every Gaussian the object that most of its blending weight falls on, and that object's code.
@@ -112,7 +131,7 @@ pub fn by_consensus(
     let areas: Vec<&[(u32, usize)]> = chosen.nodes.iter().map(|n| support[*n].areas.as_slice()).collect();
     let (found, object_of) = embed(folder, training, object, &chosen.parents, &best_views(&areas), common)?;
     told("embeddings", found.len());
-    let mut grid = Grid::build(&found, &object_of, chosen.nodes.len() as u16, common.seed);
+    let mut grid = Grid::build(&found, &object_of, codes::lattice(chosen.nodes.len(), common.seed));
     for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
         (object.parent, object.support, object.views) = (*parent, support[*node].iou, support[*node].areas.len());
     }
