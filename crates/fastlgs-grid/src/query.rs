@@ -65,11 +65,18 @@ const SUPPORT_WEIGHT: f32 = 2.5;
 /// All objects, best first: by their score, and the less the worse the masks bear them out. A union of two things is often
 /// more relevant than the one that is meant.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
-    let odds = |score: f32| (score.max(1e-6) / (1.0 - score).max(1e-6)).ln();
     let hits = grid.objects.iter().map(|o| (object_score(o, query), o));
     let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (odds(score) + SUPPORT_WEIGHT * o.support, Hit { id: o.id, score })).collect();
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
+}
+
+/// By how much, in log-odds, a part must be more relevant than what it is a part of to be meant: a face is more like "cat" than a
+/// cat is.
+const PART_MARGIN: f32 = 1.2;
+
+fn odds(score: f32) -> f32 {
+    (score.max(1e-6) / (1.0 - score).max(1e-6)).ln()
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
@@ -84,7 +91,8 @@ pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
     let mut chosen: Vec<Hit> = Vec::new();
     for hit in ranked.iter().filter(|h| h.score >= floor) {
-        let around: Vec<u16> = grid.chain(hit.id).filter(|id| score[usize::from(*id)] >= floor.max(hit.score - config.margin)).collect();
+        let hardly_less = |s: f32| s >= config.min_score && odds(s) >= odds(hit.score) - PART_MARGIN;
+        let around: Vec<u16> = grid.chain(hit.id).filter(|id| hardly_less(score[usize::from(*id)])).collect();
         let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
         let best = around.iter().map(support).fold(0.0, f32::max);
         let id = around.iter().rev().find(|id| support(id) >= BORNE_OUT * best).copied().unwrap_or(hit.id);
@@ -205,8 +213,8 @@ mod tests {
         assert_eq!(find([-0.5, 1.0], &config), [3]);
         assert!(find([-1.0, 0.0], &config).is_empty());
         // The part is a little more relevant than the whole: it takes more than that to be meant.
-        assert_eq!(find([0.8, 0.6], &QueryConfig { top_k: 1, ..config }), [1]);
-        assert_eq!(find([0.8, 0.6], &QueryConfig { margin: 0.0, ..config }), [2]);
+        let one = QueryConfig { top_k: 1, ..config };
+        assert_eq!((find([0.85, 0.5], &one), find([0.8, 0.6], &one)), (vec![1], vec![2]));
     }
 
     #[test]

@@ -22,7 +22,7 @@ pub struct Args {
     /// Iterations, instead of the preset's.
     #[arg(long)]
     iterations: Option<u32>,
-    /// Gaussians: `auto` (as many as pay for themselves; at most 100,000 with the preset quick, 300,000 with standard, a
+    /// Gaussians: `auto` (as many as pay for themselves; at most 200,000 with the preset quick, 300,000 with standard, a
     /// million with paper), or exactly how many there may be.
     #[arg(long, default_value = "auto", value_parser = parse_budget)]
     budget: BudgetChoice,
@@ -112,7 +112,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
     let held_out = manifest.held_out(&cameras).iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
     let (preset, preset_degree, preset_most) = match args.preset.as_str() {
-        "quick" => (2_000, 2, 100_000),
+        "quick" => (2_000, 2, 200_000),
         "standard" => (7_000, 2, 300_000),
         _ => (30_000, 3, 1_000_000),
     };

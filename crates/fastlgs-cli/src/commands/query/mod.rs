@@ -52,7 +52,7 @@ pub struct Args {
     /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
     #[arg(long, value_name = "FILE")]
     clip_text: Option<PathBuf>,
-    /// Further objects must score within this of the best, and a part by more than this above the whole.
+    /// Further objects must score within this of the best.
     #[arg(long, default_value_t = QueryConfig::default().margin)]
     margin: f32,
     /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
