@@ -296,7 +296,7 @@ fn every_way_to_ask_ends_in_the_same_object() {
     let photo = fastlgs_core::image_io::load_rgb(&f.photos.join("images/008.png")).expect("the photo");
     let crop = image::imageops::crop_imm(&photo, middle[0], middle[1], middle[2] - middle[0], middle[3] - middle[1]).to_image();
     fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");
-    let picture = ask(&["--image", text(&file("crop.png")), "--min-score", "0.3"]);
+    let picture = ask(&["--image", text(&file("crop.png")), "--min-score", "0.2"]);
     assert_eq!(picture["objects"][0]["id"], id, "{picture}");
 
     // Wider masks, and a text that is ruled out by another one.

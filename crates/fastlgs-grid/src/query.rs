@@ -82,6 +82,13 @@ fn odds(score: f32) -> f32 {
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
 const BORNE_OUT: f32 = 0.9;
 
+/// Of objects that lie in each other, from small to large: the largest that masks bear out about as well as any of them.
+pub fn borne_out(grid: &Grid, nested: &[u16]) -> Option<u16> {
+    let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
+    let best = nested.iter().map(support).fold(0.0, f32::max);
+    nested.iter().rev().find(|id| support(id) >= BORNE_OUT * best).copied()
+}
+
 /// The target objects; empty means "not found". Of things that lie in each other one is taken: of the best and what around
 /// it is hardly less relevant, the largest that the masks bear out about as well as any of them.
 pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
@@ -93,9 +100,7 @@ pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     for hit in ranked.iter().filter(|h| h.score >= floor) {
         let hardly_less = |s: f32| s >= config.min_score && odds(s) >= odds(hit.score) - PART_MARGIN;
         let around: Vec<u16> = grid.chain(hit.id).filter(|id| hardly_less(score[usize::from(*id)])).collect();
-        let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
-        let best = around.iter().map(support).fold(0.0, f32::max);
-        let id = around.iter().rev().find(|id| support(id) >= BORNE_OUT * best).copied().unwrap_or(hit.id);
+        let id = borne_out(grid, &around).unwrap_or(hit.id);
         let nested = |other: &Hit| grid.chain(id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == id);
         if chosen.len() < config.top_k && !chosen.iter().any(nested) {
             chosen.push(Hit { id, score: score[usize::from(id)] });

@@ -8,7 +8,7 @@ pub const CANONICAL: [&str; 3] = ["object", "stuff", "texture"];
 pub const OFFLINE_ANYTHING: f32 = 0.6;
 
 /// The cosine that pictures of unrelated things reach; not calibrated.
-pub const IMAGE_ANYTHING: f32 = 0.75;
+pub const IMAGE_ANYTHING: f32 = 0.6;
 
 /// Factor on the cosines before the softmax: LERF's code has it, its paper does not.
 pub const TEMPERATURE: f32 = 10.0;

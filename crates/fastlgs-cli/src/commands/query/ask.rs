@@ -96,13 +96,10 @@ impl Meaning {
                 if *x >= camera.width || *y >= camera.height {
                     bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
                 }
-                let owner = field.owners(grid).at(*x, *y);
-                let best = grid.chain(owner).map(|id| Hit { id, score: grid.objects[usize::from(id) - 1].support });
-                // Of all that contains the pixel, what the masks bear out best; the larger of equals.
-                let mut ranked: Vec<Hit> = best.collect();
-                ranked.reverse();
-                ranked.sort_by(|a, b| b.score.total_cmp(&a.score));
-                Ok(Found { targets: ranked.first().copied().into_iter().collect(), ranked })
+                let nested: Vec<u16> = grid.chain(field.owners(grid).at(*x, *y)).collect();
+                let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
+                let targets = query::borne_out(grid, &nested).map(hit).into_iter().collect();
+                Ok(Found { ranked: nested.into_iter().map(hit).collect(), targets })
             }
         }
     }
