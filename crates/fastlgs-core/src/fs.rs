@@ -5,11 +5,21 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// Writes `path` through a temporary neighbour that is renamed into place when `write` succeeded.
+/// Writes `path` through a temporary neighbour that is renamed into place when `write` succeeded. A symbolic link stays one: what
+/// it points at is replaced. What is no regular file (`/dev/null`, a pipe) is written to as it is.
 ///
 /// # Errors
 /// Whatever `write` returns, or the system's refusal; the earlier file then stays as it was.
 pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
+    let path = &path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    if path.metadata().is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        let into = |device: File| {
+            let mut device = BufWriter::new(device);
+            write(&mut device)?;
+            device.flush()
+        };
+        return File::options().write(true).open(path).and_then(into).map_err(Error::io(path));
+    }
     if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }
@@ -145,3 +155,31 @@ macro_rules! number {
     };
 }
 number!(u32 u32, i32 i32, u64 u64, f64 f64);
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    /// Run by root, a rename onto `/dev/null` would replace the machine's device by a file.
+    #[test]
+    fn devices_and_links_stay_what_they_are() {
+        use std::os::unix::fs::FileTypeExt;
+        let folder = tempfile::tempdir().expect("a folder");
+        let pipe = folder.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || std::fs::read(pipe).expect("the pipe")
+        });
+        write_atomic(&pipe, |file| file.write_all(b"through")).expect("written");
+        assert_eq!(reader.join().expect("the reader"), b"through");
+        assert!(pipe.metadata().expect("the pipe").file_type().is_fifo());
+
+        let (target, link) = (folder.path().join("target"), folder.path().join("link"));
+        write_atomic(&target, |file| file.write_all(b"old")).expect("written");
+        std::os::unix::fs::symlink("target", &link).expect("a link");
+        write_atomic(&link, |file| file.write_all(b"new")).expect("written");
+        assert!(link.symlink_metadata().expect("the link").is_symlink());
+        assert_eq!(std::fs::read(&target).expect("the target"), b"new");
+    }
+}
