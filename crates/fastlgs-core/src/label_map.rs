@@ -4,6 +4,7 @@ use crate::undistort::Distortion;
 use crate::{Camera, Error, Result, fs, image_io};
 use glam::Vec2;
 use image::{DynamicImage, ImageBuffer, ImageReader, Luma};
+use std::collections::BTreeSet;
 use std::io::Cursor;
 use std::path::Path;
 
@@ -73,6 +74,33 @@ impl LabelMap {
         (Self { labels: self.labels.iter().map(|l| number[usize::from(*l)]).collect(), ..*self }, names)
     }
 
+    /// The map of the pairs (own label, other's label) that occur, numbered in their order from 0; and the pair of each number.
+    ///
+    /// # Panics
+    /// If the maps differ in size.
+    pub fn joint(&self, other: &Self) -> (Self, Vec<(u16, u16)>) {
+        assert_eq!((self.width, self.height), (other.width, other.height), "maps of one view have one size");
+        let ((own, names), (theirs, their_names)) = (self.dense(), other.dense());
+        let place = |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
+        let mut number = vec![None; names.len() * their_names.len()];
+        own.labels.iter().zip(&theirs.labels).for_each(|pair| number[place(pair)] = Some(0));
+        let mut pairs = Vec::new();
+        for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
+            *number = Some(pairs.len() as u16);
+            pairs.push((names[place / their_names.len()], their_names[place % their_names.len()]));
+        }
+        let labels = own.labels.iter().zip(&theirs.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
+        (Self { labels, ..*self }, pairs)
+    }
+
+    /// Pairs of labels (a < b, neither 0) of pixels beside or below each other.
+    pub fn contacts(&self) -> BTreeSet<(u16, u16)> {
+        let (w, n) = (self.width as usize, self.labels.len());
+        let beside = |p: usize| [(p % w + 1 < w).then_some(p + 1), (p + w < n).then_some(p + w)].into_iter().flatten();
+        let pairs = (0..n).flat_map(|p| beside(p).map(move |q| (self.labels[p].min(self.labels[q]), self.labels[p].max(self.labels[q]))));
+        pairs.filter(|(a, b)| *a > 0 && a != b).collect()
+    }
+
     /// The same map at another size, nearest neighbour.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let pick = |n: u32, from: u32, to: u32| ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32;
@@ -138,6 +166,14 @@ mod tests {
         assert_eq!(map.areas()[2], 2);
         let double = map.resized(6, 4);
         assert_eq!((double.at(4, 1), double.at(0, 2), double.at(2, 3)), (300, 65535, 2));
+    }
+
+    #[test]
+    fn pairs_of_labels() {
+        let map = |labels: &[u16]| LabelMap { width: 3, height: 2, labels: labels.to_vec() };
+        let (joint, pairs) = map(&[9, 9, 0, 9, 4, 4]).joint(&map(&[1, 2, 2, 1, 2, 2]));
+        assert_eq!((joint.labels, pairs), (vec![2, 3, 0, 2, 1, 1], vec![(0, 2), (4, 2), (9, 1), (9, 2)]));
+        assert_eq!(map(&[1, 1, 0, 2, 3, 3]).contacts(), BTreeSet::from([(1, 2), (1, 3), (2, 3)]));
     }
 
     #[test]

@@ -184,6 +184,35 @@ pub struct Chosen {
     pub dropped: [usize; 4],
 }
 
+impl Chosen {
+    /// Object of a node of [`Tree`]; 0 for node 0.
+    pub fn object(&self, node: u16) -> u16 {
+        if node > 0 { self.object_of[usize::from(node) - 1] } else { 0 }
+    }
+
+    /// An object and all that contain it, from small to large.
+    fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
+        std::iter::successors(Some(id), |id| Some(self.parents[usize::from(*id) - 1]).filter(|p| *p > 0))
+    }
+
+    /// Objects none of which lies in another one of the same layer: by the number of objects around them.
+    pub fn layers(&self) -> Vec<BTreeSet<u16>> {
+        let mut layers: Vec<BTreeSet<u16>> = Vec::new();
+        for id in 1..=self.parents.len() as u16 {
+            let depth = self.chain(id).skip(1).count();
+            layers.resize(layers.len().max(depth + 1), BTreeSet::new());
+            layers[depth].insert(id);
+        }
+        layers
+    }
+
+    /// For each id 0..=K the object of `layer` that it is or lies in, where `wanted`; 0 for none.
+    pub fn ancestors_on(&self, layer: &BTreeSet<u16>, wanted: impl Fn(u16) -> bool) -> Vec<u16> {
+        let on_layer = |id: u16| self.chain(id).find(|a| layer.contains(a)).filter(|a| wanted(*a));
+        std::iter::once(0).chain((1..=self.parents.len() as u16).map(|id| on_layer(id).unwrap_or(0))).collect()
+    }
+}
+
 /// Chooses the objects among the nodes and numbers them, 1..=K, by falling size, so that none precedes what contains it.
 pub fn choose(tree: &Tree, support: &[Support], pixels: usize, config: &Config) -> Chosen {
     let mut chosen = Chosen::default();
@@ -266,6 +295,16 @@ mod tests {
         assert_eq!(chosen.object_of, [2, 2, 4, 3, 5, 3, 3, 2, 1]);
         assert_eq!(chosen.dropped, [0, 0, 4, 0]);
         assert_eq!(choose(&tree, &support, 800, &Config { min_views: 5, ..config }).dropped, [9, 0, 0, 0]);
+    }
+
+    #[test]
+    fn layers_hold_no_object_inside_another() {
+        // 2 and 3 lie in 1, 4 in 2.
+        let chosen = Chosen { parents: vec![0, 1, 1, 2, 0], ..Chosen::default() };
+        let layers = chosen.layers();
+        assert_eq!(layers, [BTreeSet::from([1, 5]), BTreeSet::from([2, 3]), BTreeSet::from([4])]);
+        assert_eq!(chosen.ancestors_on(&layers[0], |_| true), [0, 1, 1, 1, 1, 5]);
+        assert_eq!(chosen.ancestors_on(&layers[1], |id| id != 3), [0, 0, 2, 0, 2, 0]);
     }
 
     #[test]

@@ -104,7 +104,7 @@ impl OfflineSegmenter {
 }
 
 /// The photo with its longer side at `side`, and no side below a cell of the classifier.
-pub fn at_side(photo: &RgbImage, side: u32) -> RgbImage {
+fn at_side(photo: &RgbImage, side: u32) -> RgbImage {
     let scale = side as f32 / photo.width().max(photo.height()) as f32;
     let size = |n: u32| ((n as f32 * scale).round() as u32).max(32);
     image_io::resize(photo, size(photo.width()), size(photo.height()))

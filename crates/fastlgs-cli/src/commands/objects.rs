@@ -5,14 +5,14 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::consensus::{self, Seen};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
-use fastlgs_grid::tree::{self, Tree};
+use fastlgs_grid::tree::{self, Chosen, Tree};
 use fastlgs_grid::{Grid, codes, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::{Encoder, Level, histogram};
 use image::RgbImage;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// Objects of a scene with the object map of each training view.
 pub struct Objects {
@@ -51,26 +51,8 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         map.save(&folder.objects_path(&camera.name))?;
         maps.push(map);
     }
-    let codes = codes::separated(usize::from(count), &touching(&maps), seed);
+    let codes = codes::separated(usize::from(count), &maps.iter().flat_map(LabelMap::contacts).collect(), seed);
     Ok(Objects { grid: Grid::build(&masks, &object_of, codes), maps })
-}
-
-/// Pairs of objects (a < b) that touch in some view.
-fn touching(maps: &[LabelMap]) -> BTreeSet<(u16, u16)> {
-    let mut pairs = BTreeSet::new();
-    for map in maps {
-        let (w, n) = (map.width as usize, map.labels.len());
-        for p in 0..n {
-            let beside = [(p % w + 1 < w).then_some(p + 1), (p + w < n).then_some(p + w)];
-            for q in beside.into_iter().flatten() {
-                let (a, b) = (map.labels[p], map.labels[q]);
-                if a != b && a.min(b) > 0 {
-                    pairs.insert((a.min(b), a.max(b)));
-                }
-            }
-        }
-    }
-    pairs
 }
 
 /// Gives every Gaussian the object that most of its blending weight falls on, and that object's code.
@@ -125,11 +107,10 @@ pub fn by_consensus(
     let support = tree::support(&tree, training.len(), load)?;
     let chosen = tree::choose(&tree, &support, pixels, &config.objects);
     told("objects", chosen.nodes.len());
-    let object = |node: u16| if node > 0 { chosen.object_of[usize::from(node) - 1] } else { 0 };
-    scene.object_ids = tree.of.iter().map(|node| object(*node)).collect();
+    scene.object_ids = tree.of.iter().map(|node| chosen.object(*node)).collect();
 
     let areas: Vec<&[(u32, usize)]> = chosen.nodes.iter().map(|n| support[*n].areas.as_slice()).collect();
-    let (found, object_of) = embed(folder, training, object, &chosen.parents, &best_views(&areas), common)?;
+    let (found, object_of) = embed(folder, training, &chosen, &best_views(&areas), common)?;
     told("embeddings", found.len());
     let mut grid = Grid::build(&found, &object_of, codes::lattice(chosen.nodes.len(), common.seed));
     for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
@@ -140,26 +121,25 @@ pub fn by_consensus(
     Ok((grid, Summary { regions: regions.seen.len(), parts: parts.seen.len(), few_views, small, unsupported, same }))
 }
 
-/// Embeds every object as its best views show it; also writes the object maps of all views. `object` gives a node's object.
+/// Embeds every object as its best views show it; also writes the object maps of all views.
 fn embed(
     folder: &SceneFolder,
     training: &[Camera],
-    object: impl Fn(u16) -> u16,
-    parents: &[u16],
+    chosen: &Chosen,
     shown: &[Vec<usize>],
     common: &ui::Common,
 ) -> Result<(Vec<Mask>, Vec<u16>)> {
     let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
-    let layers = layers(parents);
+    let layers = chosen.layers();
     let bar = ui::bar(common, training.len() as u64, "embeddings");
     let (mut found, mut object_of, mut impressions) = (Vec::new(), Vec::new(), Vec::new());
     for (view, camera) in training.iter().enumerate() {
         let mut map = folder.objects(&camera.name)?;
-        map.labels.iter_mut().for_each(|l| *l = object(*l));
+        map.labels.iter_mut().for_each(|l| *l = chosen.object(*l));
         map.save(&folder.objects_path(&camera.name))?;
         let photo = folder.photo(&camera.name)?;
         for layer in &layers {
-            let on_layer = ancestors_on(layer, parents, |id| shown[usize::from(id) - 1].contains(&view));
+            let on_layer = chosen.ancestors_on(layer, |id| shown[usize::from(id) - 1].contains(&view));
             let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
             let masks = masks_of(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
             object_of.extend(masks.iter().map(|m| m.label));
@@ -190,20 +170,10 @@ fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], common: &
     let mut seen = [vec![Seen::new(); scene.len()], vec![Seen::new(); scene.len()]];
     let bar = ui::bar(common, training.len() as u64, "votes");
     for (view, camera) in training.iter().enumerate() {
-        let (whole, names) = whole_masks(folder, camera)?.dense();
-        let (part, part_names) = masks(folder, camera, Level::Part)?.map_or_else(|| (whole.clone(), names.clone()), |map| map.dense());
-        // Every pair of labels that occurs is a label of its own; numbered in order, so that votes stay sorted by whole mask.
-        let width = usize::from(part.max()) + 1;
-        let place = |(whole, part): (&u16, &u16)| usize::from(*whole) * width + usize::from(*part);
-        let mut number = vec![None; (usize::from(whole.max()) + 1) * width];
-        whole.labels.iter().zip(&part.labels).for_each(|pair| number[place(pair)] = Some(0));
-        let mut pairs = Vec::new();
-        for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
-            *number = Some(pairs.len() as u16);
-            pairs.push((names[place / width], part_names[place % width]));
-        }
-        let labels = whole.labels.iter().zip(&part.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
-        for vote in lift::votes(scene, camera, &LabelMap { labels, ..whole }) {
+        let whole = whole_masks(folder, camera)?;
+        let part = masks(folder, camera, Level::Part)?.unwrap_or_else(|| whole.clone());
+        let (joint, pairs) = whole.joint(&part);
+        for vote in lift::votes(scene, camera, &joint) {
             let (whole, part) = pairs[usize::from(vote.label)];
             for (seen, label) in seen.iter_mut().zip([whole, part]) {
                 let own = &mut seen[vote.gaussian as usize];
@@ -228,25 +198,6 @@ fn best_views(areas: &[&[(u32, usize)]]) -> Vec<Vec<usize>> {
         areas.into_iter().take(EMBEDDED_VIEWS).map(|a| a.1).collect()
     };
     areas.iter().map(best).collect()
-}
-
-/// Objects none of which lies in another one of the same layer: by the number of objects around them.
-fn layers(parents: &[u16]) -> Vec<BTreeSet<u16>> {
-    let mut layers: Vec<BTreeSet<u16>> = Vec::new();
-    for id in 1..=parents.len() as u16 {
-        let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|p| *p > 0);
-        let depth = std::iter::successors(up(&id), up).count();
-        layers.resize(layers.len().max(depth + 1), BTreeSet::new());
-        layers[depth].insert(id);
-    }
-    layers
-}
-
-/// For each id 0..=K the object of `layer` that it is or lies in, where `wanted`; 0 for none.
-fn ancestors_on(layer: &BTreeSet<u16>, parents: &[u16], wanted: impl Fn(u16) -> bool) -> Vec<u16> {
-    let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|p| *p > 0);
-    let on_layer = |id: u16| std::iter::successors(Some(id), up).find(|a| layer.contains(a)).filter(|a| wanted(*a));
-    std::iter::once(0).chain((1..=parents.len() as u16).map(|id| on_layer(id).unwrap_or(0))).collect()
 }
 
 /// Embedding and colour distribution of every mask of a photo, by label.
@@ -278,19 +229,4 @@ fn masks(folder: &SceneFolder, camera: &Camera, level: Level) -> Result<Option<L
 fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
     let path = folder.masks_path(Level::Whole.name(), &camera.name);
     masks(folder, camera, Level::Whole)?.with_context(|| format!("{} is missing; run 'fastlgs preprocess' again", path.display()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn layers_hold_no_object_inside_another() {
-        // 2 and 3 lie in 1, 4 in 2.
-        let parents = [0, 1, 1, 2, 0];
-        let layers = layers(&parents);
-        assert_eq!(layers, [BTreeSet::from([1, 5]), BTreeSet::from([2, 3]), BTreeSet::from([4])]);
-        assert_eq!(ancestors_on(&layers[0], &parents, |_| true), [0, 1, 1, 1, 1, 5]);
-        assert_eq!(ancestors_on(&layers[1], &parents, |id| id != 3), [0, 0, 2, 0, 2, 0]);
-    }
 }

@@ -334,15 +334,16 @@ fn describe(
     let identity = args.eyes.encoder_identity()?;
     for ViewMasks { view, labels } in segmented {
         let photo = &training[*view];
-        let make = || objects::masks_of(&photo.camera.name, &photo.pixels, *view, labels, encoder);
-        let of_view = match &identity {
+        let make = || objects::masks_of(&photo.camera.name, &photo.pixels, 0, labels, encoder);
+        let of_view: Vec<Mask> = match &identity {
             Some(identity) => {
-                let inputs = [&photo.key, bytemuck::cast_slice(&labels.labels), &view.to_le_bytes(), identity.as_bytes()];
+                let inputs = [&photo.key, bytemuck::cast_slice(&labels.labels), identity.as_bytes()];
                 cache.get("embeddings", &cache::key(&inputs), make)?
             }
             None => make()?,
         };
-        masks.extend(of_view);
+        // A photo keeps what is known of it when others come or go before it.
+        masks.extend(of_view.into_iter().map(|mask| Mask { view: *view, ..mask }));
         bar.inc(1);
     }
     bar.finish_and_clear();

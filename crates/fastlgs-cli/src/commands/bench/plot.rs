@@ -17,28 +17,42 @@ pub struct Line {
     pub points: Vec<(f64, f64)>,
 }
 
-/// Draws the lines; atomically.
-pub fn write(path: &Path, axes: &Axes, lines: &[Line]) -> Result<()> {
+type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
+type Drawn = Result<(), Box<dyn std::error::Error>>;
+
+/// Draws on a white sheet and writes it, atomically.
+fn save(path: &Path, draw: impl FnOnce(&Area) -> Drawn) -> Result<()> {
     let mut svg = String::new();
-    draw(&mut svg, axes, lines).map_err(|e| anyhow!("{}: the chart cannot be drawn: {e}", path.display()))?;
+    let drawn = (|| -> Drawn {
+        let area = SVGBackend::with_string(&mut svg, (860, 560)).into_drawing_area();
+        area.fill(&WHITE)?;
+        draw(&area)?;
+        Ok(area.present()?)
+    })();
+    drawn.map_err(|e| anyhow!("{}: the chart cannot be drawn: {e}", path.display()))?;
     Ok(fastlgs_core::fs::write_atomic(path, |file| std::io::Write::write_all(file, svg.as_bytes()))?)
 }
 
-fn draw(svg: &mut String, axes: &Axes, lines: &[Line]) -> Result<(), Box<dyn std::error::Error>> {
+/// A chart with its title and room for the axes.
+fn titled<'a, 'b>(area: &'a Area<'b>, axes: &Axes) -> ChartBuilder<'a, 'b, SVGBackend<'b>> {
+    let mut chart = ChartBuilder::on(area);
+    chart.caption(axes.title, ("sans-serif", 20)).margin(16).x_label_area_size(44).y_label_area_size(60);
+    chart
+}
+
+/// Draws the lines.
+pub fn write(path: &Path, axes: &Axes, lines: &[Line]) -> Result<()> {
+    save(path, |area| draw(area, axes, lines))
+}
+
+fn draw(area: &Area, axes: &Axes, lines: &[Line]) -> Drawn {
     let points = || lines.iter().flat_map(|l| &l.points).filter(|p| p.0 > 0.0 && p.1 > 0.0);
     // Half an octave of room around the points.
     let range = |of: fn(&(f64, f64)) -> f64| {
         let (low, high) = points().map(of).fold((f64::INFINITY, 0.0f64), |(l, h), v| (l.min(v), h.max(v)));
         if low.is_finite() { low / 1.5..high * 1.5 } else { 1.0..10.0 }
     };
-    let area = SVGBackend::with_string(svg, (860, 560)).into_drawing_area();
-    area.fill(&WHITE)?;
-    let mut chart = ChartBuilder::on(&area)
-        .caption(axes.title, ("sans-serif", 20))
-        .margin(16)
-        .x_label_area_size(44)
-        .y_label_area_size(60)
-        .build_cartesian_2d(range(|p| p.0).log_scale(), range(|p| p.1).log_scale())?;
+    let mut chart = titled(area, axes).build_cartesian_2d(range(|p| p.0).log_scale(), range(|p| p.1).log_scale())?;
     chart.configure_mesh().x_desc(axes.x).y_desc(axes.y).draw()?;
     for (k, line) in lines.iter().enumerate() {
         let color = Palette99::pick(k).to_rgba();
@@ -47,8 +61,6 @@ fn draw(svg: &mut String, axes: &Axes, lines: &[Line]) -> Result<(), Box<dyn std
         entry.legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], color.stroke_width(2)));
     }
     chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
-    area.present()?;
-    drop(chart);
     Ok(())
 }
 
@@ -63,24 +75,15 @@ pub struct Spot {
     pub front: bool,
 }
 
-/// Draws named spots over logarithmic x and y from 0 to 1; those of the front are filled and joined. Atomically.
+/// Draws named spots over logarithmic x and y from 0 to 1; those of the front are filled and joined.
 pub fn scatter(path: &Path, axes: &Axes, spots: &[Spot]) -> Result<()> {
-    let mut svg = String::new();
-    draw_spots(&mut svg, axes, spots).map_err(|e| anyhow!("{}: the chart cannot be drawn: {e}", path.display()))?;
-    Ok(fastlgs_core::fs::write_atomic(path, |file| std::io::Write::write_all(file, svg.as_bytes()))?)
+    save(path, |area| draw_spots(area, axes, spots))
 }
 
-fn draw_spots(svg: &mut String, axes: &Axes, spots: &[Spot]) -> Result<(), Box<dyn std::error::Error>> {
+fn draw_spots(area: &Area, axes: &Axes, spots: &[Spot]) -> Drawn {
     let (low, high) = spots.iter().fold((f64::INFINITY, 0.0f64), |(l, h), s| (l.min(s.x), h.max(s.x)));
     let range = if low.is_finite() { low.max(0.01) / 1.5..high.max(0.02) * 3.0 } else { 1.0..10.0 };
-    let area = SVGBackend::with_string(svg, (860, 560)).into_drawing_area();
-    area.fill(&WHITE)?;
-    let mut chart = ChartBuilder::on(&area)
-        .caption(axes.title, ("sans-serif", 20))
-        .margin(16)
-        .x_label_area_size(44)
-        .y_label_area_size(60)
-        .build_cartesian_2d(range.log_scale(), 0.0..1.0f64)?;
+    let mut chart = titled(area, axes).build_cartesian_2d(range.log_scale(), 0.0..1.0f64)?;
     chart.configure_mesh().x_desc(axes.x).y_desc(axes.y).draw()?;
     let series: std::collections::BTreeSet<&String> = spots.iter().map(|s| &s.series).collect();
     for (k, name) in series.into_iter().enumerate() {
@@ -98,7 +101,5 @@ fn draw_spots(svg: &mut String, axes: &Axes, spots: &[Spot]) -> Result<(), Box<d
         }))?;
     }
     chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
-    area.present()?;
-    drop(chart);
     Ok(())
 }
