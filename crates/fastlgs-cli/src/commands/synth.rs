@@ -3,26 +3,27 @@
 use crate::scene::parse_size;
 use crate::{Outcome, report, ui};
 use anyhow::{Result, bail};
-use fastlgs_core::synth::{self, Room};
+use clap::builder::PossibleValue;
+use fastlgs_core::synth::{self, KINDS, Kind};
 use fastlgs_vision::models;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs synth room -o photos/room --views 40 --size 320x240")]
+#[command(after_help = "Example: fastlgs synth table -o photos/table --views 40 --size 320x240")]
 pub struct Args {
-    /// Kind of scene: `room` (four blocks with pictures in a brick room).
-    #[arg(value_parser = ["room"])]
+    /// Kind of scene.
+    #[arg(value_parser = kinds())]
     kind: String,
-    /// Folder to write: images/, transforms.json, masks/, depth/, labels/.
+    /// Folder to write: images/, transforms.json, masks/ of three levels, depth/, labels/.
     #[arg(short, long)]
     output: PathBuf,
-    /// Number of photos.
-    #[arg(long, default_value_t = 40)]
-    views: usize,
+    /// Number of photos; by default 40 for most kinds.
+    #[arg(long)]
+    views: Option<usize>,
     /// Size of the photos.
     #[arg(long, default_value = "320x240", value_parser = parse_size)]
     size: (u32, u32),
-    /// Folder of the pictures, instead of the installed ones.
+    /// Folder of the room's pictures, instead of the installed ones.
     #[arg(long)]
     pictures: Option<PathBuf>,
     /// Every N-th view is labelled, to be held out.
@@ -30,22 +31,27 @@ pub struct Args {
     holdout: usize,
 }
 
+fn kinds() -> Vec<PossibleValue> {
+    KINDS.iter().map(|(name, _, about)| PossibleValue::new(name).help(about)).collect()
+}
+
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    if args.views < 4 {
-        bail!("--views {}: at least 4 are needed", args.views);
+    let kind = Kind::of(&args.kind).expect("clap knows the kinds");
+    let views = args.views.unwrap_or(kind.views());
+    if views < 4 {
+        bail!("--views {views}: at least 4 are needed");
     }
     let pictures = args.pictures.clone().unwrap_or_else(models::pictures_dir);
-    let room = Room::new(&pictures, common.seed)?;
-    let cameras = Room::cameras(args.views, args.size.0, args.size.1);
-    let bar = ui::bar(common, args.views as u64, "synth");
-    synth::write(&args.output, &room, &cameras, args.holdout, || bar.inc(1))?;
+    let world = kind.world(&pictures, views, args.size, common.seed)?;
+    let bar = ui::bar(common, views as u64, "synth");
+    synth::write(&args.output, &world, args.holdout, || bar.inc(1))?;
     bar.finish_and_clear();
     let value = serde_json::json!({
         "kind": args.kind,
         "photos": args.output,
-        "views": args.views,
+        "views": views,
         "size": format!("{}x{}", args.size.0, args.size.1),
-        "objects": room.names(),
+        "objects": world.things.iter().map(|t| &t.name).collect::<Vec<_>>(),
     });
     report::give(common, &value)?;
     Ok(Outcome::Done)

@@ -1,0 +1,113 @@
+//! A tree of boxes around solids: the nearest hit of a ray without asking each solid.
+
+use super::solid::{Crossing, Solid};
+use glam::Vec3;
+
+/// Boxes that halve the solids until few are left.
+pub struct Hierarchy {
+    nodes: Vec<Node>,
+    /// Solids in the order of the leaves.
+    order: Vec<u32>,
+}
+
+struct Node {
+    bounds: [Vec3; 2],
+    /// Solids `first..first + count` of `order`, or the right child's place with count 0; the left child follows its parent.
+    first: u32,
+    count: u32,
+}
+
+/// Solids in a leaf.
+const FEW: usize = 4;
+
+impl Hierarchy {
+    /// Builds the tree.
+    pub fn new(solids: &[Solid]) -> Self {
+        let mut tree = Self { nodes: Vec::new(), order: (0..solids.len() as u32).collect() };
+        let bounds: Vec<[Vec3; 2]> = solids.iter().map(Solid::bounds).collect();
+        tree.split(&bounds, 0, solids.len());
+        tree
+    }
+
+    fn split(&mut self, bounds: &[[Vec3; 2]], from: usize, to: usize) {
+        let place = self.nodes.len();
+        let around = self.order[from..to].iter().fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[low, high], i| {
+            let [l, h] = bounds[*i as usize];
+            [low.min(l), high.max(h)]
+        });
+        self.nodes.push(Node { bounds: around, first: from as u32, count: (to - from) as u32 });
+        if to - from <= FEW {
+            return;
+        }
+        let axis = (around[1] - around[0]).max_position();
+        let middle = |i: &u32| bounds[*i as usize][0][axis] + bounds[*i as usize][1][axis];
+        self.order[from..to].sort_by(|a, b| middle(a).total_cmp(&middle(b)).then(a.cmp(b)));
+        let half = usize::midpoint(from, to);
+        self.split(bounds, from, half);
+        let right = self.nodes.len() as u32;
+        self.split(bounds, half, to);
+        (self.nodes[place].first, self.nodes[place].count) = (right, 0);
+    }
+
+    /// The solid that a ray meets first, and where.
+    pub fn nearest(&self, solids: &[Solid], origin: Vec3, direction: Vec3) -> Option<(usize, Crossing)> {
+        let inverse = direction.recip();
+        let mut best: Option<(usize, Crossing)> = None;
+        let mut stack = vec![0usize];
+        while let Some(place) = stack.pop() {
+            let node = &self.nodes[place];
+            let (a, b) = ((node.bounds[0] - origin) * inverse, (node.bounds[1] - origin) * inverse);
+            let (enter, exit) = (a.min(b).max_element(), a.max(b).min_element());
+            if exit < enter.max(0.0) || best.is_some_and(|(_, hit)| enter > hit.t) {
+                continue;
+            }
+            if node.count == 0 {
+                stack.extend([node.first as usize, place + 1]);
+                continue;
+            }
+            for &i in &self.order[node.first as usize..(node.first + node.count) as usize] {
+                let hit = solids[i as usize].hit(origin, direction);
+                if let Some(hit) = hit.filter(|h| best.is_none_or(|(_, b)| h.t < b.t)) {
+                    best = Some((i as usize, hit));
+                }
+            }
+        }
+        best
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::solid::Shape;
+    use super::super::surface::Surface;
+    use super::*;
+    use crate::rng::Rng;
+    use glam::Mat3;
+
+    #[test]
+    fn the_tree_finds_what_asking_everyone_finds() {
+        let mut rng = Rng::new(1, "hierarchy");
+        let mut point = |reach: f32| Vec3::from_array(std::array::from_fn(|_| rng.range(-reach, reach)));
+        let solids: Vec<Solid> = (0..200)
+            .map(|k| Solid {
+                shape: [Shape::Ball, Shape::Block, Shape::Cylinder, Shape::Cone][k % 4],
+                centre: point(5.0),
+                half: point(0.3).abs() + 0.05,
+                turn: Mat3::from_rotation_y(k as f32),
+                surface: Surface::plain(Vec3::ONE),
+                thing: k as u16 + 1,
+            })
+            .collect();
+        let tree = Hierarchy::new(&solids);
+        let mut hits = 0;
+        for _ in 0..2000 {
+            let (origin, direction) = (point(6.0), point(1.0));
+            let all = solids.iter().enumerate().filter_map(|(i, s)| Some((i, s.hit(origin, direction)?.t)));
+            let nearest = all.min_by(|a, b| a.1.total_cmp(&b.1));
+            let found = tree.nearest(&solids, origin, direction).map(|(i, hit)| (i, hit.t));
+            assert_eq!(found, nearest);
+            hits += usize::from(found.is_some());
+        }
+        assert!(hits > 150, "{hits} of 2000 rays hit something");
+    }
+}

@@ -1,0 +1,456 @@
+//! The kinds of generated scenes: each shows one thing that methods fail at.
+
+use super::hierarchy::Hierarchy;
+use super::props::{self, Look, Piece};
+use super::solid::{Shape, Solid};
+use super::surface::Surface;
+use super::{Backdrop, Thing, World};
+use crate::rng::Rng;
+use crate::{Camera, Error, Result, image_io};
+use glam::{Mat3, Vec3};
+use std::f32::consts::{FRAC_PI_2, TAU};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Pictures that the room needs, by file name: all of them ship with scikit-image.
+pub const PICTURES: [(&str, &str); 4] =
+    [("cat", "chelsea.png"), ("coffee", "coffee.png"), ("rocket", "rocket.jpg"), ("astronaut", "astronaut.png")];
+/// Textures of its floor and walls.
+pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
+
+/// What a generated scene is about: [`KINDS`] says it for each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs)]
+pub enum Kind {
+    Room,
+    Table,
+    Twins,
+    Nested,
+    Thin,
+    Mirror,
+    Glass,
+    Dark,
+    Sparse,
+    Long,
+    Big,
+}
+
+/// Every kind with its name and what it shows.
+pub const KINDS: [(&str, Kind, &str); 11] = [
+    ("room", Kind::Room, "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room"),
+    ("table", Kind::Table, "a dozen different things on a table"),
+    ("twins", Kind::Twins, "three pairs of the same thing, side by side"),
+    ("nested", Kind::Nested, "things with parts with parts"),
+    ("thin", Kind::Thin, "wires, spokes and leaves"),
+    ("mirror", Kind::Mirror, "things before a mirror and a mirrored ball"),
+    ("glass", Kind::Glass, "things behind a pane and a ball of glass"),
+    ("dark", Kind::Dark, "the table under light that drifts from view to view"),
+    ("sparse", Kind::Sparse, "the table, seen from few places"),
+    ("long", Kind::Long, "a walk along a corridor that ends where it began"),
+    ("big", Kind::Big, "a thousand things"),
+];
+
+/// Colours by name, in the order in which things get them.
+const COLORS: [(&str, Vec3); 12] = [
+    ("red", Vec3::new(0.85, 0.12, 0.12)),
+    ("blue", Vec3::new(0.15, 0.3, 0.85)),
+    ("green", Vec3::new(0.15, 0.6, 0.2)),
+    ("yellow", Vec3::new(0.95, 0.85, 0.15)),
+    ("purple", Vec3::new(0.5, 0.2, 0.65)),
+    ("orange", Vec3::new(0.95, 0.5, 0.1)),
+    ("white", Vec3::new(0.92, 0.92, 0.9)),
+    ("pink", Vec3::new(0.95, 0.5, 0.65)),
+    ("brown", Vec3::new(0.45, 0.28, 0.15)),
+    ("turquoise", Vec3::new(0.2, 0.75, 0.7)),
+    ("black", Vec3::new(0.1, 0.1, 0.12)),
+    ("grey", Vec3::new(0.5, 0.5, 0.52)),
+];
+
+/// Height of the table's top.
+const TABLE: f32 = 0.75;
+
+impl Kind {
+    /// The kind of a name.
+    pub fn of(name: &str) -> Option<Self> {
+        KINDS.iter().find(|k| k.0 == name).map(|k| k.1)
+    }
+
+    /// Photos, where the user names no number.
+    pub fn views(self) -> usize {
+        match self {
+            Self::Sparse => 8,
+            Self::Long => 200,
+            Self::Big => 60,
+            _ => 40,
+        }
+    }
+
+    /// Builds the scene with `views` cameras of `size`. `pictures` is the folder of [`PICTURES`] and [`TEXTURES`], which only the room needs.
+    ///
+    /// # Errors
+    /// When a picture is missing.
+    pub fn world(self, pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<World> {
+        let mut build = Builder::new(seed);
+        let ring = Ring { radius: 2.9, height: 1.75, wave: 0.35, target: Vec3::Y * (TABLE + 0.12), fov: 0.85 };
+        let mut cameras = ring.cameras(views, size);
+        let mut exposures = vec![Vec3::ONE; views];
+        match self {
+            Self::Room => return room(pictures, views, size, seed),
+            Self::Table | Self::Sparse => build.dozen(),
+            Self::Dark => {
+                build.dozen();
+                exposures = (0..views).map(|k| drift(k as f32 / views as f32)).collect();
+            }
+            Self::Twins => build.twins(),
+            Self::Nested => build.nested(),
+            Self::Thin => build.thin(),
+            Self::Mirror => build.mirrors(),
+            Self::Glass => build.glass(),
+            Self::Long => {
+                build.corridor();
+                cameras = walk(views, size);
+            }
+            Self::Big => {
+                build.thousand();
+                let ring = Ring { radius: 6.0, height: 4.2, wave: 0.5, target: Vec3::ZERO, fov: 0.9 };
+                cameras = ring.cameras(views, size);
+            }
+        }
+        let half = if self == Self::Long { CORRIDOR } else { Vec3::new(7.5, 3.0, 7.5) };
+        let wall = |a: [f32; 3], b: [f32; 3], grain: f32| Surface::Grain { colors: [a.into(), b.into()], grain };
+        let backdrop = Backdrop {
+            half,
+            floor: wall([0.35, 0.3, 0.25], [0.6, 0.53, 0.45], 3.0),
+            walls: wall([0.5, 0.55, 0.6], [0.75, 0.78, 0.78], 1.6),
+            ceiling: wall([0.8, 0.8, 0.78], [0.88, 0.88, 0.86], 1.0),
+        };
+        Ok(build.finish(cameras, exposures, backdrop))
+    }
+}
+
+/// Cameras on a wavy ring that look at one point.
+struct Ring {
+    radius: f32,
+    height: f32,
+    wave: f32,
+    target: Vec3,
+    fov: f32,
+}
+
+impl Ring {
+    fn cameras(&self, count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
+        let at = |k: usize| {
+            let angle = TAU * k as f32 / count as f32;
+            let eye = Vec3::new(self.radius * angle.cos(), self.height + self.wave * (3.0 * angle).sin(), self.radius * angle.sin());
+            Camera::look_at(&format!("{k:03}.png"), eye, self.target, Vec3::Y, width, height, self.fov)
+        };
+        (0..count).map(at).collect()
+    }
+}
+
+/// Half extents of the corridor's outside, and of the block that it goes around.
+const CORRIDOR: Vec3 = Vec3::new(6.5, 1.5, 6.5);
+const CORE: Vec3 = Vec3::new(3.5, 1.5, 3.5);
+
+/// A point of the square path in the middle of the corridor; `along` in 0..1.
+fn path(along: f32) -> Vec3 {
+    let side = 4.0 * along.rem_euclid(1.0);
+    let r = 0.5 * (CORRIDOR.x + CORE.x);
+    let t = 2.0 * side.fract() - 1.0;
+    // Corners are cut, as feet do.
+    let cut = |v: f32| v.clamp(-0.8, 0.8);
+    let p = match side as u32 {
+        0 => Vec3::new(1.0, 0.0, cut(t)),
+        1 => Vec3::new(cut(-t), 0.0, 1.0),
+        2 => Vec3::new(-1.0, 0.0, cut(-t)),
+        _ => Vec3::new(cut(t), 0.0, -1.0),
+    };
+    p * r
+}
+
+/// A walk along the corridor, looking ahead and to both sides.
+fn walk(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
+    let at = |k: usize| {
+        let along = k as f32 / count as f32;
+        // The mean of a stretch of path, so that corners are rounded.
+        let smooth = |from: f32| (0..9).map(|s| path(from + (s as f32 - 4.0) * 0.008)).sum::<Vec3>() / 9.0;
+        let (eye, ahead) = (smooth(along) + Vec3::Y * 1.25, smooth(along + 0.05) + Vec3::Y * 0.75);
+        let sway = Mat3::from_rotation_y(0.55 * (TAU * k as f32 / 17.0).sin());
+        Camera::look_at(&format!("{k:03}.png"), eye, eye + sway * (ahead - eye), Vec3::Y, width, height, 0.95)
+    };
+    (0..count).map(at).collect()
+}
+
+/// Light that goes from full to a third and back twice, and from warm to cold once.
+fn drift(along: f32) -> Vec3 {
+    let level = 0.67 + 0.33 * (2.0 * TAU * along).cos();
+    let warmth = 0.12 * (TAU * along).sin();
+    Vec3::new(1.0 + warmth, 1.0, 1.0 - warmth) * level
+}
+
+/// What the thing's own colour is made of.
+#[derive(Clone, Copy)]
+enum Material {
+    Grain(Vec3),
+    Mirror,
+    Glass,
+}
+
+/// A world that grows thing by thing.
+struct Builder {
+    things: Vec<Thing>,
+    solids: Vec<Solid>,
+    rng: Rng,
+}
+
+/// Where a thing stands.
+struct Place {
+    at: Vec3,
+    scale: f32,
+    yaw: f32,
+}
+
+impl Builder {
+    fn new(seed: u64) -> Self {
+        Self { things: Vec::new(), solids: Vec::new(), rng: Rng::new(seed, "synth things") }
+    }
+
+    /// The number of a thing with a name and parent, made where there is none.
+    fn thing(&mut self, name: &str, parent: u16) -> u16 {
+        let thing = Thing { name: name.to_owned(), parent };
+        let known = self.things.iter().position(|t| *t == thing);
+        let place = known.unwrap_or_else(|| {
+            self.things.push(thing);
+            self.things.len() - 1
+        });
+        place as u16 + 1
+    }
+
+    /// Adds a thing; with `parts`, its parts are things of their own ("NAME's PART").
+    fn add(&mut self, name: &str, pieces: Vec<Piece>, material: Material, place: &Place, parts: bool) {
+        let whole = self.thing(name, 0);
+        let to_world = Mat3::from_rotation_y(place.yaw);
+        for piece in pieces {
+            let path = if parts { piece.part.as_slice() } else { &[] };
+            let thing = path.iter().fold(whole, |parent, part| self.thing(&format!("{name}'s {part}"), parent));
+            let own = Mat3::from_rotation_z(piece.tilt[0]) * Mat3::from_rotation_x(piece.tilt[1]);
+            let surface = match (piece.look, material) {
+                (Look::Fixed(color), _) => Surface::plain(color),
+                (Look::Own(factor), Material::Grain(color)) => Surface::grained(color * factor, 2.2),
+                (Look::Own(_), Material::Mirror) => Surface::Mirror(Vec3::splat(0.92)),
+                (Look::Own(_), Material::Glass) => Surface::Glass(Vec3::new(0.9, 0.97, 0.95)),
+            };
+            self.solids.push(Solid {
+                shape: piece.shape,
+                centre: place.at + place.scale * (to_world * piece.centre),
+                half: place.scale * piece.half,
+                turn: (to_world * own).transpose(),
+                surface,
+                thing,
+            });
+        }
+    }
+
+    fn table(&mut self) {
+        let slab = |centre: Vec3, half: Vec3, thing: u16| Solid {
+            shape: Shape::Block,
+            centre,
+            half,
+            turn: Mat3::IDENTITY,
+            surface: Surface::Grain { colors: [Vec3::new(0.4, 0.25, 0.13), Vec3::new(0.66, 0.45, 0.26)], grain: 6.0 },
+            thing,
+        };
+        let table = self.thing("wooden table", 0);
+        self.solids.push(slab(Vec3::Y * (TABLE - 0.04), Vec3::new(1.35, 0.04, 1.35), table));
+        for (x, z) in [(-1.2, -1.2), (-1.2, 1.2), (1.2, -1.2), (1.2, 1.2)] {
+            self.solids.push(slab(Vec3::new(x, 0.5 * (TABLE - 0.08), z), Vec3::new(0.06, 0.5 * (TABLE - 0.08), 0.06), table));
+        }
+    }
+
+    /// A place on a circle on the table.
+    fn on_table(&mut self, radius: f32, turn: f32, scale: f32) -> Place {
+        let (s, c) = (TAU * turn).sin_cos();
+        Place { at: Vec3::new(radius * c, TABLE, radius * s), scale, yaw: self.rng.range(0.0, TAU) }
+    }
+
+    /// Every entry of the catalogue once, in colours dealt at random.
+    fn dozen(&mut self) {
+        self.table();
+        let mut colors = COLORS;
+        self.rng.shuffle(&mut colors);
+        let mut order: Vec<usize> = (0..props::CATALOGUE.len()).collect();
+        self.rng.shuffle(&mut order);
+        for (k, entry) in order.into_iter().enumerate() {
+            let (name, make) = props::CATALOGUE[entry];
+            let (color_name, color) = colors[entry];
+            let place = if k < 4 { self.on_table(0.42, k as f32 / 4.0, 0.42) } else { self.on_table(1.02, k as f32 / 8.0, 0.42) };
+            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+        }
+    }
+
+    fn twins(&mut self) {
+        self.table();
+        let pairs: [(&str, fn() -> Vec<Piece>, usize, f32); 3] =
+            [("mug", props::mug, 0, 0.0), ("lamp", props::lamp, 1, 1.0), ("ball", || props::CATALOGUE[1].1(), 3, 2.0)];
+        for (name, make, color, third) in pairs {
+            let (s, c) = (TAU * third / 3.0).sin_cos();
+            for (twin, side) in [(1, -1.0), (2, 1.0)] {
+                // Side by side as seen from the middle.
+                let at = Vec3::new(0.75 * c - side * 0.27 * s, TABLE, 0.75 * s + side * 0.27 * c);
+                let place = Place { at, scale: 0.5, yaw: 0.0 };
+                self.add(&format!("{} {name} {twin}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, false);
+            }
+        }
+    }
+
+    fn nested(&mut self) {
+        self.table();
+        let things: [(&str, fn() -> Vec<Piece>, usize); 6] = [
+            ("cart", props::cart, 0),
+            ("cabinet", props::cabinet, 8),
+            ("lamp", props::lamp, 9),
+            ("cart", props::cart, 1),
+            ("cabinet", props::cabinet, 2),
+            ("mug", props::mug, 5),
+        ];
+        for (k, (name, make, color)) in things.into_iter().enumerate() {
+            let turn = k as f32 / 6.0;
+            // Drawers look outwards.
+            let place = Place { yaw: FRAC_PI_2 - TAU * turn, ..self.on_table(0.88, turn, 0.55) };
+            self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, true);
+        }
+    }
+
+    fn thin(&mut self) {
+        self.table();
+        let things: [(&str, fn() -> Vec<Piece>, usize); 6] = [
+            ("wire cube", props::wire_frame, 0),
+            ("spoked wheel", props::spoked_wheel, 11),
+            ("plant", props::plant, 8),
+            ("wire cube", props::wire_frame, 1),
+            ("spoked wheel", props::spoked_wheel, 5),
+            ("plant", props::plant, 4),
+        ];
+        for (k, (name, make, color)) in things.into_iter().enumerate() {
+            let place = self.on_table(0.8, k as f32 / 6.0, 0.65);
+            self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, false);
+        }
+    }
+
+    /// Some of the catalogue on the table's outer circle, at these places out of eight.
+    fn around(&mut self, places: &[usize]) {
+        self.table();
+        for &k in places {
+            let ((name, make), (color_name, color)) = (props::CATALOGUE[k], COLORS[k]);
+            let place = self.on_table(0.95, k as f32 / 8.0, 0.45);
+            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+        }
+    }
+
+    fn mirrors(&mut self) {
+        self.around(&[0, 1, 3, 4, 5, 7]);
+        self.add("mirror", props::slab(), Material::Mirror, &Place { at: Vec3::Y * TABLE, scale: 0.75, yaw: 0.3 }, false);
+        let place = self.on_table(0.95, 0.25, 0.5);
+        self.add("mirrored ball", props::CATALOGUE[1].1(), Material::Mirror, &place, false);
+    }
+
+    fn glass(&mut self) {
+        self.around(&[0, 1, 3, 4, 5, 7]);
+        self.add("glass pane", props::slab(), Material::Glass, &Place { at: Vec3::Y * TABLE, scale: 0.75, yaw: 0.3 }, false);
+        let place = self.on_table(0.95, 0.25, 0.5);
+        self.add("glass ball", props::CATALOGUE[1].1(), Material::Glass, &place, false);
+    }
+
+    fn corridor(&mut self) {
+        let walls = Surface::Grain { colors: [Vec3::new(0.6, 0.5, 0.4), Vec3::new(0.85, 0.76, 0.66)], grain: 9.0 };
+        let centre = Vec3::Y * CORE.y;
+        self.solids.push(Solid { shape: Shape::Block, centre, half: CORE, turn: Mat3::IDENTITY, surface: walls, thing: 0 });
+        for k in 0..24 {
+            let ((name, make), (color_name, color)) = (props::CATALOGUE[k % 12], COLORS[(k + k / 12 * 5) % 12]);
+            let out = if k % 2 == 0 { 1.18 } else { 0.8 };
+            let place = Place { at: path((k as f32 + 0.5) / 24.0) * out, scale: 0.75, yaw: self.rng.range(0.0, TAU) };
+            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+        }
+    }
+
+    fn thousand(&mut self) {
+        for k in 0..1000 {
+            let (name, make) = props::CATALOGUE[self.rng.below(12)];
+            let (color_name, color) = COLORS[self.rng.below(12)];
+            let at = Vec3::new((k % 40) as f32 - 19.5, 0.0, (k / 40) as f32 - 12.0) * Vec3::new(0.25, 0.0, 0.3);
+            let jitter = Vec3::new(self.rng.range(-0.02, 0.02), 0.0, self.rng.range(-0.04, 0.04));
+            let place = Place { at: at + jitter, scale: self.rng.range(0.17, 0.21), yaw: self.rng.range(0.0, TAU) };
+            self.add(&format!("{color_name} {name} {}", k + 1), make(), Material::Grain(color), &place, false);
+        }
+    }
+
+    fn finish(self, cameras: Vec<Camera>, exposures: Vec<Vec3>, backdrop: Backdrop) -> World {
+        World { tree: Hierarchy::new(&self.solids), things: self.things, cameras, exposures, solids: self.solids, backdrop }
+    }
+}
+
+/// Blocks with pictures, on a ring and turned at random.
+fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<World> {
+    let load = |file: &str| {
+        let path = pictures.join(file);
+        if !path.is_file() {
+            return Err(Error::Invalid(format!("{}: the picture is missing; run 'fastlgs models install-offline'", path.display())));
+        }
+        Ok(Arc::new(image_io::load_rgb(&path)?))
+    };
+    let mut rng = Rng::new(seed, "synth room");
+    let mut build = Builder::new(seed);
+    for (k, (name, file)) in PICTURES.into_iter().enumerate() {
+        let angle = TAU * (k as f32 + 0.25 * rng.uniform()) / PICTURES.len() as f32;
+        let picture = load(file)?;
+        let aspect = picture.width() as f32 / picture.height() as f32;
+        let height = rng.range(0.42, 0.55);
+        let half = Vec3::new(height * aspect.min(1.3), height, height * aspect.min(1.3));
+        let centre = Vec3::new(1.15 * angle.cos(), half.y, 1.15 * angle.sin());
+        let turn = Mat3::from_rotation_y(rng.range(-0.6, 0.6) - angle);
+        let thing = build.thing(name, 0);
+        build.solids.push(Solid { shape: Shape::Block, centre, half, turn, surface: Surface::Picture(picture), thing });
+    }
+    let [floor, walls] = TEXTURES;
+    let backdrop = Backdrop {
+        half: Vec3::new(5.0, 2.0, 5.0),
+        floor: Surface::Tiles { picture: load(floor)?, tint: Vec3::ONE, times: 0.5 },
+        walls: Surface::Tiles { picture: load(walls)?, tint: Vec3::new(1.0, 0.9, 0.82), times: 0.4 },
+        ceiling: Surface::Grain { colors: [Vec3::new(0.882, 0.871, 0.839); 2], grain: 1.0 },
+    };
+    let ring = Ring { radius: 3.4, height: 1.5, wave: 0.35, target: Vec3::new(0.0, 0.35, 0.0), fov: 0.85 };
+    Ok(build.finish(ring.cameras(views, size), vec![Vec3::ONE; views], backdrop))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every thing can be seen, and names tell things apart.
+    #[test]
+    fn kinds_show_what_they_name() {
+        for (name, kind, _) in KINDS.into_iter().filter(|k| k.1 != Kind::Room) {
+            let views = if kind == Kind::Long { 40 } else { 6 };
+            let size = if kind == Kind::Big { (320, 240) } else { (120, 90) };
+            let world = kind.world(Path::new(""), views, size, 0).expect("a world");
+            let names: std::collections::BTreeSet<&str> = world.things.iter().map(|t| t.name.as_str()).collect();
+            assert_eq!(names.len(), world.things.len(), "{name}");
+            let mut seen = vec![false; world.things.len() + 1];
+            for view in 0..views {
+                let view = world.render(view, 1);
+                view.instances.labels.iter().for_each(|l| seen[usize::from(*l)] = true);
+                assert!(view.depth.iter().all(|d| *d > 0.0 && d.is_finite()), "{name}");
+            }
+            // A thing that has parts shows through them; the smallest hide behind others in few views.
+            let hidden = (1..seen.len()).filter(|&k| !seen[k] && !world.things.iter().any(|t| usize::from(t.parent) == k)).count();
+            assert!(hidden * 10 <= world.things.len(), "{name}: {hidden} of {} things cannot be seen", world.things.len());
+        }
+    }
+
+    #[test]
+    fn the_same_seed_makes_the_same_photo() {
+        let photo = |seed| Kind::Table.world(Path::new(""), 3, (60, 45), seed).expect("a world").render(1, 2).photo;
+        assert_eq!(photo(4), photo(4));
+        assert_ne!(photo(4), photo(5));
+    }
+}

@@ -1,0 +1,218 @@
+//! Things to place: each a few solids, standing on y = 0 before x and z = 0, about one unit high.
+
+use super::solid::Shape::{self, Ball, Block, Cone, Cylinder};
+use glam::Vec3;
+
+/// A solid of a thing.
+pub struct Piece {
+    /// Names of the part and of the part's part that it belongs to, from outside in; empty for the thing itself.
+    pub part: Vec<String>,
+    pub shape: Shape,
+    pub centre: Vec3,
+    pub half: Vec3,
+    /// Turn around z, then around x, in radians.
+    pub tilt: [f32; 2],
+    pub look: Look,
+}
+
+/// What a piece looks like.
+#[derive(Clone, Copy)]
+pub enum Look {
+    /// A multiple of the thing's colour.
+    Own(f32),
+    /// A colour of its own.
+    Fixed(Vec3),
+}
+
+/// Every catalogue entry: its name, and how it is made.
+pub const CATALOGUE: [(&str, fn() -> Vec<Piece>); 12] = [
+    ("mug", mug),
+    ("ball", ball),
+    ("book", book),
+    ("bottle", bottle),
+    ("lamp", lamp),
+    ("bowl", bowl),
+    ("candle", candle),
+    ("box", crate_box),
+    ("apple", apple),
+    ("vase", vase),
+    ("tower", tower),
+    ("hat", hat),
+];
+
+fn piece(shape: Shape, centre: [f32; 3], half: [f32; 3], look: Look) -> Piece {
+    Piece { part: Vec::new(), shape, centre: centre.into(), half: half.into(), tilt: [0.0; 2], look }
+}
+
+impl Piece {
+    fn tilted(self, around_z: f32, around_x: f32) -> Self {
+        Self { tilt: [around_z, around_x], ..self }
+    }
+
+    fn of(self, part: &[&str]) -> Self {
+        Self { part: part.iter().map(|p| (*p).to_owned()).collect(), ..self }
+    }
+}
+
+const OWN: Look = Look::Own(1.0);
+const DARKER: Look = Look::Own(0.55);
+const BRASS: Look = Look::Fixed(Vec3::new(0.75, 0.6, 0.25));
+const WOOD: Look = Look::Fixed(Vec3::new(0.5, 0.33, 0.18));
+const LEAF: Look = Look::Fixed(Vec3::new(0.2, 0.55, 0.2));
+const CREAM: Look = Look::Fixed(Vec3::new(0.95, 0.9, 0.8));
+
+pub fn mug() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.45, 0.0], [0.38, 0.45, 0.38], OWN).of(&["cup"]),
+        piece(Block, [0.48, 0.7, 0.0], [0.14, 0.05, 0.07], DARKER).of(&["handle"]),
+        piece(Block, [0.58, 0.45, 0.0], [0.05, 0.3, 0.07], DARKER).of(&["handle"]),
+        piece(Block, [0.48, 0.2, 0.0], [0.14, 0.05, 0.07], DARKER).of(&["handle"]),
+    ]
+}
+
+fn ball() -> Vec<Piece> {
+    vec![piece(Ball, [0.0, 0.45, 0.0], [0.45; 3], OWN)]
+}
+
+fn book() -> Vec<Piece> {
+    vec![
+        piece(Block, [0.0, 0.08, 0.0], [0.5, 0.08, 0.38], CREAM).of(&["pages"]),
+        piece(Block, [0.0, 0.18, 0.0], [0.54, 0.025, 0.42], OWN).of(&["cover"]),
+    ]
+}
+
+fn bottle() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.4, 0.0], [0.25, 0.4, 0.25], OWN).of(&["body"]),
+        piece(Cone, [0.0, 0.95, 0.0], [0.25, 0.15, 0.25], OWN).of(&["body"]),
+        piece(Cylinder, [0.0, 1.0, 0.0], [0.09, 0.2, 0.09], DARKER).of(&["neck"]),
+    ]
+}
+
+pub fn lamp() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.05, 0.0], [0.32, 0.05, 0.32], DARKER).of(&["foot"]),
+        piece(Cylinder, [0.0, 0.5, 0.0], [0.06, 0.45, 0.06], BRASS).of(&["pole"]),
+        piece(Cone, [0.0, 0.98, 0.0], [0.42, 0.3, 0.42], OWN).of(&["shade"]),
+    ]
+}
+
+fn bowl() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.06, 0.0], [0.25, 0.06, 0.25], DARKER).of(&["foot"]),
+        piece(Ball, [0.0, 0.3, 0.0], [0.5, 0.22, 0.5], OWN).of(&["basin"]),
+    ]
+}
+
+fn candle() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.08, 0.0], [0.35, 0.08, 0.35], BRASS).of(&["holder"]),
+        piece(Cylinder, [0.0, 0.55, 0.0], [0.16, 0.42, 0.16], OWN).of(&["wax"]),
+        piece(Ball, [0.0, 1.06, 0.0], [0.07, 0.14, 0.07], Look::Fixed(Vec3::new(1.0, 0.75, 0.2))).of(&["flame"]),
+    ]
+}
+
+fn crate_box() -> Vec<Piece> {
+    vec![piece(Block, [0.0, 0.38, 0.0], [0.45, 0.38, 0.38], OWN)]
+}
+
+fn apple() -> Vec<Piece> {
+    vec![
+        piece(Ball, [0.0, 0.4, 0.0], [0.42, 0.4, 0.42], OWN).of(&["flesh"]),
+        piece(Cylinder, [0.0, 0.86, 0.0], [0.04, 0.14, 0.04], WOOD).of(&["stem"]).tilted(0.2, 0.0),
+        piece(Ball, [0.16, 0.92, 0.0], [0.18, 0.03, 0.09], LEAF).of(&["leaf"]).tilted(0.3, 0.0),
+    ]
+}
+
+fn vase() -> Vec<Piece> {
+    vec![
+        piece(Ball, [0.0, 0.38, 0.0], [0.35, 0.38, 0.35], OWN).of(&["belly"]),
+        piece(Cylinder, [0.0, 0.85, 0.0], [0.13, 0.2, 0.13], DARKER).of(&["neck"]),
+    ]
+}
+
+fn tower() -> Vec<Piece> {
+    vec![
+        piece(Block, [0.0, 0.2, 0.0], [0.4, 0.2, 0.4], OWN).of(&["base"]),
+        piece(Block, [0.0, 0.55, 0.0], [0.28, 0.15, 0.28], DARKER).of(&["middle"]),
+        piece(Cone, [0.0, 0.95, 0.0], [0.28, 0.25, 0.28], OWN).of(&["roof"]),
+    ]
+}
+
+fn hat() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.05, 0.0], [0.55, 0.05, 0.55], DARKER).of(&["brim"]),
+        piece(Cylinder, [0.0, 0.35, 0.0], [0.3, 0.3, 0.3], OWN).of(&["crown"]),
+    ]
+}
+
+/// A cart with wheels with hubs: three levels.
+pub fn cart() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Block, [0.0, 0.55, 0.0], [0.75, 0.22, 0.4], OWN).of(&["body"]),
+        piece(Block, [0.3, 0.95, 0.0], [0.3, 0.2, 0.3], DARKER).of(&["cabin"]),
+    ];
+    for (name, x, z) in [("front left", 0.5, 0.45), ("front right", 0.5, -0.45), ("rear left", -0.5, 0.45), ("rear right", -0.5, -0.45)] {
+        let (wheel, hub) = (format!("{name} wheel"), format!("{name} hub"));
+        let across = std::f32::consts::FRAC_PI_2;
+        let tyre = Look::Fixed(Vec3::new(0.16, 0.16, 0.18));
+        pieces.push(piece(Cylinder, [x, 0.28, z], [0.28, 0.06, 0.28], tyre).of(&[&wheel]).tilted(0.0, across));
+        pieces.push(piece(Cylinder, [x, 0.28, z], [0.14, 0.085, 0.14], BRASS).of(&[&wheel, &hub]).tilted(0.0, across));
+    }
+    pieces
+}
+
+/// A cabinet with drawers with knobs: three levels.
+pub fn cabinet() -> Vec<Piece> {
+    let mut pieces = vec![piece(Block, [0.0, 0.65, 0.0], [0.5, 0.65, 0.35], OWN).of(&["frame"])];
+    for (name, y) in [("lower", 0.25), ("middle", 0.65), ("upper", 1.05)] {
+        let (drawer, knob) = (format!("{name} drawer"), format!("{name} knob"));
+        pieces.push(piece(Block, [0.0, y, 0.37], [0.42, 0.16, 0.04], CREAM).of(&[&drawer]));
+        pieces.push(piece(Ball, [0.0, y, 0.44], [0.09; 3], DARKER).of(&[&drawer, &knob]));
+    }
+    pieces
+}
+
+/// A wire frame: twelve thin rods.
+pub fn wire_frame() -> Vec<Piece> {
+    let (r, thin) = (0.5, 0.014);
+    let mut pieces = Vec::new();
+    for (a, b) in [(-r, -r), (-r, r), (r, -r), (r, r)] {
+        pieces.push(piece(Block, [0.0, r + a, b], [r, thin, thin], OWN));
+        pieces.push(piece(Block, [a, r, b], [thin, r, thin], OWN));
+        pieces.push(piece(Block, [a, r + b, 0.0], [thin, thin, r], OWN));
+    }
+    pieces
+}
+
+/// A wheel of thin spokes.
+pub fn spoked_wheel() -> Vec<Piece> {
+    let (count, radius) = (14, 0.5);
+    let mut pieces = vec![piece(Ball, [0.0, 0.55, 0.0], [0.07; 3], BRASS)];
+    for k in 0..count {
+        let angle = std::f32::consts::TAU * k as f32 / count as f32;
+        let (s, c) = angle.sin_cos();
+        pieces.push(piece(Block, [0.5 * radius * c, 0.55 + 0.5 * radius * s, 0.0], [0.5 * radius, 0.01, 0.01], OWN).tilted(angle, 0.0));
+        let chord = radius * (std::f32::consts::PI / count as f32).tan() * 1.05;
+        pieces.push(piece(Block, [radius * c, 0.55 + radius * s, 0.0], [0.03, chord, 0.03], DARKER).tilted(angle, 0.0));
+    }
+    pieces
+}
+
+/// A pot with thin stems and leaves.
+pub fn plant() -> Vec<Piece> {
+    let mut pieces = vec![piece(Cylinder, [0.0, 0.18, 0.0], [0.25, 0.18, 0.25], OWN)];
+    for k in 0..9 {
+        let angle = 2.4 * k as f32;
+        let lean = 0.12 + 0.05 * k as f32;
+        let (x, z) = (lean * angle.cos(), lean * angle.sin());
+        pieces.push(piece(Cylinder, [0.5 * x, 0.65, 0.5 * z], [0.012, 0.32, 0.012], LEAF).tilted(-0.8 * x, 0.8 * z));
+        pieces.push(piece(Ball, [x, 0.95 + 0.03 * k as f32, z], [0.16, 0.012, 0.07], LEAF).tilted(0.5 * angle.cos(), 0.5 * angle.sin()));
+    }
+    pieces
+}
+
+/// A standing slab.
+pub fn slab() -> Vec<Piece> {
+    vec![piece(Block, [0.0, 0.06, 0.0], [0.55, 0.06, 0.2], WOOD), piece(Block, [0.0, 0.75, 0.0], [0.5, 0.65, 0.03], OWN)]
+}

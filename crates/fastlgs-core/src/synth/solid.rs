@@ -1,0 +1,182 @@
+//! Solids that rays can hit: balls, blocks, cylinders and cones, stretched and turned.
+
+use super::surface::Surface;
+use glam::{Mat3, Vec3};
+
+/// A solid of half extent 1 around the origin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shape {
+    /// The unit ball.
+    Ball,
+    /// The cube [-1, 1]^3.
+    Block,
+    /// Radius 1 around y, from -1 to 1.
+    Cylinder,
+    /// Radius 1 at y = -1, its tip at y = 1.
+    Cone,
+}
+
+/// A stretched and turned shape in the world.
+#[derive(Clone, Debug)]
+pub struct Solid {
+    /// What it is stretched from.
+    pub shape: Shape,
+    /// Its middle in the world.
+    pub centre: Vec3,
+    /// Half extents along its own axes.
+    pub half: Vec3,
+    /// World to its own axes.
+    pub turn: Mat3,
+    /// What it looks like.
+    pub surface: Surface,
+    /// The thing that it belongs to; 0 for what is only background.
+    pub thing: u16,
+}
+
+/// Where a ray passes a solid's surface.
+#[derive(Clone, Copy, Debug)]
+pub struct Crossing {
+    /// Multiples of the ray's direction.
+    pub t: f32,
+    /// Outer normal in the world, of length 1.
+    pub normal: Vec3,
+    /// The point in the frame of the unstretched shape.
+    pub local: Vec3,
+}
+
+/// What counts as touching the surface that a ray starts from.
+const NEAR: f32 = 1e-3;
+
+impl Solid {
+    /// Where a ray enters and leaves, in this order; nothing where it passes by.
+    pub fn crossings(&self, origin: Vec3, direction: Vec3) -> Option<[Crossing; 2]> {
+        let o = self.turn * (origin - self.centre) / self.half;
+        let d = self.turn * direction / self.half;
+        let pair = match self.shape {
+            Shape::Block => block(o, d),
+            Shape::Ball => quadric(o, d, Vec3::ONE, Vec3::ZERO, -1.0).map(|ts| ts.map(|t| (t, o + t * d))),
+            Shape::Cylinder => {
+                between_planes(o, d, quadric(o, d, Vec3::new(1.0, 0.0, 1.0), Vec3::ZERO, -1.0), |p| Vec3::new(p.x, 0.0, p.z))
+            }
+            // x^2 + z^2 = ((1 - y) / 2)^2
+            Shape::Cone => {
+                let sides = quadric(o, d, Vec3::new(1.0, -0.25, 1.0), Vec3::new(0.0, 0.5, 0.0), -0.25);
+                cone(o, d, sides)
+            }
+        }?;
+        let crossing = |(t, normal): (f32, Vec3)| {
+            let world = (self.turn.transpose() * (normal / self.half)).normalize_or_zero();
+            Crossing { t, normal: world, local: o + t * d }
+        };
+        Some(pair.map(crossing))
+    }
+
+    /// The nearest point before the eye where a ray meets the surface: entering, or leaving where it starts inside.
+    pub fn hit(&self, origin: Vec3, direction: Vec3) -> Option<Crossing> {
+        self.crossings(origin, direction)?.into_iter().find(|c| c.t > NEAR)
+    }
+
+    /// Corners of the box around it, in the world.
+    pub fn bounds(&self) -> [Vec3; 2] {
+        let axes = self.turn.transpose();
+        let reach = axes.x_axis.abs() * self.half.x + axes.y_axis.abs() * self.half.y + axes.z_axis.abs() * self.half.z;
+        [self.centre - reach, self.centre + reach]
+    }
+}
+
+/// Entry and exit of the cube [-1, 1]^3, each with its normal.
+fn block(o: Vec3, d: Vec3) -> Option<[(f32, Vec3); 2]> {
+    let (mut enter, mut exit) = ((f32::NEG_INFINITY, Vec3::ZERO), (f32::INFINITY, Vec3::ZERO));
+    for k in 0..3 {
+        let (a, b) = ((-1.0 - o[k]) / d[k], (1.0 - o[k]) / d[k]);
+        let mut normal = Vec3::ZERO;
+        normal[k] = d[k].signum();
+        if a.min(b) > enter.0 {
+            enter = (a.min(b), -normal);
+        }
+        if a.max(b) < exit.0 {
+            exit = (a.max(b), normal);
+        }
+    }
+    (enter.0 < exit.0).then_some([enter, exit])
+}
+
+/// Both roots of `sum of weight * p^2 + slope . p + constant = 0` on the ray, in order.
+fn quadric(o: Vec3, d: Vec3, weight: Vec3, slope: Vec3, constant: f32) -> Option<[f32; 2]> {
+    let a = (weight * d).dot(d);
+    let b = 2.0 * (weight * o).dot(d) + slope.dot(d);
+    let c = (weight * o).dot(o) + slope.dot(o) + constant;
+    let root = b * b - 4.0 * a * c;
+    if root < 0.0 || a == 0.0 {
+        return None;
+    }
+    // The form that does not cancel.
+    let q = -0.5 * (b + b.signum() * root.sqrt());
+    let (s, t) = (q / a, c / q);
+    Some([s.min(t), s.max(t)])
+}
+
+/// A cylinder's two crossings: those of its endless side where they lie between the planes y = -1 and 1, else those of the planes.
+fn between_planes(o: Vec3, d: Vec3, sides: Option<[f32; 2]>, normal: impl Fn(Vec3) -> Vec3) -> Option<[(f32, Vec3); 2]> {
+    let [low, high] = match sides {
+        Some(ts) => ts,
+        None if o.x * o.x + o.z * o.z < 1.0 => [f32::NEG_INFINITY, f32::INFINITY],
+        None => return None,
+    };
+    let (a, b) = ((-1.0 - o.y) / d.y, (1.0 - o.y) / d.y);
+    let side = |t: f32| (t, normal(o + t * d));
+    let enter = if a.min(b) > low { (a.min(b), Vec3::Y * -d.y.signum()) } else { side(low) };
+    let exit = if a.max(b) < high { (a.max(b), Vec3::Y * d.y.signum()) } else { side(high) };
+    (enter.0 < exit.0).then_some([enter, exit])
+}
+
+/// A cone's two crossings, of its side below the tip and of its base.
+fn cone(o: Vec3, d: Vec3, sides: Option<[f32; 2]>) -> Option<[(f32, Vec3); 2]> {
+    let mut found: Vec<(f32, Vec3)> = Vec::with_capacity(3);
+    for t in sides.into_iter().flatten() {
+        let p = o + t * d;
+        if (-1.0..1.0).contains(&p.y) {
+            found.push((t, Vec3::new(p.x, 0.25 * (1.0 - p.y), p.z)));
+        }
+    }
+    let t = (-1.0 - o.y) / d.y;
+    let p = o + t * d;
+    if p.x * p.x + p.z * p.z < 1.0 {
+        found.push((t, Vec3::NEG_Y));
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0));
+    found.try_into().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn solid(shape: Shape) -> Solid {
+        let surface = Surface::plain(Vec3::ONE);
+        Solid { shape, centre: Vec3::new(1.0, 2.0, 3.0), half: Vec3::new(0.5, 1.0, 2.0), turn: Mat3::IDENTITY, surface, thing: 1 }
+    }
+
+    #[test]
+    fn rays_cross_where_geometry_says() {
+        // Along x through the middle: half extent 0.5; a cone has half its radius there.
+        for (shape, reach) in [(Shape::Ball, 0.5), (Shape::Block, 0.5), (Shape::Cylinder, 0.5), (Shape::Cone, 0.25)] {
+            let [enter, exit] = solid(shape).crossings(Vec3::new(-3.0, 2.0, 3.0), Vec3::X).expect("a hit");
+            assert!((enter.t - (4.0 - reach)).abs() < 1e-5 && (exit.t - (4.0 + reach)).abs() < 1e-5, "{shape:?} {enter:?} {exit:?}");
+            assert!(enter.normal.x < -0.5 && exit.normal.x > 0.5, "{shape:?} {enter:?}");
+            assert!(solid(shape).crossings(Vec3::new(-3.0, 5.0, 3.0), Vec3::X).is_none(), "{shape:?}");
+        }
+        // From above: the cone's tip, and the flat top of the others.
+        for (shape, t) in [(Shape::Ball, 3.0), (Shape::Block, 3.0), (Shape::Cylinder, 3.0), (Shape::Cone, 3.0)] {
+            let hit = solid(shape).hit(Vec3::new(1.001, 6.0, 3.0), Vec3::NEG_Y).expect("a hit");
+            assert!((hit.t - t).abs() < 0.02, "{shape:?} {hit:?}");
+        }
+        assert_eq!(solid(Shape::Block).bounds(), [Vec3::new(0.5, 1.0, 1.0), Vec3::new(1.5, 3.0, 5.0)]);
+    }
+
+    #[test]
+    fn a_ray_that_starts_inside_hits_from_inside() {
+        let hit = solid(Shape::Ball).hit(Vec3::new(1.0, 2.0, 3.0), Vec3::Y).expect("a hit");
+        assert!((hit.t - 1.0).abs() < 1e-5 && hit.normal.y > 0.9);
+    }
+}

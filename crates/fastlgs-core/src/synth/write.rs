@@ -1,0 +1,92 @@
+//! A generated scene as a folder of photos.
+
+use super::{Thing, World};
+use crate::{Camera, LabelMap, Result, exr_image, fs, image_io};
+use serde_json::json;
+use std::path::Path;
+
+/// Writes PHOTOS: `images/`, `transforms.json`, exact masks of three levels in `masks/`, `masks/part/` and `masks/subpart/` (16-bit),
+/// `depth/` (EXR) and `labels/` of every `holdout`-th view.
+///
+/// # Errors
+/// The system's refusal.
+pub fn write(out: &Path, world: &World, holdout: usize, mut done: impl FnMut()) -> Result<()> {
+    let mut frames = Vec::new();
+    for (index, camera) in world.cameras.iter().enumerate() {
+        let view = world.render(index, 2);
+        let name = &camera.name;
+        image_io::save_png(&out.join("images").join(name), view.photo.clone())?;
+        for (level, folder) in ["masks", "masks/part", "masks/subpart"].into_iter().enumerate() {
+            let labels = view.instances.labels.iter().map(|id| at_level(&world.things, *id, level)).collect();
+            LabelMap { labels, ..view.instances }.save(&out.join(folder).join(format!("{name}.png")))?;
+        }
+        let depth = out.join("depth").join(format!("{name}.exr"));
+        exr_image::write(&depth, camera.width as usize, camera.height as usize, &[("Z", &view.depth)])?;
+        if crate::scene_folder::is_held_out(index, holdout) {
+            write_labels(out, &world.things, camera, &view.instances)?;
+        }
+        let flip = glam::Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));
+        let camera_to_world = (camera.world_to_camera.inverse() * flip).transpose().to_cols_array_2d();
+        frames.push(json!({ "file_path": format!("images/{name}"), "transform_matrix": camera_to_world }));
+        done();
+    }
+    let first = &world.cameras[0];
+    let instances = world.things.iter().enumerate().map(|(k, t)| json!({ "instance": k + 1, "name": t.name, "parent": t.parent }));
+    fs::write_json(&out.join("instances.json"), &instances.collect::<Vec<_>>())?;
+    // Written last: its presence says that the folder is whole.
+    let transforms = json!({
+        "fl_x": first.fx, "fl_y": first.fy, "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height, "frames": frames,
+    });
+    fs::write_json(&out.join("transforms.json"), &transforms)
+}
+
+/// A thing and all that contain it, from small to large.
+fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
+    let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0);
+    std::iter::successors(Some(id).filter(|id| *id > 0), above)
+}
+
+/// What a thing belongs to at a level: 0 whole things, 1 their parts, 2 parts of parts.
+fn at_level(things: &[Thing], id: u16, level: usize) -> u16 {
+    let chain: Vec<u16> = chain(things, id).collect();
+    chain.iter().rev().nth(level).or(chain.first()).copied().unwrap_or(0)
+}
+
+/// Exact labels of things and parts in the LERF-OVS layout: one rectangle for each run of pixels in a row.
+fn write_labels(out: &Path, things: &[Thing], camera: &Camera, instances: &LabelMap) -> Result<()> {
+    let mut objects = Vec::new();
+    for (k, thing) in things.iter().enumerate() {
+        let own = k as u16 + 1;
+        let inside = |x: u32, y: u32| chain(things, instances.at(x, y)).any(|id| id == own);
+        for y in 0..instances.height {
+            let mut x = 0;
+            while x < instances.width {
+                let (within, start) = (inside(x, y), x);
+                while x < instances.width && inside(x, y) == within {
+                    x += 1;
+                }
+                if within {
+                    let (x0, x1, y0, y1) = (start, x, y, y + 1);
+                    objects.push(json!({ "category": thing.name, "segmentation": [[x0, y0], [x1, y0], [x1, y1], [x0, y1]] }));
+                }
+            }
+        }
+    }
+    let stem = Path::new(&camera.name).file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let info = json!({ "name": camera.name, "width": camera.width, "height": camera.height });
+    fs::write_json(&out.join("labels").join(format!("{stem}.json")), &json!({ "info": info, "objects": objects }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_go_from_wholes_to_parts() {
+        let thing = |name: &str, parent| Thing { name: name.to_owned(), parent };
+        let things = [thing("cart", 0), thing("wheel", 1), thing("hub", 2), thing("ball", 0)];
+        assert_eq!([0, 1, 2].map(|level| at_level(&things, 3, level)), [1, 2, 3]);
+        assert_eq!([0, 1, 2].map(|level| at_level(&things, 4, level)), [4, 4, 4]);
+        assert_eq!(at_level(&things, 0, 1), 0);
+    }
+}
