@@ -41,13 +41,18 @@ impl Scene {
     /// Loads SCENE and puts it on the device.
     pub fn open(root: &Path, device: &str) -> Result<Self> {
         let folder = SceneFolder::open(root)?;
+        let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
+        if !manifest.notes.contains_key("train") {
+            let root = root.display();
+            bail!("{root}: its photos were preprocessed again after it was trained; run 'fastlgs train {root}' again");
+        }
         if folder.is_compact() {
             Grid::load(&folder).context("the object grid cannot be read; export the scene again")?.set_codes(&mut gaussians);
         }
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
-        let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
+        let cameras = folder.cameras()?;
         Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, texts: OnceCell::new() })
     }
 

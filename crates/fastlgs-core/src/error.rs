@@ -30,9 +30,12 @@ pub enum Error {
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// An [`Error::Format`] for `path`.
-    pub fn format(path: impl AsRef<Path>, reason: impl Into<String>) -> Self {
-        Self::Format { path: path.as_ref().to_owned(), reason: reason.into() }
+    /// An [`Error::Format`] for `path`. What parsers say in several lines, or repeat from the file, becomes one line.
+    pub fn format(path: impl AsRef<Path>, reason: impl AsRef<str>) -> Self {
+        const LONGEST: usize = 300;
+        let words = reason.as_ref().split(|c: char| c.is_whitespace() || c.is_control()).filter(|w| !w.is_empty());
+        let reason: String = words.collect::<Vec<_>>().join(" ").chars().take(LONGEST).collect();
+        Self::Format { path: path.as_ref().to_owned(), reason }
     }
 
     /// Wraps an I/O error with the path it happened on; for `map_err`.

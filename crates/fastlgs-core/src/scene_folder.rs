@@ -28,6 +28,9 @@ pub struct Manifest {
     pub photos: PathBuf,
     /// Every n-th view (by sorted name) is held out; 0 for none.
     pub holdout: usize,
+    /// Views that are held out by name, as their labels ask.
+    #[serde(default)]
+    pub held_out_views: Vec<String>,
     /// Segmenter that made the masks.
     pub segmenter: String,
     /// Encoder that made the embeddings; queries must use the same.
@@ -53,13 +56,18 @@ pub struct Manifest {
 impl Manifest {
     /// The views that may be trained on, in their order.
     pub fn training(&self, cameras: &[Camera]) -> Vec<Camera> {
-        let usable = |(i, c): &(usize, &Camera)| !is_held_out(*i, self.holdout) && !self.excluded.contains(&c.name);
+        let usable = |(i, c): &(usize, &Camera)| !self.is_held_out(*i, &c.name) && !self.excluded.contains(&c.name);
         cameras.iter().enumerate().filter(usable).map(|(_, c)| c.clone()).collect()
     }
 
     /// The views that are held out, in their order.
     pub fn held_out(&self, cameras: &[Camera]) -> Vec<Camera> {
-        cameras.iter().enumerate().filter(|(i, _)| is_held_out(*i, self.holdout)).map(|(_, c)| c.clone()).collect()
+        cameras.iter().enumerate().filter(|(i, c)| self.is_held_out(*i, &c.name)).map(|(_, c)| c.clone()).collect()
+    }
+
+    /// Whether a view, by its index in sorted order and its name, is held out.
+    pub fn is_held_out(&self, index: usize, name: &str) -> bool {
+        is_held_out(index, self.holdout) || self.held_out_views.iter().any(|v| v == name)
     }
 }
 
@@ -164,23 +172,11 @@ impl SceneFolder {
     /// # Errors
     /// An unknown name; the message lists what there is.
     pub fn view_index(&self, cameras: &[Camera], name: &str) -> Result<usize> {
-        let stem = |c: &Camera| Path::new(&c.name).file_stem().is_some_and(|s| s == name);
-        if let Some(i) = cameras.iter().position(|c| c.name == name) {
-            return Ok(i);
-        }
-        let mut hits = cameras.iter().enumerate().filter(|(_, c)| stem(c)).map(|(i, _)| i);
-        match (hits.next(), hits.next()) {
-            (Some(i), None) => Ok(i),
-            _ => {
-                let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
-                Err(Error::Invalid(format!(
-                    "no view '{name}' in {}; it has {} views: {}, ...",
-                    self.root.display(),
-                    cameras.len(),
-                    names.join(", ")
-                )))
-            }
-        }
+        view_of(cameras.iter().map(|c| c.name.as_str()), name).ok_or_else(|| {
+            let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
+            let (root, n, names) = (self.root.display(), cameras.len(), names.join(", "));
+            Error::Invalid(format!("no view '{name}' in {root}; it has {n} views: {names}, ..."))
+        })
     }
 
     /// Undistorted, scaled photo of a view.
@@ -247,7 +243,14 @@ impl SceneFolder {
     }
 }
 
-/// Whether the view at `index` (sorted by name) is held out.
+/// Index of a view by exact file name, or by name without ending where that is unique.
+pub fn view_of<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> Option<usize> {
+    let bare = |n: &&str| Path::new(n).file_stem().is_some_and(|s| s == name);
+    let mut hits = names.clone().enumerate().filter(|(_, n)| bare(n)).map(|(i, _)| i);
+    names.clone().position(|n| n == name).or_else(|| hits.next().filter(|_| hits.next().is_none()))
+}
+
+/// Whether every `holdout`-th view takes the one at `index` (sorted by name).
 pub fn is_held_out(index: usize, holdout: usize) -> bool {
     holdout > 0 && index.is_multiple_of(holdout)
 }

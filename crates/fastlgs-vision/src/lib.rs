@@ -3,6 +3,7 @@
 //! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
 
 pub mod attributes;
+pub mod brightness;
 pub mod clip;
 pub mod clip_tokens;
 pub mod conse;

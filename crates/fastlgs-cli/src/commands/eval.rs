@@ -4,7 +4,6 @@ use crate::scene::Scene;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::labels::{Label, LabelledView};
-use fastlgs_core::scene_folder::is_held_out;
 use fastlgs_core::{Camera, image_io, labels, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
@@ -18,9 +17,18 @@ use std::time::Instant;
 pub struct Args {
     /// Trained scene folder.
     scene: PathBuf,
-    /// Folder of LERF-OVS label files (one JSON a view); without it only colour is measured.
+    /// Folder of labels in the layout of LERF-OVS, 3D-OVS or SPIn-NeRF; without it only colour is measured.
     #[arg(long)]
     labels: Option<PathBuf>,
+    /// What names the thing in SPIn-NeRF's masks, instead of their folder's name.
+    #[arg(long, value_name = "TEXT")]
+    label_text: Option<String>,
+    /// Decide pixels as in the paper: by the distance of the rendered code to the object's, on the 0..255 scale.
+    #[arg(long, value_name = "DISTANCE")]
+    tau_ac: Option<f32>,
+    /// Relevancy from which an object counts as found, instead of the program's constant.
+    #[arg(long, value_name = "SCORE")]
+    min_score: Option<f32>,
     /// Texts that must not be found, one a line; a list of everyday things is built in.
     #[arg(long, value_name = "FILE")]
     absent: Option<PathBuf>,
@@ -74,6 +82,7 @@ const ABSENT: [&str; 40] = [
 struct Sums {
     iou: Vec<f64>,
     oracle: Vec<f64>,
+    apart: Vec<f64>,
     recall: Vec<f64>,
     boundary: Vec<f64>,
     localised: Vec<f64>,
@@ -93,27 +102,35 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let mut scene = Scene::open(&args.scene, &common.device)?;
     let grid = scene.grid()?;
     let (psnr, ssim) = color_quality(&mut scene)?;
-    let views = args.labels.as_deref().map(labels::load).transpose()?.unwrap_or_default();
+    let label_text = args.label_text.as_deref();
+    let views = args.labels.as_deref().map(|folder| labels::load(folder, label_text)).transpose()?.unwrap_or_default();
+    let config = QueryConfig { min_score: args.min_score.unwrap_or(scene.min_score()), ..QueryConfig::default() };
     let total: usize = views.iter().map(|v| v.labels.len()).sum();
     let mut sums = Sums::default();
     for view in &views {
-        let index = scene.cameras.iter().position(|c| c.name == view.name);
-        let index = index.with_context(|| format!("the label file of '{}' names no view of {}", view.name, args.scene.display()))?;
-        if !is_held_out(index, scene.manifest.holdout) {
-            bail!("'{}' is labelled but was trained on; preprocess with --holdout so that it is held out", view.name);
-        }
+        let index = scene.folder.view_index(&scene.cameras, &view.name).context("labels")?;
         let camera = scene.cameras[index].clone();
-        scene.field(&camera, None)?; // compiles the kernels
-        let started = Instant::now();
-        let field = scene.field(&camera, None)?;
-        let render_ms = started.elapsed().as_secs_f64() * 1e3;
-        for (k, label) in view.labels.iter().enumerate() {
-            let ms = score_label(&scene, &grid, view, label, &camera, &field, &mut sums)?;
-            if k == 0 { sums.first_ms.push(render_ms + ms) } else { sums.next_ms.push(ms) }
+        if !scene.manifest.is_held_out(index, &camera.name) {
+            bail!("'{}' is labelled but was trained on; preprocess with --holdout or --holdout-labels so that it is held out", view.name);
         }
+        scene.field(&camera, args.tau_ac)?; // compiles the kernels
+        let started = Instant::now();
+        let field = scene.field(&camera, args.tau_ac)?;
+        let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        let mut best = Vec::new();
+        for (k, label) in view.labels.iter().enumerate() {
+            let (ms, masks) = score_label(&scene, &grid, &config, view, label, &camera, &field, &mut sums)?;
+            if k == 0 {
+                sums.first_ms.push(render_ms + ms)
+            } else {
+                sums.next_ms.push(ms)
+            }
+            best.push(masks);
+        }
+        sums.apart.extend(apart(&best));
     }
     let absent = absent_scores(args, &scene, &grid, &views)?;
-    let rejected = absent.iter().filter(|a| a.1 < f64::from(query::MIN_SCORE)).count();
+    let rejected = absent.iter().filter(|a| a.1 < f64::from(config.min_score)).count();
     let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
     let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
     let present_by_label: BTreeMap<&String, f64> = sums.labels.iter().zip(sums.present.iter().copied()).collect();
@@ -131,6 +148,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "boundary_iou": mean(&sums.boundary),
         "loc_acc": mean(&sums.localised),
         "oracle_miou": mean(&sums.oracle),
+        "apart": mean(&sums.apart),
         "text_top1": mean(&sums.top1),
         "absent_auroc": if auroc.is_nan() { Value::Null } else { json!(auroc) },
         "absent_texts": absent.len(),
@@ -154,9 +172,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 /// Mean PSNR and SSIM over the held-out views.
 fn color_quality(scene: &mut Scene) -> Result<(Option<f64>, Option<f64>)> {
     let (mut psnr, mut ssim) = (Vec::new(), Vec::new());
-    let held_out: Vec<_> = (0..scene.cameras.len()).filter(|&i| is_held_out(i, scene.manifest.holdout)).collect();
-    for i in held_out {
-        let camera = scene.cameras[i].clone();
+    for camera in scene.manifest.held_out(&scene.cameras) {
         let frame = scene.render(&camera)?;
         let photo = image_io::to_planar(&scene.folder.photo(&camera.name)?);
         psnr.push(metrics::psnr(frame.channels(0, 3), &photo));
@@ -165,16 +181,36 @@ fn color_quality(scene: &mut Scene) -> Result<(Option<f64>, Option<f64>)> {
     Ok((mean(&psnr), mean(&ssim)))
 }
 
-/// Scores one label; returns the milliseconds of the query beyond rendering.
+/// A label's true pixels, and those of the object that fits it best.
+struct Best {
+    truth: Vec<bool>,
+    found: Vec<bool>,
+}
+
+/// For each label, the share of its pixels that no best object of a label elsewhere claims: 1 where things are told apart, even where
+/// they are not found. Objects that two labels share tell neither apart.
+fn apart(best: &[Best]) -> Vec<f64> {
+    let elsewhere = |a: &Best, b: &Best| !a.truth.iter().zip(&b.truth).any(|(a, b)| *a && *b);
+    let share = |own: &Best| {
+        let others: Vec<&Best> = best.iter().filter(|b| elsewhere(own, b)).collect();
+        let pixels: Vec<usize> = (0..own.truth.len()).filter(|p| own.truth[*p]).collect();
+        let mixed = pixels.iter().filter(|p| others.iter().any(|o| o.found[**p])).count();
+        1.0 - mixed as f64 / pixels.len().max(1) as f64
+    };
+    best.iter().map(share).collect()
+}
+
+/// Scores one label; returns the milliseconds of the query beyond rendering, and the masks.
 fn score_label(
     scene: &Scene,
     grid: &Grid,
+    config: &QueryConfig,
     view: &LabelledView,
     label: &Label,
     camera: &Camera,
     field: &Field,
     sums: &mut Sums,
-) -> Result<f64> {
+) -> Result<(f64, Best)> {
     let (w, h) = (camera.width, camera.height);
     let truth = view.mask(label, w, h);
     if !truth.contains(&true) {
@@ -185,7 +221,7 @@ fn score_label(
     let started = Instant::now();
     let text_query = scene.text_query(&label.category)?;
     let ranked = query::rank(grid, &text_query);
-    let targets = query::select(grid, &ranked, &QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() });
+    let targets = query::select(grid, &ranked, config);
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
@@ -196,20 +232,26 @@ fn score_label(
     let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
     sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
     let relevancy = field.relevancy(grid, &ranked);
-    let (sx, sy) = (f64::from(w) / f64::from(view.width), f64::from(h) / f64::from(view.height));
-    let boxes: Vec<[f64; 4]> = label.polygons.iter().map(|p| polygon_box(p, sx, sy)).collect();
-    sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &boxes))));
+    sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &view.boxes(label, w, h)))));
     sums.labels.push(label.category.clone());
     sums.present.push(f64::from(ranked.first().map_or(0.0, |r| r.score)));
     // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
     let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
-    sums.oracle.push(candidates(grid, field, &truth).into_iter().map(|id| metrics::iou(&object_mask(id), &truth)).fold(0.0, f64::max));
+    let (oracle, found) = best_object(grid, field, &truth);
+    sums.oracle.push(oracle);
     let inside = |mask: Vec<bool>| {
         let (hit, all) = mask.iter().zip(&truth).filter(|(m, _)| **m).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
         all > 0 && 2 * hit > all
     };
     sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(object_mask(r.id))))));
-    Ok(ms)
+    Ok((ms, Best { truth, found }))
+}
+
+/// IoU and mask of the object that fits a mask best.
+pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool>) {
+    let masks = candidates(grid, field, truth).into_iter().map(|id| field.mask(grid, &[Hit { id, score: 0.0 }]));
+    let tried = masks.map(|mask| (metrics::iou(&mask, truth), mask));
+    tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()]))
 }
 
 /// The objects that come nearest to a mask by their owned pixels: one of them is the best.
@@ -231,12 +273,6 @@ fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
     ids.sort_by(|a, b| iou(b).total_cmp(&iou(a)).then(a.cmp(b)));
     ids.truncate(MOST);
     ids
-}
-
-fn polygon_box(polygon: &[[f64; 2]], sx: f64, sy: f64) -> [f64; 4] {
-    polygon.iter().fold([f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY], |b, p| {
-        [b[0].min(p[0] * sx), b[1].min(p[1] * sy), b[2].max(p[0] * sx), b[3].max(p[1] * sy)]
-    })
 }
 
 /// Best scores of texts that name nothing in the scene.

@@ -6,15 +6,15 @@ use crate::eyes::Eyes;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
-use fastlgs_core::scene_folder::{Manifest, is_held_out};
+use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::undistort::{undistort, undistort_gray};
-use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io};
+use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io, labels};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::triangulate::{self, PairMatches};
-use fastlgs_vision::{Encoder, Level, Segmenter, import};
+use fastlgs_vision::{Encoder, Level, Segmenter, brightness, import};
 use fastlgs_vision::{pose_check, structure};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
@@ -36,6 +36,9 @@ pub struct Args {
     /// Every N-th photo (by sorted name) is kept out of training and mapping; 0 for none.
     #[arg(long, default_value_t = 8)]
     holdout: usize,
+    /// Keep out the photos that these labels name instead (of LERF-OVS, 3D-OVS or SPIn-NeRF).
+    #[arg(long, value_name = "DIR", conflicts_with = "holdout")]
+    holdout_labels: Option<PathBuf>,
     #[command(flatten)]
     eyes: Eyes,
     /// Photos that each photo's key points are matched with.
@@ -45,6 +48,9 @@ pub struct Args {
     #[arg(long, default_value = "4G", value_name = "BYTES", value_parser = parse_bytes)]
     memory: u64,
 }
+
+/// The manifest's note of how much the photos' brightness varies, in stops.
+pub const BRIGHTNESS_SPREAD: &str = "brightness_spread_stops";
 
 /// Parses `500M`.
 fn parse_bytes(text: &str) -> Result<u64, String> {
@@ -114,7 +120,22 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
-    let usable = |i: usize| !is_held_out(i, args.holdout) && !checked.contradictory.contains(&i);
+    let held_out_views = labelled_views(args, &cameras)?;
+    let mut manifest = Manifest {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        photos: args.photos.clone(),
+        holdout: if args.holdout_labels.is_some() { 0 } else { args.holdout },
+        held_out_views,
+        segmenter: args.eyes.segmenter.clone(),
+        encoder: args.eyes.encoder.clone(),
+        models: args.eyes.files()?,
+        seed: common.seed,
+        warnings: warnings.clone(),
+        excluded,
+        seconds: BTreeMap::new(),
+        notes: BTreeMap::new(),
+    };
+    let usable = |i: usize| !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i);
     let mut index = 0..;
     keypoints.retain(|_| index.next().is_some_and(usable));
     let training: Vec<Photo> = photos.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
@@ -131,6 +152,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     lap("embeddings");
     let matches = match_photos(&training, &keypoints, args.neighbours, &cache, common)?;
     lap("matches");
+    let pixels: Vec<&RgbImage> = training.iter().map(|p| &p.pixels).collect();
+    let spread = brightness::spread(&pixels, &keypoints, &matches);
 
     // Points of moved cameras lie where those cameras were.
     let points = if dataset.points.is_empty() || !checked.moved.is_empty() {
@@ -149,19 +172,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     lap("mapping");
 
     let matched: usize = matches.iter().map(|m| m.pairs.len()).sum();
-    let manifest = Manifest {
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        photos: args.photos.clone(),
-        holdout: args.holdout,
-        segmenter: args.eyes.segmenter.clone(),
-        encoder: args.eyes.encoder.clone(),
-        models: args.eyes.files()?,
-        seed: common.seed,
-        warnings: warnings.clone(),
-        excluded,
-        seconds: seconds.clone(),
-        notes: BTreeMap::new(),
-    };
+    manifest.seconds = seconds.clone();
+    manifest.notes.insert(BRIGHTNESS_SPREAD.to_owned(), spread.into());
     folder.save_manifest(&manifest)?;
     cache.tidy();
     let value = serde_json::json!({
@@ -178,12 +190,23 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "sift": keypoints::backend(),
         "moved_cameras": checked.moved.len(),
         "warnings": warnings,
+        "brightness_spread_stops": spread,
         "cached": cache.counts(),
         "seconds": seconds,
         "seconds_total": started.elapsed().as_secs_f64(),
     });
     report::give(common, &value)?;
     Ok(Outcome::Done)
+}
+
+/// Names of the views that `--holdout-labels` keeps out.
+fn labelled_views(args: &Args, cameras: &[Camera]) -> Result<Vec<String>> {
+    let Some(folder) = &args.holdout_labels else { return Ok(Vec::new()) };
+    let index = |name: &str| {
+        let index = view_of(cameras.iter().map(|c| c.name.as_str()), name);
+        index.with_context(|| format!("{}: the labelled view '{name}' is none of the photos", folder.display()))
+    };
+    labels::load(folder, None)?.iter().map(|view| Ok(cameras[index(&view.name)?].name.clone())).collect()
 }
 
 /// Structure from motion for photos without poses.

@@ -1,6 +1,7 @@
 //! `fastlgs train`: colour and semantic field together (paper, training features for Gaussians).
 
 use super::objects;
+use super::preprocess::BRIGHTNESS_SPREAD;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::rng::Rng;
@@ -38,9 +39,9 @@ pub struct Args {
     /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`.
     #[arg(long, default_value = "0,0,0", value_parser = parse_background)]
     background: Background,
-    /// Learn an affine exposure for each training photo.
-    #[arg(long)]
-    exposure: bool,
+    /// Learn an affine exposure for each training photo: `on`, `off`, or `auto`, which does where their brightness varies.
+    #[arg(long, default_value = "auto", num_args = 0..=1, default_missing_value = "on", require_equals = true, value_parser = ["auto", "on", "off"])]
+    exposure: String,
     /// Keep geometry and colour as --init-ply gives them; train features only.
     #[arg(long, requires = "init_ply")]
     freeze: bool,
@@ -84,6 +85,9 @@ pub struct Args {
     #[arg(long)]
     resume: bool,
 }
+
+/// Difference of two photos in stops from which exposures are learned.
+const VARYING: f64 = 0.15;
 
 /// Fewest triangulated points worth starting from.
 const FEW_POINTS: usize = 500;
@@ -139,7 +143,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         antialias: args.antialias,
         background: args.background.color,
         learn_background: args.background.learn,
-        exposure: args.exposure,
+        exposure: match args.exposure.as_str() {
+            "auto" => manifest.notes.get(BRIGHTNESS_SPREAD).and_then(|s| s.as_f64()).is_some_and(|stops| stops >= VARYING),
+            choice => choice == "on",
+        },
         ..TrainConfig::default()
     };
     if config.iterations >= WORTH_TUNING {
@@ -210,6 +217,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "gaussians": result.gaussians,
         "removals": result.removals,
         "sh_degree": scene.sh_degree,
+        "exposure": config.exposure,
         "antialias": config.antialias,
         "background": &result.background[..3],
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),

@@ -1,7 +1,7 @@
 //! The kinds of generated scenes: each shows one thing that methods fail at.
 
 use super::hierarchy::Hierarchy;
-use super::props::{self, Look, Piece};
+use super::props::{self, Look, Make, Piece};
 use super::solid::{Shape, Solid};
 use super::surface::Surface;
 use super::{Backdrop, Thing, World};
@@ -290,7 +290,7 @@ impl Builder {
 
     fn twins(&mut self) {
         self.table();
-        let pairs: [(&str, fn() -> Vec<Piece>, usize, f32); 3] =
+        let pairs: [(&str, Make, usize, f32); 3] =
             [("mug", props::mug, 0, 0.0), ("lamp", props::lamp, 1, 1.0), ("ball", || props::CATALOGUE[1].1(), 3, 2.0)];
         for (name, make, color, third) in pairs {
             let (s, c) = (TAU * third / 3.0).sin_cos();
@@ -305,7 +305,7 @@ impl Builder {
 
     fn nested(&mut self) {
         self.table();
-        let things: [(&str, fn() -> Vec<Piece>, usize); 6] = [
+        let things: [(&str, Make, usize); 6] = [
             ("cart", props::cart, 0),
             ("cabinet", props::cabinet, 8),
             ("lamp", props::lamp, 9),
@@ -323,7 +323,7 @@ impl Builder {
 
     fn thin(&mut self) {
         self.table();
-        let things: [(&str, fn() -> Vec<Piece>, usize); 6] = [
+        let things: [(&str, Make, usize); 6] = [
             ("wire cube", props::wire_frame, 0),
             ("spoked wheel", props::spoked_wheel, 11),
             ("plant", props::plant, 8),

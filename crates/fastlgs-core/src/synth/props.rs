@@ -24,8 +24,11 @@ pub enum Look {
     Fixed(Vec3),
 }
 
+/// How a thing is made.
+pub type Make = fn() -> Vec<Piece>;
+
 /// Every catalogue entry: its name, and how it is made.
-pub const CATALOGUE: [(&str, fn() -> Vec<Piece>); 12] = [
+pub const CATALOGUE: [(&str, Make); 12] = [
     ("mug", mug),
     ("ball", ball),
     ("book", book),

@@ -1,105 +1,143 @@
 //! `fastlgs bench chart`: accuracy against time, for the ways from masks to a field that answers.
 
-use super::plot::{self, Axes, Spot};
-use super::trial::Trial;
+use super::plot::{self, Axes, Scatter, Spot};
+use super::table::{self, number};
+use super::trial::{self, Trial};
 use crate::{Outcome, report, ui};
 use anyhow::Result;
-use fastlgs_core::fs;
+use fastlgs_core::SceneFolder;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs bench chart scenes/fox scenes/bonsai -o out")]
 pub struct Args {
-    /// Trained scenes whose photos have labels/ beside them.
-    #[arg(required = true)]
+    /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
     scenes: Vec<PathBuf>,
     /// Only what takes seconds: no long descents, no training of geometry.
     #[arg(long)]
     quick: bool,
-    /// Also the presets, which train geometry anew.
+    /// Also what takes long: the paper's number of steps, and the presets, which train geometry anew.
     #[arg(long, conflicts_with = "quick")]
-    presets: bool,
-    /// Folder for chart.svg, chart.md, chart.csv and chart.json.
+    long: bool,
+    /// Folder for chart.md, .csv, .json, and two charts as SVG and PNG.
     #[arg(short, long)]
     output: PathBuf,
 }
 
-/// A way from masks to a field, and what `train` is given for it.
+/// A way from masks to a field.
 struct Way {
     name: &'static str,
-    args: &'static [&'static str],
-    /// How long it takes: 0 seconds, 1 minutes, 2 geometry anew.
+    how: How,
+    /// How long it takes: 0 seconds, 1 minutes, 2 much longer.
     cost: u8,
 }
 
-/// Geometry and colour stay as they are in the scene; objects and field are made anew.
-const WAYS: [Way; 10] = [
+/// What a way runs.
+enum How {
+    /// `train` with options on the scene's Gaussians, whose geometry and colour stay.
+    Remap(&'static [&'static str]),
+    /// Descent on the paper's codes alone, for so many iterations.
+    Descent(&'static str),
+    /// `train` from the photos on.
+    Train(&'static [&'static str]),
+    /// `bench baseline` on the scene as it is.
+    Baseline(&'static str),
+}
+
+const WAYS: [Way; 20] = [
+    Way { name: "embeddings", how: How::Remap(&["--mapping", "paper", "--cues", "none"]), cost: 0 },
+    Way { name: "+ key points", how: How::Remap(&["--mapping", "paper", "--cues", "keypoints"]), cost: 0 },
+    Way { name: "+ colour (paper)", how: How::Remap(&["--mapping", "paper"]), cost: 0 },
+    Way { name: "global", how: How::Remap(&[]), cost: 0 },
+    Way { name: "code of 1 number", how: How::Baseline("code1"), cost: 0 },
+    Way { name: "code of 2 numbers", how: How::Baseline("code2"), cost: 0 },
+    Way { name: "code of 3 numbers", how: How::Baseline("code3"), cost: 0 },
+    Way { name: "code of 4 numbers", how: How::Baseline("code4"), cost: 0 },
+    Way { name: "no grid", how: How::Baseline("raw"), cost: 0 },
+    Way { name: "like LangSplat", how: How::Baseline("langsplat"), cost: 1 },
+    Way { name: "like LERF", how: How::Baseline("lerf"), cost: 1 },
+    Way { name: "paper, 300 steps", how: How::Descent("300"), cost: 0 },
+    Way { name: "paper, 1,000 steps", how: How::Descent("1000"), cost: 1 },
+    Way { name: "paper, 3,000 steps", how: How::Descent("3000"), cost: 1 },
+    Way { name: "paper, 7,000 steps", how: How::Descent("7000"), cost: 2 },
+    Way { name: "paper, 30,000 steps", how: How::Descent("30000"), cost: 2 },
+    Way { name: "preset quick", how: How::Train(&["--preset", "quick"]), cost: 2 },
+    Way { name: "preset standard", how: How::Train(&["--preset", "standard"]), cost: 2 },
+    Way { name: "preset paper", how: How::Train(&["--preset", "paper"]), cost: 2 },
     Way {
-        name: "embeddings",
-        args: &["--init-ply", "SCENE/scene.ply", "--iterations", "0", "--mapping", "paper", "--cues", "none"],
-        cost: 0,
+        name: "preset paper, paper's way",
+        how: How::Train(&["--preset", "paper", "--mapping", "paper", "--feature-mode", "train"]),
+        cost: 2,
     },
-    Way {
-        name: "+ key points",
-        args: &["--init-ply", "SCENE/scene.ply", "--iterations", "0", "--mapping", "paper", "--cues", "keypoints"],
-        cost: 0,
-    },
-    Way { name: "+ colour (paper)", args: &["--init-ply", "SCENE/scene.ply", "--iterations", "0", "--mapping", "paper"], cost: 0 },
-    Way { name: "global", args: &["--init-ply", "SCENE/scene.ply", "--iterations", "0"], cost: 0 },
-    Way {
-        name: "paper, 300 steps",
-        args: &["--init-ply", "SCENE/scene.ply", "--freeze", "--feature-mode", "train", "--mapping", "paper", "--iterations", "300"],
-        cost: 0,
-    },
-    Way {
-        name: "paper, 1,000 steps",
-        args: &["--init-ply", "SCENE/scene.ply", "--freeze", "--feature-mode", "train", "--mapping", "paper", "--iterations", "1000"],
-        cost: 1,
-    },
-    Way {
-        name: "paper, 3,000 steps",
-        args: &["--init-ply", "SCENE/scene.ply", "--freeze", "--feature-mode", "train", "--mapping", "paper", "--iterations", "3000"],
-        cost: 1,
-    },
-    Way { name: "quick", args: &["--preset", "quick"], cost: 2 },
-    Way { name: "standard", args: &["--preset", "standard"], cost: 2 },
-    Way { name: "paper preset", args: &["--preset", "paper", "--mapping", "paper", "--feature-mode", "train"], cost: 2 },
 ];
 
+impl How {
+    /// The command and its arguments; SCENE stands for the scene.
+    fn command(&self) -> Vec<&'static str> {
+        const START: [&str; 3] = ["SCENE", "--init-ply", "SCENE/scene.ply"];
+        match self {
+            Self::Remap(args) => [&["train"], &START[..], &["--iterations", "0"], args].concat(),
+            Self::Descent(steps) => {
+                let descent = ["--freeze", "--feature-mode", "train", "--mapping", "paper", "--iterations", steps];
+                [&["train"], &START[..], &descent].concat()
+            }
+            Self::Train(args) => [&["train", "SCENE"], *args].concat(),
+            Self::Baseline(method) => vec!["bench", "baseline", "SCENE", "--method", method],
+        }
+    }
+}
+
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    let most = if args.presets { 2 } else { u8::from(!args.quick) };
+    let most = if args.long { 2 } else { u8::from(!args.quick) };
     let ways: Vec<&Way> = WAYS.iter().filter(|w| w.cost <= most).collect();
-    let bar = ui::bar(common, (args.scenes.len() * ways.len()) as u64, "ways");
+    let work = trial::workshop(&args.output)?;
+    let mut scenes = args.scenes.clone();
+    if scenes.is_empty() {
+        let (views, size) = trial::QUICK;
+        let scene = trial::generated(common, &work, "table", views, size)?;
+        trial::call(common, common.seed, "train", &[trial::text(&scene), "--iterations", "1000"])?;
+        scenes.push(scene);
+    }
+    let bar = ui::bar(common, (scenes.len() * ways.len()) as u64, "ways");
     let mut rows = Vec::new();
-    for scene in &args.scenes {
+    for scene in &scenes {
+        let before: f64 =
+            SceneFolder::open(scene)?.manifest()?.seconds.iter().filter(|s| s.0.starts_with("preprocess.")).map(|s| s.1).sum();
         for way in &ways {
-            let trial = Trial::new(scene, common)?;
-            let [trained, scored] = trial.train_and_eval(way.args)?;
-            rows.push(row(scene.display().to_string(), way, &trained, &scored));
+            let trial = Trial::new(scene, &work, common)?;
+            let command = way.how.command();
+            let mut row = if let How::Baseline(_) = way.how { baseline(&trial, &command, common)? } else { trained(&trial, &command)? };
+            row["scene"] = json!(trial::name(scene));
+            row["way"] = json!(way.name);
+            row["preprocess_seconds"] = json!(before);
+            row["command"] = json!(format!("fastlgs {}", command.join(" ").replace("SCENE", &scene.display().to_string())));
+            rows.push(row);
             bar.inc(1);
         }
     }
     bar.finish_and_clear();
+    std::fs::remove_dir_all(&work)?;
     mark_front(&mut rows);
-    for (file, content) in [("chart.md", table(&rows, " | ", true)), ("chart.csv", table(&rows, ",", false))] {
-        fs::write_atomic(&args.output.join(file), |out| std::io::Write::write_all(out, content.as_bytes()))?;
+    let value = table::write(&args.output, "chart", &COLUMNS, &rows)?;
+    for (file, x, title, label) in [
+        ("chart", "seconds", "Accuracy against time: from masks to a field", "seconds after preprocessing"),
+        ("chart-query", "query_ms", "Accuracy against time: the first answer in a view", "milliseconds"),
+    ] {
+        let spots: Vec<Spot> = rows.iter().map(|row| spot(row, x)).collect();
+        let axes = Axes { title, x: label, y: "oracle mIoU of held-out labels" };
+        plot::save(&args.output, file, &Scatter { axes, spots: &spots })?;
     }
-    let spots: Vec<Spot> = rows.iter().map(spot).collect();
-    let axes = Axes { title: "Accuracy against time: from masks to a field", x: "seconds", y: "oracle mIoU of held-out labels" };
-    plot::scatter(&args.output.join("chart.svg"), &axes, &spots)?;
-    let value = json!({ "rows": rows, "chart": args.output.join("chart.svg") });
-    fs::write_json(&args.output.join("chart.json"), &value)?;
     report::give(common, &value)?;
     Ok(Outcome::Done)
 }
 
-fn row(scene: String, way: &Way, trained: &Value, scored: &Value) -> Value {
-    let seconds = trained["seconds"].as_f64().unwrap_or(0.0) + trained["mapping_seconds"].as_f64().unwrap_or(0.0);
-    json!({
-        "scene": scene,
-        "way": way.name,
-        "seconds": seconds,
+/// Trains and evaluates.
+fn trained(trial: &Trial, command: &[&str]) -> Result<Value> {
+    let [trained, scored] = trial.train_and_eval(&command[2..])?;
+    Ok(json!({
+        "seconds": number(&trained, "seconds") + number(&trained, "mapping_seconds"),
+        "query_ms": scored["query_ms_first"],
         "oracle_miou": scored["oracle_miou"],
         "miou": scored["miou"],
         "text_top1": scored["text_top1"],
@@ -107,15 +145,19 @@ fn row(scene: String, way: &Way, trained: &Value, scored: &Value) -> Value {
         "psnr": scored["psnr"],
         "objects": scored["objects"],
         "gaussians": scored["gaussians"],
-        "scene_bytes": scored["scene_bytes"],
+        "bytes": scored["scene_bytes"],
         "size": scored["size"],
         "adapter": scored["adapter"],
-        "command": format!("fastlgs train {scene} {}", way.args.join(" ").replace("SCENE/", &format!("{scene}/"))),
-    })
+    }))
 }
 
-fn number(row: &Value, name: &str) -> f64 {
-    row[name].as_f64().unwrap_or(0.0)
+/// Makes another field. Its oracle is the best threshold of each label, where it knows no objects.
+fn baseline(trial: &Trial, command: &[&str], common: &ui::Common) -> Result<Value> {
+    let scene = trial.scene();
+    let args: Vec<&str> = command[1..].iter().map(|a| if *a == "SCENE" { trial::text(&scene.root) } else { *a }).collect();
+    let mut found = trial::call(common, common.seed, command[0], &args)?;
+    (found["query_ms"], found["bytes"]) = (found["render_ms"].clone(), found["field_bytes"].clone());
+    Ok(found)
 }
 
 /// Marks the rows of each scene that no other one beats in time and accuracy both.
@@ -132,35 +174,27 @@ fn mark_front(rows: &mut [Value]) {
     rows.iter_mut().zip(front).for_each(|(row, front)| row["pareto"] = json!(front));
 }
 
-const COLUMNS: [&str; 11] =
-    ["scene", "way", "seconds", "oracle_miou", "miou", "text_top1", "loc_acc", "objects", "scene_bytes", "pareto", "command"];
+const COLUMNS: [&str; 13] = [
+    "scene",
+    "way",
+    "preprocess_seconds",
+    "seconds",
+    "query_ms",
+    "oracle_miou",
+    "miou",
+    "loc_acc",
+    "psnr",
+    "objects",
+    "bytes",
+    "pareto",
+    "command",
+];
 
-/// The rows as Markdown (`framed`) or CSV.
-fn table(rows: &[Value], between: &str, framed: bool) -> String {
-    let line = |cells: Vec<String>| if framed { format!("| {} |\n", cells.join(between)) } else { format!("{}\n", cells.join(between)) };
-    let cell = |row: &Value, name: &str| match &row[name] {
-        Value::String(text) if framed => text.clone(),
-        Value::String(text) => format!("\"{text}\""),
-        Value::Number(n) if n.is_f64() => format!("{:.3}", n.as_f64().unwrap_or(f64::NAN)),
-        other => other.to_string(),
-    };
-    let mut out = line(COLUMNS.iter().map(|c| (*c).to_owned()).collect());
-    if framed {
-        out += &line(COLUMNS.iter().map(|_| "---".to_owned()).collect());
-    }
-    rows.iter().for_each(|row| out += &line(COLUMNS.iter().map(|c| cell(row, c)).collect()));
-    out
-}
-
-fn spot(row: &Value) -> Spot {
+fn spot(row: &Value, x: &str) -> Spot {
     let name = row["way"].as_str().unwrap_or_default().to_owned();
-    Spot {
-        series: row["scene"].as_str().unwrap_or_default().to_owned(),
-        name,
-        x: number(row, "seconds"),
-        y: number(row, "oracle_miou"),
-        front: row["pareto"] == true,
-    }
+    let series = row["scene"].as_str().unwrap_or_default().to_owned();
+    // The front is one in seconds.
+    Spot { series, name, x: number(row, x), y: number(row, "oracle_miou"), front: row["pareto"] == true && x == "seconds" }
 }
 
 #[cfg(test)]

@@ -102,7 +102,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if let Some(folder) = &args.output {
         fastlgs_core::fs::write_json(&folder.join("speed.json"), &value)?;
         let axes = plot::Axes { title: "Training: colour + features + D-SSIM", x: "Gaussians", y: "iterations a second" };
-        plot::write(&folder.join("speed.svg"), &axes, &lines)?;
+        plot::save(folder, "speed", &plot::Lines { axes, lines: &lines })?;
     }
     report::give(common, &value)?;
     Ok(Outcome::Done)

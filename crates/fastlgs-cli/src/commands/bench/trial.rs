@@ -1,4 +1,4 @@
-//! Trials: the program's own commands on a copy of a scene, so that every figure can be had again by hand.
+//! Trials: the program's own commands on copies of scenes, so that every figure can be had again by hand.
 
 use crate::ui;
 use anyhow::{Context, Result, bail};
@@ -7,55 +7,102 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A copy of a scene that trials may change.
+/// Runs `fastlgs COMMAND ARGS` with the same device, and `seed`; returns its report.
+pub fn call(common: &ui::Common, seed: u64, command: &str, args: &[&str]) -> Result<Value> {
+    let program = std::env::current_exe().context("this program's own file")?;
+    let mut call = Command::new(program);
+    call.arg(command).args(args).args(["--json", "-", "-q", "--device", &common.device, "--seed", &seed.to_string()]);
+    let output = call.output().context("the program cannot be started again")?;
+    if !output.status.success() {
+        bail!("fastlgs {command} {}: {}", args.join(" "), String::from_utf8_lossy(&output.stderr).trim());
+    }
+    serde_json::from_slice(&output.stdout).with_context(|| format!("fastlgs {command} gave no report"))
+}
+
+/// A path as an argument.
+pub fn text(path: &Path) -> &str {
+    path.to_str().unwrap_or_default()
+}
+
+/// An empty folder for trials below `output`; what a killed run left there is removed.
+pub fn workshop(output: &Path) -> Result<PathBuf> {
+    let work = output.join(".trials");
+    let _ = std::fs::remove_dir_all(&work);
+    std::fs::create_dir_all(&work).with_context(|| work.display().to_string())?;
+    Ok(work.canonicalize()?)
+}
+
+/// Views and size of the generated scenes of quick suites.
+pub const QUICK: (usize, &str) = (32, "240x180");
+
+/// Makes a generated scene and preprocesses it with its exact masks, unless it is there; returns the scene folder.
+pub fn generated(common: &ui::Common, work: &Path, kind: &str, views: usize, size: &str) -> Result<PathBuf> {
+    let (photos, scene) = (work.join(kind).join("photos"), work.join(kind).join(kind));
+    if !scene.is_dir() {
+        call(common, common.seed, "synth", &[kind, "-o", text(&photos), "--size", size, "--views", &views.to_string()])?;
+        call(common, common.seed, "preprocess", &[text(&photos), "-o", text(&scene), "--segmenter", "import"])?;
+    }
+    Ok(scene)
+}
+
+/// The last part of a path.
+pub fn name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// A copy of a scene that may be changed; it is gone with the trial.
 pub struct Trial {
     folder: tempfile::TempDir,
-    /// The original.
-    pub scene: PathBuf,
-    /// Its labels.
+    /// The original's model.
+    start: PathBuf,
     labels: PathBuf,
     common: ui::Common,
 }
 
 impl Trial {
-    /// Copies `scene` beside itself (by hard links: whatever is written replaces files as a whole). Labels are those beside the photos
-    /// that it was made from.
-    pub fn new(scene: &Path, common: &ui::Common) -> Result<Self> {
+    /// Copies `scene` into `work` (by hard links where it can: whatever is written replaces files as a whole). Labels are those beside
+    /// the photos that it was made from.
+    pub fn new(scene: &Path, work: &Path, common: &ui::Common) -> Result<Self> {
         let manifest = SceneFolder::open(scene)?.manifest()?;
         let labels = Path::new(&manifest.photos).join("labels");
         if !labels.is_dir() {
             bail!("{}: no labels beside the photos of {}", labels.display(), scene.display());
         }
         let beside = scene.canonicalize()?;
-        let folder = tempfile::Builder::new().prefix(".trial-").tempdir_in(beside.parent().unwrap_or(Path::new(".")))?;
+        let folder = tempfile::tempdir_in(work).with_context(|| work.display().to_string())?;
         link_all(&beside, &folder.path().join("scene")).with_context(|| format!("{} cannot be copied", scene.display()))?;
-        Ok(Self { folder, scene: scene.to_owned(), labels, common: common.clone() })
+        Ok(Self { folder, start: beside.join("scene.ply"), labels, common: common.clone() })
     }
 
-    fn copy(&self) -> PathBuf {
-        self.folder.path().join("scene")
+    /// The copy.
+    pub fn scene(&self) -> SceneFolder {
+        SceneFolder::new(self.folder.path().join("scene"))
     }
 
-    /// Runs `fastlgs COMMAND SCENE ARGS` on the copy; returns its report.
-    fn run(&self, command: &str, args: &[String]) -> Result<Value> {
-        let program = std::env::current_exe().context("this program's own file")?;
-        let mut call = Command::new(program);
-        call.arg(command).arg(self.copy()).args(args).args(["--json", "-", "-q", "--device", &self.common.device]);
-        call.args(["--seed", &self.common.seed.to_string()]);
-        let output = call.output().context("the program cannot be started again")?;
-        if !output.status.success() {
-            bail!("fastlgs {command}: {}", String::from_utf8_lossy(&output.stderr).trim());
-        }
-        serde_json::from_slice(&output.stdout).with_context(|| format!("fastlgs {command} gave no report"))
+    /// Trains with `args`, in which `SCENE/scene.ply` means the original's.
+    pub fn train(&self, args: &[&str], seed: u64) -> Result<Value> {
+        let scene = self.scene();
+        let place = |a: &&str| if *a == "SCENE/scene.ply" { text(&self.start).to_owned() } else { (*a).to_owned() };
+        let args: Vec<String> = args.iter().map(place).collect();
+        let all: Vec<&str> = std::iter::once(text(&scene.root)).chain(args.iter().map(String::as_str)).collect();
+        call(&self.common, seed, "train", &all)
+    }
+
+    /// Evaluates against the labels.
+    pub fn eval(&self, args: &[&str]) -> Result<Value> {
+        let scene = self.scene();
+        let first = [text(&scene.root), "--labels", text(&self.labels)];
+        call(&self.common, self.common.seed, "eval", &[&first, args].concat())
+    }
+
+    /// Evaluates another folder of the same scene.
+    pub fn eval_of(&self, scene: &Path) -> Result<Value> {
+        call(&self.common, self.common.seed, "eval", &[text(scene), "--labels", text(&self.labels)])
     }
 
     /// Trains with `args` and evaluates; returns both reports.
     pub fn train_and_eval(&self, args: &[&str]) -> Result<[Value; 2]> {
-        let start = self.scene.canonicalize()?.join("scene.ply");
-        let place = |a: &&str| if *a == "SCENE/scene.ply" { start.display().to_string() } else { (*a).to_owned() };
-        let trained = self.run("train", &args.iter().map(place).collect::<Vec<_>>())?;
-        let scored = self.run("eval", &["--labels".to_owned(), self.labels.display().to_string()])?;
-        Ok([trained, scored])
+        Ok([self.train(args, self.common.seed)?, self.eval(&[])?])
     }
 }
 

@@ -51,7 +51,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         let lenses = import::lenses(&dataset);
         let segmenter = args.eyes.segmenter(folder, &lenses)?;
         let encoder = args.eyes.encoder(folder, &lenses)?;
-        for view in labels::load(&folder.join("labels"))? {
+        for view in labels::load(&folder.join("labels"), None)? {
             let posed = dataset.photos.iter().find(|p| p.camera.name == view.name);
             let posed = posed.with_context(|| format!("{}: the label '{}' has no photo", folder.display(), view.name))?;
             let photo = load_photo(posed, args.max_side)?;
@@ -112,8 +112,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "masks_per_photo": counts.into_iter().map(|(level, n)| (level, n / f64::from(photos))).collect::<BTreeMap<_, _>>(),
         "segment_seconds_per_photo": segment_seconds / f64::from(photos),
         "embed_seconds_per_label": embed_seconds / scored.len() as f64,
-        "by_label": rows,
+        "rows": rows,
     });
+    if let Some(folder) = &args.output {
+        fastlgs_core::fs::write_json(&folder.join("vision.json"), &value)?;
+    }
     report::give(common, &value)?;
     Ok(Outcome::Done)
 }

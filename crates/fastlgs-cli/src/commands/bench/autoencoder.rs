@@ -1,0 +1,128 @@
+//! A small scene-wise autoencoder of embeddings, as LangSplat has one: 3 numbers stand for an embedding.
+
+use fastlgs_core::rng::Rng;
+use ndarray::{Array1, Array2, ArrayView2, Axis, Zip};
+
+/// Widths between an embedding and its code, and between a code and its embedding.
+const ENCODER: [usize; 3] = [128, 32, 3];
+const DECODER: [usize; 2] = [32, 128];
+const EPOCHS: usize = 300;
+const BATCH: usize = 64;
+const RATE: f32 = 2e-3;
+
+/// A linear layer with Adam's moments.
+struct Layer {
+    weights: Array2<f32>,
+    bias: Array1<f32>,
+    moments: [Array2<f32>; 2],
+    bias_moments: [Array1<f32>; 2],
+    /// Whether what comes out is cut at 0.
+    cut: bool,
+}
+
+impl Layer {
+    fn new(inputs: usize, outputs: usize, cut: bool, rng: &mut Rng) -> Self {
+        let scale = (2.0 / inputs as f32).sqrt();
+        let (weights, bias) = (Array2::from_shape_fn((inputs, outputs), |_| scale * rng.normal()), Array1::zeros(outputs));
+        let (zeros, bias_zeros) = (Array2::zeros((inputs, outputs)), Array1::zeros(outputs));
+        Self { weights, bias, moments: [zeros.clone(), zeros], bias_moments: [bias_zeros.clone(), bias_zeros], cut }
+    }
+
+    fn forward(&self, x: ArrayView2<f32>) -> Array2<f32> {
+        let out = x.dot(&self.weights) + &self.bias;
+        if self.cut { out.mapv_into(|v| v.max(0.0)) } else { out }
+    }
+
+    /// Takes one step of Adam; returns the gradient of the input. `out` is what `forward` gave for `x`.
+    fn backward(&mut self, x: ArrayView2<f32>, out: ArrayView2<f32>, mut gradient: Array2<f32>, step: i32) -> Array2<f32> {
+        if self.cut {
+            Zip::from(&mut gradient).and(out).for_each(|g, o| *g *= f32::from(u8::from(*o > 0.0)));
+        }
+        let before = gradient.dot(&self.weights.t());
+        let (of_weights, of_bias) = (x.t().dot(&gradient), gradient.sum_axis(Axis(0)));
+        let rate = RATE * (1.0 - 0.999f32.powi(step)).sqrt() / (1.0 - 0.9f32.powi(step));
+        let adam = |value: &mut f32, m: &mut f32, v: &mut f32, g: &f32| {
+            *m = 0.9 * *m + 0.1 * g;
+            *v = 0.999 * *v + 0.001 * g * g;
+            *value -= rate * *m / (v.sqrt() + 1e-8);
+        };
+        let [m, v] = &mut self.moments;
+        Zip::from(&mut self.weights).and(m).and(v).and(&of_weights).for_each(adam);
+        let [m, v] = &mut self.bias_moments;
+        Zip::from(&mut self.bias).and(m).and(v).and(&of_bias).for_each(adam);
+        before
+    }
+}
+
+/// Encoder and decoder.
+pub struct Autoencoder {
+    layers: Vec<Layer>,
+}
+
+impl Autoencoder {
+    /// Learns the rows of `embeddings`, which have length 1.
+    pub fn learn(embeddings: &Array2<f32>, seed: u64) -> Self {
+        let mut rng = Rng::new(seed, "autoencoder");
+        let width = embeddings.ncols();
+        let widths: Vec<usize> = [&[width], &ENCODER[..], &DECODER[..], &[width]].concat();
+        let last = widths.len() - 2;
+        // Codes and embeddings may be negative.
+        let layer = |k: usize, rng: &mut Rng| Layer::new(widths[k], widths[k + 1], k + 1 != ENCODER.len() && k != last, rng);
+        let mut own = Self { layers: (0..=last).map(|k| layer(k, &mut rng)).collect() };
+        let mut order: Vec<usize> = (0..embeddings.nrows()).collect();
+        let mut step = 0;
+        for _ in 0..EPOCHS {
+            rng.shuffle(&mut order);
+            for batch in order.chunks(BATCH) {
+                step += 1;
+                own.step(embeddings.select(Axis(0), batch), step);
+            }
+        }
+        own
+    }
+
+    fn step(&mut self, x: Array2<f32>, step: i32) {
+        let mut outs = vec![x];
+        for layer in &self.layers {
+            outs.push(layer.forward(outs[outs.len() - 1].view()));
+        }
+        let rows = outs[0].nrows() as f32;
+        let mut gradient = (&outs[outs.len() - 1] - &outs[0]) * (2.0 / rows);
+        for (k, layer) in self.layers.iter_mut().enumerate().rev() {
+            gradient = layer.backward(outs[k].view(), outs[k + 1].view(), gradient, step);
+        }
+    }
+
+    fn through(layers: &[Layer], x: Array2<f32>) -> Array2<f32> {
+        layers.iter().fold(x, |x, layer| layer.forward(x.view()))
+    }
+
+    /// Codes of embeddings: three numbers a row.
+    pub fn encode(&self, embeddings: Array2<f32>) -> Array2<f32> {
+        Self::through(&self.layers[..ENCODER.len()], embeddings)
+    }
+
+    /// Embeddings of codes, not normalised.
+    pub fn decode(&self, codes: Array2<f32>) -> Array2<f32> {
+        Self::through(&self.layers[ENCODER.len()..], codes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_few_directions_survive_three_numbers() {
+        let mut rng = Rng::new(3, "test");
+        let mut kinds = Array2::from_shape_fn((6, 40), |_| rng.normal());
+        kinds.rows_mut().into_iter().for_each(|mut r| r /= r.dot(&r).sqrt());
+        let embeddings = kinds.select(Axis(0), &(0..90).map(|k| k % 6).collect::<Vec<_>>());
+        let coder = Autoencoder::learn(&embeddings, 0);
+        let back = coder.decode(coder.encode(kinds.clone()));
+        for (a, b) in kinds.rows().into_iter().zip(back.rows()) {
+            let cosine = a.dot(&b) / b.dot(&b).sqrt();
+            assert!(cosine > 0.95, "{cosine}");
+        }
+    }
+}

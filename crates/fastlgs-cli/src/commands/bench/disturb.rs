@@ -1,0 +1,308 @@
+//! What goes wrong with photos, masks and embeddings, done on purpose.
+
+use anyhow::{Context, Result};
+use fastlgs_core::labels::{self, LabelledView};
+use fastlgs_core::rng::Rng;
+use fastlgs_core::scene_folder::view_of;
+use fastlgs_core::{Camera, LabelMap, SceneFolder, fs, image_io};
+use fastlgs_grid::Grid;
+use fastlgs_vision::Level;
+use glam::{Mat4, Quat, Vec2, Vec3, Vec4};
+use image::codecs::jpeg::JpegEncoder;
+use image::{GrayImage, Luma, RgbImage, imageops};
+use serde_json::json;
+use std::collections::BTreeSet;
+use std::io::Cursor;
+use std::path::Path;
+
+/// A change of photos or poses. Labelled views keep their poses and photos: they are what is measured with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Photos {
+    /// Nothing: what the others are compared with.
+    Unchanged,
+    /// Each camera turns so that the image moves by this many pixels in the mean.
+    Pose(f32),
+    /// This share of the photos is missing.
+    Missing(f32),
+    /// Photos come in another order.
+    Shuffled,
+    /// Brightness varies from photo to photo, by this standard deviation in stops.
+    Exposure(f32),
+    /// Red and blue vary from photo to photo, by this standard deviation.
+    WhiteBalance(f32),
+    /// A Gaussian blur of this many pixels.
+    Blur(f32),
+    /// JPEG of this quality.
+    Jpeg(u8),
+    /// The focal length is wrong by this share.
+    Focal(f32),
+}
+
+/// A change of the masks of every level.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Masks {
+    /// Borders move inwards by this many pixels.
+    Eroded(u32),
+    /// This share of the masks is cut in two by a line.
+    Split(f32),
+    /// This share of the masks is joined with one that it touches.
+    Merged(f32),
+    /// This share of the masks is missing.
+    Dropped(f32),
+}
+
+/// A photo of a scene with all that belongs to it.
+struct Shot {
+    camera: Camera,
+    pixels: RgbImage,
+    /// Black where nothing counts.
+    ignore: Option<GrayImage>,
+    /// Masks by level, where they are not made by a segmenter.
+    masks: Vec<(Level, LabelMap)>,
+    labelled: bool,
+}
+
+/// The photos of a scene as `preprocess` left them: undistorted and small.
+pub struct Album {
+    shots: Vec<Shot>,
+    labels: Vec<LabelledView>,
+    /// Names of the shots that each label belongs to.
+    labelled: Vec<String>,
+}
+
+impl Album {
+    /// Training views and labelled views of a scene, with its masks where those were imported.
+    pub fn of(scene: &SceneFolder, label_folder: &Path) -> Result<Self> {
+        let manifest = scene.manifest()?;
+        let cameras = scene.cameras()?;
+        let labels = labels::load(label_folder, None)?;
+        let named = |view: &LabelledView| view_of(cameras.iter().map(|c| c.name.as_str()), &view.name).map(|i| cameras[i].name.clone());
+        let labelled: Vec<String> =
+            labels.iter().map(|v| named(v).with_context(|| format!("no photo '{}'", v.name))).collect::<Result<_>>()?;
+        let training: BTreeSet<String> = manifest.training(&cameras).into_iter().map(|c| c.name).collect();
+        let mut shots = Vec::new();
+        for camera in cameras.into_iter().filter(|c| training.contains(&c.name) || labelled.contains(&c.name)) {
+            let name = &camera.name;
+            let ignored: Vec<GrayImage> = [scene.ignore_path(name), scene.alpha_path(name)]
+                .into_iter()
+                .filter(|p| p.is_file())
+                .map(|p| image_io::load_gray(&p))
+                .collect::<Result<_, _>>()?;
+            let darker = |a: GrayImage, b: GrayImage| {
+                GrayImage::from_fn(a.width(), a.height(), |x, y| Luma([a.get_pixel(x, y)[0].min(b.get_pixel(x, y)[0])]))
+            };
+            let mut masks = Vec::new();
+            for level in Level::ALL.into_iter().filter(|_| manifest.segmenter == "import") {
+                let path = scene.masks_path(level.name(), name);
+                if path.is_file() {
+                    masks.push((level, LabelMap::load(&path)?));
+                }
+            }
+            let (pixels, labelled) = (scene.photo(name)?, labelled.contains(name));
+            shots.push(Shot { ignore: ignored.into_iter().reduce(darker), pixels, masks, labelled, camera });
+        }
+        Ok(Self { shots, labels, labelled })
+    }
+
+    /// Writes the photos with a change: `images/`, `transforms.json`, `masks/`, `ignore/`, and `labels/` in 3D-OVS's layout.
+    pub fn write(&self, to: &Path, change: Photos, seed: u64) -> Result<()> {
+        let mut rng = Rng::new(seed, "disturbed photos");
+        let missing = match change {
+            Photos::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| !self.shots[k].labelled),
+            _ => BTreeSet::new(),
+        };
+        let mut places: Vec<usize> = (0..self.shots.len()).collect();
+        if change == Photos::Shuffled {
+            rng.shuffle(&mut places);
+        }
+        let mut frames = Vec::new();
+        for (shot, place) in self.shots.iter().zip(&places).enumerate().filter(|(k, _)| !missing.contains(k)).map(|(_, s)| s) {
+            let (camera, pixels) = if shot.labelled { (shot.camera.clone(), shot.pixels.clone()) } else { shot.changed(change, &mut rng)? };
+            let name = format!("{place:05}.png");
+            image_io::save_png(&to.join("images").join(&name), pixels)?;
+            if let Some(ignore) = &shot.ignore {
+                image_io::save_png(&to.join("ignore").join(format!("{name}.png")), ignore.clone())?;
+            }
+            for (level, map) in &shot.masks {
+                let folder = if *level == Level::Whole { to.join("masks") } else { to.join("masks").join(level.name()) };
+                map.save(&folder.join(format!("{name}.png")))?;
+            }
+            let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
+            let camera_to_world = (camera.world_to_camera.inverse() * flip).transpose().to_cols_array_2d();
+            frames.push(json!({
+                "file_path": format!("images/{name}"), "transform_matrix": camera_to_world,
+                "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
+            }));
+        }
+        let mut classes = BTreeSet::new();
+        for (view, name) in self.labels.iter().zip(&self.labelled) {
+            let place = places[self.shots.iter().position(|s| s.camera.name == *name).context("a labelled shot")?];
+            for label in &view.labels {
+                let mask = view.mask(label, view.width, view.height);
+                let picture =
+                    GrayImage::from_fn(view.width, view.height, |x, y| Luma([255 * u8::from(mask[(y * view.width + x) as usize])]));
+                // A slash would be a folder.
+                let class = label.category.replace('/', " ");
+                image_io::save_png(&to.join(format!("labels/{place:05}/{class}.png")), picture)?;
+                classes.insert(class);
+            }
+        }
+        let list: String = classes.iter().map(|c| format!("{c}\n")).collect();
+        fs::write_atomic(&to.join("labels/classes.txt"), |file| std::io::Write::write_all(file, list.as_bytes()))?;
+        Ok(fs::write_json(&to.join("transforms.json"), &json!({ "frames": frames }))?)
+    }
+}
+
+/// A random `share` of those of `count` that may be taken.
+fn some_of(count: usize, share: f32, rng: &mut Rng, may: impl Fn(usize) -> bool) -> BTreeSet<usize> {
+    let mut all: Vec<usize> = (0..count).filter(|k| may(*k)).collect();
+    rng.shuffle(&mut all);
+    all.truncate((share * all.len() as f32).round() as usize);
+    all.into_iter().collect()
+}
+
+impl Shot {
+    fn changed(&self, change: Photos, rng: &mut Rng) -> Result<(Camera, RgbImage)> {
+        let (mut camera, mut pixels) = (self.camera.clone(), self.pixels.clone());
+        match change {
+            Photos::Unchanged | Photos::Missing(_) | Photos::Shuffled => {}
+            Photos::Pose(moved) => {
+                // The mean length of two normal numbers is sqrt(pi / 2).
+                let deviation = moved / (camera.fx * std::f32::consts::FRAC_PI_2.sqrt());
+                let axis = Vec3::new(rng.normal(), rng.normal(), 0.0) * deviation;
+                camera.world_to_camera = Mat4::from_quat(Quat::from_scaled_axis(axis)) * camera.world_to_camera;
+            }
+            Photos::Exposure(stops) => {
+                let gain = (stops * rng.normal()).exp2();
+                scale_channels(&mut pixels, [gain; 3]);
+            }
+            Photos::WhiteBalance(deviation) => {
+                let gains = [1.0 + deviation * rng.normal(), 1.0, 1.0 + deviation * rng.normal()];
+                scale_channels(&mut pixels, gains);
+            }
+            Photos::Blur(sigma) => pixels = imageops::blur(&pixels, sigma),
+            Photos::Jpeg(quality) => {
+                let mut file = Vec::new();
+                JpegEncoder::new_with_quality(Cursor::new(&mut file), quality).encode_image(&pixels)?;
+                pixels = image::load_from_memory(&file)?.into_rgb8();
+            }
+            Photos::Focal(share) => (camera.fx, camera.fy) = (camera.fx * (1.0 + share), camera.fy * (1.0 + share)),
+        }
+        Ok((camera, pixels))
+    }
+}
+
+fn scale_channels(pixels: &mut RgbImage, gains: [f32; 3]) {
+    for pixel in pixels.pixels_mut() {
+        for (value, gain) in pixel.0.iter_mut().zip(gains) {
+            *value = (f32::from(*value) * gain + 0.5).clamp(0.0, 255.0) as u8;
+        }
+    }
+}
+
+/// Changes all masks of a scene folder in place.
+pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
+    let mut rng = Rng::new(seed, "disturbed masks");
+    for camera in scene.manifest()?.training(&scene.cameras()?) {
+        for level in Level::ALL {
+            let path = scene.masks_path(level.name(), &camera.name);
+            if path.is_file() {
+                changed_masks(&LabelMap::load(&path)?, change, &mut rng).save(&path)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The changed masks, numbered anew; their numbers mean nothing.
+fn changed_masks(map: &LabelMap, change: Masks, rng: &mut Rng) -> LabelMap {
+    let (mut out, names) = map.dense();
+    let before = out.clone();
+    let some = |share: f32, rng: &mut Rng| some_of(names.len(), share, rng, |k| k > 0);
+    let (w, h) = (map.width as usize, map.height as usize);
+    match change {
+        Masks::Eroded(pixels) => {
+            let at = |x: isize, y: isize| before.at(x.clamp(0, w as isize - 1) as u32, y.clamp(0, h as isize - 1) as u32);
+            let r = pixels as isize;
+            for (p, label) in out.labels.iter_mut().enumerate() {
+                let (x, y) = ((p % w) as isize, (p / w) as isize);
+                if (-r..=r).any(|d| at(x + d, y) != *label || at(x, y + d) != *label) {
+                    *label = 0;
+                }
+            }
+        }
+        Masks::Dropped(share) => {
+            let dropped = some(share, rng);
+            out.labels.iter_mut().filter(|l| dropped.contains(&usize::from(**l))).for_each(|l| *l = 0);
+        }
+        Masks::Merged(share) => {
+            let contacts = before.contacts();
+            for own in some(share, rng) {
+                let own = own as u16;
+                let other = |&(a, b): &(u16, u16)| if a == own { Some(b) } else { (b == own).then_some(a) };
+                let beside: Vec<u16> = contacts.iter().filter_map(other).collect();
+                if !beside.is_empty() {
+                    let other = beside[rng.below(beside.len())];
+                    out.labels.iter_mut().filter(|l| **l == own).for_each(|l| *l = other);
+                }
+            }
+        }
+        Masks::Split(share) => {
+            for (number, own) in some(share, rng).into_iter().enumerate() {
+                let inside: Vec<usize> = (0..out.labels.len()).filter(|p| usize::from(out.labels[*p]) == own).collect();
+                let place = |p: &usize| Vec2::new((p % w) as f32, (p / w) as f32);
+                let middle = inside.iter().map(place).sum::<Vec2>() / inside.len() as f32;
+                let across = Vec2::from_angle(std::f32::consts::TAU * rng.uniform());
+                for p in inside.into_iter().filter(|p| across.dot(place(p) - middle) > 0.0) {
+                    out.labels[p] = (names.len() + number) as u16;
+                }
+            }
+        }
+    }
+    out
+}
+
+/// Adds noise of this length, as a share of their own, to all embeddings of a scene's objects.
+pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
+    let mut rng = Rng::new(seed, "disturbed embeddings");
+    let mut grid = Grid::load(scene)?;
+    for embedding in grid.objects.iter_mut().flat_map(|o| &mut o.embeddings) {
+        let deviation = noise / (embedding.len() as f32).sqrt();
+        embedding.iter_mut().for_each(|v| *v += deviation * rng.normal());
+        let length = embedding.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        embedding.iter_mut().for_each(|v| *v /= length);
+    }
+    Ok(grid.save(scene)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn map() -> LabelMap {
+        // Four columns of two pixels each: none, 5, 9, 7.
+        LabelMap { width: 8, height: 4, labels: (0..32).map(|p| [0, 5, 9, 7][p % 8 / 2]).collect() }
+    }
+
+    fn labels(map: &LabelMap) -> BTreeSet<u16> {
+        map.labels.iter().copied().collect()
+    }
+
+    #[test]
+    fn masks_are_changed_as_their_names_say() {
+        let mut rng = Rng::new(0, "test");
+        let before = map().dense().0;
+        let kept = |m: &LabelMap| m.labels.iter().zip(&before.labels).all(|(l, b)| *l == 0 || l == b);
+        let dropped = changed_masks(&map(), Masks::Dropped(0.34), &mut rng);
+        assert!(labels(&dropped).len() == 3 && kept(&dropped), "one of three is gone, and none stays none");
+        assert_eq!(labels(&changed_masks(&map(), Masks::Split(1.0), &mut rng)).len(), 7);
+        assert_eq!(labels(&changed_masks(&map(), Masks::Merged(0.34), &mut rng)).len(), 3);
+        let eroded = changed_masks(&map(), Masks::Eroded(1), &mut rng);
+        assert!(kept(&eroded));
+        assert_eq!(eroded.labels.iter().filter(|l| **l > 0).count(), 4, "only the outer side of the last column has no neighbour");
+        for change in [Masks::Split(0.5), Masks::Merged(0.5)] {
+            let zero = |m: &LabelMap| m.labels.iter().map(|l| *l == 0).collect::<Vec<_>>();
+            assert_eq!(zero(&changed_masks(&map(), change, &mut rng)), zero(&map()), "{change:?}");
+        }
+    }
+}

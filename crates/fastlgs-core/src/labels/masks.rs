@@ -1,0 +1,117 @@
+//! Labels as pictures: 3D-OVS's mask of each class and view, SPIn-NeRF's mask of each view.
+
+use super::{Label, LabelledView, Region};
+use crate::{Error, Result, fs, image_io};
+use std::path::{Path, PathBuf};
+
+/// The last part of a path without its ending.
+fn stem(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// A mask with its size; nothing where it is black all over.
+fn mask(path: &Path) -> Result<((u32, u32), Option<Region>)> {
+    let picture = image_io::load_gray(path)?;
+    let mask: Vec<bool> = picture.pixels().map(|p| p[0] > 0).collect();
+    Ok((picture.dimensions(), mask.contains(&true).then_some(Region::Mask(mask))))
+}
+
+/// 3D-OVS: `VIEW/CLASS.png` for the classes that `classes.txt` lists, one a line. A class that a view does not show has no picture
+/// there, or a black one; a picture of no listed class is an error.
+pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
+    let list = folder.join("classes.txt");
+    let text = String::from_utf8(fs::read(&list)?).map_err(|_| Error::format(&list, "not UTF-8 text"))?;
+    let classes: Vec<&str> = text.lines().map(str::trim).filter(|c| !c.is_empty()).collect();
+    if classes.is_empty() {
+        return Err(Error::format(&list, "it lists no classes"));
+    }
+    let mut views: Vec<PathBuf> = std::fs::read_dir(folder).map_err(Error::io(folder))?.flatten().map(|e| e.path()).collect();
+    views.retain(|p| p.is_dir());
+    views.sort();
+    let mut seen = vec![false; classes.len()];
+    let mut out = Vec::new();
+    for path in views {
+        let mut pictures: Vec<PathBuf> = std::fs::read_dir(&path).map_err(Error::io(&path))?.flatten().map(|e| e.path()).collect();
+        pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
+        pictures.sort();
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let mut view = LabelledView { name, width: 0, height: 0, labels: Vec::new() };
+        for picture in pictures {
+            let category = stem(&picture);
+            let class = classes.iter().position(|c| *c == category);
+            let class = class.ok_or_else(|| Error::format(&picture, format!("'{category}' is no class of {}", list.display())))?;
+            let (size, region) = mask(&picture)?;
+            if !view.labels.is_empty() && size != (view.width, view.height) {
+                return Err(Error::format(&picture, "its size is not that of the view's other masks"));
+            }
+            (view.width, view.height) = size;
+            if let Some(region) = region {
+                seen[class] = true;
+                view.labels.push(Label { category, region });
+            }
+        }
+        out.push(view);
+    }
+    match seen.iter().position(|s| !s) {
+        Some(never) if !out.is_empty() => Err(Error::format(&list, format!("no view shows the class '{}'", classes[never]))),
+        _ => Ok(out),
+    }
+}
+
+/// SPIn-NeRF: each picture is the mask of the one thing in the view of its name. Views that do not show it are left out.
+pub fn spin_nerf(folder: &Path, pictures: &[PathBuf], text: Option<&str>) -> Result<Vec<LabelledView>> {
+    let category = text.map_or_else(|| stem(folder), str::to_owned);
+    let mut out = Vec::new();
+    for picture in pictures {
+        let ((width, height), region) = mask(picture)?;
+        let label = |region| Label { category: category.clone(), region };
+        out.extend(region.map(|region| LabelledView { name: stem(picture), width, height, labels: vec![label(region)] }));
+    }
+    Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::load;
+    use super::*;
+    use image::{GrayImage, Luma};
+
+    fn picture(path: &Path, white: u32) {
+        let picture = GrayImage::from_fn(6, 4, |x, _| Luma([if x < white { 255 } else { 0 }]));
+        image_io::save_png(path, picture).unwrap();
+    }
+
+    #[test]
+    fn layout_of_3d_ovs() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path().join("segmentations");
+        picture(&root.join("04/red bag.png"), 2);
+        picture(&root.join("04/camera.png"), 3);
+        picture(&root.join("10/red bag.png"), 0);
+        picture(&root.join("10/camera.png"), 1);
+        std::fs::write(root.join("classes.txt"), "camera\nred bag\n").unwrap();
+        let views = load(dir.path(), None).unwrap();
+        let found: Vec<(&str, Vec<&str>)> =
+            views.iter().map(|v| (v.name.as_str(), v.labels.iter().map(|l| l.category.as_str()).collect())).collect();
+        assert_eq!(found, [("04", vec!["camera", "red bag"]), ("10", vec!["camera"])], "a black mask is no label");
+        assert_eq!(views[0].mask(&views[0].labels[1], 6, 4).iter().filter(|m| **m).count(), 8);
+        std::fs::write(root.join("classes.txt"), "camera\nred bag\nbanana\n").unwrap();
+        assert!(load(dir.path(), None).unwrap_err().to_string().contains("banana"));
+        std::fs::write(root.join("classes.txt"), "camera\n").unwrap();
+        assert!(load(dir.path(), None).unwrap_err().to_string().contains("red bag"));
+    }
+
+    #[test]
+    fn layout_of_spin_nerf() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("fortress");
+        picture(&folder.join("IMG_1.png"), 3);
+        picture(&folder.join("IMG_2.png"), 0);
+        let views = load(&folder, None).unwrap();
+        assert_eq!((views.len(), views[0].name.as_str(), views[0].labels[0].category.as_str()), (1, "IMG_1", "fortress"));
+        assert_eq!(load(&folder, Some("a stone fortress")).unwrap()[0].labels[0].category, "a stone fortress");
+        let empty = dir.path().join("empty");
+        std::fs::create_dir(&empty).unwrap();
+        assert!(load(&empty, None).unwrap_err().to_string().contains("3D-OVS"));
+    }
+}
