@@ -5,37 +5,18 @@
 
 #[path = "support/onnx.rs"]
 mod onnx;
+#[path = "support/run.rs"]
+mod run;
 #[path = "support/toy_models.rs"]
 mod toy_models;
 
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::ply;
+use run::{fails, fastlgs, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 use std::sync::OnceLock;
-
-fn fastlgs(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(args).output().expect("the binary starts")
-}
-
-fn json(args: &[&str]) -> Value {
-    let mut all = args.to_vec();
-    all.extend(["--json", "-"]);
-    let output = fastlgs(&all);
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{args:?}: {e}"))
-}
-
-/// Fails with exit code 1 and one line that holds all `words`.
-fn fails(args: &[&str], words: &[&str]) {
-    let output = fastlgs(args);
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(1), "{args:?}: {said}");
-    let line = said.lines().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{args:?} gives no message: {said}"));
-    assert!(words.iter().all(|w| line.contains(w)), "{args:?}: '{line}' lacks one of {words:?}");
-    assert!(!said.contains("panicked"), "{said}");
-}
 
 struct Fixture {
     dir: tempfile::TempDir,
@@ -43,20 +24,12 @@ struct Fixture {
     scene: PathBuf,
 }
 
-fn text(path: &Path) -> &str {
-    path.to_str().expect("a UTF-8 path")
-}
-
 /// One small generated scene, preprocessed with its exact masks and trained, shared by the tests.
 fn fixture() -> Option<&'static Fixture> {
     static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
     FIXTURE
         .get_or_init(|| {
-            let ready = json(&["info"]);
-            let complete = ready["offline_models"] == true && ready["adapters"].as_array().is_some_and(|a| !a.is_empty());
-            if !complete {
-                assert!(std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(), "models or device are missing: {ready}");
-                eprintln!("SKIPPED: needs the offline models and a Vulkan device: {ready}");
+            if !run::ready() {
                 return None;
             }
             let dir = tempfile::tempdir().expect("a temporary folder");
@@ -357,26 +330,67 @@ fn texts_are_answered_line_by_line() {
     assert!(answers[0]["ms"]["render"].as_f64() > Some(0.0) && answers[1]["ms"]["render"] == 0.0, "the view is rendered once");
 }
 
+/// The same truth in three layouts gives the same figures, and what is wrong with labels is said.
 #[test]
-fn ways_from_masks_to_a_field_are_charted() {
+fn labels_of_every_layout_agree() {
     let Some(f) = fixture() else { return };
-    let out = f.dir.path().join("chart");
-    let report = json(&["bench", "chart", text(&f.scene), "--quick", "--device", "cpu", "-o", text(&out)]);
-    let rows = report["rows"].as_array().expect("rows");
-    let oracle = |way: &str| rows.iter().find(|r| r["way"] == way).and_then(|r| r["oracle_miou"].as_f64()).expect("a figure");
-    assert_eq!(rows.len(), 5);
-    assert!(oracle("global") > 0.6 && oracle("global") >= oracle("+ colour (paper)"), "{report}");
-    assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| r["seconds"].as_f64() > Some(0.0)));
-    for file in ["chart.svg", "chart.md", "chart.csv", "chart.json"] {
-        assert!(std::fs::metadata(out.join(file)).expect("a file").len() > 100, "{file}");
+    let at = |name: &str| f.dir.path().join("layouts").join(name);
+    let names: Vec<String> = instance_names(&f.photos.join("instances.json")).into_iter().collect();
+    let mut classes = String::new();
+    for view in ["000", "008", "016", "024"] {
+        let truth = LabelMap::load(&f.photos.join(format!("masks/{view}.png.png"))).expect("exact masks");
+        for (k, name) in names.iter().enumerate().filter(|(k, _)| truth.labels.contains(&(*k as u16 + 1))) {
+            let mask = truth.mask(k as u16 + 1);
+            let picture = image::GrayImage::from_fn(320, 240, |x, y| image::Luma([255 * u8::from(mask[(y * 320 + x) as usize])]));
+            fastlgs_core::image_io::save_png(&at("3dovs/segmentations").join(view).join(format!("{name}.png")), picture.clone())
+                .expect("a mask");
+            if name == "cat" {
+                fastlgs_core::image_io::save_png(&at("cat").join(format!("{view}.png")), picture).expect("a mask");
+            }
+        }
     }
-    assert!(
-        !std::fs::read_dir(f.dir.path()).expect("a folder").any(|e| e
-            .expect("an entry")
-            .file_name()
-            .to_string_lossy()
-            .starts_with(".trial"))
-    );
+    names.iter().for_each(|n| classes += &format!("{n}\n"));
+    std::fs::write(at("3dovs/segmentations/classes.txt"), classes).expect("a list");
+    let eval = |labels: &Path, more: &[&str]| json(&[&["eval", text(&f.scene), "--labels", text(labels)], more].concat());
+    let (lerf, masks) = (eval(&f.photos.join("labels"), &[]), eval(&at("3dovs"), &[]));
+    for figure in ["labels_scored", "miou", "oracle_miou", "macc", "apart", "boundary_iou"] {
+        let [a, b] = [&lerf, &masks].map(|report| report[figure].as_f64().expect("a number"));
+        assert!((a - b).abs() < 1e-9, "{figure}: {a} {b}; only the order of the sums differs");
+    }
+    let cat = eval(&at("cat"), &[]);
+    assert_eq!(cat["miou"], lerf["miou_by_label"]["cat"], "SPIn-NeRF's masks are named by their folder");
+    assert_eq!(eval(&at("cat"), &["--label-text", "a submarine"])["miou"], 0.0);
+
+    // Views that were trained on, and views that there are not.
+    let wrong = at("wrong");
+    std::fs::create_dir_all(&wrong).expect("a folder");
+    std::fs::copy(at("cat/008.png"), wrong.join("009.png")).expect("a mask");
+    fails(&["eval", text(&f.scene), "--labels", text(&wrong)], &["009.png", "trained on", "--holdout-labels"]);
+    std::fs::rename(wrong.join("009.png"), wrong.join("none.png")).expect("a mask");
+    fails(&["eval", text(&f.scene), "--labels", text(&wrong)], &["no view 'none'"]);
+
+    // Labelled views are kept out where the user asks for it.
+    let scene = at("scene");
+    let report = json(&[
+        "preprocess",
+        text(&f.photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--holdout-labels",
+        text(&at("cat")),
+        "--max-side",
+        "96",
+    ]);
+    assert_eq!((report["training_photos"].as_u64(), report["held_out"].as_u64()), (Some(28), Some(4)));
+    fails(&["query", text(&scene), "cat"], &["never trained"]);
+}
+
+/// Names of the instances of a generated scene.
+fn instance_names(path: &Path) -> Vec<String> {
+    let list: Value = serde_json::from_slice(&std::fs::read(path).expect("the instances")).expect("JSON");
+    list.as_array().expect("a list").iter().map(|i| i["name"].as_str().expect("a name").to_owned()).collect()
 }
 
 #[test]

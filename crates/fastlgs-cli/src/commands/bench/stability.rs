@@ -305,7 +305,9 @@ impl Bench<'_> {
                     break;
                 }
             }
-            rows.push(row(name, case, reference, &runs));
+            let row = row(name, case, reference, &runs);
+            tracing::info!(%row, "trial");
+            rows.push(row);
             bar.inc(1);
         }
         Ok(rows)

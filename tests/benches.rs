@@ -1,0 +1,80 @@
+//! The quick suite of benches on generated scenes: that they run, that their figures add up, and the bounds that are promised.
+
+#[path = "support/run.rs"]
+mod run;
+
+use run::{json, text};
+use serde_json::Value;
+use std::path::Path;
+
+fn number(row: &Value, name: &str) -> f64 {
+    row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"))
+}
+
+fn written(folder: &Path, files: &[&str]) {
+    for file in files {
+        assert!(std::fs::metadata(folder.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")).len() > 100, "{file}");
+    }
+    assert!(!folder.join(".trials").exists(), "trials are cleaned away");
+}
+
+#[test]
+fn quick_suite() {
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let out = dir.path();
+    let bench = |what: &str| json(&["bench", what, "--quick", "--device", "cpu", "-o", text(out)]);
+
+    let chart = bench("chart");
+    let rows = chart["rows"].as_array().expect("rows");
+    let oracle = |way: &str| number(rows.iter().find(|r| r["way"] == way).expect("a way"), "oracle_miou");
+    println!(
+        "chart: {} ways, global {:.3}, paper {:.3}, no grid {:.3}",
+        rows.len(),
+        oracle("global"),
+        oracle("+ colour (paper)"),
+        oracle("no grid")
+    );
+    assert!(oracle("global") > 0.75 && oracle("global") > oracle("embeddings") && oracle("global") > oracle("no grid"), "{chart}");
+    assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| number(r, "seconds") > 0.0));
+    written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
+
+    let size = bench("size");
+    let verdict = &size["auto"][0];
+    println!("size: {verdict}");
+    assert!(number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 1.0, "{verdict}");
+    let rows = size["rows"].as_array().expect("rows");
+    let bytes = |model: &str| number(rows.iter().find(|r| r["model"] == model).expect("a model"), "scene_bytes");
+    assert!(bytes("auto, compact") < bytes("auto") && bytes("degree 0") < bytes("full"));
+    written(out, &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
+
+    let stability = bench("stability");
+    let rows = stability["rows"].as_array().expect("rows");
+    let row = |disturbance: &str| rows.iter().find(|r| r["disturbance"] == disturbance).expect("a row");
+    println!("stability: {} rows hold, {} fail", stability["holds"], stability["fails"]);
+    for row in rows {
+        println!(
+            "stability: {} {} {}: {:+.1} of {} ({})",
+            row["scene"],
+            row["disturbance"],
+            row["strength"],
+            number(row, "change"),
+            row["bound"],
+            row["verdict"]
+        );
+    }
+    // What is promised; the other rows are measured.
+    for promised in ["photos shuffled", "masks split", "masks dropped"] {
+        assert_eq!(row(promised)["verdict"], "holds", "{}", row(promised));
+    }
+    let twins = rows.iter().find(|r| r["scene"] == "twins").expect("twins");
+    assert!(number(twins, "apart") >= 0.95, "{twins}");
+    written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
+
+    let report = json(&["bench", "report", text(out), "-o", text(&out.join("report.html"))]);
+    assert_eq!(report["results"].as_array().map(Vec::len), Some(3));
+    let page = std::fs::read_to_string(out.join("report.html")).expect("the report");
+    assert!(page.matches("<svg").count() == 5 && page.contains("photos shuffled") && !page.contains("src=\"http"), "self-contained");
+}

@@ -1,0 +1,168 @@
+//! What must hold when things go wrong from outside: kills, full disks, places that cannot be written, many users at once.
+
+#[path = "support/run.rs"]
+mod run;
+
+use fastlgs_core::rng::Rng;
+use run::{complaint, json, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// A small preprocessed scene, and how long its training takes.
+struct Fixture {
+    dir: tempfile::TempDir,
+    trained: PathBuf,
+    training: Duration,
+}
+
+const TRAINING: [&str; 6] = ["--iterations", "1200", "--budget", "2500", "--device", "cpu"];
+
+fn fixture() -> Option<&'static Fixture> {
+    static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
+    FIXTURE
+        .get_or_init(|| {
+            if !run::ready() {
+                return None;
+            }
+            let dir = tempfile::tempdir().expect("a temporary folder");
+            let (photos, trained) = (dir.path().join("photos"), dir.path().join("trained"));
+            json(&["synth", "table", "-o", text(&photos), "--views", "14", "--size", "128x96"]);
+            json(&["preprocess", text(&photos), "-o", text(&trained), "--segmenter", "import"]);
+            copy_folder(&trained, &dir.path().join("untrained"));
+            let started = Instant::now();
+            json(&[&["train", text(&trained)], &TRAINING[..]].concat());
+            Some(Fixture { dir, trained, training: started.elapsed() })
+        })
+        .as_ref()
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    assert!(Command::new("cp").arg("-r").arg(from).arg(to).status().expect("cp").success());
+}
+
+/// The files that training makes.
+fn results(scene: &Path) -> [Vec<u8>; 3] {
+    ["scene.ply", "grid.json", "grid.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"))
+}
+
+#[test]
+fn training_survives_twenty_kills() {
+    let Some(f) = fixture() else { return };
+    let scene = f.dir.path().join("killed");
+    copy_folder(&f.dir.path().join("untrained"), &scene);
+    let mut rng = Rng::new(20, "kills");
+    let (mut kills, mut resumed, mut finished) = (0, 0, 0);
+    while kills < 20 {
+        resumed += usize::from(scene.join("checkpoints/train.json").is_file());
+        let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+            .args([&["train", text(&scene), "--resume", "-q"], &TRAINING[..]].concat())
+            .stderr(Stdio::null())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("the binary starts");
+        std::thread::sleep(f.training.mul_f32(rng.range(0.05, 0.8)));
+        match child.try_wait().expect("a child") {
+            Some(status) => {
+                assert!(status.success(), "after {kills} kills: {status}");
+                finished += 1;
+            }
+            None => {
+                child.kill().expect("a child");
+                child.wait().expect("an end");
+                kills += 1;
+            }
+        }
+    }
+    json(&[&["train", text(&scene), "--resume"], &TRAINING[..]].concat());
+    println!("kills: {kills}, runs that found a checkpoint: {resumed}, runs that ended before their kill: {finished}");
+    assert!(resumed >= 3, "kills at random moments leave checkpoints");
+    assert!(results(&scene) == results(&f.trained), "a run that was killed and resumed ends in the same bytes");
+    let left = std::fs::read_dir(&scene).expect("the scene").flatten().filter(|e| e.file_name().to_string_lossy().contains(".partial"));
+    println!("partial files left by kills: {}", left.count());
+}
+
+#[test]
+fn a_full_disk_leaves_earlier_results_whole() {
+    let Some(f) = fixture() else { return };
+    let scene = f.dir.path().join("full");
+    copy_folder(&f.trained, &scene);
+    let before = results(&scene);
+    // Files may have 64 blocks of 512 or 1024 bytes, whoever runs this; the signal that usually goes with it is ignored.
+    let limited = |args: &[&str]| {
+        let script = "trap '' XFSZ; ulimit -f 64; exec \"$0\" \"$@\"";
+        Command::new("sh").args(["-c", script, env!("CARGO_BIN_EXE_fastlgs")]).args(args).output().expect("a shell")
+    };
+    let (small, ply) = (f.dir.path().join("small"), f.dir.path().join("out.ply"));
+    std::fs::write(&ply, "earlier").expect("a file");
+    let train = [&["train", text(&scene)], &TRAINING[..]].concat();
+    let mut tried = 0;
+    for (args, word) in [
+        (train.as_slice(), "train"),
+        (&["export", text(&scene), text(&ply)], "out.ply"),
+        (&["export", text(&scene), text(&small)], "small"),
+    ] {
+        let line = complaint(args, &limited(args));
+        assert!(line.contains("too large") || line.contains("No space"), "{line}");
+        assert!(line.contains(word) || line.contains(text(&scene)), "the message names the file: {line}");
+        tried += 1;
+    }
+    assert!(results(&scene) == before, "the earlier scene is whole");
+    assert_eq!(std::fs::read(&ply).expect("the earlier file"), b"earlier");
+    json(&["query", text(&scene), "table", "--min-score", "0.01", "--device", "cpu"]);
+    println!("full disk: {tried} commands refused, earlier results whole");
+}
+
+#[test]
+fn places_that_cannot_be_written_are_named() {
+    let Some(f) = fixture() else { return };
+    let scene = text(&f.trained);
+    // No user may write there, not even root.
+    let nowhere = "/proc/fastlgs";
+    let mut tried = 0;
+    for args in [
+        vec!["synth", "twins", "-o", nowhere, "--views", "4", "--size", "16x12"],
+        vec!["preprocess", text(&f.dir.path().join("photos")), "-o", nowhere, "--segmenter", "import"],
+        vec!["render", scene, "-o", nowhere, "--device", "cpu"],
+        vec!["query", scene, "table", "--min-score", "0.01", "-o", nowhere, "--device", "cpu"],
+        vec!["export", scene, "/proc/fastlgs/out.ply", "--device", "cpu"],
+        vec!["eval", scene, "--json", "/proc/fastlgs/report.json", "--device", "cpu"],
+        vec!["bench", "size", scene, "-o", nowhere, "--device", "cpu"],
+    ] {
+        let line = complaint(&args, &run::fastlgs(&args));
+        assert!(line.contains(nowhere), "{args:?}: {line}");
+        tried += 1;
+    }
+    println!("read-only output: {tried} commands refused");
+}
+
+#[test]
+fn many_queries_at_once_agree() {
+    let Some(f) = fixture() else { return };
+    const USERS: usize = 24;
+    let out = |user: usize| f.dir.path().join(format!("user-{user}"));
+    let ask = |user: usize| {
+        Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+            .args(["query", text(&f.trained), "table", "--min-score", "0.01", "--device", "cpu", "--json", "-", "-o", text(&out(user))])
+            .stdout(Stdio::piped())
+            .spawn()
+            .expect("the binary starts")
+    };
+    let children: Vec<_> = (0..USERS).map(ask).collect();
+    let answers: Vec<(Value, Vec<u8>)> = children
+        .into_iter()
+        .map(|child| {
+            let output = child.wait_with_output().expect("an end");
+            assert!(output.status.success());
+            let mut answer: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+            let mask = std::fs::read(answer["mask"].as_str().expect("a path")).expect("the mask");
+            // Times and places differ.
+            ["ms", "mask", "overlay", "heatmap"].iter().for_each(|k| drop(answer.as_object_mut().expect("an object").remove(*k)));
+            (answer, mask)
+        })
+        .collect();
+    assert!(answers.iter().all(|a| *a == answers[0]), "{:?}", answers[0].0);
+    println!("{USERS} queries at once agree");
+}
