@@ -12,7 +12,7 @@ mod toy_models;
 
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::ply;
-use run::{fails, fastlgs, json, text};
+use run::{copy_folder, fails, fastlgs, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -471,16 +471,4 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     fails(&["info", "--device", "nonsense", text(&at("nowhere"))], &["nowhere"]);
     fails(&["render", text(&f.scene), "--device", "nonsense", "-o", text(&at("r"))], &["nonsense"]);
     assert_eq!(fastlgs(&["query"]).status.code(), Some(2), "wrong usage");
-}
-
-fn copy_folder(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).expect("a folder");
-    for entry in std::fs::read_dir(from).expect("a folder").flatten() {
-        let target = to.join(entry.file_name());
-        if entry.path().is_dir() {
-            copy_folder(&entry.path(), &target)
-        } else {
-            std::fs::copy(entry.path(), &target).map(|_| ()).expect("a copy")
-        }
-    }
 }

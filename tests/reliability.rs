@@ -4,7 +4,7 @@
 mod run;
 
 use fastlgs_core::rng::Rng;
-use run::{complaint, json, text};
+use run::{complaint, copy_folder, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -37,10 +37,6 @@ fn fixture() -> Option<&'static Fixture> {
             Some(Fixture { dir, trained, training: started.elapsed() })
         })
         .as_ref()
-}
-
-fn copy_folder(from: &Path, to: &Path) {
-    assert!(Command::new("cp").arg("-r").arg(from).arg(to).status().expect("cp").success());
 }
 
 /// The files that training makes.

@@ -100,7 +100,9 @@ impl Scene {
             return Ok(Field::Shares(self.engine.render_ids(self.view(camera), &self.gaussians.object_ids)?));
         }
         let frame = self.engine.render(self.view(camera), Channels::Feature)?;
-        let (width, height, values) = (frame.width, frame.height, frame.channels(3, 6).to_vec());
+        let (width, height) = (frame.width, frame.height);
+        // Codes that were trained make up for what passes through; those that were lifted do not.
+        let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
         Ok(Field::Features { width, height, values, tau_ac: tau_ac.unwrap_or(codes::TAU_AC) })
     }
 
@@ -136,6 +138,12 @@ impl Scene {
     pub fn min_score(&self) -> f32 {
         if self.manifest.encoder == "offline" { query::MIN_SCORE } else { query::CLIP_MIN_SCORE }
     }
+}
+
+/// The three features of each pixel as a mean over what covers it: blended ones over 1 - transmittance.
+pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
+    let over = |(v, t): (&f32, &f32)| if *t < 0.999 { v / (1.0 - t) } else { 0.0 };
+    [3, 4, 5].map(|k| frame.channels(k, k + 1).iter().zip(frame.channels(6, 7)).map(over).collect())
 }
 
 /// Bytes of everything that a query needs.

@@ -22,7 +22,7 @@ pub fn pack(id: u16, weight: f32) -> u32 {
 }
 
 /// Id and weight of [`pack`].
-fn unpack(share: u32) -> (u16, u32) {
+pub fn unpack(share: u32) -> (u16, u32) {
     ((share >> 16) as u16, share & 0xffff)
 }
 
