@@ -13,6 +13,7 @@ const SAME: f32 = 1.0;
 const THUMB: u32 = 32;
 
 /// What a photo looks like, in a few numbers.
+#[derive(Clone)]
 pub struct Impression {
     sharpness: f32,
     thumb: Vec<u8>,

@@ -4,7 +4,6 @@ use crate::keypoints::{Keypoints, epipolar_error, fundamental};
 use fastlgs_core::Camera;
 use fastlgs_core::dataset::SfmPoint;
 use glam::{Vec2, Vec3};
-use image::RgbImage;
 
 /// A matched pair of photos: indices, and key-point pairs that obey the known poses.
 #[derive(Clone, Debug)]
@@ -62,17 +61,15 @@ pub(crate) fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2) -> Option<Ve
     (s > 0.0 && t > 0.0 && seen(a, pa) && seen(b, pb)).then_some(point)
 }
 
-/// Triangulates every match; colours come from the first photo.
-pub fn triangulate(cameras: &[Camera], keypoints: &[Keypoints], photos: &[RgbImage], matches: &[PairMatches]) -> Vec<SfmPoint> {
+/// Triangulates every match; `colors` are those of each photo's key points, of which the first photo's is taken.
+pub fn triangulate(cameras: &[Camera], keypoints: &[Keypoints], colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Vec<SfmPoint> {
     let mut points = Vec::new();
     for m in matches {
         let (a, b) = (&cameras[m.a], &cameras[m.b]);
         for &(i, j) in &m.pairs {
             let pa = keypoints[m.a].positions[i];
             if let Some(position) = intersect(a, pa, b, keypoints[m.b].positions[j]) {
-                let photo = &photos[m.a];
-                let (x, y) = ((pa.x as u32).min(photo.width() - 1), (pa.y as u32).min(photo.height() - 1));
-                points.push(SfmPoint { position, color: photo.get_pixel(x, y).0 });
+                points.push(SfmPoint { position, color: colors[m.a][i] });
             }
         }
     }

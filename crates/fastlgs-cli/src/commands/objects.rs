@@ -12,13 +12,7 @@ use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::{Encoder, Level, histogram};
 use image::RgbImage;
-use std::collections::BTreeMap;
-
-/// Objects of a scene with the object map of each training view.
-pub struct Objects {
-    pub grid: Grid,
-    pub maps: Vec<LabelMap>,
-}
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Constants of global mapping.
 pub struct Config {
@@ -34,11 +28,11 @@ const NEIGHBOURS: usize = 10;
 const EMBEDDED_VIEWS: usize = 5;
 
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
-pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Objects> {
+pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Grid> {
     let (masks, pairs) = evidence::load(folder)?;
     let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config);
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
-    let mut maps = Vec::new();
+    let mut contacts = BTreeSet::new();
     for (view, camera) in training.iter().enumerate() {
         let labels = whole_masks(folder, camera)?;
         let mut table = vec![0u16; usize::from(labels.max()) + 1];
@@ -49,23 +43,23 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         }
         let map = LabelMap { labels: labels.labels.iter().map(|l| table[usize::from(*l)]).collect(), ..labels };
         map.save(&folder.objects_path(&camera.name))?;
-        maps.push(map);
+        contacts.extend(map.contacts());
     }
-    let codes = codes::separated(usize::from(count), &maps.iter().flat_map(LabelMap::contacts).collect(), seed);
-    Ok(Objects { grid: Grid::build(&masks, &object_of, codes), maps })
+    Ok(Grid::build(&masks, &object_of, codes::separated(usize::from(count), &contacts, seed)))
 }
 
-/// Gives every Gaussian the object that most of its blending weight falls on, and that object's code.
-pub fn lift(scene: &mut Gaussians, training: &[Camera], maps: &[LabelMap], grid: &Grid) {
+/// Gives every Gaussian the object of the views' object maps that most of its blending weight falls on, and that object's code.
+pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], grid: &Grid) -> Result<()> {
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
-    for (camera, map) in training.iter().zip(maps) {
-        for vote in lift::votes(scene, camera, map) {
+    for camera in training {
+        for vote in lift::votes(scene, camera, &folder.objects(&camera.name)?) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }
     }
     let most = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).map_or(0, |(id, _)| *id);
     scene.object_ids = weights.iter().map(most).collect();
     grid.set_codes(scene);
+    Ok(())
 }
 
 /// Global mapping: the views vote over the trained Gaussians which of them form regions and parts of regions, a tree grows
@@ -226,7 +220,7 @@ fn masks(folder: &SceneFolder, camera: &Camera, level: Level) -> Result<Option<L
 }
 
 /// The masks from which objects are made.
-fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
+pub fn whole_masks(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
     let path = folder.masks_path(Level::Whole.name(), &camera.name);
     masks(folder, camera, Level::Whole)?.with_context(|| format!("{} is missing; run 'fastlgs preprocess' again", path.display()))
 }

@@ -16,6 +16,7 @@ use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::triangulate::{self, PairMatches};
 use fastlgs_vision::{Encoder, Level, Segmenter, brightness, import};
 use fastlgs_vision::{pose_check, structure};
+use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -74,15 +75,17 @@ pub struct Photo {
     alpha: Option<GrayImage>,
     /// Black where nothing counts.
     ignore: Option<GrayImage>,
-    /// Fingerprint of the pixels.
-    key: Key,
 }
 
-/// Masks of one training view.
-struct ViewMasks {
-    /// Index into the training photos.
-    view: usize,
-    labels: LabelMap,
+/// What is kept in memory of a photo; its pixels lie in the scene folder, so that thousands of photos fit.
+struct Known {
+    camera: Camera,
+    /// Fingerprint of the pixels.
+    key: Key,
+    impression: Impression,
+    points: Keypoints,
+    /// Colour at each key point.
+    colors: Vec<[u8; 3]>,
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
@@ -110,13 +113,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
     let folder = SceneFolder::new(&args.output);
     let cache = Cache::new(&folder);
-    let mut photos = load_photos(&dataset, args, &folder, common)?;
+    let mut photos = load_photos(&dataset, args, &folder, &cache, common)?;
     lap("photos");
-    let mut keypoints = detect(&photos, &cache, common)?;
-    lap("key_points");
     let mut warnings = dataset.warnings.clone();
     warn_of_bad_photos(&photos, &mut warnings);
-    let checked = check_poses(&mut photos, &keypoints, &cache, common, &mut warnings)?;
+    let checked = check_poses(&mut photos, &folder, &cache, common, &mut warnings)?;
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
@@ -136,39 +137,37 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         notes: BTreeMap::new(),
     };
     let usable = |i: usize| !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i);
-    let mut index = 0..;
-    keypoints.retain(|_| index.next().is_some_and(usable));
-    let training: Vec<Photo> = photos.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
+    let training: Vec<Known> = photos.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
     if training.len() < 2 {
         bail!("{}: only {} photos are left for training; at least 2 are needed", args.photos.display(), training.len());
     }
     lap("pose_check");
 
-    let (segmented, mask_counts) = segment(args, segmenter.as_ref(), &training, &folder, &cache, common)?;
+    let mask_counts = segment(args, segmenter.as_ref(), &training, &folder, &cache, common)?;
     drop(segmenter);
     lap("masks");
-    let masks = describe(args, encoder.as_ref(), &training, &segmented, &cache, common)?;
+    let masks = describe(args, encoder.as_ref(), &training, &folder, &cache, common)?;
     drop(encoder);
     lap("embeddings");
-    let matches = match_photos(&training, &keypoints, args.neighbours, &cache, common)?;
+    let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let matches = match_photos(&training, &poses, args.neighbours, &cache, common)?;
     lap("matches");
-    let pixels: Vec<&RgbImage> = training.iter().map(|p| &p.pixels).collect();
-    let spread = brightness::spread(&pixels, &keypoints, &matches);
+    let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
+    let spread = brightness::spread(&colors, &matches);
 
     // Points of moved cameras lie where those cameras were.
     let points = if dataset.points.is_empty() || !checked.moved.is_empty() {
-        triangulated(&training, &keypoints, &matches)
+        triangulate::triangulate(&poses, &keypoints, &colors, &matches)
     } else {
         dataset.points.clone()
     };
     folder.save_points(&points)?;
-    let pairs = correspondences(&masks, &segmented, &keypoints, &matches);
+    let pairs = correspondences(&masks, &folder, &poses, &keypoints, &matches)?;
     evidence::save(&folder, &masks, &pairs)?;
     lap("points");
     // Without Gaussians only Algorithm 1 can map the masks; `train` maps again with what it learns, or with its options.
-    let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
     let mapped = objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), common.seed)?;
-    mapped.grid.save(&folder)?;
+    mapped.save(&folder)?;
     lap("mapping");
 
     let matched: usize = matches.iter().map(|m| m.pairs.len()).sum();
@@ -179,12 +178,12 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let value = serde_json::json!({
         "scene": args.output,
         "photos": cameras.len(),
-        "training_photos": training.len(),
-        "held_out": cameras.len() - training.len(),
+        "training_photos": poses.len(),
+        "held_out": cameras.len() - poses.len(),
         "size": format!("{}x{}", cameras[0].width, cameras[0].height),
         "masks": masks.len(),
         "masks_per_photo": mask_counts,
-        "objects_by_algorithm_1": mapped.grid.objects.len(),
+        "objects_by_algorithm_1": mapped.objects.len(),
         "key_point_matches": matched,
         "points": points.len(),
         "sift": keypoints::backend(),
@@ -224,8 +223,8 @@ fn find_poses(photos: &Path, common: &ui::Common) -> Result<()> {
 }
 
 /// Blurred and repeated photos are used all the same, but the user hears of them.
-fn warn_of_bad_photos(photos: &[Photo], warnings: &mut Vec<String>) {
-    let seen: Vec<Impression> = photos.iter().map(|p| Impression::of(&p.pixels)).collect();
+fn warn_of_bad_photos(photos: &[Known], warnings: &mut Vec<String>) {
+    let seen: Vec<Impression> = photos.iter().map(|p| p.impression.clone()).collect();
     for (list, what) in
         [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "show the same as the photo before them")]
     {
@@ -241,19 +240,20 @@ fn warn_of_bad_photos(photos: &[Photo], warnings: &mut Vec<String>) {
 /// Bytes that a photo takes while it is read, for each of its file's pixels: decoded, shrunk, undistorted, encoded again.
 const BYTES_A_PIXEL: u64 = 12;
 
-fn load_photos(dataset: &Dataset, args: &Args, folder: &SceneFolder, common: &ui::Common) -> Result<Vec<Photo>> {
+/// Reads the photos, writes them into the scene folder, and looks at each once.
+fn load_photos(dataset: &Dataset, args: &Args, folder: &SceneFolder, cache: &Cache, common: &ui::Common) -> Result<Vec<Known>> {
     let bar = ui::bar(common, dataset.photos.len() as u64, "photos");
     let largest = dataset.photos.iter().map(|p| u64::from(p.camera.width) * u64::from(p.camera.height)).max().unwrap_or(1);
     let together = (args.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
     let mut photos = Vec::with_capacity(dataset.photos.len());
     for some in dataset.photos.chunks(together) {
-        let loaded: Vec<Result<Photo>> = some
+        let loaded: Vec<Result<Known>> = some
             .par_iter()
             .map(|posed| {
                 let photo = load_photo(posed, args.max_side)?;
                 save_photo(&photo, folder)?;
                 bar.inc(1);
-                Ok(photo)
+                known(photo, cache)
             })
             .collect();
         for photo in loaded {
@@ -262,6 +262,16 @@ fn load_photos(dataset: &Dataset, args: &Args, folder: &SceneFolder, common: &ui
     }
     bar.finish_and_clear();
     Ok(photos)
+}
+
+/// What stays in memory of a photo.
+fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
+    let key = cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()]);
+    let inputs = cache::key(&[&key, keypoints::backend().as_bytes()]);
+    let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
+    let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
+    let colors = points.positions.iter().map(color).collect();
+    Ok(Known { impression: Impression::of(&pixels), camera, key, points, colors })
 }
 
 /// Writes a working photo with its masks into the scene folder.
@@ -299,27 +309,25 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
     let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
     let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
-    let key = cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()]);
-    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera, key })
+    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
 }
 
-/// Masks of every training photo; returns the whole ones, and the mean number of masks a photo by level.
+/// Writes the masks of every training photo; returns the mean number of masks a photo by level.
 fn segment(
     args: &Args,
     segmenter: &dyn Segmenter,
-    training: &[Photo],
+    training: &[Known],
     folder: &SceneFolder,
     cache: &Cache,
     common: &ui::Common,
-) -> Result<(Vec<ViewMasks>, BTreeMap<&'static str, f64>)> {
+) -> Result<BTreeMap<&'static str, f64>> {
     let bar = ui::bar(common, training.len() as u64, "masks");
-    let mut out = Vec::new();
     let mut counts = BTreeMap::new();
     let identity = args.eyes.segmenter_identity()?;
-    for (view, photo) in training.iter().enumerate() {
+    for photo in training {
         let name = &photo.camera.name;
         let make = || -> Result<[LabelMap; 3]> {
-            Ok(segmenter.segment(name, &photo.pixels).with_context(|| format!("segmenting {name}"))?.levels)
+            Ok(segmenter.segment(name, &folder.photo(name)?).with_context(|| format!("segmenting {name}"))?.levels)
         };
         let levels = match &identity {
             Some(identity) => cache.get("masks", &cache::key(&[&photo.key, identity.as_bytes()]), make)?,
@@ -335,29 +343,28 @@ fn segment(
                 std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
             }
         }
-        let [labels, ..] = levels;
-        out.push(ViewMasks { view, labels });
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok((out, counts))
+    Ok(counts)
 }
 
 /// Embedding and colour distribution of every mask, sorted by view and label.
 fn describe(
     args: &Args,
     encoder: &dyn Encoder,
-    training: &[Photo],
-    segmented: &[ViewMasks],
+    training: &[Known],
+    folder: &SceneFolder,
     cache: &Cache,
     common: &ui::Common,
 ) -> Result<Vec<Mask>> {
     let bar = ui::bar(common, training.len() as u64, "embeddings");
     let mut masks = Vec::new();
     let identity = args.eyes.encoder_identity()?;
-    for ViewMasks { view, labels } in segmented {
-        let photo = &training[*view];
-        let make = || objects::masks_of(&photo.camera.name, &photo.pixels, 0, labels, encoder);
+    for (view, photo) in training.iter().enumerate() {
+        let name = &photo.camera.name;
+        let labels = objects::whole_masks(folder, &photo.camera)?;
+        let make = || objects::masks_of(name, &folder.photo(name)?, 0, &labels, encoder);
         let of_view: Vec<Mask> = match &identity {
             Some(identity) => {
                 let inputs = [&photo.key, bytemuck::cast_slice(&labels.labels), identity.as_bytes()];
@@ -366,24 +373,11 @@ fn describe(
             None => make()?,
         };
         // A photo keeps what is known of it when others come or go before it.
-        masks.extend(of_view.into_iter().map(|mask| Mask { view: *view, ..mask }));
+        masks.extend(of_view.into_iter().map(|mask| Mask { view, ..mask }));
         bar.inc(1);
     }
     bar.finish_and_clear();
     Ok(masks)
-}
-
-/// Key points of each photo.
-fn detect(photos: &[Photo], cache: &Cache, common: &ui::Common) -> Result<Vec<Keypoints>> {
-    let bar = ui::bar(common, photos.len() as u64, "key points");
-    let found = photos.par_iter().map(|photo| {
-        bar.inc(1);
-        let inputs = cache::key(&[&photo.key, keypoints::backend().as_bytes()]);
-        cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&photo.pixels))?))
-    });
-    let found = found.collect();
-    bar.finish_and_clear();
-    found
 }
 
 /// Longer side of the pictures on which poses are checked. Its tolerances are pixels, and the coarser key points of small
@@ -392,8 +386,8 @@ const CHECK_SIDE: u32 = 480;
 
 /// Moves misplaced cameras and warns about them. Poses come from all photos, held out or not, as in structure from motion.
 fn check_poses(
-    photos: &mut [Photo],
-    keypoints: &[Keypoints],
+    photos: &mut [Known],
+    folder: &SceneFolder,
     cache: &Cache,
     common: &ui::Common,
     warnings: &mut Vec<String>,
@@ -405,8 +399,8 @@ fn check_poses(
     inputs.extend([given.as_slice(), &seed, keypoints::backend().as_bytes()]);
     let (report, poses) = cache.get("poses", &cache::key(&inputs), || {
         let small = photos.iter().zip(&cameras).any(|(p, c)| p.camera.width != c.width);
-        let detected = if small { Some(detect_small(photos, &cameras, common)?) } else { None };
-        let report = pose_check::repair(&mut cameras, detected.as_deref().unwrap_or(keypoints), common.seed);
+        let points = if small { detect_small(folder, &cameras, common)? } else { photos.iter().map(|p| p.points.clone()).collect() };
+        let report = pose_check::repair(&mut cameras, &points, common.seed);
         Ok((report, cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>()))
     })?;
     let names = |list: &[usize]| list.iter().map(|&i| photos[i].camera.name.as_str()).collect::<Vec<_>>().join(", ");
@@ -425,11 +419,11 @@ fn check_poses(
 }
 
 /// Key points of the photos at the sizes of `cameras`.
-fn detect_small(photos: &[Photo], cameras: &[Camera], common: &ui::Common) -> Result<Vec<Keypoints>> {
-    let bar = ui::bar(common, photos.len() as u64, "key points for the pose check");
+fn detect_small(folder: &SceneFolder, cameras: &[Camera], common: &ui::Common) -> Result<Vec<Keypoints>> {
+    let bar = ui::bar(common, cameras.len() as u64, "key points for the pose check");
     let mut points = Vec::new();
-    for (photo, camera) in photos.iter().zip(cameras) {
-        let small = image_io::resize(&photo.pixels, camera.width, camera.height);
+    for camera in cameras {
+        let small = image_io::resize(&folder.photo(&camera.name)?, camera.width, camera.height);
         points.push(keypoints::detect(&image::imageops::grayscale(&small))?);
         bar.inc(1);
     }
@@ -437,22 +431,16 @@ fn detect_small(photos: &[Photo], cameras: &[Camera], common: &ui::Common) -> Re
     Ok(points)
 }
 
-fn match_photos(
-    training: &[Photo],
-    points: &[Keypoints],
-    neighbours: usize,
-    cache: &Cache,
-    common: &ui::Common,
-) -> Result<Vec<PairMatches>> {
-    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+fn match_photos(training: &[Known], cameras: &[Camera], neighbours: usize, cache: &Cache, common: &ui::Common) -> Result<Vec<PairMatches>> {
     let described = cameras.iter().map(serde_json::to_vec).collect::<Result<Vec<_>, _>>()?;
-    let chosen = triangulate::overlapping_pairs(&cameras, neighbours);
+    let chosen = triangulate::overlapping_pairs(cameras, neighbours);
     let bar = ui::bar(common, chosen.len() as u64, "matches");
     let match_pair = |(a, b): (usize, usize)| {
         let inputs = [&training[a].key, &training[b].key, described[a].as_slice(), &described[b], keypoints::backend().as_bytes()];
         let pairs = cache.get("matches", &cache::key(&inputs), || {
-            let pairs = keypoints::matches(&points[a], &points[b]);
-            Ok(triangulate::epipolar_filter((&cameras[a], &points[a]), (&cameras[b], &points[b]), &pairs))
+            let [pa, pb] = [a, b].map(|k| &training[k].points);
+            let pairs = keypoints::matches(pa, pb);
+            Ok(triangulate::epipolar_filter((&cameras[a], pa), (&cameras[b], pb), &pairs))
         })?;
         bar.inc(1);
         Ok(PairMatches { a, b, pairs })
@@ -462,28 +450,28 @@ fn match_photos(
     matches
 }
 
-fn triangulated(training: &[Photo], points: &[Keypoints], matches: &[PairMatches]) -> Vec<dataset::SfmPoint> {
-    let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
-    let photos: Vec<RgbImage> = training.iter().map(|p| p.pixels.clone()).collect();
-    triangulate::triangulate(&cameras, points, &photos, matches)
-}
-
 /// Counts the key-point pairs between the masks of matched photos.
-fn correspondences(masks: &[Mask], segmented: &[ViewMasks], points: &[Keypoints], matches: &[PairMatches]) -> Correspondences {
+fn correspondences(
+    masks: &[Mask],
+    folder: &SceneFolder,
+    cameras: &[Camera],
+    points: &[Keypoints],
+    matches: &[PairMatches],
+) -> Result<Correspondences> {
     let index: BTreeMap<(usize, u16), usize> = masks.iter().enumerate().map(|(i, m)| ((m.view, m.label), i)).collect();
-    let mask_at = |view: usize, point: usize| {
-        let map = &segmented[view].labels;
-        let p = points[view].positions[point];
-        let label = map.at((p.x as u32).min(map.width - 1), (p.y as u32).min(map.height - 1));
-        index.get(&(view, label)).copied()
+    let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<Option<usize>>> {
+        let map = objects::whole_masks(folder, camera)?;
+        let label = |p: &Vec2| map.at((p.x as u32).min(map.width - 1), (p.y as u32).min(map.height - 1));
+        Ok(points[view].positions.iter().map(|p| index.get(&(view, label(p))).copied()).collect())
     };
+    let mask_at: Vec<Vec<Option<usize>>> = cameras.iter().enumerate().map(of_view).collect::<Result<_>>()?;
     let mut out = Correspondences::new();
     for m in matches {
         for &(i, j) in &m.pairs {
-            if let (Some(a), Some(b)) = (mask_at(m.a, i), mask_at(m.b, j)) {
+            if let (Some(a), Some(b)) = (mask_at[m.a][i], mask_at[m.b][j]) {
                 *out.entry((b, a)).or_default() += 1;
             }
         }
     }
-    out
+    Ok(out)
 }

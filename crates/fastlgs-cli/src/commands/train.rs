@@ -112,7 +112,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     } else {
         None
     };
-    let codes = paper.as_ref().filter(|_| by_descent).map(|p| &p.grid);
+    let codes = paper.as_ref().filter(|_| by_descent);
     let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
     let held_out = manifest.held_out(&cameras).iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
     let (preset, preset_degree, preset_most) = match args.preset.as_str() {
@@ -184,13 +184,13 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let grid = match paper {
         Some(found) if by_descent => {
             for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
-                *id = found.grid.nearest(*feature).map_or(0, |(id, _)| id);
+                *id = found.nearest(*feature).map_or(0, |(id, _)| id);
             }
-            found.grid
+            found
         }
         Some(found) => {
-            objects::lift(&mut scene, &training, &found.maps, &found.grid);
-            found.grid
+            objects::lift(&mut scene, &folder, &training, &found)?;
+            found
         }
         None => {
             let consensus = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
