@@ -7,8 +7,9 @@ use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, image_io, labels, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
+use rayon::prelude::*;
 use serde_json::{Value, json};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -111,7 +112,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         let index = scene.folder.view_index(&scene.cameras, &view.name).context("labels")?;
         let camera = scene.cameras[index].clone();
         if !scene.manifest.is_held_out(index, &camera.name) {
-            bail!("'{}' is labelled but was trained on; preprocess with --holdout or --holdout-labels so that it is held out", view.name);
+            bail!("'{}' is labelled but was trained on; preprocess with --holdout or --holdout-labels so that it is held out", camera.name);
         }
         scene.field(&camera, args.tau_ac)?; // compiles the kernels
         let started = Instant::now();
@@ -190,14 +191,20 @@ struct Best {
 /// For each label, the share of its pixels that no best object of a label elsewhere claims: 1 where things are told apart, even where
 /// they are not found. Objects that two labels share tell neither apart.
 fn apart(best: &[Best]) -> Vec<f64> {
-    let elsewhere = |a: &Best, b: &Best| !a.truth.iter().zip(&b.truth).any(|(a, b)| *a && *b);
-    let share = |own: &Best| {
-        let others: Vec<&Best> = best.iter().filter(|b| elsewhere(own, b)).collect();
-        let pixels: Vec<usize> = (0..own.truth.len()).filter(|p| own.truth[*p]).collect();
-        let mixed = pixels.iter().filter(|p| others.iter().any(|o| o.found[**p])).count();
-        1.0 - mixed as f64 / pixels.len().max(1) as f64
-    };
-    best.iter().map(share).collect()
+    let pixels = best.first().map_or(0, |b| b.truth.len());
+    let at = |p: usize, mask: fn(&Best) -> &Vec<bool>| (0..best.len()).filter(|&k| mask(&best[k])[p]).collect::<Vec<_>>();
+    let there: Vec<[Vec<usize>; 2]> = (0..pixels).into_par_iter().map(|p| [at(p, |b| &b.truth), at(p, |b| &b.found)]).collect();
+    let overlapping: BTreeSet<(usize, usize)> =
+        there.iter().flat_map(|[truth, _]| truth.iter().flat_map(move |a| truth.iter().map(move |b| (*a, *b)))).collect();
+    let mut counts = vec![[0usize; 2]; best.len()];
+    for [truth, found] in &there {
+        for &own in truth {
+            let mixed = found.iter().any(|other| !overlapping.contains(&(own, *other)));
+            counts[own][0] += usize::from(mixed);
+            counts[own][1] += 1;
+        }
+    }
+    counts.iter().map(|[mixed, all]| 1.0 - *mixed as f64 / (*all).max(1) as f64).collect()
 }
 
 /// Scores one label; returns the milliseconds of the query beyond rendering, and the masks.
@@ -293,4 +300,20 @@ fn absent_scores(args: &Args, scene: &Scene, grid: &Grid, views: &[LabelledView]
             Ok((text.clone(), f64::from(ranked.first().map_or(0.0, |h| h.score))))
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn twins_are_apart_where_each_has_its_own_object() {
+        let mask = |pixels: &str| pixels.bytes().map(|b| b == b'x').collect::<Vec<_>>();
+        let best = |truth: &str, found: &str| Best { truth: mask(truth), found: mask(found) };
+        // One pixel of the left twin is claimed by the right one's object; the pair around both claims all and is not compared.
+        let both = [best("xx....", "x....."), best("....xx", ".x..xx"), best("xx..xx", "xxxxxx")];
+        assert_eq!(apart(&both), [0.5, 1.0, 1.0]);
+        // One object for both twins.
+        assert_eq!(apart(&[best("xx..", "xxxx"), best("..xx", "xxxx")]), [0.0, 0.0]);
+    }
 }

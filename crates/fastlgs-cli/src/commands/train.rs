@@ -72,6 +72,9 @@ pub struct Args {
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
     #[arg(long, default_value_t = tree::Config::default().min_support)]
     support: f32,
+    /// Global mapping: smallest object, as the mean share of the pixels of the views that show it.
+    #[arg(long, default_value_t = tree::Config::default().min_share)]
+    min_share: f32,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     curve: Option<u32>,
@@ -193,8 +196,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             found
         }
         None => {
-            let consensus = consensus::Config { agreement: args.agreement, ..consensus::Config::default() };
-            let config = objects::Config { consensus, objects: tree::Config { min_support: args.support, ..tree::Config::default() } };
+            // Regions may be smaller than objects, which are made of them.
+            let of_regions = consensus::Config::default().min_share * args.min_share / tree::Config::default().min_share;
+            let consensus = consensus::Config { agreement: args.agreement, min_share: of_regions, ..consensus::Config::default() };
+            let objects = tree::Config { min_support: args.support, min_share: args.min_share, ..tree::Config::default() };
+            let config = objects::Config { consensus, objects };
             let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, &config, common)?;
             summary = Some(found);
             grid

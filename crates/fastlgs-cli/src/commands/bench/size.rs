@@ -104,7 +104,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         ("oracle_miou", "oracle mIoU of held-out labels", "Accuracy against size: filled is --budget auto"),
     ] {
         let spots: Vec<Spot> = rows.iter().map(|row| spot(row, what)).collect();
-        let axes = Axes { title, x: "bytes of everything that a query needs", y: label };
+        let axes = Axes { title, x: "megabytes of everything that a query needs", y: label };
         plot::save(&args.output, &format!("size-{}", what.replace('_', "-")), &Scatter { axes, spots: &spots })?;
     }
     let mut value = table::write(&args.output, "size", &COLUMNS, &rows)?;
@@ -145,7 +145,7 @@ fn spot(row: &Value, what: &str) -> Spot {
     Spot {
         series: row["scene"].as_str().unwrap_or_default().to_owned(),
         name: model,
-        x: number(row, "scene_bytes"),
+        x: number(row, "scene_bytes") / 1e6,
         y: number(row, what),
         front,
     }
