@@ -11,4 +11,5 @@ cargo clippy --release --locked --all-targets --features fastlgs-cli/opencv --qu
 RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps --features fastlgs-cli/opencv --quiet
 # The pure-Rust key points must keep building too.
 cargo check --release --locked --quiet
-cargo test --release --locked --features fastlgs-cli/opencv
+# Counts of kills, damaged inputs and benches are part of the log.
+cargo test --release --locked --features fastlgs-cli/opencv -- --show-output
