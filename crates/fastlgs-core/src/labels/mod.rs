@@ -4,7 +4,7 @@ mod lerf;
 mod masks;
 
 use crate::{Error, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// One labelled object of a view.
 #[derive(Clone, Debug)]
@@ -115,7 +115,7 @@ fn fill(polygon: &[[f64; 2]], width: u32, height: u32, mask: &mut [bool]) {
 pub fn load(folder: &Path, text: Option<&str>) -> Result<Vec<LabelledView>> {
     let segmentations = folder.join("segmentations");
     let three_d_ovs = [folder, &segmentations].into_iter().find(|f| f.join("classes.txt").is_file());
-    let with_ending = |ending: &str| -> Result<Vec<std::path::PathBuf>> {
+    let with_ending = |ending: &str| -> Result<Vec<PathBuf>> {
         let entries = std::fs::read_dir(folder).map_err(Error::io(folder))?;
         let mut files: Vec<_> = entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == ending)).collect();
         files.sort();

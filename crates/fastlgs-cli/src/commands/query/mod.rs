@@ -204,9 +204,10 @@ impl Session<'_> {
         if let (Some(folder), Some(color)) = (&args.output, color) {
             answer.write(folder, color, &ask.name(), &camera.name, args.heatmap, &mut value)?;
         }
-        let exports = [(&args.export_ply, true), (&args.remove_ply, false)].into_iter();
-        for (path, keep) in exports.filter_map(|(path, keep)| path.as_ref().filter(|_| !found.targets.is_empty()).map(|p| (p, keep))) {
-            selection::export(path, scene, &selection::gaussians(scene, grid, &found.targets), keep)?;
+        for (path, keep) in [(&args.export_ply, true), (&args.remove_ply, false)] {
+            if let Some(path) = path.as_ref().filter(|_| !found.targets.is_empty()) {
+                selection::export(path, scene, &selection::gaussians(scene, grid, &found.targets), keep)?;
+            }
         }
         Ok(value)
     }
