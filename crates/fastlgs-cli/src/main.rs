@@ -5,6 +5,7 @@ mod commands;
 mod eyes;
 mod report;
 mod scene;
+mod serve;
 mod ui;
 
 use clap::{Parser, Subcommand};
@@ -30,6 +31,8 @@ enum Command {
     Render(commands::render::Args),
     /// Finds what a text names: mask, heat map, JSON.
     Query(commands::query::Args),
+    /// Shows a scene in the browser, with an HTTP interface.
+    Serve(commands::serve::Args),
     /// Measures accuracy on held-out views against labels.
     Eval(commands::eval::Args),
     /// Measures speed.
@@ -64,6 +67,7 @@ fn main() -> ExitCode {
         Command::Train(args) => commands::train::run(&args, &common),
         Command::Render(args) => commands::render::run(&args, &common),
         Command::Query(args) => commands::query::run(&args, &common),
+        Command::Serve(args) => commands::serve::run(&args, &common),
         Command::Eval(args) => commands::eval::run(&args, &common),
         Command::Bench(args) => commands::bench::run(&args, &common),
         Command::Export(args) => commands::export::run(&args, &common),

@@ -56,6 +56,13 @@ impl Scene {
         Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, texts: OnceCell::new() })
     }
 
+    /// Puts other Gaussians in the place of the scene's.
+    pub fn show(&mut self, gaussians: Gaussians) -> Result<()> {
+        self.engine.set_state(&State::of(&gaussians))?;
+        self.gaussians = gaussians;
+        Ok(())
+    }
+
     /// Renders once in passing: drivers compile kernels when they first run, which no query should wait for.
     pub fn warm_up(&mut self) -> Result<()> {
         match self.cameras.first().map(|c| c.resized(16, 16)) {

@@ -122,6 +122,12 @@ pub fn scene_extent(cameras: &[Camera]) -> f32 {
     (radius * 1.1).max(1e-3)
 }
 
+/// Which way is up in the world, as a unit vector: how photographers hold their cameras on average.
+pub fn mean_up(cameras: &[Camera]) -> Vec3 {
+    let up = |c: &Camera| -c.world_to_camera.transpose().y_axis.truncate();
+    cameras.iter().map(up).sum::<Vec3>().try_normalize().unwrap_or(Vec3::NEG_Y)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

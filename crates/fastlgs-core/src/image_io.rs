@@ -14,7 +14,10 @@ pub fn load_rgb(path: &Path) -> Result<RgbImage> {
 }
 
 fn decode(path: &Path) -> Result<DynamicImage> {
-    let data = fs::read(path)?;
+    decode_bytes(path, &fs::read(path)?)
+}
+
+fn decode_bytes(path: &Path, data: &[u8]) -> Result<DynamicImage> {
     let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
     reader.decode().map_err(|e| Error::format(path, format!("the picture cannot be read ({e}); export it again or remove it")))
 }
@@ -71,14 +74,31 @@ pub fn resize_gray(mask: &GrayImage, width: u32, height: u32) -> GrayImage {
     image::imageops::resize(mask, width, height, FilterType::Triangle)
 }
 
+/// A picture as PNG.
+///
+/// # Errors
+/// [`Error::Invalid`] for a picture without pixels.
+pub fn encode_png(picture: impl Into<DynamicImage>) -> Result<Vec<u8>> {
+    let mut data = Vec::new();
+    let encode = picture.into().write_to(&mut Cursor::new(&mut data), ImageFormat::Png);
+    encode.map_err(|e| Error::Invalid(format!("a picture cannot be encoded as PNG: {e}")))?;
+    Ok(data)
+}
+
+/// Decodes a photo that is already in memory as 8-bit RGB; `name` is what errors call it.
+///
+/// # Errors
+/// [`Error::Format`] when it cannot be decoded.
+pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
+    Ok(decode_bytes(Path::new(name), data)?.into_rgb8())
+}
+
 /// Writes a PNG atomically.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
 pub fn save_png(path: &Path, picture: impl Into<DynamicImage>) -> Result<()> {
-    let mut data = Vec::new();
-    let encode = picture.into().write_to(&mut Cursor::new(&mut data), ImageFormat::Png);
-    encode.map_err(|e| Error::format(path, format!("cannot encode PNG: {e}")))?;
+    let data = encode_png(picture)?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 

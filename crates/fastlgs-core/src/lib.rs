@@ -14,6 +14,7 @@ pub mod error;
 pub mod exr_image;
 pub mod fs;
 pub mod gaussians;
+pub mod glb;
 pub mod image_io;
 pub mod label_map;
 pub mod labels;

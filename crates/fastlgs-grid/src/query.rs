@@ -80,7 +80,7 @@ fn odds(score: f32) -> f32 {
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
-const BORNE_OUT: f32 = 0.86;
+pub const BORNE_OUT: f32 = 0.86;
 
 /// Of objects that lie in each other, from small to large: the largest that masks bear out about as well as any of them.
 pub fn borne_out(grid: &Grid, nested: &[u16]) -> Option<u16> {

@@ -6,7 +6,6 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply, spz};
-use fastlgs_raster::density::State;
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -47,7 +46,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             (written, Some(precision.by_group()))
         }
     };
-    show(&mut scene, &written)?;
+    scene.show(written)?;
     let after = pictures(&mut scene, &held_out)?;
     // Both against each other, not against photos: an exported scene may have none.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
@@ -76,13 +75,6 @@ fn held_out(scene: &Scene) -> Vec<Camera> {
     views
 }
 
-/// Puts other Gaussians on the scene's device.
-fn show(scene: &mut Scene, gaussians: &Gaussians) -> Result<()> {
-    scene.engine.set_state(&State::of(gaussians))?;
-    scene.gaussians = gaussians.clone();
-    Ok(())
-}
-
 /// Colours of these views.
 fn pictures(scene: &mut Scene, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
     views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
@@ -107,11 +99,11 @@ fn precision(scene: &mut Scene) -> Result<Precision> {
         return Ok(Precision::default());
     }
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
-        show(scene, gaussians)?;
+        scene.show(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
         against_photos(scene, &views, &pictures).context("a photo of the scene cannot be read; run 'fastlgs preprocess' again")
     })?;
-    show(scene, &original)?;
+    scene.show(original)?;
     Ok(chosen)
 }
 

@@ -9,5 +9,6 @@ mod objects;
 pub mod preprocess;
 pub mod query;
 pub mod render;
+pub mod serve;
 pub mod synth;
 pub mod train;

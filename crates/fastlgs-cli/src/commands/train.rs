@@ -2,6 +2,8 @@
 
 use super::objects;
 use super::preprocess::BRIGHTNESS_SPREAD;
+use super::serve::{DEFAULT_BIND, parse_bind};
+use crate::serve::{Live, Point, Server};
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::rng::Rng;
@@ -9,7 +11,9 @@ use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::{Grid, consensus, tree};
 use fastlgs_raster::{Budget, Channels, Strategy, Target, TargetImage, TrainConfig, Trainer, init, pack};
+use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Instant;
 
 #[derive(clap::Args)]
@@ -87,6 +91,9 @@ pub struct Args {
     /// Continue from the last checkpoint.
     #[arg(long)]
     resume: bool,
+    /// Show the scene in the browser while it grows, with its curves; when it is trained, questions are answered until Ctrl-C.
+    #[arg(long, value_name = "IP:PORT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_BIND, value_parser = parse_bind)]
+    serve: Option<SocketAddr>,
 }
 
 /// Difference of two photos in stops from which exposures are learned.
@@ -162,16 +169,25 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if args.resume && !trainer.resume(&checkpoint)? {
         tracing::warn!("{}: no checkpoint to resume from; starting anew", checkpoint.display());
     }
+    let watched = args.serve.map(|bind| watch(&folder, bind, &config, &first)).transpose()?;
     let mut curve = Vec::new();
     let result = trainer.run(Some(&checkpoint), |p, trainer| {
+        let mut psnr_held_out = None;
         if args.curve.is_some_and(|every| p.iteration % every.next_multiple_of(20) == 0) {
             let psnr = trainer.quality(&held_out, None)?;
+            psnr_held_out = psnr;
             tracing::info!(iteration = p.iteration, seconds = p.seconds, psnr_held_out = psnr, gaussians = p.gaussians, "curve");
             curve.push(serde_json::json!({ "iteration": p.iteration, "seconds": p.seconds, "psnr": psnr, "gaussians": p.gaussians }));
         }
         bar.set_position(u64::from(p.iteration));
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
         bar.set_message(format!("loss {loss:.4} {:.1} dB {:.0}k G", p.psnr, p.gaussians as f64 / 1000.0));
+        if let Some((live, _)) = &watched {
+            let (iteration, seconds, psnr, gaussians) = (p.iteration, p.seconds, p.psnr, p.gaussians);
+            if live.report(Point { iteration, seconds, loss, psnr, psnr_held_out, gaussians }) {
+                live.picture(&trainer.gaussians()?);
+            }
+        }
         if p.iteration % 200 == 0 {
             tracing::info!(iteration = p.iteration, loss, psnr = p.psnr, feature_l1 = p.losses.feature_l1, gaussians = p.gaussians);
         }
@@ -182,6 +198,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let degree = trainer.needed_degree()?;
     let psnr = trainer.quality(&held_out, Some(degree))?;
     let mut scene = trainer.gaussians()?.with_sh_degree(degree);
+    if let Some((live, _)) = &watched {
+        live.finish(&scene);
+    }
     let started = Instant::now();
     let mut summary = None;
     let grid = match paper {
@@ -237,7 +256,21 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     // Checkpoints serve a broken run only.
     let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
     report::give(common, &value)?;
+    if let Some((_, server)) = watched {
+        server.open_scene(&common.device, None)?;
+        server.wait()?;
+    }
     Ok(Outcome::Done)
+}
+
+/// Starts the page that shows how the scene grows.
+fn watch(folder: &SceneFolder, bind: SocketAddr, config: &TrainConfig, first: &Gaussians) -> Result<(Arc<Live>, Server)> {
+    let live = Arc::new(Live::new(config.iterations, first, config.antialias, config.background));
+    let server = Server::start(folder, bind, Some(live.clone()))?;
+    server.set_focus(&first.means);
+    // Standard output is the report's.
+    eprintln!("watch it at {}", server.url);
+    Ok((live, server))
 }
 
 /// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count, nor do

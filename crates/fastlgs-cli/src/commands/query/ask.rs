@@ -2,19 +2,18 @@
 
 use crate::scene::Scene;
 use anyhow::{Context, Result, bail};
-use fastlgs_core::{Camera, LabelMap, image_io};
+use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_grid::{Grid, relevancy};
-use std::path::{Path, PathBuf};
+use image::RgbImage;
 
 /// One question.
-#[derive(Clone, Debug)]
 pub enum Ask {
     /// Words; "A of B" means the part A of B where there is one.
     Text(String),
-    /// A picture of the thing.
-    Image(PathBuf),
+    /// A picture of the thing, with its name.
+    Image(String, RgbImage),
     /// A pixel of the view.
     Point(u32, u32),
 }
@@ -32,7 +31,7 @@ impl Ask {
     pub fn name(&self) -> String {
         match self {
             Self::Text(text) => text.clone(),
-            Self::Image(path) => path.file_stem().unwrap_or_default().to_string_lossy().into_owned(),
+            Self::Image(name, _) => name.clone(),
             Self::Point(x, y) => format!("{x},{y}"),
         }
     }
@@ -47,7 +46,7 @@ impl Ask {
         };
         Ok(match self {
             Self::Point(x, y) => Meaning::Point(*x, *y),
-            Self::Image(path) => Meaning::Embedded(with_negatives(picture(scene, path)?)?, None),
+            Self::Image(name, photo) => Meaning::Embedded(with_negatives(picture(scene, name, photo)?)?, None),
             Self::Text(text) => {
                 let whole = |text: &str| with_negatives(scene.text_query(text)?);
                 match part_of(text) {
@@ -68,13 +67,11 @@ fn part_of(text: &str) -> Option<(&str, &str)> {
 }
 
 /// A picture as a query: the whole of it is embedded like a mask.
-fn picture(scene: &Scene, path: &Path) -> Result<TextQuery> {
-    let photo = image_io::load_rgb(path)?;
+fn picture(scene: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
     let (width, height) = photo.dimensions();
     let everything = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
-    let name = path.to_string_lossy();
     let encoder = scene.image_encoder()?;
-    let embedding = encoder.embed_masks(&name, &photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
+    let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let embedding =
         embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
     Ok(TextQuery { text: embedding, canonical: Vec::new(), anything: relevancy::IMAGE_ANYTHING })

@@ -1,15 +1,15 @@
 //! `fastlgs query`: what a text, a picture or a point names, as masks and as Gaussians (paper, querying features).
 
-mod answer;
-mod ask;
-mod selection;
+pub mod answer;
+pub mod ask;
+pub mod selection;
 
 use crate::scene::{Scene, ViewChoice, parse_size};
 use crate::{Outcome, report, ui};
-use answer::Answer;
+use answer::{CANDIDATES, Question};
 use anyhow::{Result, bail};
 use ask::Ask;
-use fastlgs_core::{Camera, metrics};
+use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{Field, QueryConfig};
 use fastlgs_raster::Frame;
@@ -68,12 +68,12 @@ pub struct Args {
     /// How often the kernel of --dilate is applied.
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     dilate_times: u32,
-    /// Write the selected Gaussians as a scene of their own.
-    #[arg(long, value_name = "FILE")]
-    export_ply: Option<PathBuf>,
-    /// Write the scene without the selected Gaussians.
-    #[arg(long, value_name = "FILE")]
-    remove_ply: Option<PathBuf>,
+    /// Write the selected Gaussians as a scene of their own: FILE.ply, FILE.spz or FILE.glb.
+    #[arg(long, value_name = "FILE", alias = "export-ply")]
+    export: Option<PathBuf>,
+    /// Write the scene without the selected Gaussians, in the same formats.
+    #[arg(long, value_name = "FILE", alias = "remove-ply")]
+    export_rest: Option<PathBuf>,
 }
 
 /// Parses `120,45`.
@@ -121,11 +121,15 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 impl Session<'_> {
     fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
         let texts = self.args.text.iter().cloned().map(Ask::Text);
-        let pictures = self.args.image.iter().cloned().map(Ask::Image);
+        let picture = |path: &PathBuf| -> Result<Ask> {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            Ok(Ask::Image(name, image_io::load_rgb(path)?))
+        };
+        let pictures = self.args.image.iter().map(picture).collect::<Result<Vec<_>>>()?;
         let points = self.args.point.iter().map(|&(x, y)| Ask::Point(x, y));
         let asks: Vec<Ask> = texts.chain(pictures).chain(points).collect();
-        if asks.len() > 1 && (self.args.export_ply.is_some() || self.args.remove_ply.is_some()) {
-            bail!("--export-ply and --remove-ply write the answer to one question: ask only one");
+        if asks.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
+            bail!("--export and --export-rest write the answer to one question: ask only one");
         }
         let mut answers = Vec::new();
         for place in 0..self.cameras.len() {
@@ -184,29 +188,17 @@ impl Session<'_> {
         let render_ms = self.show(place)?;
         let Some(Shown { field, color, .. }) = &self.shown else { bail!("no view was rendered") };
         let (args, scene, grid, camera) = (self.args, &self.scene, &self.grid, &self.cameras[place]);
-        let started = Instant::now();
-        let meaning = ask.meaning(scene, &args.negative)?;
-        let encode_ms = started.elapsed().as_secs_f64() * 1e3;
-        let started = Instant::now();
-        let found = meaning.find(grid, field, camera, &self.config)?;
-        let select_ms = started.elapsed().as_secs_f64() * 1e3;
-        let started = Instant::now();
-        let mut mask = field.mask(grid, &found.targets);
-        let restore_ms = started.elapsed().as_secs_f64() * 1e3;
-        if let Some((kw, kh)) = args.dilate {
-            let radius = [kw / 2 * args.dilate_times, kh / 2 * args.dilate_times];
-            mask = metrics::dilate(&mask, camera.width, camera.height, radius);
-        }
-        let answer = Answer { grid, field, found: &found, mask: &mask };
-        let mut value = answer.report(scene, &ask.name(), camera);
-        let total = encode_ms + render_ms + select_ms + restore_ms;
-        value["ms"] = json!({ "encode": encode_ms, "render": render_ms, "select": select_ms, "restore": restore_ms, "total": total });
+        let dilate = args.dilate.map(|(w, h)| [w / 2 * args.dilate_times, h / 2 * args.dilate_times]);
+        let question = Question { ask, negatives: &args.negative, config: self.config, dilate, candidates: CANDIDATES };
+        let (answer, mut value) = question.put(scene, grid, field, camera, render_ms)?;
+        let targets = &answer.found.targets;
         if let (Some(folder), Some(color)) = (&args.output, color) {
             answer.write(folder, color, &ask.name(), &camera.name, args.heatmap, &mut value)?;
         }
-        for (path, keep) in [(&args.export_ply, true), (&args.remove_ply, false)] {
-            if let Some(path) = path.as_ref().filter(|_| !found.targets.is_empty()) {
-                selection::export(path, scene, &selection::gaussians(scene, grid, &found.targets), keep)?;
+        for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
+            if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
+                let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
+                selection::export(path, scene, &selection::gaussians(scene, grid, &ids), keep)?;
             }
         }
         Ok(value)

@@ -2,19 +2,19 @@
 
 use crate::scene::Scene;
 use anyhow::{Context, Result, bail};
-use fastlgs_core::ply;
+use fastlgs_core::camera::mean_up;
+use fastlgs_core::{Camera, Gaussians, glb, ply, spz};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::Hit;
 use std::path::Path;
 
 /// Places of the Gaussians of some objects.
-pub fn gaussians(scene: &Scene, grid: &Grid, targets: &[Hit]) -> Vec<usize> {
-    let members = grid.members(&targets.iter().map(|t| t.id).collect::<Vec<_>>());
+pub fn gaussians(scene: &Scene, grid: &Grid, objects: &[u16]) -> Vec<usize> {
+    let members = grid.members(objects);
     let ids = scene.gaussians.object_ids.iter().enumerate();
     ids.filter(|(_, id)| members.get(usize::from(**id)) == Some(&true)).map(|(i, _)| i).collect()
 }
 
-/// Writes the selection (`keep`), or the scene without it.
+/// Writes the selection (`keep`), or the scene without it, in the format of the file's ending.
 pub fn export(path: &Path, scene: &Scene, selected: &[usize], keep: bool) -> Result<()> {
     let mut inside = vec![false; scene.gaussians.len()];
     selected.iter().for_each(|&i| inside[i] = true);
@@ -22,7 +22,19 @@ pub fn export(path: &Path, scene: &Scene, selected: &[usize], keep: bool) -> Res
     if places.is_empty() {
         bail!("{}: nothing would be left to write", path.display());
     }
-    ply::write(path, &scene.gaussians.select(&places)).context("the selection cannot be written")
+    let selected = scene.gaussians.select(&places);
+    write(path, &selected, &scene.cameras).context("the selection cannot be written")
+}
+
+/// Writes Gaussians as the file's ending says: `.ply`, `.spz`, or `.glb`, whose up is that of the cameras.
+pub fn write(path: &Path, gaussians: &Gaussians, cameras: &[Camera]) -> Result<()> {
+    match path.extension().and_then(|e| e.to_str()) {
+        Some("ply") => ply::write(path, gaussians)?,
+        Some("spz") => spz::write(path, gaussians)?,
+        Some("glb") => glb::write(path, gaussians, mean_up(cameras))?,
+        _ => bail!("{}: name it .ply, .spz or .glb", path.display()),
+    }
+    Ok(())
 }
 
 /// World box [min, max] between the 2nd and 98th percentile of the Gaussians' centres: a few floaters do not stretch it.

@@ -1,0 +1,32 @@
+//! Translates the viewer's one shader, `web/splat.wgsl`, for browsers without WebGPU: naga writes the GLSL of WebGL2, so that both
+//! draw by the same source and a broken shader fails the build.
+
+use naga::back::glsl;
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+use std::path::Path;
+use std::{env, fs};
+
+const SOURCE: &str = "web/splat.wgsl";
+
+fn main() {
+    println!("cargo::rerun-if-changed={SOURCE}");
+    let source = fs::read_to_string(SOURCE).expect("web/ is in the crate");
+    let module = naga::front::wgsl::parse_str(&source).unwrap_or_else(|e| panic!("{SOURCE}:\n{}", e.emit_to_string(&source)));
+    let info = Validator::new(ValidationFlags::all(), Capabilities::empty())
+        .validate(&module)
+        .unwrap_or_else(|e| panic!("{SOURCE}:\n{}", e.emit_to_string(&source)));
+    let options = glsl::Options {
+        version: glsl::Version::Embedded { version: 300, is_webgl: true },
+        writer_flags: glsl::WriterFlags::empty(),
+        ..Default::default()
+    };
+    let out = env::var("OUT_DIR").expect("cargo sets OUT_DIR");
+    for (stage, entry) in [(naga::ShaderStage::Vertex, "corner"), (naga::ShaderStage::Fragment, "pixel")] {
+        let pipeline = glsl::PipelineOptions { shader_stage: stage, entry_point: entry.to_owned(), multiview: None };
+        let mut text = String::new();
+        let mut writer = glsl::Writer::new(&mut text, &module, &info, &options, &pipeline, Default::default())
+            .unwrap_or_else(|e| panic!("{SOURCE}, {entry}: {e}"));
+        writer.write().unwrap_or_else(|e| panic!("{SOURCE}, {entry}: {e}"));
+        fs::write(Path::new(&out).join(format!("{entry}.glsl")), text).expect("writable OUT_DIR");
+    }
+}

@@ -1,0 +1,74 @@
+//! Who may ask: on the loopback any program of this machine that calls the server by a loopback name; elsewhere who knows the token.
+
+use super::api::Failure;
+use axum::extract::{Request, State};
+use axum::http::{HeaderValue, StatusCode, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use tokio::sync::Semaphore;
+
+/// Requests that are worked on at the same time; more are told to come back.
+const AT_ONCE: usize = 64;
+
+/// What every request is checked against.
+pub struct Guard {
+    loopback: bool,
+    /// Hexadecimal digits that requests must know; nothing on the loopback.
+    pub token: Option<String>,
+    places: Semaphore,
+}
+
+impl Guard {
+    /// The guard of a server at `address`; with a new token unless that is the machine itself.
+    pub fn new(address: SocketAddr) -> anyhow::Result<Self> {
+        let loopback = address.ip().is_loopback();
+        let mut secret = [0u8; 16];
+        // The one thing that must not follow from --seed.
+        getrandom::fill(&mut secret).map_err(|e| anyhow::anyhow!("the system gives no random numbers for the token: {e}"))?;
+        let token = (!loopback).then(|| secret.iter().map(|b| format!("{b:02x}")).collect());
+        Ok(Self { loopback, token, places: Semaphore::new(AT_ONCE) })
+    }
+
+    /// Whether a request may pass. A foreign page that had its name resolve to this machine would send that name as host.
+    fn refusal(&self, request: &Request) -> Option<Failure> {
+        if self.loopback {
+            let host = request.headers().get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or_default();
+            let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
+            let bare = name.trim_start_matches('[').trim_end_matches(']');
+            let own = bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
+            return (!own).then(|| Failure::new(StatusCode::FORBIDDEN, format!("this server is not '{name}'; use its loopback address")));
+        }
+        let wanted = self.token.as_deref()?;
+        // The page itself holds no secret; it passes the token on with what it asks for.
+        if !request.uri().path().starts_with("/api/") {
+            return None;
+        }
+        let by_header = request.headers().get(header::AUTHORIZATION).and_then(|h| h.to_str().ok()).and_then(|h| h.strip_prefix("Bearer "));
+        let by_query = || request.uri().query()?.split('&').find_map(|p| p.strip_prefix("token="));
+        let given = by_header.or_else(by_query).unwrap_or_default();
+        // Every byte is looked at, so that time tells nothing about the first wrong one.
+        let differs = given.len() != wanted.len() || given.bytes().zip(wanted.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) != 0;
+        differs.then(|| Failure::new(StatusCode::UNAUTHORIZED, "the token is missing or wrong; open the address that the server printed"))
+    }
+}
+
+/// Checks a request, counts it, and adds what browsers need to know to every answer.
+pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
+    let mut response = match (guard.refusal(&request), guard.places.try_acquire()) {
+        (Some(refusal), _) => refusal.into_response(),
+        (None, Err(_)) => Failure::busy().into_response(),
+        (None, Ok(_place)) => next.run(request).await,
+    };
+    let policy = "default-src 'self'; img-src 'self' blob: data:; style-src 'self'; frame-ancestors 'none'; base-uri 'none'";
+    for (name, value) in [
+        (header::CONTENT_SECURITY_POLICY, policy),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CACHE_CONTROL, "no-store"),
+    ] {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}

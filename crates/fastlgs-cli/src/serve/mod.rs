@@ -1,0 +1,152 @@
+//! The viewer: a page in the browser and an HTTP interface to one scene, opened or still in training.
+
+mod api;
+mod desk;
+mod guard;
+mod live;
+mod page;
+mod splats;
+mod thumbnails;
+
+use anyhow::{Context, Result};
+use api::Failure;
+use axum::extract::DefaultBodyLimit;
+use axum::http::StatusCode;
+use axum::routing::{get, post};
+use axum::{Router, middleware};
+use desk::{Bell, Desk};
+use fastlgs_core::{Camera, SceneFolder};
+use guard::Guard;
+pub use live::{Live, Point};
+use serde_json::{Value, json};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
+use tokio::net::TcpListener;
+use tokio::runtime::Runtime;
+
+/// Largest request in bytes: a picture to look for.
+const LARGEST_BODY: usize = 8 << 20;
+
+/// What all requests share.
+pub struct Shared {
+    name: String,
+    folder: SceneFolder,
+    cameras: Vec<Camera>,
+    live: Option<Arc<Live>>,
+    bell: OnceLock<Bell>,
+    focus: OnceLock<Vec<f32>>,
+}
+
+impl Shared {
+    /// The opened scene, once there is one.
+    fn bell(&self) -> Option<Bell> {
+        self.bell.get().cloned()
+    }
+
+    /// The opened scene, or why there is none yet.
+    fn ready(&self) -> Result<Bell, Failure> {
+        self.bell().ok_or_else(|| Failure::new(StatusCode::CONFLICT, "the scene is still in training; ask again when it has objects"))
+    }
+
+    /// All views as the page wants them.
+    fn views(&self) -> Result<Vec<Value>> {
+        let manifest = self.folder.manifest()?;
+        let distances = self.focus.get();
+        let view = |(k, camera): (usize, &Camera)| {
+            let mut value = serde_json::to_value(camera)?;
+            value["held_out"] = json!(manifest.is_held_out(k, &camera.name));
+            value["photo"] = json!(self.folder.photo_path(&camera.name).is_file());
+            value["focus"] = json!(distances.and_then(|d| d.get(k)).copied().unwrap_or(1.0));
+            Ok(value)
+        };
+        self.cameras.iter().enumerate().map(view).collect()
+    }
+}
+
+/// A running server.
+pub struct Server {
+    runtime: Runtime,
+    shared: Arc<Shared>,
+    /// Where the page is.
+    pub url: String,
+}
+
+impl Server {
+    /// Binds and answers from now on. With `live` the scene is still in training; without it, [`Self::open_scene`] must follow.
+    pub fn start(folder: &SceneFolder, bind: SocketAddr, live: Option<Arc<Live>>) -> Result<Self> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+        let listener = runtime.block_on(TcpListener::bind(bind));
+        let listener = listener.with_context(|| format!("{bind} cannot be listened on; name another address with --bind"))?;
+        let address = listener.local_addr()?;
+        let guard = Arc::new(Guard::new(address)?);
+        let url = match &guard.token {
+            Some(token) => format!("http://{address}/?token={token}"),
+            None => format!("http://{address}/"),
+        };
+        let root = folder.root.canonicalize().unwrap_or_else(|_| folder.root.clone());
+        let shared = Arc::new(Shared {
+            name: root.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            cameras: folder.cameras()?,
+            folder: folder.clone(),
+            live,
+            bell: OnceLock::new(),
+            focus: OnceLock::new(),
+        });
+        let router = router(guard, shared.clone());
+        runtime.spawn(async move {
+            if let Err(error) = axum::serve(listener, router).await {
+                tracing::error!("the server stopped: {error}");
+            }
+        });
+        Ok(Self { runtime, shared, url })
+    }
+
+    /// Tells the page how far the cameras' subjects are.
+    pub fn set_focus(&self, means: &[glam::Vec3]) {
+        let _ = self.shared.focus.set(self.shared.cameras.iter().map(|c| api::focus(means, c)).collect());
+    }
+
+    /// Opens the trained scene for questions.
+    pub fn open_scene(&self, device: &str, clip_text: Option<PathBuf>) -> Result<()> {
+        let bell = Desk::open(self.shared.folder.root.clone(), device.to_owned(), clip_text)?;
+        let _ = self.shared.bell.set(bell);
+        Ok(())
+    }
+
+    /// Answers until the process is told to stop (Ctrl-C or SIGTERM).
+    pub fn wait(self) -> Result<()> {
+        self.runtime.block_on(async {
+            #[cfg(unix)]
+            {
+                let mut terminate = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?;
+                tokio::select! {
+                    pressed = tokio::signal::ctrl_c() => pressed,
+                    _ = terminate.recv() => Ok(()),
+                }
+            }
+            #[cfg(not(unix))]
+            tokio::signal::ctrl_c().await
+        })?;
+        self.runtime.shutdown_background();
+        Ok(())
+    }
+}
+
+fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
+    page::routes()
+        .route("/api/scene", get(api::scene))
+        .route("/api/training", get(api::training))
+        .route("/api/splats", get(api::splats))
+        .route("/api/objects", get(api::objects))
+        .route("/api/objects/{id}/thumbnail.png", get(api::thumbnail))
+        .route("/api/photos/{view}", get(api::photo))
+        .route("/api/query", post(api::query))
+        .route("/api/render", post(api::render))
+        .route("/api/export", get(api::export))
+        .fallback(api::unknown)
+        .method_not_allowed_fallback(api::wrong_method)
+        .layer(DefaultBodyLimit::max(LARGEST_BODY))
+        .layer(middleware::from_fn_with_state(guard, guard::check))
+        .with_state(shared)
+}

@@ -1,0 +1,247 @@
+// The page: what is asked, selected, hidden and shown, and the controls for it.
+
+import { Objects } from "/objects.js";
+import { Stage } from "/stage.js";
+import { follow, recall } from "/training.js";
+import { getBlob, getJson, postJson, save } from "/server.js";
+
+const $ = (id) => document.getElementById(id);
+const LISTED = 24; // objects before "more"
+const ASKED_SIDE = 640; // pixels of the view that a question is put to
+
+let scene, stage, objects;
+const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED };
+
+function failed(error) {
+  $("problem").textContent = error.message;
+  $("problem").hidden = false;
+  clearTimeout(failed.timer);
+  failed.timer = setTimeout(() => { $("problem").hidden = true; }, 8000);
+}
+
+// Runs what a control does; what goes wrong is shown, not thrown.
+const guarded = (work) => async (...args) => {
+  try {
+    await work(...args);
+  } catch (error) {
+    failed(error);
+  }
+};
+
+function say(text, absent = false) {
+  $("answer").textContent = text;
+  $("answer").classList.toggle("absent", absent);
+}
+
+// Shows the state: in the picture, in the lists, and on the buttons.
+function update() {
+  const { selected, hidden, only, scores, text } = state;
+  stage.setObjects({ selected, hidden, only, scores, text, list: objects.list, members: objects.chain });
+  const options = { selected, hidden, minScore: scene.min_score, choose: (id) => select([id]) };
+  const rows = state.ranked ?? objects.parts(0).map((id) => ({ id }));
+  $("list-title").textContent = state.ranked ? `Most relevant to "${state.text}"` : "Objects";
+  objects.fill($("list"), rows.slice(0, state.listed), options);
+  $("more").hidden = rows.length <= state.listed;
+  $("selection").hidden = selected.size === 0;
+  $("show-all").disabled = hidden.size + only.size === 0;
+  if (selected.size === 0) return;
+  const [first] = selected;
+  const chain = selected.size === 1 ? objects.chain(first).reverse() : [...selected];
+  $("chain").replaceChildren(...chain.map((id) => {
+    const button = document.createElement("button");
+    button.textContent = `#${id}`;
+    button.setAttribute("aria-current", selected.has(id));
+    button.addEventListener("click", () => select([id]));
+    return button;
+  }));
+  const own = [...selected].map((id) => objects.byId.get(id));
+  const sum = own.reduce((n, o) => n + o.gaussians, 0).toLocaleString("en");
+  $("facts").textContent = own.length === 1
+    ? `${sum} Gaussians, seen in ${own[0].views} photos, borne out by masks to ${own[0].support.toFixed(2)}`
+    : `${own.length} objects, ${sum} Gaussians`;
+  const parts = own.length === 1 ? objects.parts(first).map((id) => ({ id })) : [];
+  $("parts-title").hidden = parts.length === 0;
+  objects.fill($("parts"), parts, options);
+}
+
+function select(ids) {
+  state.selected = new Set(ids);
+  update();
+}
+
+const find = guarded(async (text) => {
+  if (!text.trim()) return clear();
+  say(`looking for "${text}" ...`);
+  const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
+  const answer = await postJson("/api/query", { text, camera, candidates: objects.list.length });
+  state.text = text;
+  state.ranked = answer.candidates;
+  state.scores = new Map(answer.candidates.map(({ id, score }) => [id, score]));
+  state.listed = LISTED;
+  const ms = Math.round(answer.ms.total);
+  if (answer.found) {
+    const parts = answer.objects.length === 1 ? `#${answer.objects[0].id}` : `${answer.objects.length} objects`;
+    say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}, ${answer.pixels.toLocaleString("en")} pixels here (${ms} ms)`);
+  } else {
+    say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score} is needed (${ms} ms)`, true);
+  }
+  select(answer.objects.map((o) => o.id));
+});
+
+function clear() {
+  Object.assign(state, { selected: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED });
+  say("");
+  update();
+}
+
+function setMode(mode) {
+  document.querySelector(`#modes input[value=${mode}]`).checked = true;
+  stage.setMode(mode);
+}
+
+function step(by) {
+  const count = scene.views.length;
+  return stage.lookFrom((stage.index + by + count) % count);
+}
+
+function setCompare(value) {
+  stage.compare = Number(value);
+  $("compare").value = value;
+  // The photo fits only where it was taken.
+  if (stage.compare > 0 && stage.camera.moved) stage.lookFrom(stage.index);
+  stage.draw();
+}
+
+const exported = guarded(async (keep) => {
+  const format = $("format").value;
+  const ids = [...state.selected].join(",");
+  save(await getBlob(`/api/export?objects=${ids}&format=${format}&keep=${keep}`), `${scene.name}-${keep ? "selection" : "rest"}.${format}`);
+});
+
+const actions = {
+  isolate: () => {
+    state.only = new Set(state.selected);
+    update();
+  },
+  hide: () => {
+    state.hidden = new Set([...state.hidden, ...state.selected]);
+    select([]);
+  },
+  "show-all": () => {
+    state.hidden = new Set();
+    state.only = new Set();
+    update();
+  },
+  clear,
+  export: () => exported(true),
+  "export-rest": () => exported(false),
+  more: () => {
+    state.listed += 4 * LISTED;
+    update();
+  },
+  previous: () => step(-1),
+  next: () => step(1),
+  save: guarded(async () => save(await stage.snapshot(), `${scene.name}.png`)),
+};
+
+const cameras = () => {
+  stage.showCameras = $("show-cameras").checked;
+  stage.draw();
+};
+
+const keys = {
+  "/": () => $("text").focus(),
+  "[": () => step(-1),
+  "]": () => step(1),
+  1: () => setMode("color"),
+  2: () => setMode("relevancy"),
+  3: () => setMode("objects"),
+  c: () => {
+    $("show-cameras").checked = !$("show-cameras").checked;
+    cameras();
+  },
+  p: () => setCompare(stage.compare > 0 ? 0 : 50),
+  i: actions.isolate,
+  x: actions.hide,
+  a: actions["show-all"],
+  s: actions.save,
+  Escape: clear,
+  "+": () => stage.camera.zoom(0.9),
+  "=": () => stage.camera.zoom(0.9),
+  "-": () => stage.camera.zoom(1.1),
+};
+
+function pressed(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  const typing = event.target.matches("input[type=search], select");
+  if (typing) {
+    if (event.key === "Escape") $("canvas").focus();
+    return;
+  }
+  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+  const arrow = event.target === $("canvas") && arrows[event.key];
+  const action = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+  if (arrow) {
+    const [x, y] = arrow;
+    if (event.shiftKey) stage.camera.move(-0.04 * x, -0.04 * y);
+    else stage.camera.turn(0.08 * x, -0.08 * y);
+  } else if (action && objects) action();
+  else return;
+  event.preventDefault();
+  stage.changed();
+}
+
+function listen() {
+  $("search").addEventListener("submit", (event) => {
+    event.preventDefault();
+    find($("text").value);
+  });
+  $("modes").addEventListener("change", (event) => stage.setMode(event.target.value));
+  $("views").addEventListener("change", () => stage.lookFrom($("views").selectedIndex));
+  $("show-cameras").addEventListener("change", cameras);
+  $("compare").addEventListener("input", () => setCompare($("compare").value));
+  for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
+  document.addEventListener("keydown", pressed);
+  stage.looked = (index) => { $("views").selectedIndex = index; };
+  stage.picked = (id) => {
+    if (!objects || id === 0) return select([]);
+    const [only] = state.selected;
+    select([state.selected.size === 1 ? objects.below(id, only) : objects.meant(id)]);
+  };
+}
+
+async function ready() {
+  scene = Object.assign(stage.scene, await getJson("/api/scene"));
+  objects = new Objects(await getJson("/api/objects"), scene.borne_out);
+  $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
+    + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, answered by ${scene.adapter}`;
+  $("text").disabled = false;
+  update();
+}
+
+async function main() {
+  scene = await getJson("/api/scene");
+  document.title = `${scene.name} - FastLGS`;
+  $("name").textContent = scene.name;
+  stage = new Stage(scene, { stage: $("stage"), canvas: $("canvas"), cameras: $("cameras"), photo: $("photo"), divider: $("divider") }, failed);
+  await stage.open(new URLSearchParams(location.search).get("renderer"));
+  $("views").replaceChildren(...scene.views.map((view) => new Option(`${view.name}${view.held_out ? " (held out)" : ""}`)));
+  listen();
+  stage.lookFrom(0);
+  const training = { training: $("training"), text: $("training-text"), loss: $("curve-loss"), psnr: $("curve-psnr") };
+  if (scene.stage === "training") {
+    $("text").disabled = true;
+    await follow(training, () => stage.load());
+  }
+  await ready();
+  await stage.load();
+  if (scene.trained_here) await recall(training);
+  // For programs that drive this page.
+  window.fastlgs = { stage, state, find };
+  document.body.dataset.ready = "true";
+}
+
+main().catch((error) => {
+  failed(error);
+  clearTimeout(failed.timer);
+});

@@ -1,0 +1,86 @@
+// Objects as the page knows them: what contains what, and their buttons with pictures.
+
+import { getBlob } from "/server.js";
+
+export class Objects {
+  constructor(list, borneOut) {
+    this.list = list;
+    this.borneOut = borneOut;
+    this.byId = new Map(list.map((o) => [o.id, o]));
+    this.children = new Map();
+    for (const o of list) this.children.set(o.parent, [...(this.children.get(o.parent) ?? []), o.id]);
+    const bySize = (a, b) => this.byId.get(b).gaussians - this.byId.get(a).gaussians;
+    for (const ids of this.children.values()) ids.sort(bySize);
+    this.pictures = new Map();
+    this.chain = this.chain.bind(this);
+  }
+
+  // An object and what contains it, from small to large.
+  chain(id) {
+    const chain = [];
+    for (let own = this.byId.get(id); own && !chain.includes(own.id); own = this.byId.get(own.parent)) chain.push(own.id);
+    return chain;
+  }
+
+  parts(id) {
+    return this.children.get(id) ?? [];
+  }
+
+  // Of things that lie in each other, the largest that masks bear out about as well as any of them (fastlgs_grid::query::borne_out).
+  meant(id) {
+    const chain = this.chain(id);
+    const support = (id) => this.byId.get(id).support;
+    const best = Math.max(...chain.map(support));
+    return chain.findLast((id) => support(id) >= this.borneOut * best);
+  }
+
+  // The next smaller thing around `id` below `selected`; where there is none, the largest again.
+  below(id, selected) {
+    const chain = this.chain(id);
+    const at = chain.indexOf(selected);
+    return at > 0 ? chain[at - 1] : this.meant(id);
+  }
+
+  async picture(id) {
+    if (!this.pictures.has(id)) {
+      const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), () => null);
+      this.pictures.set(id, made);
+    }
+    return this.pictures.get(id);
+  }
+
+  // Fills a list with a button for each of `rows`: { id, score }.
+  fill(element, rows, { selected, hidden, minScore, choose }) {
+    element.replaceChildren(...rows.map(({ id, score }) => {
+      const button = document.createElement("button");
+      button.dataset.id = id;
+      button.classList.toggle("selected", selected.has(id));
+      button.classList.toggle("hidden-object", hidden.has(id));
+      button.setAttribute("aria-pressed", selected.has(id));
+      const image = document.createElement("img");
+      image.alt = "";
+      image.loading = "lazy";
+      const name = document.createElement("span");
+      name.textContent = score === undefined ? `#${id}` : `#${id}  ${score.toFixed(2)}`;
+      button.append(image, name);
+      if (score !== undefined) {
+        const meter = document.createElement("meter");
+        meter.className = "score";
+        Object.assign(meter, { min: 0, max: 1, low: minScore, high: minScore, optimum: 1, value: score });
+        meter.setAttribute("aria-label", `relevancy ${score.toFixed(2)}`);
+        button.append(meter);
+      }
+      button.addEventListener("click", () => choose(id));
+      // Only what comes into sight is asked for.
+      new IntersectionObserver(async (entries, observer) => {
+        if (!entries.some((entry) => entry.isIntersecting)) return;
+        observer.disconnect();
+        const url = await this.picture(id);
+        if (url) image.src = url;
+      }).observe(button);
+      const item = document.createElement("li");
+      item.append(button);
+      return item;
+    }));
+  }
+}

@@ -1,0 +1,47 @@
+// Requests to the program that serves this page.
+
+const address = new URL(location.href);
+const token = address.searchParams.get("token");
+// The token must not stay where others can read it over one's shoulder.
+if (token) {
+  address.searchParams.delete("token");
+  history.replaceState(null, "", address);
+}
+
+async function request(path, options = {}) {
+  const headers = { ...options.headers };
+  if (token) headers.Authorization = `Bearer ${token}`;
+  let response;
+  try {
+    response = await fetch(path, { ...options, headers });
+  } catch {
+    throw new Error("the server does not answer; is fastlgs still running?");
+  }
+  if (!response.ok) {
+    const body = await response.json().catch(() => ({}));
+    throw new Error(body.error ?? `${path}: ${response.status}`);
+  }
+  return response;
+}
+
+const posted = (body, signal) => ({
+  method: "POST",
+  headers: { "Content-Type": "application/json" },
+  body: JSON.stringify(body),
+  signal,
+});
+
+export const getJson = async (path) => (await request(path)).json();
+export const getBytes = async (path) => (await request(path)).arrayBuffer();
+export const getBlob = async (path) => (await request(path)).blob();
+export const postJson = async (path, body) => (await request(path, posted(body))).json();
+export const postBlob = async (path, body) => (await request(path, posted(body))).blob();
+
+// Gives a blob to the user as a file.
+export function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}

@@ -1,0 +1,259 @@
+// The picture: canvas, camera, hands on it, and what lies over it (cameras of the photos, the photo itself).
+
+import { Camera, frustum } from "/camera.js";
+import { OBJECT_ROWS, openRenderer, parseSplats } from "/renderer.js";
+import { getBlob, getBytes } from "/server.js";
+
+// More pixels than this, along the longer side, are not drawn: software rasterisers would crawl.
+const MOST_PIXELS = 1280;
+
+export class Stage {
+  constructor(scene, elements, failed) {
+    Object.assign(this, { scene, elements, failed });
+    this.camera = new Camera(scene.up);
+    this.mode = "color";
+    this.objects = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), text: null, list: [], members: () => [] };
+    this.showCameras = false;
+    this.compare = 0;
+    this.picked = () => {};
+    this.looked = () => {};
+  }
+
+  async open(wish) {
+    this.renderer = await openRenderer(this.elements.canvas, wish);
+    this.sorter = new Worker("/sorter.js");
+    this.sorter.onmessage = ({ data }) => this.sorted(data);
+    new ResizeObserver(() => this.resize()).observe(this.elements.stage);
+    this.listen();
+    this.resize();
+  }
+
+  // Fetches the Gaussians; also those of a scene that grows.
+  async load() {
+    if (this.renderer.name === "pictures") return this.draw();
+    this.splats = parseSplats(await getBytes("/api/splats"));
+    this.renderer.setSplats(this.splats);
+    this.renderer.setObjects(this.objectBytes());
+    this.sorter.postMessage({ means: this.splats.means });
+    this.sorting = false;
+    this.loading = (this.loading ?? 0) + 1;
+    return this.settle();
+  }
+
+  resize() {
+    const box = this.elements.stage.getBoundingClientRect();
+    const ratio = Math.min(window.devicePixelRatio, MOST_PIXELS / Math.max(box.width, box.height, 1));
+    const size = [box.width, box.height].map((n) => Math.max(1, Math.round(n * ratio)));
+    for (const canvas of [this.elements.canvas, this.elements.cameras]) [canvas.width, canvas.height] = size;
+    [this.width, this.height] = size;
+    this.ratio = ratio;
+    this.changed();
+  }
+
+  lookFrom(index) {
+    this.index = index;
+    this.camera.lookFrom(this.scene.views[index]);
+    this.elements.photo.hidden = true;
+    this.looked(index);
+    return this.settle();
+  }
+
+  // Draws once the order of the Gaussians fits the camera.
+  settle() {
+    const settled = new Promise((done) => (this.settled = [...(this.settled ?? []), done]));
+    this.changed();
+    return settled;
+  }
+
+  changed() {
+    if (!this.camera.view) return;
+    if (this.splats && this.splats.count > 0) {
+      if (this.sorting) this.sortAgain = true;
+      else this.sort();
+    }
+    this.draw();
+    if (this.renderer?.name === "pictures" || !this.splats) this.finish();
+  }
+
+  sort() {
+    const m = this.camera.worldToCamera();
+    this.sorting = true;
+    this.sortAgain = false;
+    this.sorter.postMessage({ depth: [m[2], m[6], m[10], m[14]], number: this.loading });
+  }
+
+  sorted({ order, number }) {
+    // An order of Gaussians that were replaced meanwhile fits no longer.
+    if (number === this.loading) this.renderer.setOrder(order);
+    if (number !== this.loading || this.sortAgain) return this.sort();
+    this.sorting = false;
+    this.draw();
+    this.finish();
+  }
+
+  finish() {
+    const settled = this.settled ?? [];
+    this.settled = [];
+    requestAnimationFrame(() => requestAnimationFrame(() => settled.forEach((done) => done())));
+  }
+
+  draw() {
+    if (this.pending || !this.renderer) return;
+    this.pending = true;
+    requestAnimationFrame(() => {
+      this.pending = false;
+      this.drawNow();
+    });
+  }
+
+  frame() {
+    const { camera, width, height, scene, mode, objects, failed } = this;
+    const { selected, hidden, only, text } = objects;
+    const sets = { selected: [...selected], hidden: [...hidden], only: [...only] };
+    return { camera, width, height, scene, mode, text, failed, dim: selected.size > 0, ...sets };
+  }
+
+  drawNow() {
+    if (!this.camera.view || !(this.splats || this.renderer.name === "pictures")) return;
+    const drawn = this.renderer.draw(this.frame());
+    this.drawCameras();
+    this.placePhoto();
+    return drawn;
+  }
+
+  // The picture as a PNG, as it is drawn now.
+  async snapshot() {
+    await this.drawNow();
+    return new Promise((done) => this.elements.canvas.toBlob(done, "image/png"));
+  }
+
+  setMode(mode) {
+    this.mode = mode;
+    this.draw();
+  }
+
+  // What is selected, hidden, shown alone and relevant; see app.js.
+  setObjects(objects) {
+    this.objects = objects;
+    this.renderer.setObjects(this.objectBytes());
+    this.draw();
+  }
+
+  objectBytes() {
+    const bytes = new Uint8Array(4 * 256 * OBJECT_ROWS);
+    const { list, selected, hidden, only, scores, members } = this.objects;
+    for (const { id, color } of [{ id: 0, color: [0, 0, 0] }, ...list]) {
+      // Relevant, selected or hidden is also what lies in a thing that is.
+      const around = members(id);
+      const score = Math.max(0, ...around.map((above) => scores.get(above) ?? 0));
+      const any = (set) => around.some((above) => set.has(above));
+      const gone = any(hidden) || (only.size > 0 && !any(only));
+      bytes.set([Math.round(255 * score), any(selected) ? 255 : 0, gone ? 255 : 0, 255], 4 * id);
+      bytes.set([...color, 255], 4 * (65536 + id));
+    }
+    return bytes;
+  }
+
+  drawCameras() {
+    const context = this.elements.cameras.getContext("2d");
+    context.clearRect(0, 0, this.width, this.height);
+    if (!this.showCameras) return;
+    const lens = this.camera.lens(this.width, this.height);
+    for (const [index, view] of this.scene.views.entries()) {
+      if (index === this.index && !this.camera.moved) continue;
+      const { apex, corners } = frustum(view, 0.08 * view.focus);
+      const [top, ...base] = [apex, ...corners].map((p) => this.camera.project(p, lens));
+      if (!top || base.some((p) => !p)) continue;
+      context.strokeStyle = view.held_out ? "#58b6ff" : "#ff8a3c";
+      context.beginPath();
+      base.forEach((p, k) => {
+        context.moveTo(...top);
+        context.lineTo(...p);
+        context.lineTo(...base[(k + 1) % 4]);
+      });
+      context.stroke();
+    }
+  }
+
+  // The photo lies over the picture while the camera stands where it was taken.
+  async placePhoto() {
+    const { photo, divider } = this.elements;
+    const view = this.camera.view;
+    const shown = this.compare > 0 && !this.camera.moved && view.photo;
+    photo.hidden = divider.hidden = !shown;
+    if (!shown) return;
+    if (photo.dataset.view !== view.name) {
+      photo.dataset.view = view.name;
+      URL.revokeObjectURL(photo.src);
+      photo.src = URL.createObjectURL(await getBlob(`/api/photos/${encodeURIComponent(view.name)}`));
+    }
+    const { picture } = this.camera.lens(this.width, this.height);
+    const css = (v) => `${v / this.ratio}px`;
+    Object.assign(photo.style, { left: css(picture.left), top: css(picture.top), width: css(picture.width), height: css(picture.height) });
+    photo.style.clipPath = `inset(0 ${100 - this.compare}% 0 0)`;
+    const at = picture.left + picture.width * this.compare / 100;
+    Object.assign(divider.style, { left: css(at), top: css(picture.top), height: css(picture.height) });
+  }
+
+  // Mouse, touch and wheel. Keys are in app.js.
+  listen() {
+    const { canvas } = this.elements;
+    const pointers = new Map();
+    let travelled = 0;
+    const place = (event) => [event.offsetX * this.ratio, event.offsetY * this.ratio];
+    const spread = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, place(event));
+      travelled = 0;
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const before = pointers.get(event.pointerId);
+      if (!before) return;
+      const now = place(event);
+      const [dx, dy] = [(now[0] - before[0]) / this.height, (now[1] - before[1]) / this.height];
+      travelled += Math.abs(dx) + Math.abs(dy);
+      if (pointers.size === 2) {
+        const old = spread([...pointers.values()]);
+        pointers.set(event.pointerId, now);
+        this.camera.zoom(old / Math.max(spread([...pointers.values()]), 1));
+        this.camera.move(dx / 2, dy / 2);
+      } else {
+        pointers.set(event.pointerId, now);
+        if (event.buttons & 2 || event.shiftKey) this.camera.move(dx, dy);
+        else this.camera.turn(-3 * dx, 3 * dy);
+      }
+      this.changed();
+    });
+    const end = (event) => {
+      if (event.type === "pointerup" && pointers.size === 1 && travelled < 0.01 && event.button === 0) this.click(...place(event));
+      pointers.delete(event.pointerId);
+    };
+    canvas.addEventListener("pointerup", end);
+    canvas.addEventListener("pointercancel", end);
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.camera.zoom(Math.exp(event.deltaY * 0.001));
+      this.changed();
+    }, { passive: false });
+  }
+
+  async click(x, y) {
+    if (this.showCameras) {
+      const lens = this.camera.lens(this.width, this.height);
+      const near = (view) => {
+        const p = this.camera.project(frustum(view, 0.04 * view.focus).apex, lens);
+        return p ? Math.hypot(p[0] - x, p[1] - y) : Infinity;
+      };
+      const distances = this.scene.views.map(near);
+      const nearest = distances.indexOf(Math.min(...distances));
+      if (distances[nearest] < 12 * this.ratio) return this.lookFrom(nearest);
+    }
+    try {
+      this.picked(await this.renderer.pick(this.frame(), Math.floor(x), Math.floor(y)));
+    } catch (error) {
+      this.failed(error);
+    }
+  }
+}

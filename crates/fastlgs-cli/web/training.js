@@ -1,0 +1,58 @@
+// A scene that grows: its curves, and new Gaussians when the server has made a picture of it.
+
+import { getJson } from "/server.js";
+
+const EVERY_MS = 1000;
+
+// Follows a run until the scene can be asked; `grown` is called when there are new Gaussians.
+export async function follow(elements, grown) {
+  elements.training.hidden = false;
+  let revision = 0;
+  for (;;) {
+    const progress = await getJson("/api/training");
+    show(elements, progress);
+    if (progress.revision !== revision) {
+      revision = progress.revision;
+      await grown();
+    }
+    if ((await getJson("/api/scene")).stage === "ready") return;
+    await new Promise((done) => setTimeout(done, EVERY_MS));
+  }
+}
+
+// The curves of a run that is over.
+export async function recall(elements) {
+  elements.training.hidden = false;
+  show(elements, await getJson("/api/training"));
+}
+
+function show(elements, { curve, iterations, finished }) {
+  const last = curve.at(-1);
+  const state = finished ? "steps are done; objects come next, then questions can be asked" : `step ${last?.iteration ?? 0} of ${iterations}`;
+  elements.text.textContent = last
+    ? `${state}: ${last.gaussians.toLocaleString("en")} Gaussians, ${last.psnr.toFixed(1)} dB, ${Math.round(last.seconds)} s`
+    : "the first steps are on their way";
+  const points = (of) => curve.filter((p) => of(p) !== null && Number.isFinite(of(p))).map((p) => [p.iteration, of(p)]);
+  plot(elements.loss, "loss", iterations, [["", points((p) => p.loss)]]);
+  plot(elements.psnr, "PSNR of training (orange) and held-out views (blue), dB", iterations, [
+    ["", points((p) => p.psnr)],
+    ["held-out", points((p) => p.psnr_held_out)],
+  ]);
+}
+
+// Lines in a box of 300 x 90.
+function plot(svg, title, most, lines) {
+  const values = lines.flatMap(([, points]) => points.map((p) => p[1]));
+  const low = Math.min(...values), high = Math.max(...values);
+  const element = (name, attributes, text = "") => {
+    const made = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    made.textContent = text;
+    return made;
+  };
+  const at = ([x, y]) => `${(4 + 292 * x / most).toFixed(1)},${(84 - 66 * (y - low) / Math.max(high - low, 1e-9)).toFixed(1)}`;
+  svg.replaceChildren(
+    element("text", { x: 4, y: 11 }, values.length ? `${title}: ${values.at(-1).toPrecision(3)}  (${low.toPrecision(3)} to ${high.toPrecision(3)})` : title),
+    ...lines.map(([name, points]) => element("polyline", { class: name, points: points.map(at).join(" ") })),
+  );
+}

@@ -1,0 +1,156 @@
+//! Binary glTF 2.0 with the Khronos extension `KHR_gaussian_splatting`: one mesh of points whose attributes are the Gaussians.
+//!
+//! Scales are written as they are (not as logarithms), opacity after the sigmoid, rotations as unit quaternions (x, y, z, w).
+//! Coordinates stay those of the scene; the node turns them so that the scene's up is glTF's +y. Programs that do not know the
+//! extension show coloured points. Features and object ids have no place in it.
+
+use crate::gaussians::{SH_C0, rest_len, sigmoid};
+use crate::{Gaussians, Result, fs};
+use glam::{Quat, Vec3};
+use serde_json::{Value, json};
+use std::io::Write;
+use std::path::Path;
+
+const MAGIC: u32 = 0x4654_6c67;
+const VERSION: u32 = 2;
+const JSON_CHUNK: u32 = 0x4e4f_534a;
+const BINARY_CHUNK: u32 = 0x004e_4942;
+const FLOAT: u32 = 5126;
+const POINTS: u32 = 0;
+const VERTICES: u32 = 34962;
+
+/// Attribute name, glTF type, and the values of all Gaussians one after the other.
+type Attribute = (String, &'static str, Vec<f32>);
+
+fn attributes(scene: &Gaussians) -> Vec<Attribute> {
+    let flat = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
+    let own = |name: &str| format!("KHR_gaussian_splatting:{name}");
+    let opacity: Vec<f32> = scene.opacity_logits.iter().map(|o| sigmoid(*o)).collect();
+    let color = |(c, o): (&Vec3, &f32)| (0.5 + SH_C0 * *c).clamp(Vec3::ZERO, Vec3::ONE).extend(*o).to_array();
+    let mut out = vec![
+        ("POSITION".to_owned(), "VEC3", flat(&scene.means)),
+        ("COLOR_0".to_owned(), "VEC4", scene.sh_dc.iter().zip(&opacity).flat_map(color).collect()),
+        (own("ROTATION"), "VEC4", (0..scene.len()).flat_map(|i| scene.rotation(i).to_array()).collect()),
+        (own("SCALE"), "VEC3", scene.log_scales.iter().flat_map(|s| s.exp().to_array()).collect()),
+        (own("OPACITY"), "SCALAR", opacity),
+        (own("SH_DEGREE_0_COEF_0"), "VEC3", flat(&scene.sh_dc)),
+    ];
+    for degree in 1..=scene.sh_degree {
+        let before = rest_len(degree - 1);
+        for k in before..rest_len(degree) {
+            let values = (0..scene.len()).flat_map(|i| scene.rest(i)[k].to_array()).collect();
+            out.push((own(&format!("SH_DEGREE_{degree}_COEF_{}", k - before)), "VEC3", values));
+        }
+    }
+    out
+}
+
+/// The JSON chunk for attributes that lie one after the other in the binary chunk.
+fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, bytes: usize) -> Value {
+    let (mut views, mut accessors, mut names) = (Vec::new(), Vec::new(), serde_json::Map::new());
+    let mut offset = 0;
+    for (k, (name, kind, values)) in attributes.iter().enumerate() {
+        let length = 4 * values.len();
+        views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": length, "target": VERTICES }));
+        accessors.push(json!({ "bufferView": k, "componentType": FLOAT, "count": scene.len(), "type": kind }));
+        names.insert(name.clone(), json!(k));
+        offset += length;
+    }
+    // The format wants the bounds of positions.
+    let bound = |by: fn(Vec3, Vec3) -> Vec3| scene.means.iter().copied().reduce(by).unwrap_or(Vec3::ZERO).to_array();
+    accessors[0]["min"] = json!(bound(Vec3::min));
+    accessors[0]["max"] = json!(bound(Vec3::max));
+    let kernel = json!({ "kernel": "ellipse", "colorSpace": "srgb_rec709_display" });
+    json!({
+        "asset": { "version": "2.0", "generator": concat!("FastLGS ", env!("CARGO_PKG_VERSION")) },
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{ "nodes": [0] }],
+        "nodes": [{ "mesh": 0, "rotation": Quat::from_rotation_arc(up, Vec3::Y).to_array() }],
+        "meshes": [{ "primitives": [{
+            "attributes": names,
+            "mode": POINTS,
+            "extensions": { "KHR_gaussian_splatting": kernel },
+        }] }],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{ "byteLength": bytes }],
+    })
+}
+
+/// Writes a scene whose up, a unit vector of the world, becomes +y.
+///
+/// # Errors
+/// [`crate::Error::Invalid`] for an empty scene and for more than 4 GiB, which the format cannot hold; the system's refusal.
+pub fn write(path: &Path, scene: &Gaussians, up: Vec3) -> Result<()> {
+    let attributes = attributes(scene);
+    let bytes: usize = attributes.iter().map(|a| 4 * a.2.len()).sum();
+    let mut text = document(scene, &attributes, up, bytes).to_string();
+    text.extend(std::iter::repeat_n(' ', text.len().next_multiple_of(4) - text.len()));
+    let total = u32::try_from(12 + 8 + text.len() + 8 + bytes).ok().filter(|_| !scene.is_empty());
+    let Some(total) = total else {
+        let reason = format!("{}: {} Gaussians cannot be written as one glTF file; use .ply", path.display(), scene.len());
+        return Err(crate::Error::Invalid(reason));
+    };
+    fs::write_atomic(path, |file| {
+        for word in [MAGIC, VERSION, total, text.len() as u32, JSON_CHUNK] {
+            file.write_all(&word.to_le_bytes())?;
+        }
+        file.write_all(text.as_bytes())?;
+        file.write_all(&(bytes as u32).to_le_bytes())?;
+        file.write_all(&BINARY_CHUNK.to_le_bytes())?;
+        for (_, _, values) in &attributes {
+            values.iter().try_for_each(|v| file.write_all(&v.to_le_bytes()))?;
+        }
+        Ok(())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn word(data: &[u8], at: usize) -> usize {
+        u32::from_le_bytes(data[at..at + 4].try_into().unwrap()) as usize
+    }
+
+    #[test]
+    fn attributes_are_where_the_document_says() {
+        let mut scene = Gaussians::default();
+        scene.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.25, 0.75, [1.0, 0.5, 0.0]);
+        scene.push_sphere(Vec3::new(-1.0, 0.0, 5.0), 0.5, 0.5, [0.2; 3]);
+        let mut scene = scene.with_sh_degree(2);
+        scene.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.glb");
+        write(&path, &scene, Vec3::NEG_Y).unwrap();
+        let data = std::fs::read(&path).unwrap();
+        assert_eq!((word(&data, 0), word(&data, 4), word(&data, 8)), (MAGIC as usize, 2, data.len()));
+        let length = word(&data, 12);
+        assert!(length.is_multiple_of(4));
+        let document: Value = serde_json::from_slice(&data[20..20 + length]).unwrap();
+        let body = &data[20 + length + 8..];
+        assert_eq!(word(&data, 20 + length), body.len());
+        assert_eq!(document["buffers"][0]["byteLength"], body.len());
+
+        let names = &document["meshes"][0]["primitives"][0]["attributes"];
+        let values = |name: &str, width: usize| -> Vec<f32> {
+            let accessor = &document["accessors"][names[name].as_u64().unwrap() as usize];
+            let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+            let at = view["byteOffset"].as_u64().unwrap() as usize;
+            assert_eq!(view["byteLength"], 4 * width * 2);
+            body[at..at + 4 * width * 2].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+        };
+        assert_eq!(values("POSITION", 3), [1.0, 2.0, 3.0, -1.0, 0.0, 5.0]);
+        assert_eq!(document["accessors"][0]["min"], json!([-1.0, 0.0, 3.0]));
+        let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);
+        assert!(close(&values("KHR_gaussian_splatting:SCALE", 3), &[0.25, 0.25, 0.25, 0.5, 0.5, 0.5]));
+        assert!(close(&values("KHR_gaussian_splatting:OPACITY", 1), &[0.75, 0.5]));
+        assert!(close(&values("KHR_gaussian_splatting:ROTATION", 4), &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]));
+        assert!(close(&values("COLOR_0", 4), &[1.0, 0.5, 0.0, 0.75, 0.2, 0.2, 0.2, 0.5]));
+        // The last of degree 2 is the eighth coefficient; of the second Gaussian it is the sixteenth.
+        assert!(close(&values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_4", 3), &[7.0, 7.0, 7.0, 15.0, 15.0, 15.0]));
+        assert!(names.get("KHR_gaussian_splatting:SH_DEGREE_3_COEF_0").is_none());
+        assert!(write(&path, &Gaussians::default(), Vec3::Y).is_err());
+    }
+}
