@@ -1,20 +1,17 @@
-//! Translates the viewer's one shader, `web/splat.wgsl`, for browsers without WebGPU: naga writes the GLSL of WebGL2, so that both
-//! draw by the same source and a broken shader fails the build.
+//! Validates the viewer's shaders, and translates the one that draws, `web/splat.wgsl`, for browsers without WebGPU: naga writes the
+//! GLSL of WebGL2, so that both draw by the same source and a broken shader fails the build.
 
+use naga::Module;
 use naga::back::glsl;
-use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use std::path::Path;
 use std::{env, fs};
 
 const SOURCE: &str = "web/splat.wgsl";
 
 fn main() {
-    println!("cargo::rerun-if-changed={SOURCE}");
-    let source = fs::read_to_string(SOURCE).expect("web/ is in the crate");
-    let module = naga::front::wgsl::parse_str(&source).unwrap_or_else(|e| panic!("{SOURCE}:\n{}", e.emit_to_string(&source)));
-    let info = Validator::new(ValidationFlags::all(), Capabilities::empty())
-        .validate(&module)
-        .unwrap_or_else(|e| panic!("{SOURCE}:\n{}", e.emit_to_string(&source)));
+    valid("web/present.wgsl");
+    let (module, info) = valid(SOURCE);
     let options = glsl::Options {
         version: glsl::Version::Embedded { version: 300, is_webgl: true },
         writer_flags: glsl::WriterFlags::empty(),
@@ -29,4 +26,13 @@ fn main() {
         writer.write().unwrap_or_else(|e| panic!("{SOURCE}, {entry}: {e}"));
         fs::write(Path::new(&out).join(format!("{entry}.glsl")), text).expect("writable OUT_DIR");
     }
+}
+
+fn valid(path: &str) -> (Module, ModuleInfo) {
+    println!("cargo::rerun-if-changed={path}");
+    let source = fs::read_to_string(path).expect("web/ is in the crate");
+    let module = naga::front::wgsl::parse_str(&source).unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(&source)));
+    let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);
+    let info = info.unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(&source)));
+    (module, info)
 }

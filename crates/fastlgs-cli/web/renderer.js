@@ -39,12 +39,12 @@ const WAYS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openP
 
 // The first way that this browser can go, or the one that is wished for. A browser without a GPU draws slower than the server, so
 // it gets pictures unless something else is wished for.
-export async function openRenderer(canvas, wish) {
+export async function openRenderer(canvas, wish, evenSlow) {
   const reasons = [];
   for (const [name, open] of WAYS) {
     if (wish && wish !== name) continue;
     try {
-      return Object.assign(await open(canvas, Boolean(wish)), { name, reasons });
+      return Object.assign(await open(canvas, evenSlow || Boolean(wish)), { name, reasons });
     } catch (error) {
       reasons.push(`${name}: ${error.message}`);
     }

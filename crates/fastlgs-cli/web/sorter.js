@@ -14,8 +14,8 @@ onmessage = ({ data }) => {
   const depths = new Float32Array(count);
   let near = Infinity, far = -Infinity, kept = 0;
   for (let i = 0; i < count; i++) {
-    const depth = x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w;
-    depths[i] = depth;
+    // Rounded as it is kept, so that none lies beyond near or far.
+    const depth = depths[i] = Math.fround(x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w);
     if (depth > NEAR) {
       kept++;
       if (depth < near) near = depth;

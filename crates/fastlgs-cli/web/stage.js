@@ -20,7 +20,8 @@ export class Stage {
   }
 
   async open(wish) {
-    this.renderer = await openRenderer(this.elements.canvas, wish);
+    // The server renders no pictures of a scene in training.
+    this.renderer = await openRenderer(this.elements.canvas, wish, this.scene.stage === "training");
     this.sorter = new Worker("/sorter.js");
     this.sorter.onmessage = ({ data }) => this.sorted(data);
     new ResizeObserver(() => this.resize()).observe(this.elements.stage);

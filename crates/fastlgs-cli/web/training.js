@@ -34,7 +34,7 @@ function show(elements, { curve, iterations, finished }) {
     : "the first steps are on their way";
   const points = (of) => curve.filter((p) => of(p) !== null && Number.isFinite(of(p))).map((p) => [p.iteration, of(p)]);
   plot(elements.loss, "loss", iterations, [["", points((p) => p.loss)]]);
-  plot(elements.psnr, "PSNR of training (orange) and held-out views (blue), dB", iterations, [
+  plot(elements.psnr, "PSNR in dB, blue: held out", iterations, [
     ["", points((p) => p.psnr)],
     ["held-out", points((p) => p.psnr_held_out)],
   ]);

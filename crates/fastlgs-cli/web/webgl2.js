@@ -49,7 +49,16 @@ export async function openWebGl2(canvas, evenSlow) {
   };
   texture(0);
   texture(1);
-  const ids = { buffer: gl.createRenderbuffer(), frame: gl.createFramebuffer() };
+  // Blending goes through 16-bit floats where there are such, for the reason that present.wgsl gives.
+  const floats = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  const target = () => ({ buffer: gl.createRenderbuffer(), frame: gl.createFramebuffer() });
+  const [ids, picture] = [target(), target()];
+  function bind({ buffer, frame }, format, { width, height }) {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
+    gl.bindRenderbuffer(gl.RENDERBUFFER, buffer);
+    gl.renderbufferStorage(gl.RENDERBUFFER, format, width, height);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, buffer);
+  }
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
   let orderLength = 0, splats;
 
@@ -78,15 +87,18 @@ export async function openWebGl2(canvas, evenSlow) {
       orderLength = next.length;
     },
     draw(frame) {
+      if (floats) bind(picture, gl.RGBA16F, frame);
       gl.enable(gl.BLEND);
       pass(frame, frame.mode === "objects" ? [0, 0, 0, 1] : [...frame.scene.background, 1]);
+      if (!floats) return;
+      const all = [0, 0, frame.width, frame.height];
+      gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+      gl.blitFramebuffer(...all, ...all, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     },
     // The object id at a pixel of the canvas.
     async pick(frame, x, y) {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, ids.frame);
-      gl.bindRenderbuffer(gl.RENDERBUFFER, ids.buffer);
-      gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, frame.width, frame.height);
-      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, ids.buffer);
+      bind(ids, gl.RGBA8, frame);
       gl.disable(gl.BLEND);
       pass({ ...frame, mode: "ids" }, [0, 0, 0, 0]);
       const pixel = new Uint8Array(4);

@@ -8,7 +8,8 @@ export async function openWebGpu(canvas, evenSlow) {
   if (adapter.info.isFallbackAdapter && !evenSlow) throw new Error("only a software adapter");
   const device = await adapter.requestDevice();
   const format = navigator.gpu.getPreferredCanvasFormat();
-  const module = device.createShaderModule({ code: await (await fetch("/splat.wgsl")).text() });
+  const shader = async (path) => device.createShaderModule({ code: await (await fetch(path)).text() });
+  const [module, present] = await Promise.all([shader("/splat.wgsl"), shader("/present.wgsl")]);
   const layout = device.createBindGroupLayout({
     entries: [
       { binding: 0, visibility: GPUShaderStage.VERTEX | GPUShaderStage.FRAGMENT, buffer: {} },
@@ -26,9 +27,10 @@ export async function openWebGpu(canvas, evenSlow) {
     fragment: { module, entryPoint: "pixel", targets: [target] },
     primitive: { topology: "triangle-strip" },
   });
-  const [blending, picking] = await Promise.all([
-    pipeline({ format, blend: { color: over, alpha: over } }),
+  const [blending, picking, presenting] = await Promise.all([
+    pipeline({ format: "rgba16float", blend: { color: over, alpha: over } }),
     pipeline({ format: "rgba8unorm" }),
+    device.createRenderPipelineAsync({ layout: "auto", vertex: { module: present }, fragment: { module: present, targets: [{ format }] } }),
   ]);
   // Only now: a canvas that has a WebGPU context can have no other.
   const context = canvas.getContext("webgpu");
@@ -39,7 +41,16 @@ export async function openWebGpu(canvas, evenSlow) {
   });
   const uniform = device.createBuffer({ size: 128, usage: GPUBufferUsage.UNIFORM | GPUBufferUsage.COPY_DST });
   const states = texture("rgba8unorm", OBJECT_ROWS, 256);
-  let splatTexture, order, orderLength = 0, group, splats;
+  let splatTexture, order, orderLength = 0, group, splats, picture, shown;
+
+  // The picture in floats, as large as the canvas.
+  function resize({ width, height }) {
+    if (picture?.width === width && picture.height === height) return;
+    picture?.destroy();
+    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.TEXTURE_BINDING;
+    picture = device.createTexture({ size: [width, height], format: "rgba16float", usage });
+    shown = device.createBindGroup({ layout: presenting.getBindGroupLayout(0), entries: [{ binding: 0, resource: picture.createView() }] });
+  }
 
   function pass(encoder, view, color, pipeline) {
     const pass = encoder.beginRenderPass({ colorAttachments: [{ view, clearValue: color, loadOp: "clear", storeOp: "store" }] });
@@ -77,8 +88,16 @@ export async function openWebGpu(canvas, evenSlow) {
     draw(frame) {
       device.queue.writeBuffer(uniform, 0, packFrame({ ...frame, splats }));
       const [r, g, b] = frame.mode === "objects" ? [0, 0, 0] : frame.scene.background;
+      resize(frame);
       const encoder = device.createCommandEncoder();
-      pass(encoder, context.getCurrentTexture().createView(), { r, g, b, a: 1 }, blending);
+      pass(encoder, picture.createView(), { r, g, b, a: 1 }, blending);
+      const last = encoder.beginRenderPass({
+        colorAttachments: [{ view: context.getCurrentTexture().createView(), loadOp: "clear", storeOp: "store" }],
+      });
+      last.setPipeline(presenting);
+      last.setBindGroup(0, shown);
+      last.draw(3);
+      last.end();
       device.queue.submit([encoder.finish()]);
     },
     // The object id at a pixel of the canvas.

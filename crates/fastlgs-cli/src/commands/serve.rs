@@ -12,7 +12,9 @@ use std::path::PathBuf;
 pub const DEFAULT_BIND: &str = "127.0.0.1:8742";
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs serve scenes/fox\n\nStop it with Ctrl-C. Addresses that other machines can reach need the token that is printed.")]
+#[command(
+    after_help = "Example: fastlgs serve scenes/fox\n\nStop it with Ctrl-C. Addresses that other machines can reach need the token that is printed."
+)]
 pub struct Args {
     /// Trained scene folder.
     scene: PathBuf,

@@ -71,6 +71,23 @@ impl From<fastlgs_core::Error> for Failure {
     }
 }
 
+impl From<JsonRejection> for Failure {
+    fn from(rejection: JsonRejection) -> Self {
+        match rejection.status() {
+            StatusCode::PAYLOAD_TOO_LARGE => {
+                Self::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {} bytes", super::LARGEST_BODY))
+            }
+            status => Self::new(status, rejection.body_text()),
+        }
+    }
+}
+
+impl From<QueryRejection> for Failure {
+    fn from(rejection: QueryRejection) -> Self {
+        Self::new(rejection.status(), rejection.body_text())
+    }
+}
+
 type Answer<T = Json<Value>> = Result<T, Failure>;
 type App = State<Arc<Shared>>;
 
@@ -227,7 +244,7 @@ pub struct Asked {
 
 /// `POST /api/query`: the fields of `fastlgs query --json`.
 pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>) -> Answer {
-    let Json(asked) = request.map_err(|e| Failure::new(e.status(), e.body_text()))?;
+    let Json(asked) = request?;
     let camera = camera_of(&app, asked.view.as_deref(), asked.camera.clone(), asked.size.as_deref())?;
     let ask = match (&asked.text, asked.point, &asked.image) {
         (Some(text), None, None) => Ask::Text(checked_text(text)?.to_owned()),
@@ -296,7 +313,7 @@ pub struct Wanted {
 
 /// `POST /api/render`: a PNG.
 pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection>) -> Answer<Response> {
-    let Json(wanted) = request.map_err(|e| Failure::new(e.status(), e.body_text()))?;
+    let Json(wanted) = request?;
     let camera = camera_of(&app, wanted.view.as_deref(), wanted.camera.clone(), wanted.size.as_deref())?;
     let what = wanted.what.as_deref().unwrap_or("color").to_owned();
     let text = wanted.text.as_deref().map(checked_text).transpose()?.map(str::to_owned);
@@ -351,7 +368,7 @@ fn yes() -> bool {
 
 /// `GET /api/export`
 pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejection>) -> Answer<Response> {
-    let Query(wanted) = request.map_err(|e| Failure::new(e.status(), e.body_text()))?;
+    let Query(wanted) = request?;
     let ids: Option<Vec<u16>> = wanted.objects.split(',').map(|id| id.trim().parse().ok()).collect();
     let ids = ids.ok_or_else(|| Failure::bad("objects: give ids like 3,17"))?;
     let ending = wanted.format;

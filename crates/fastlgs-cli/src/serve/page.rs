@@ -7,7 +7,7 @@ use axum::routing::get;
 use std::sync::Arc;
 
 /// Address, kind, and content.
-const FILES: [(&str, &str, &str); 17] = [
+const FILES: [(&str, &str, &str); 18] = [
     ("/", HTML, include_str!("../../web/index.html")),
     ("/style.css", "text/css; charset=utf-8", include_str!("../../web/style.css")),
     ("/app.js", SCRIPT, include_str!("../../web/app.js")),
@@ -22,6 +22,7 @@ const FILES: [(&str, &str, &str); 17] = [
     ("/pictures.js", SCRIPT, include_str!("../../web/pictures.js")),
     ("/sorter.js", SCRIPT, include_str!("../../web/sorter.js")),
     ("/splat.wgsl", TEXT, include_str!("../../web/splat.wgsl")),
+    ("/present.wgsl", TEXT, include_str!("../../web/present.wgsl")),
     ("/corner.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/corner.glsl"))),
     ("/pixel.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/pixel.glsl"))),
     ("/api/openapi.json", "application/json", include_str!("../../web/openapi.json")),

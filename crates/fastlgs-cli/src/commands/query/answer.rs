@@ -30,14 +30,7 @@ pub struct Question<'a> {
 
 impl Question<'_> {
     /// Asks a rendered view; the answer and its report with milliseconds, to which the view's own are added.
-    pub fn put<'a>(
-        &self,
-        scene: &Scene,
-        grid: &'a Grid,
-        field: &'a Field,
-        camera: &Camera,
-        render_ms: f64,
-    ) -> Result<(Answer<'a>, Value)> {
+    pub fn put<'a>(&self, scene: &Scene, grid: &'a Grid, field: &'a Field, camera: &Camera, render_ms: f64) -> Result<(Answer<'a>, Value)> {
         let mut clock = Instant::now();
         let mut lap = || std::mem::replace(&mut clock, Instant::now()).elapsed().as_secs_f64() * 1e3;
         let meaning = self.ask.meaning(scene, self.negatives)?;

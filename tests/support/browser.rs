@@ -1,0 +1,121 @@
+//! Drives headless Chromium through chromedriver: the few requests of WebDriver that the viewer's test needs.
+#![allow(dead_code)]
+
+use base64::Engine as _;
+use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A browser with one page; it ends with this value.
+pub struct Browser {
+    driver: Child,
+    session: String,
+    agent: ureq::Agent,
+}
+
+/// Whether Chromium and its driver are installed.
+pub fn installed() -> bool {
+    let runs = |program: &str| Command::new(program).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status().is_ok();
+    runs("chromedriver") && runs("chromium")
+}
+
+impl Browser {
+    /// Opens a window of this size with further flags.
+    pub fn open(width: u32, height: u32, flags: &[&str]) -> Self {
+        let mut driver =
+            Command::new("chromedriver").arg("--port=0").stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("chromedriver");
+        let lines = BufReader::new(driver.stdout.take().expect("piped")).lines().map_while(Result::ok);
+        let port = lines
+            .filter_map(|l| l.split("on port ").nth(1).map(|p| p.trim_end_matches('.').to_owned()))
+            .find(|p| p.parse::<u16>().is_ok_and(|p| p > 0));
+        let base = format!("http://127.0.0.1:{}/session", port.expect("chromedriver tells its port"));
+        let agent = ureq::Agent::config_builder().timeout_global(Some(Duration::from_secs(180))).http_status_as_error(false).build().into();
+        let size = format!("--window-size={width},{height}");
+        let mut args = vec!["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", &size];
+        args.extend(flags);
+        let options = json!({ "args": args });
+        let always = json!({ "browserName": "chrome", "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" } });
+        let mut browser = Self { driver, session: base, agent };
+        let made = browser.post("", &json!({ "capabilities": { "alwaysMatch": always } }));
+        browser.session = format!("{}/{}", browser.session, made["sessionId"].as_str().expect("a session"));
+        browser
+    }
+
+    fn post(&self, path: &str, body: &Value) -> Value {
+        let url = format!("{}{path}", self.session);
+        let mut response =
+            self.agent.post(&url).header("Content-Type", "application/json").send(body.to_string()).expect("chromedriver answers");
+        let text = response.body_mut().with_config().limit(64 << 20).read_to_string().expect("an answer");
+        let value: Value = serde_json::from_str(&text).expect("JSON");
+        assert!(response.status().is_success(), "{path}: {value}");
+        value["value"].clone()
+    }
+
+    pub fn go(&self, url: &str) {
+        self.post("/url", &json!({ "url": url }));
+    }
+
+    /// What the body of an async function returns; a thrown error fails the test.
+    pub fn run(&self, body: &str) -> Value {
+        let script =
+            format!("const done = arguments[0]; (async () => {{ {body} }})().then((v) => done({{ v }}), (e) => done({{ e: String(e) }}));");
+        let result = self.post("/execute/async", &json!({ "script": script, "args": [] }));
+        assert!(result["e"].is_null(), "{body}: {}", result["e"]);
+        result["v"].clone()
+    }
+
+    /// Waits until an expression is true.
+    pub fn wait_for(&self, expression: &str, at_most: Duration) {
+        let began = Instant::now();
+        while self.run(&format!("return Boolean({expression});")) != true {
+            let problem = self.run("return document.getElementById('problem')?.textContent ?? '';");
+            assert!(began.elapsed() < at_most, "'{expression}' did not come true; the page says: {problem}");
+            std::thread::sleep(Duration::from_millis(200));
+        }
+    }
+
+    /// Types into what has the focus.
+    pub fn keys(&self, keys: &str) {
+        let actions: Vec<Value> =
+            keys.chars().flat_map(|k| [json!({ "type": "keyDown", "value": k }), json!({ "type": "keyUp", "value": k })]).collect();
+        self.post("/actions", &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": actions }] }));
+    }
+
+    /// Presses the mouse at one place of the page and lets go at another.
+    pub fn drag(&self, from: [i32; 2], to: [i32; 2]) {
+        let to_place = |p: [i32; 2]| json!({ "type": "pointerMove", "duration": 50, "x": p[0], "y": p[1] });
+        let actions =
+            [to_place(from), json!({ "type": "pointerDown", "button": 0 }), to_place(to), json!({ "type": "pointerUp", "button": 0 })];
+        self.post("/actions", &json!({ "actions": [{ "type": "pointer", "id": "mouse", "actions": actions }] }));
+    }
+
+    /// A data URL's bytes.
+    pub fn decode(url: &Value) -> Vec<u8> {
+        let url = url.as_str().expect("a data URL");
+        base64::engine::general_purpose::STANDARD.decode(url.split(',').nth(1).expect("a data URL")).expect("base64")
+    }
+
+    pub fn screenshot(&self, path: &Path) {
+        let mut response = self.agent.get(&format!("{}/screenshot", self.session)).call().expect("a screenshot");
+        let value: Value = response.body_mut().with_config().limit(64 << 20).read_json().expect("JSON");
+        let data = base64::engine::general_purpose::STANDARD.decode(value["value"].as_str().expect("base64")).expect("base64");
+        std::fs::write(path, data).expect("the screenshot");
+    }
+
+    /// Errors on the console since the last call.
+    pub fn errors(&self) -> Vec<String> {
+        let logs = self.post("/se/log", &json!({ "type": "browser" }));
+        let logs = logs.as_array().expect("a list").iter().filter(|l| l["level"] == "SEVERE");
+        logs.map(|l| l["message"].as_str().unwrap_or_default().to_owned()).collect()
+    }
+}
+
+impl Drop for Browser {
+    fn drop(&mut self) {
+        let _ = self.agent.delete(&self.session).call();
+        let _ = self.driver.kill();
+        let _ = self.driver.wait();
+    }
+}

@@ -1,0 +1,435 @@
+//! The viewer: its HTTP interface, and its page in headless Chromium, drawn in all three ways.
+//!
+//! Needs the offline models; the page's test also Chromium with its driver. Skips loudly without them unless
+//! FASTLGS_REQUIRE_GPU is set, which makes them a must.
+
+#[path = "support/browser.rs"]
+mod browser;
+#[path = "support/run.rs"]
+mod run;
+
+use browser::Browser;
+use fastlgs_core::image_io;
+use image::RgbImage;
+use run::{copy_folder, json, text};
+use serde_json::Value;
+use std::collections::BTreeSet;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// The generated room with exact masks, trained; shared by the tests.
+fn room() -> Option<&'static Path> {
+    static ROOM: OnceLock<Option<(tempfile::TempDir, PathBuf)>> = OnceLock::new();
+    let made = ROOM.get_or_init(|| {
+        if !run::ready() {
+            return None;
+        }
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let (photos, scene) = (dir.path().join("photos"), dir.path().join("room"));
+        json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "320x240"]);
+        json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+        json(&["train", text(&scene), "--iterations", "1500", "--budget", "25000", "--device", "cpu"]);
+        Some((dir, scene))
+    });
+    made.as_ref().map(|(_, scene)| scene.as_path())
+}
+
+/// A running `fastlgs serve` or `train --serve`; killed with this value.
+struct Served {
+    process: Child,
+    /// Address without a path.
+    url: String,
+    token: Option<String>,
+}
+
+impl Served {
+    fn start(args: &[&str]) -> Self {
+        let command = Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+        let mut process = command.expect("the binary starts");
+        let out: Box<dyn Read + Send> = match args[0] {
+            "serve" => Box::new(process.stdout.take().expect("piped")),
+            _ => Box::new(process.stderr.take().expect("piped")),
+        };
+        let mut lines = BufReader::new(out).lines().map_while(Result::ok);
+        let address = lines.find_map(|l| l.split_whitespace().find(|w| w.starts_with("http://")).map(str::to_owned)).expect("an address");
+        // Whoever starts it may stop reading; the pipe must not fill up.
+        std::thread::spawn(move || lines.for_each(drop));
+        let (url, rest) = address.split_once("/?").unwrap_or((address.trim_end_matches('/'), ""));
+        Self { process, url: url.to_owned(), token: rest.strip_prefix("token=").map(str::to_owned) }
+    }
+
+    /// Status and body; a body that is given is posted as JSON.
+    fn ask(&self, path: &str, body: Option<&str>) -> (u16, Vec<u8>) {
+        let url = format!("{}{path}", self.url);
+        let agent: ureq::Agent =
+            ureq::Agent::config_builder().http_status_as_error(false).timeout_global(Some(Duration::from_secs(120))).build().into();
+        let bearer = format!("Bearer {}", self.token.as_deref().unwrap_or_default());
+        let response = match body {
+            Some(body) => agent.post(&url).header("Authorization", &bearer).header("Content-Type", "application/json").send(body),
+            None => agent.get(&url).header("Authorization", &bearer).call(),
+        };
+        let mut response = response.unwrap_or_else(|e| panic!("{path}: {e}"));
+        let data = response.body_mut().with_config().limit(256 << 20).read_to_vec().unwrap_or_else(|e| panic!("{path}: {e}"));
+        (response.status().as_u16(), data)
+    }
+
+    fn json(&self, path: &str, body: Option<Value>) -> Value {
+        let (status, data) = self.ask(path, body.map(|b| b.to_string()).as_deref());
+        let value = serde_json::from_slice(&data).unwrap_or_else(|e| panic!("{path}: {e}: {}", String::from_utf8_lossy(&data)));
+        assert_eq!(status, 200, "{path}: {value}");
+        value
+    }
+
+    /// The one sentence of a refusal.
+    fn refusal(&self, path: &str, body: Option<&str>, expected: u16) -> String {
+        let (status, data) = self.ask(path, body);
+        let value: Value = serde_json::from_slice(&data).unwrap_or_else(|e| panic!("{path}: {e}: {}", String::from_utf8_lossy(&data)));
+        assert_eq!(status, expected, "{path} {body:?}: {value}");
+        value["error"].as_str().unwrap_or_else(|| panic!("{path}: {value}")).to_owned()
+    }
+}
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}
+
+fn keys(value: &Value) -> BTreeSet<&str> {
+    value.as_object().unwrap_or_else(|| panic!("no object: {value}")).keys().map(String::as_str).collect()
+}
+
+#[test]
+fn the_interface_answers_as_the_query_command_does() {
+    let Some(scene) = room() else { return };
+    let served = Served::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
+    let mut answer = served.json("/api/query", Some(serde_json::json!({ "text": "cat", "view": "008.png" })));
+    let mut own = json(&["query", text(scene), "cat", "--view", "008.png", "--device", "cpu"]);
+    for value in [&mut answer, &mut own] {
+        assert!(value["ms"]["total"].as_f64().is_some_and(|ms| ms > 0.0), "{value}");
+        value["ms"].as_object_mut().expect("milliseconds").values_mut().for_each(|ms| *ms = Value::Null);
+    }
+    assert_eq!(answer, own);
+    assert_eq!(answer["found"], true);
+
+    // The document names all addresses, and all fields that come.
+    let document = served.json("/api/openapi.json", None);
+    let schema =
+        |path: &str, method: &str| document["paths"][path][method]["responses"]["200"]["content"]["application/json"]["schema"].clone();
+    let scene_facts = served.json("/api/scene", None);
+    let objects = served.json("/api/objects", None);
+    assert_eq!(keys(&schema("/api/query", "post")["properties"]), keys(&answer));
+    assert_eq!(keys(&schema("/api/query", "post")["properties"]["objects"]["items"]["properties"]), keys(&answer["objects"][0]));
+    assert_eq!(keys(&schema("/api/scene", "get")["properties"]), keys(&scene_facts));
+    assert_eq!(keys(&schema("/api/scene", "get")["properties"]["views"]["items"]["properties"]), keys(&scene_facts["views"][0]));
+    assert_eq!(keys(&schema("/api/objects", "get")["items"]["properties"]), keys(&objects[0]));
+    for (path, methods) in document["paths"].as_object().expect("paths") {
+        let path = path.replace("{id}", "1").replace("{view}", "008.png").replace("/api/training", "/api/scene");
+        let path = if path == "/api/export" { format!("{path}?objects=1&format=glb") } else { path };
+        let body = methods.get("post").map(|_| {
+            r#"{"text":"cat","what":"heatmap"}"#
+                .replace(r#","what":"heatmap""#, if path.ends_with("render") { r#","what":"heatmap""# } else { "" })
+        });
+        let (status, data) = served.ask(&path, body.as_deref());
+        assert_eq!(status, 200, "{path}: {}", String::from_utf8_lossy(&data[..data.len().min(200)]));
+    }
+    // Members of an object are counted with what lies in it, as the answer does.
+    let id = answer["objects"][0]["id"].as_u64().expect("an id") as usize;
+    assert_eq!(objects[id - 1]["gaussians"], answer["objects"][0]["gaussians"]);
+    assert!(served.ask(&format!("/api/export?objects={id}&format=ply"), None).1.starts_with(b"ply\n"));
+    let picture = |body: &str| {
+        let (status, data) = served.ask("/api/render", Some(body));
+        assert_eq!(status, 200, "{}", String::from_utf8_lossy(&data[..data.len().min(200)]));
+        image_io::decode_rgb("render", &data).expect("a PNG")
+    };
+    let whole = picture(r#"{"view":"008.png"}"#);
+    assert_eq!(whole.dimensions(), (320, 240));
+    assert_eq!(picture(r#"{"view":"008.png","size":"160x120"}"#).dimensions(), (160, 120));
+    assert_ne!(picture(&format!(r#"{{"view":"008.png","hidden":[{id}]}}"#)), whole);
+    assert_eq!(picture(r#"{"view":"008.png"}"#), whole, "what was hidden comes back");
+
+    // What is wrong is said in one sentence.
+    let long = format!(r#"{{"text":"{}"}}"#, "x".repeat(301));
+    let huge = format!(r#"{{"image":"{}"}}"#, "A".repeat(9 << 20));
+    for (path, body, status, word) in [
+        ("/api/query", "{", 400, "JSON"),
+        ("/api/query", "{}", 400, "one of text, point and image"),
+        ("/api/query", r#"{"text":" "}"#, 400, "empty"),
+        ("/api/query", long.as_str(), 400, "301 letters"),
+        ("/api/query", r#"{"txt":"cat"}"#, 422, "txt"),
+        ("/api/query", r#"{"text":"cat","view":"nowhere"}"#, 400, "nowhere"),
+        ("/api/query", r#"{"text":"cat","size":"9000x9000"}"#, 400, "too large"),
+        ("/api/query", r#"{"point":[999,3]}"#, 400, "outside"),
+        ("/api/query", r#"{"image":"AAAA"}"#, 400, "picture"),
+        ("/api/query", huge.as_str(), 413, "large"),
+        ("/api/render", r#"{"what":"smell"}"#, 400, "smell"),
+        ("/api/render", r#"{"only":[60000]}"#, 500, "nothing would be left"),
+        ("/api/scene", "{}", 405, "openapi"),
+    ] {
+        let said = served.refusal(path, Some(body), status);
+        assert!(said.to_lowercase().contains(&word.to_lowercase()), "{path}: '{said}' lacks '{word}'");
+    }
+    assert!(served.refusal("/api/nothing", None, 404).contains("openapi"));
+    assert!(served.refusal("/api/training", None, 404).contains("not trained here"));
+    assert!(served.refusal("/api/objects/60000/thumbnail.png", None, 404).contains("60000"));
+    assert!(served.refusal("/api/photos/..%2Fscene.json", None, 404).contains("scene.json"), "only photos of views are given");
+    assert!(served.refusal("/api/export?objects=1&format=doc", None, 400).contains("doc"));
+
+    // Too many at once are told to come back; the others are answered, and so is who comes later.
+    let statuses: Vec<u16> = std::thread::scope(|scope| {
+        let work = |k: usize| served.ask("/api/query", Some(&format!(r#"{{"text":"thing {k}","size":"{}x240"}}"#, 300 + k))).0;
+        let threads: Vec<_> = (0..100).map(|k| scope.spawn(move || work(k))).collect();
+        threads.into_iter().map(|t| t.join().expect("no panic")).collect()
+    });
+    let count = |status: u16| statuses.iter().filter(|s| **s == status).count();
+    assert!(count(200) >= 32 && count(200) + count(503) == 100, "{statuses:?}");
+    println!("100 questions at once: {} answered, {} told to come back", count(200), count(503));
+    assert_eq!(served.json("/api/query", Some(serde_json::json!({ "text": "cat" })))["found"], true);
+}
+
+#[test]
+fn only_those_may_ask_who_should() {
+    let Some(scene) = room() else { return };
+    let host = |served: &Served, host: &str| {
+        let agent: ureq::Agent = ureq::Agent::config_builder().http_status_as_error(false).build().into();
+        agent.get(&format!("{}/api/scene", served.url)).header("Host", host).call().expect("an answer").status().as_u16()
+    };
+    let own = Served::start(&["serve", text(scene), "--bind", "127.0.0.1:0", "--device", "cpu"]);
+    assert!(own.token.is_none());
+    assert_eq!((host(&own, "localhost:80"), host(&own, "[::1]:80"), host(&own, "evil.example")), (200, 200, 403));
+
+    let mut open = Served::start(&["serve", text(scene), "--bind", "0.0.0.0:0", "--device", "cpu"]);
+    open.url = open.url.replace("0.0.0.0", "127.0.0.1");
+    let token = open.token.clone().expect("a token");
+    assert_eq!(token.len(), 32);
+    assert_eq!(open.json("/api/scene", None)["name"], "room");
+    assert_eq!(open.ask("/", None).0, 200);
+    for wrong in [None, Some(String::new()), Some(token[..31].to_owned()), Some("0".repeat(32))] {
+        open.token = wrong;
+        assert!(open.refusal("/api/scene", None, 401).contains("token"));
+    }
+    assert_eq!(open.ask(&format!("/api/scene?token={token}"), None).0, 200);
+}
+
+#[test]
+fn a_growing_scene_can_be_watched() {
+    let Some(scene) = room() else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let copy = dir.path().join("growing");
+    copy_folder(scene, &copy);
+    let mut served = Served::start(&[
+        "train",
+        text(&copy),
+        "--iterations",
+        "400",
+        "--budget",
+        "8000",
+        "--device",
+        "cpu",
+        "--curve",
+        "200",
+        "--serve=0",
+        "-q",
+    ]);
+    let began = Instant::now();
+    let (mut training, mut revisions, mut last) = (0, BTreeSet::new(), Value::Null);
+    loop {
+        let stage = served.json("/api/scene", None)["stage"].clone();
+        let progress = served.json("/api/training", None);
+        if stage == "ready" {
+            break;
+        }
+        training += 1;
+        revisions.insert(progress["revision"].as_u64());
+        let (status, splats) = served.ask("/api/splats", None);
+        assert!(status == 200 && splats.starts_with(b"FLGS"));
+        if progress["finished"] == false {
+            assert!(served.refusal("/api/query", Some(r#"{"text":"cat"}"#), 409).contains("in training"));
+        }
+        last = progress;
+        assert!(began.elapsed() < Duration::from_secs(300));
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    assert!(training > 2 && revisions.len() > 1, "{training} looks, pictures {revisions:?}");
+    let curve = last["curve"].as_array().expect("a curve");
+    assert_eq!(curve.last().expect("points")["iteration"], 400);
+    assert_eq!(curve.iter().filter(|p| p["psnr_held_out"].is_number()).count(), 2);
+    let rises = |name: &str| curve.last().expect("points")[name].as_f64() > curve[0][name].as_f64();
+    assert!(rises("psnr") && !rises("loss"), "{curve:?}");
+    assert_eq!(served.json("/api/query", Some(serde_json::json!({ "text": "cat" })))["found"], true);
+    // It ends in order when it is told to.
+    let id = served.process.id().to_string();
+    assert!(Command::new("kill").arg(&id).status().expect("kill").success());
+    assert!(served.process.wait().expect("it ends").success());
+}
+
+/// Peak signal-to-noise ratio of two pictures of one size.
+fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
+    assert_eq!(a.dimensions(), b.dimensions());
+    let square: f64 = a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2)).sum();
+    10.0 * (255.0f64.powi(2) / (square / a.as_raw().len() as f64).max(1e-9)).log10()
+}
+
+/// The canvas as it is drawn now.
+fn snapshot(browser: &Browser) -> RgbImage {
+    let url = browser.run(
+        "await fastlgs.stage.settle(); const blob = await fastlgs.stage.snapshot();
+         return new Promise((done) => { const reader = new FileReader(); reader.onload = () => done(reader.result); reader.readAsDataURL(blob); });",
+    );
+    image_io::decode_rgb("canvas", &Browser::decode(&url)).expect("a PNG")
+}
+
+/// IoU of the server's mask with the pixels that are lit rather than dimmed (web/splat.wgsl, `shown`).
+fn lit_iou(plain: &RgbImage, marked: &RgbImage, mask: &RgbImage) -> f64 {
+    let distance = |a: [f64; 3], b: [u8; 3]| (0..3).map(|k| (a[k] - f64::from(b[k])).powi(2)).sum::<f64>();
+    let (mut both, mut either) = (0, 0);
+    for ((p, m), s) in plain.pixels().zip(marked.pixels()).zip(mask.pixels()) {
+        let c = p.0.map(f64::from);
+        let lit = distance([c[0] / 2.0 + 127.0, c[1] / 2.0 + 40.0, c[2] / 2.0], m.0) < distance(c.map(|v| v / 3.0), m.0);
+        both += u32::from(lit && s[0] > 0);
+        either += u32::from(lit || s[0] > 0);
+    }
+    f64::from(both) / f64::from(either.max(1))
+}
+
+/// Types a text, by keys alone, and waits for the answer in the page.
+fn type_text(browser: &Browser, what: &str) -> String {
+    browser.keys("/");
+    browser.run("document.getElementById('text').value = '';");
+    browser.keys(&format!("{what}\u{e007}"));
+    let said = "document.getElementById('answer').textContent";
+    browser.wait_for(&format!("{said}.includes('\"{what}\"') && {said}.includes(' ms)')"), Duration::from_secs(30));
+    // Escape leaves the text for the picture.
+    browser.keys("\u{e00c}");
+    browser.run(&format!("return {said};")).as_str().expect("text").to_owned()
+}
+
+fn chromium() -> bool {
+    let there = browser::installed();
+    if !there {
+        assert!(std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(), "chromium and chromedriver are missing");
+        eprintln!("SKIPPED: needs chromium and chromedriver");
+    }
+    there
+}
+
+/// Chromium without a GPU draws WebGPU by its own software Vulkan only with these.
+const WEBGPU: [&str; 5] = [
+    "--enable-unsafe-webgpu",
+    "--use-webgpu-adapter=swiftshader",
+    "--use-angle=vulkan",
+    "--enable-features=Vulkan",
+    "--use-vulkan=swiftshader",
+];
+
+/// The page of a scene, drawn in one way: `word` lights up where the mask is, `absent` is not found, keys and mouse work.
+fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &str) -> Browser {
+    let browser = Browser::open(1180, 740, flags);
+    browser.go(&format!("{}/?renderer={way}", served.url));
+    browser.wait_for("document.body.dataset.ready", Duration::from_secs(60));
+    assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), way);
+    let plain = snapshot(&browser);
+    let camera = browser.run("return fastlgs.stage.camera.asJson(fastlgs.stage.width, fastlgs.stage.height);");
+    let rendered = served.ask("/api/render", Some(&serde_json::json!({ "camera": camera }).to_string()));
+    let same = psnr(&plain, &image_io::decode_rgb("render", &rendered.1).expect("a PNG"));
+    let least = if way == "pictures" { 25.0 } else { 32.0 };
+    assert!(same > least, "{way}: the browser's picture and the server's have {same} dB");
+
+    let said = type_text(&browser, word);
+    let answer = served.json("/api/query", Some(serde_json::json!({ "text": word, "camera": camera, "mask": true })));
+    assert!(said.contains(&format!("#{}", answer["objects"][0]["id"])), "{said}: {answer}");
+    let marked = snapshot(&browser);
+    let mask = image_io::decode_rgb("mask", &Browser::decode(&answer["mask"])).expect("a PNG");
+    let iou = lit_iou(&plain, &marked, &mask);
+    println!("{way}: {same:.1} dB to the server's picture; lit pixels and mask of \"{word}\" have an IoU of {iou:.3}");
+    assert!(iou > 0.8, "{way}: lit pixels and mask have an IoU of {iou}");
+
+    // A click on the object selects something that it is part of, or that is part of it.
+    let at = |p: &[u32; 2]| mask.get_pixel(p[0], p[1])[0] > 0;
+    let own: Vec<[u32; 2]> = (0..mask.width() * mask.height()).map(|p| [p % mask.width(), p / mask.width()]).filter(at).collect();
+    let [x, y] = own[own.len() / 2];
+    let place = browser.run(&format!(
+        "const box = fastlgs.stage.elements.canvas.getBoundingClientRect(); return [box.x + {x} / fastlgs.stage.ratio, box.y + {y} / fastlgs.stage.ratio];"
+    ));
+    browser.keys("\u{e00c}");
+    let place = [0, 1].map(|k| place[k].as_f64().expect("a number") as i32);
+    browser.drag(place, place);
+    browser.wait_for("fastlgs.state.selected.size === 1", Duration::from_secs(20));
+
+    // Hiding, showing and isolating, by keys.
+    browser.keys("x");
+    browser.wait_for("fastlgs.state.hidden.size === 1 && fastlgs.state.selected.size === 0", Duration::from_secs(5));
+    assert!(psnr(&snapshot(&browser), &plain) < 40.0, "{way}: hiding changes the picture");
+    browser.keys("a");
+    assert!(psnr(&snapshot(&browser), &plain) > 45.0, "{way}: what was hidden comes back");
+    assert!(browser.run("return document.querySelectorAll('#list button').length;").as_u64() > Some(3));
+
+    // Absent things are said to be absent.
+    let said = type_text(&browser, absent);
+    assert!(said.contains("not found"), "{said}");
+    assert_eq!(browser.run("return fastlgs.state.selected.size;"), 0);
+    browser.keys("\u{e00c}");
+
+    // The camera turns by keys and by the mouse, and comes back.
+    let eye = || browser.run("return fastlgs.stage.camera.eye.map((v) => v.toFixed(4)).join();");
+    let first = eye();
+    browser.keys("\u{e012}\u{e013}");
+    let turned = eye();
+    assert_ne!(first, turned, "{way}: arrow keys turn");
+    browser.drag([300, 300], [360, 330]);
+    assert_ne!(turned, eye(), "{way}: the mouse turns");
+    browser.keys("][");
+    assert_eq!(first, eye(), "{way}: photos can be stepped through");
+    browser.keys("pc3");
+    browser.wait_for("!document.getElementById('photo').hidden && document.getElementById('photo').complete", Duration::from_secs(10));
+    browser.keys("c");
+    browser.run("await fastlgs.stage.settle();");
+    assert_eq!(browser.run("return document.querySelector('#modes input:checked').value;"), "objects");
+    browser.keys("p1");
+    assert_eq!(browser.errors(), Vec::<String>::new(), "{way}: nothing on the console");
+    browser
+}
+
+#[test]
+fn a_text_lights_up_its_object_in_the_browser() {
+    if !chromium() {
+        return;
+    }
+    let Some(scene) = room() else { return };
+    let served = Served::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
+    page_works(&served, "webgpu", &WEBGPU, "cat", "bicycle");
+    page_works(&served, "pictures", &[], "cat", "bicycle");
+    let browser = page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "cat", "bicycle");
+    type_text(&browser, "cat");
+    browser.run("await fastlgs.stage.settle();");
+    std::thread::sleep(Duration::from_millis(500));
+    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join("viewer.png");
+    browser.screenshot(&path);
+    println!("the page as the README shows it: {}", path.display());
+    // Without a wish, a browser that would draw in software lets the server draw.
+    browser.go(&served.url);
+    browser.wait_for("document.body.dataset.ready", Duration::from_secs(60));
+    assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), "pictures");
+}
+
+#[test]
+fn the_fox_lights_up_in_the_browser() {
+    let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
+    if !photos.is_dir() {
+        eprintln!("SKIPPED: {} is not there", photos.display());
+        return;
+    }
+    if !chromium() || !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let scene = dir.path().join("fox");
+    json(&["preprocess", text(&photos), "-o", text(&scene), "--max-side", "320"]);
+    json(&["train", text(&scene), "--iterations", "700", "--budget", "30000", "--device", "cpu"]);
+    let served = Served::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
+    page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "fox", "bicycle");
+}
