@@ -1,5 +1,6 @@
 //! The `fastlgs` binary: wiring of the stages, progress, logging and exit codes.
 
+mod again;
 mod cache;
 mod commands;
 mod eyes;
@@ -8,7 +9,7 @@ mod scene;
 mod serve;
 mod ui;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use std::process::ExitCode;
 
 /// Posed photos in, a 3-D scene that answers text out.
@@ -27,6 +28,8 @@ enum Command {
     Preprocess(commands::preprocess::Args),
     /// Trains Gaussians: colour and semantic field together.
     Train(commands::train::Args),
+    /// Makes scenes of several folders of photos.
+    Batch(commands::batch::Args),
     /// Renders views: colour PNG, depth, feature and objects.
     Render(commands::render::Args),
     /// Finds what a text names: mask, heat map, JSON.
@@ -45,6 +48,10 @@ enum Command {
     Models(commands::models::Args),
     /// Shows the machine's devices, or what is in a scene.
     Info(commands::info::Args),
+    /// Prints a script that completes commands in a shell.
+    Completions(commands::shell::Completions),
+    /// Writes the manual pages.
+    Man(commands::shell::Man),
 }
 
 /// How a command ended when it did not fail.
@@ -65,6 +72,7 @@ fn main() -> ExitCode {
     let result = match cli.command {
         Command::Preprocess(args) => commands::preprocess::run(&args, &common),
         Command::Train(args) => commands::train::run(&args, &common),
+        Command::Batch(args) => commands::batch::run(&args, &common),
         Command::Render(args) => commands::render::run(&args, &common),
         Command::Query(args) => commands::query::run(&args, &common),
         Command::Serve(args) => commands::serve::run(&args, &common),
@@ -74,6 +82,8 @@ fn main() -> ExitCode {
         Command::Synth(args) => commands::synth::run(&args, &common),
         Command::Models(args) => commands::models::run(&args, &common),
         Command::Info(args) => commands::info::run(&args, &common),
+        Command::Completions(args) => commands::shell::completions(&args, Cli::command()),
+        Command::Man(args) => commands::shell::man(&args, Cli::command()),
     };
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

@@ -3,7 +3,7 @@
 use crate::eyes;
 use anyhow::{Context, Result, bail};
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path};
 use fastlgs_grid::query::{self, Field};
 use fastlgs_grid::relevancy::{CANONICAL, OFFLINE_ANYTHING, TextQuery};
 use fastlgs_grid::{Grid, codes};
@@ -31,10 +31,47 @@ pub struct Scene {
 }
 
 /// A loaded text tower.
-struct Texts {
+pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
     anything: f32,
+    offline: bool,
+}
+
+impl Texts {
+    /// The text tower of the encoder that made the scene's embeddings.
+    pub fn load(folder: &SceneFolder, manifest: &Manifest, clip_text: Option<&Path>) -> Result<Self> {
+        let encoder = eyes::text_encoder_of(manifest, clip_text)?;
+        let offline = manifest.encoder == "offline";
+        let canonical = if offline { Vec::new() } else { encoder.embed(&CANONICAL)? };
+        let anything = if offline { OFFLINE_ANYTHING } else { -1.0 };
+        let length = encoder.embed(&CANONICAL[..1])?[0].len();
+        let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
+        let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
+        if let Some(own) = own.filter(|own| *own != length) {
+            let root = folder.root.display();
+            bail!(
+                "{root}: its embeddings have {own} numbers, those of texts {length}; they are of another encoder or version: \
+                 run 'fastlgs train {root}' again, or name the right tower with --clip-text"
+            );
+        }
+        Ok(Self { encoder, canonical, anything, offline })
+    }
+
+    /// Prepares a text.
+    pub fn query(&self, text: &str) -> Result<TextQuery> {
+        Ok(TextQuery { text: self.encoder.embed(&[text])?.remove(0), canonical: self.canonical.clone(), anything: self.anything })
+    }
+
+    /// Relevancy from which an object counts as found.
+    pub fn min_score(&self) -> f32 {
+        min_score(self.offline)
+    }
+}
+
+/// Relevancy from which an object counts as found, with the offline encoder or with CLIP.
+fn min_score(offline: bool) -> f32 {
+    if offline { query::MIN_SCORE } else { query::CLIP_MIN_SCORE }
 }
 
 impl Scene {
@@ -116,24 +153,9 @@ impl Scene {
     /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.
     pub fn text_query(&self, text: &str) -> Result<TextQuery> {
         if self.texts.get().is_none() {
-            let encoder = eyes::text_encoder_of(&self.manifest, self.clip_text.as_deref())?;
-            let offline = self.manifest.encoder == "offline";
-            let canonical = if offline { Vec::new() } else { encoder.embed(&CANONICAL)? };
-            let anything = if offline { OFFLINE_ANYTHING } else { -1.0 };
-            let length = encoder.embed(&CANONICAL[..1])?[0].len();
-            let grid = self.grid()?;
-            let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
-            if let Some(own) = own.filter(|own| *own != length) {
-                let root = self.folder.root.display();
-                bail!(
-                    "{root}: its embeddings have {own} numbers, those of texts {length}; they are of another encoder or version: \
-                     run 'fastlgs train {root}' again, or name the right tower with --clip-text"
-                );
-            }
-            let _ = self.texts.set(Texts { encoder, canonical, anything });
+            let _ = self.texts.set(Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?);
         }
-        let texts = self.texts.get().expect("set above");
-        Ok(TextQuery { text: texts.encoder.embed(&[text])?.remove(0), canonical: texts.canonical.clone(), anything: texts.anything })
+        self.texts.get().expect("set above").query(text)
     }
 
     /// The image tower that made the scene's embeddings.
@@ -143,7 +165,7 @@ impl Scene {
 
     /// Relevancy from which an object counts as found, with the scene's encoder.
     pub fn min_score(&self) -> f32 {
-        if self.manifest.encoder == "offline" { query::MIN_SCORE } else { query::CLIP_MIN_SCORE }
+        min_score(self.manifest.encoder == "offline")
     }
 }
 
@@ -172,6 +194,9 @@ pub struct ViewChoice {
     /// A camera file: JSON with name, width, height, fx, fy, cx, cy and world_to_camera (16 numbers, column-major).
     #[arg(long, value_name = "FILE", conflicts_with_all = ["view", "all_views"])]
     pub camera: Option<PathBuf>,
+    /// A camera path as nerfstudio's viewer saves it: every frame is rendered.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["view", "all_views", "camera"])]
+    path: Option<PathBuf>,
     /// Size of the pictures, as WIDTHxHEIGHT.
     #[arg(long, value_name = "WxH", value_parser = parse_size)]
     pub size: Option<(u32, u32)>,
@@ -182,6 +207,8 @@ impl ViewChoice {
     pub fn cameras(&self, scene: &Scene) -> Result<Vec<Camera>> {
         let chosen = if let Some(path) = &self.camera {
             vec![Camera::load(path)?]
+        } else if let Some(path) = &self.path {
+            camera_path::read(path)?
         } else if self.all_views {
             scene.cameras.clone()
         } else if let Some(name) = &self.view {

@@ -7,6 +7,7 @@
 //! * images are row-major; planar float images are `[channel][row][column]`.
 
 pub mod camera;
+pub mod camera_path;
 pub mod color;
 pub mod compact;
 pub mod dataset;

@@ -5,6 +5,7 @@ pub mod codes;
 pub mod consensus;
 pub mod evidence;
 pub mod grid;
+pub mod library;
 pub mod mapping;
 pub mod query;
 pub mod relevancy;

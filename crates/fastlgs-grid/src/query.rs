@@ -62,11 +62,16 @@ pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
 /// What full support by the masks adds to the log-odds of the score when objects are ranked.
 const SUPPORT_WEIGHT: f32 = 2.5;
 
+/// What objects are ranked by.
+pub fn standing(score: f32, support: f32) -> f32 {
+    odds(score) + SUPPORT_WEIGHT * support
+}
+
 /// All objects, best first: by their score, and the less the worse the masks bear them out. A union of two things is often
 /// more relevant than the one that is meant.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     let hits = grid.objects.iter().map(|o| (object_score(o, query), o));
-    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (odds(score) + SUPPORT_WEIGHT * o.support, Hit { id: o.id, score })).collect();
+    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (standing(score, o.support), Hit { id: o.id, score })).collect();
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
 }

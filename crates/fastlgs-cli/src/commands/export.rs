@@ -3,17 +3,21 @@
 use crate::scene::Scene;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
+use fastlgs_core::camera::mean_up;
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, glb, image_io, ply, spz};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
-#[command(after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox")]
+#[command(
+    after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox\n          fastlgs export scenes/fox cameras.json"
+)]
 pub struct Args {
     /// Trained scene folder.
     scene: PathBuf,
-    /// FILE.ply (3DGS columns), FILE.spz (compressed, without objects), or a folder for everything that queries need.
+    /// FILE.ply (3DGS columns), FILE.spz (compressed, without objects), FILE.glb (glTF with KHR_gaussian_splatting), FILE.json (the
+    /// views as a camera path of nerfstudio's form), or a folder for everything that queries need.
     output: PathBuf,
     /// Drop colour's SH coefficients above this degree.
     #[arg(long, value_parser = clap::value_parser!(u32).range(0..=3))]
@@ -26,6 +30,12 @@ const PRECISION_VIEWS: usize = 4;
 const PRECISION_LOSS: f64 = 0.01;
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    if args.output.extension().is_some_and(|e| e == "json") {
+        let cameras = SceneFolder::open(&args.scene)?.cameras()?;
+        camera_path::write(&args.output, &cameras)?;
+        report::give(common, &serde_json::json!({ "scene": args.scene, "output": args.output, "frames": cameras.len() }))?;
+        return Ok(Outcome::Done);
+    }
     let mut scene = Scene::open(&args.scene, &common.device)?;
     let held_out = held_out(&scene);
     let before = pictures(&mut scene, &held_out)?;
@@ -40,6 +50,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         "spz" => {
             spz::write(&args.output, &scene.gaussians)?;
             (spz::read(&args.output)?, None)
+        }
+        // What it holds are the same floats as before.
+        "glb" => {
+            glb::write(&args.output, &scene.gaussians, mean_up(&scene.cameras))?;
+            (scene.gaussians.clone(), None)
         }
         _ => {
             let (written, precision) = small_folder(&mut scene, &args.output)?;

@@ -1,5 +1,6 @@
 //! One module a command.
 
+pub mod batch;
 pub mod bench;
 pub mod eval;
 pub mod export;
@@ -10,5 +11,6 @@ pub mod preprocess;
 pub mod query;
 pub mod render;
 pub mod serve;
+pub mod shell;
 pub mod synth;
 pub mod train;

@@ -3,6 +3,7 @@
 use super::plot::{self, Axes, Scatter, Spot};
 use super::table::{self, number};
 use super::trial::{self, Trial};
+use crate::again::call;
 use crate::{Outcome, report, ui};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
@@ -97,7 +98,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if scenes.is_empty() {
         let (views, size) = trial::QUICK;
         let scene = trial::generated(common, &work, "table", views, size)?;
-        trial::call(common, common.seed, "train", &[trial::text(&scene), "--iterations", "1000"])?;
+        call(common, common.seed, "train", &[trial::text(&scene), "--iterations", "1000"])?;
         scenes.push(scene);
     }
     let bar = ui::bar(common, (scenes.len() * ways.len()) as u64, "ways");
@@ -157,7 +158,7 @@ fn trained(trial: &Trial, command: &[&str]) -> Result<Value> {
 fn baseline(trial: &Trial, command: &[&str], common: &ui::Common) -> Result<Value> {
     let scene = trial.scene();
     let args: Vec<&str> = command[1..].iter().map(|a| if *a == "SCENE" { trial::text(&scene.root) } else { *a }).collect();
-    let mut found = trial::call(common, common.seed, command[0], &args)?;
+    let mut found = call(common, common.seed, command[0], &args)?;
     (found["query_ms"], found["bytes"]) = (found["render_ms"].clone(), found["field_bytes"].clone());
     if !found["wrong_pixels"].is_null() {
         let mapping = scene.manifest()?.notes.get("train").map_or(0.0, |train| number(train, "mapping_seconds"));

@@ -1,6 +1,7 @@
 //! `fastlgs bench report`: the other benches' results and sample pictures in one HTML file that needs nothing else.
 
-use super::trial::{self, call, text};
+use super::trial::{self, text};
+use crate::again::call;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use base64::Engine;

@@ -2,7 +2,8 @@
 
 use super::plot::{self, Axes, Scatter, Spot};
 use super::table::{self, number};
-use super::trial::{self, Trial, call, text};
+use super::trial::{self, Trial, text};
+use crate::again::call;
 use crate::{Outcome, report, ui};
 use anyhow::Result;
 use fastlgs_core::{Gaussians, SceneFolder, ply};

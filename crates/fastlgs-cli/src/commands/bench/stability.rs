@@ -3,7 +3,8 @@
 use super::disturb::{self, Album, Masks, Photos};
 use super::plot::{self, Cell, Heat};
 use super::table::{self, number};
-use super::trial::{self, Trial, call, text};
+use super::trial::{self, Trial, text};
+use crate::again::call;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
 use fastlgs_core::SceneFolder;

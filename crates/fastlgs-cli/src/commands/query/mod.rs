@@ -2,6 +2,7 @@
 
 pub mod answer;
 pub mod ask;
+mod library;
 pub mod selection;
 
 use crate::scene::{Scene, ViewChoice, parse_size};
@@ -20,14 +21,15 @@ use std::time::Instant;
 
 #[derive(clap::Args)]
 #[command(
-    after_help = "Example: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n\nExit code 3 means that nothing in the scene matches."
+    after_help = "Examples: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n          fastlgs query --library scenes \"fox\"\n\nExit code 3 means that nothing in the scene matches."
 )]
 pub struct Args {
-    /// Trained scene folder.
-    scene: PathBuf,
+    /// Trained scene folder; not with --library.
+    #[arg(required_unless_present = "library")]
+    scene: Option<PathBuf>,
     /// What to look for; several texts are answered one after the other. "wheel of the bicycle" asks for a part. `-` reads
     /// texts from standard input and answers each line at once with a line of JSON.
-    #[arg(required_unless_present_any = ["image", "point"])]
+    #[arg(required_unless_present_any = ["image", "point", "library"])]
     text: Vec<String>,
     /// A picture of what to look for.
     #[arg(long, value_name = "FILE")]
@@ -38,6 +40,12 @@ pub struct Args {
     /// A text that the object must not be nearer to than to what is looked for; may be given several times.
     #[arg(long, value_name = "TEXT")]
     negative: Vec<String>,
+    /// Ask all scenes below DIR which of them hold it; the index that this needs is kept there as library.index.
+    #[arg(long, value_name = "DIR")]
+    library: Option<PathBuf>,
+    /// Most scenes that --library names.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
+    scenes: usize,
     #[command(flatten)]
     views: ViewChoice,
     /// Folder for mask, overlay and heat map; without it only the report is given.
@@ -100,11 +108,21 @@ struct Session<'a> {
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+    if let Some(root) = &args.library {
+        // What stands in the scene's place is the first text.
+        let first = args.scene.iter().map(|text| text.to_string_lossy().into_owned());
+        let texts: Vec<String> = first.chain(args.text.iter().cloned()).collect();
+        if texts.is_empty() {
+            bail!("--library: say what to look for, or '-' for lines of standard input");
+        }
+        return library::run(args, root, &texts, common);
+    }
     let lines = args.text.iter().any(|t| t == "-");
     if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {
         bail!("'-' reads all questions from standard input: leave out other texts, --image and --point");
     }
-    let mut scene = Scene::open(&args.scene, &common.device)?;
+    let Some(path) = &args.scene else { bail!("name a trained scene") };
+    let mut scene = Scene::open(path, &common.device)?;
     let grid = scene.grid()?;
     let cameras = args.views.cameras(&scene)?;
     scene.clip_text.clone_from(&args.clip_text);

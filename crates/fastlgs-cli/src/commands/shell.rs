@@ -1,0 +1,36 @@
+//! `fastlgs completions` and `fastlgs man`: what packages install beside the binary.
+
+use crate::Outcome;
+use anyhow::{Context, Result};
+use clap_complete::Shell;
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs completions bash > ~/.local/share/bash-completion/completions/fastlgs")]
+pub struct Completions {
+    /// Shell to complete in.
+    shell: Shell,
+}
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs man -o ~/.local/share/man/man1")]
+pub struct Man {
+    /// Folder to write to: fastlgs.1, and a page for each command.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// Writes a completion script to standard output.
+pub fn completions(args: &Completions, mut program: clap::Command) -> Result<Outcome> {
+    let mut script = Vec::new();
+    clap_complete::generate(args.shell, &mut program, "fastlgs", &mut script);
+    std::io::Write::write_all(&mut std::io::stdout(), &script)?;
+    Ok(Outcome::Done)
+}
+
+/// Writes the manual pages.
+pub fn man(args: &Man, program: clap::Command) -> Result<Outcome> {
+    std::fs::create_dir_all(&args.output).with_context(|| args.output.display().to_string())?;
+    clap_mangen::generate_to(program, &args.output).with_context(|| format!("{}: the pages cannot be written", args.output.display()))?;
+    Ok(Outcome::Done)
+}

@@ -1,0 +1,129 @@
+//! Camera paths as nerfstudio's viewer saves and renders them (`camera_path.json`, also called `cameras.json`).
+//!
+//! Its cameras are x right, y up, looking along -z, given as camera-to-world with 16 numbers row by row; `fov` is vertical, in
+//! degrees. Principal points lie in the middle: a camera whose does not is written without that offset.
+
+use crate::{Camera, Error, Result, fs};
+use glam::{Mat4, Vec4};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+#[derive(Serialize, Deserialize)]
+struct Frame {
+    camera_to_world: Vec<f32>,
+    fov: f32,
+    #[serde(default)]
+    aspect: Option<f32>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct CameraPath {
+    #[serde(default = "perspective")]
+    camera_type: String,
+    render_height: u32,
+    render_width: u32,
+    #[serde(default)]
+    fps: Option<f32>,
+    #[serde(default)]
+    seconds: Option<f32>,
+    camera_path: Vec<Frame>,
+}
+
+fn perspective() -> String {
+    "perspective".into()
+}
+
+/// OpenCV's axes in those of OpenGL: its own inverse.
+const FLIP: Mat4 = Mat4::from_cols(Vec4::X, Vec4::new(0.0, -1.0, 0.0, 0.0), Vec4::new(0.0, 0.0, -1.0, 0.0), Vec4::W);
+
+/// Frames a second of written paths.
+const FPS: f32 = 24.0;
+
+/// Writes cameras as a path, in the size of the first.
+///
+/// # Errors
+/// No cameras; the system's refusal.
+pub fn write(path: &Path, cameras: &[Camera]) -> Result<()> {
+    let first = cameras.first().ok_or_else(|| Error::Invalid(format!("{}: a path needs cameras", path.display())))?;
+    let frame = |camera: &Camera| Frame {
+        camera_to_world: (camera.world_to_camera.inverse() * FLIP).transpose().to_cols_array().to_vec(),
+        fov: (2.0 * (camera.height as f32 / 2.0 / camera.fy).atan()).to_degrees(),
+        aspect: Some(camera.width as f32 / camera.height as f32),
+        name: Some(camera.name.clone()),
+    };
+    let own = CameraPath {
+        camera_type: perspective(),
+        render_height: first.height,
+        render_width: first.width,
+        fps: Some(FPS),
+        seconds: Some(cameras.len() as f32 / FPS),
+        camera_path: cameras.iter().map(frame).collect(),
+    };
+    fs::write_json(path, &own)
+}
+
+/// Reads a path: a camera for each frame, all of the path's size, named `frame_00000` and so on unless the file names them.
+///
+/// # Errors
+/// Missing or damaged files, paths that are not of perspective cameras, poses that are no rotation and translation.
+pub fn read(path: &Path) -> Result<Vec<Camera>> {
+    let own: CameraPath = fs::read_json(path)?;
+    if own.camera_type != "perspective" {
+        return Err(Error::format(path, format!("its cameras are '{}'; only perspective ones can be rendered", own.camera_type)));
+    }
+    let (width, height) = (own.render_width, own.render_height);
+    let camera = |(k, frame): (usize, &Frame)| -> Result<Camera> {
+        let numbers = <[f32; 16]>::try_from(frame.camera_to_world.as_slice()).map_err(|_| {
+            Error::format(path, format!("frame {k} has {} numbers in camera_to_world, not 16", frame.camera_to_world.len()))
+        })?;
+        let focal = height as f32 / 2.0 / (frame.fov.to_radians() / 2.0).tan();
+        let camera = Camera {
+            name: frame.name.clone().unwrap_or_else(|| format!("frame_{k:05}")),
+            width,
+            height,
+            fx: focal,
+            fy: focal,
+            cx: width as f32 / 2.0,
+            cy: height as f32 / 2.0,
+            world_to_camera: (Mat4::from_cols_array(&numbers).transpose() * FLIP).inverse(),
+        };
+        camera.check().map_err(|reason| Error::format(path, reason))?;
+        Ok(camera)
+    };
+    let cameras = own.camera_path.iter().enumerate().map(camera).collect::<Result<Vec<_>>>()?;
+    if cameras.is_empty() {
+        return Err(Error::format(path, "the path has no frames"));
+    }
+    Ok(cameras)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn cameras_come_back_and_axes_are_nerfstudios() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cameras.json");
+        let camera = |k: f32| Camera::look_at(&format!("{k}.png"), Vec3::new(k, 2.0, 3.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let cameras = [camera(1.0), camera(2.0)];
+        write(&path, &cameras).unwrap();
+        for (a, b) in cameras.iter().zip(read(&path).unwrap()) {
+            assert_eq!((&a.name, a.width, a.height), (&b.name, b.width, b.height));
+            assert!((a.fy - b.fy).abs() < 1e-3 && a.world_to_camera.abs_diff_eq(b.world_to_camera, 1e-5));
+        }
+        let file: serde_json::Value = fs::read_json(&path).unwrap();
+        let row = |r: usize, c: usize| file["camera_path"][0]["camera_to_world"][4 * r + c].as_f64().unwrap() as f32;
+        // The last column is the position; the third points away from what is looked at.
+        assert!((Vec3::new(row(0, 3), row(1, 3), row(2, 3)) - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-5);
+        assert!((Vec3::new(row(0, 2), row(1, 2), row(2, 2)) - Vec3::new(1.0, 2.0, 3.0).normalize()).length() < 1e-5);
+        assert!(row(1, 1) > 0.0, "y is up");
+
+        std::fs::write(&path, r#"{"render_height":4,"render_width":4,"camera_path":[{"camera_to_world":[1,2],"fov":50}]}"#).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("frame 0 has 2 numbers"));
+        assert!(write(&path, &[]).is_err());
+    }
+}
