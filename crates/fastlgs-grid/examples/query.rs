@@ -1,0 +1,28 @@
+//! Asks the object table of a trained scene without any model: which objects are most like a given one.
+//! A text is asked for in the same way, with its embedding as the query.
+//!
+//! `cargo run --release -p fastlgs-grid --example query -- SCENE OBJECT`
+
+use fastlgs_core::SceneFolder;
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{QueryConfig, rank, select};
+use fastlgs_grid::relevancy::{OFFLINE_ANYTHING, TextQuery};
+use std::path::Path;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut args = std::env::args().skip(1);
+    let (Some(scene), Some(object)) = (args.next(), args.next()) else { return Err("usage: query SCENE OBJECT".into()) };
+    let grid = Grid::load(&SceneFolder::open(Path::new(&scene))?)?;
+    let object: usize = object.parse()?;
+    let asked = grid.objects.get(object.wrapping_sub(1)).ok_or_else(|| format!("{scene} has objects 1 to {}", grid.objects.len()))?;
+    let embedding = asked.embeddings.first().ok_or("this object was seen from too far to be embedded")?;
+
+    let query = TextQuery { text: embedding.clone(), canonical: Vec::new(), anything: OFFLINE_ANYTHING };
+    let ranked = rank(&grid, &query);
+    for hit in ranked.iter().take(5) {
+        println!("object {:4}  relevancy {:.3}", hit.id, hit.score);
+    }
+    let answer: Vec<u16> = select(&grid, &ranked, &QueryConfig::default()).iter().map(|hit| hit.id).collect();
+    println!("the answer: {answer:?}");
+    Ok(())
+}

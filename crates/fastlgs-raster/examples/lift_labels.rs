@@ -1,0 +1,33 @@
+//! Lifts labels from pictures onto Gaussians: each takes the label that most of its blending weight falls on, over all views.
+//! The result, a PLY with the labels as object ids, is one that other programs can open.
+//!
+//! `cargo run --release -p fastlgs-raster --example lift_labels -- SCENE labelled.ply`, where SCENE is a trained scene folder.
+//! The labels are the object maps of its views; any label maps whose numbers mean the same in all views will do.
+
+use fastlgs_core::{SceneFolder, ply};
+use fastlgs_raster::lift;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut args = std::env::args().skip(1);
+    let (Some(scene), Some(output)) = (args.next(), args.next()) else { return Err("usage: lift_labels SCENE labelled.ply".into()) };
+    let folder = SceneFolder::open(Path::new(&scene))?;
+    let mut gaussians = folder.gaussians()?;
+    let cameras = folder.manifest()?.training(&folder.cameras()?);
+
+    let mut weights: Vec<BTreeMap<u16, f32>> = vec![BTreeMap::new(); gaussians.len()];
+    for camera in &cameras {
+        // One pass over a view tells how much each Gaussian contributes to each label.
+        for vote in lift::votes(&gaussians, camera, &folder.objects(&camera.name)?) {
+            *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
+        }
+    }
+    let heaviest = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1)).map_or(0, |(label, _)| *label);
+    gaussians.object_ids = weights.iter().map(heaviest).collect();
+
+    let labelled = gaussians.object_ids.iter().filter(|id| **id > 0).count();
+    ply::write(Path::new(&output), &gaussians)?;
+    println!("{labelled} of {} Gaussians have a label, from {} views: {output}", gaussians.len(), cameras.len());
+    Ok(())
+}
