@@ -11,7 +11,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let cameras: Vec<_> = dataset.photos.iter().map(|p| p.camera.clone()).collect();
     for camera in &cameras {
         let (eye, forward) = (camera.centre(), camera.forward());
-        println!("{}: {}x{} pixels, focal length {:.1}, at {eye:.2}, looking along {forward:.2}", camera.name, camera.width, camera.height, camera.fx);
+        println!(
+            "{}: {}x{} pixels, focal length {:.1}, at {eye:.2}, looking along {forward:.2}",
+            camera.name, camera.width, camera.height, camera.fx
+        );
     }
     println!("{} photos, {} points, scene extent {:.2}", cameras.len(), dataset.points.len(), camera::scene_extent(&cameras));
     Ok(())

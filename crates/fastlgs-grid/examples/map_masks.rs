@@ -16,8 +16,14 @@ fn main() {
         histogram: vec![red, 1.0 - red],
     };
     let (mug, book, spine) = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.6, 0.8]);
-    let masks =
-        [mask(0, 1, mug, 0.9), mask(0, 2, book, 0.2), mask(1, 1, book, 0.2), mask(1, 2, mug, 0.9), mask(2, 1, mug, 0.8), mask(2, 2, spine, 0.3)];
+    let masks = [
+        mask(0, 1, mug, 0.9),
+        mask(0, 2, book, 0.2),
+        mask(1, 1, book, 0.2),
+        mask(1, 2, mug, 0.9),
+        mask(2, 1, mug, 0.8),
+        mask(2, 2, spine, 0.3),
+    ];
     // (later mask, earlier mask) -> pairs of key points.
     let pairs = Correspondences::from([((5, 2), 7)]);
 

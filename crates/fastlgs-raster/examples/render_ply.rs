@@ -10,7 +10,9 @@ use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut args = std::env::args().skip(1);
-    let (Some(scene), Some(picture)) = (args.next(), args.next()) else { return Err("usage: render_ply scene.ply picture.png [DEVICE]".into()) };
+    let (Some(scene), Some(picture)) = (args.next(), args.next()) else {
+        return Err("usage: render_ply scene.ply picture.png [DEVICE]".into());
+    };
     let gaussians = ply::read(Path::new(&scene))?;
 
     // From outside onto the middle of the scene; files of 3DGS have y pointing down.

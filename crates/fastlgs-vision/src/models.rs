@@ -49,12 +49,25 @@ pub fn pictures_dir() -> PathBuf {
     cache_dir().join("pictures")
 }
 
-/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked.
+/// File name of ONNX Runtime on this system.
+const RUNTIME: &str = if cfg!(windows) {
+    "onnxruntime.dll"
+} else if cfg!(target_os = "macos") {
+    "libonnxruntime.dylib"
+} else {
+    "libonnxruntime.so"
+};
+
+/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked; this program itself where it is
+/// linked in.
 ///
 /// # Errors
 /// When there is none.
 pub fn runtime_library() -> Result<PathBuf> {
-    let installed = cache_dir().join("libonnxruntime.so");
+    if !cfg!(feature = "load-ort") {
+        return std::env::current_exe().map_err(|e| Error::Missing(format!("this program's own file: {e}")));
+    }
+    let installed = cache_dir().join(RUNTIME);
     let path = std::env::var_os("ORT_DYLIB_PATH").map_or(installed, PathBuf::from);
     if path.is_file() {
         return Ok(path);
@@ -100,8 +113,8 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     // What was made from older weights must be made again.
     let _ = std::fs::remove_file(offline_dir().join(crate::names::FILE));
     install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
-    let library = find_runtime(&packages).ok_or_else(|| Error::Missing("the onnxruntime package holds no libonnxruntime.so".to_owned()))?;
-    install_file(&library, &cache.join("libonnxruntime.so"))?;
+    let library = find_runtime(&packages).ok_or_else(|| Error::Missing(format!("the onnxruntime package holds no {RUNTIME}")))?;
+    install_file(&library, &cache.join(RUNTIME))?;
     // The environment is only needed for the conversion and is larger than the models.
     let _ = std::fs::remove_dir_all(&venv);
     say(&format!("installed in {}", cache.display()));
@@ -157,7 +170,10 @@ fn site_packages(venv: &Path) -> Option<PathBuf> {
 
 fn find_runtime(packages: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(packages.join("onnxruntime/capi")).ok()?.flatten().map(|e| e.path());
-    files.into_iter().find(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("libonnxruntime.so")))
+    // Its name may carry a version before or after the ending.
+    let (stem, ending) = RUNTIME.split_once('.').expect("a name with an ending");
+    let is_it = |name: &str| name.starts_with(stem) && !name.contains("providers") && name.contains(&format!(".{ending}"));
+    files.into_iter().find(|p| p.file_name().is_some_and(|n| is_it(&n.to_string_lossy())))
 }
 
 /// Copies through a temporary name.

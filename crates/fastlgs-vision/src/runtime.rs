@@ -1,4 +1,4 @@
-//! ONNX Runtime, loaded at run time from a shared library.
+//! ONNX Runtime, loaded at run time from a shared library, or linked in (`--features download-ort`).
 
 use crate::{Error, Result, models};
 use ort::environment::Environment;
@@ -17,7 +17,11 @@ fn environment() -> Result<Environment> {
     }
     let library = models::runtime_library()?;
     let failed = |e: &dyn std::fmt::Display| Error::Missing(format!("{}: ONNX Runtime cannot be loaded: {e}", library.display()));
-    let environment = ort::init_from(&library).map_err(|e| failed(&e))?.with_name("fastlgs").build().map_err(|e| failed(&e))?;
+    #[cfg(feature = "load-ort")]
+    let builder = ort::init_from(&library).map_err(|e| failed(&e))?;
+    #[cfg(not(feature = "load-ort"))]
+    let builder = ort::init();
+    let environment = builder.with_name("fastlgs").build().map_err(|e| failed(&e))?;
     Ok(slot.insert(environment).clone())
 }
 

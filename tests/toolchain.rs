@@ -1,0 +1,309 @@
+//! What lies around a scene: batches, libraries, exchange with other programs, scripts, manual pages.
+//!
+//! Needs the offline models and any Vulkan device; skips loudly without them unless FASTLGS_REQUIRE_GPU is set.
+
+#[path = "support/run.rs"]
+mod run;
+
+use fastlgs_core::{Camera, camera_path, ply};
+use run::{complaint, copy_folder, fails, fastlgs, json, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::OnceLock;
+
+const PREPROCESS: &str = "--segmenter import";
+const TRAIN: &str = "--iterations 600 --budget 9000";
+
+struct Library {
+    dir: tempfile::TempDir,
+    photos: PathBuf,
+    scenes: PathBuf,
+}
+
+/// Two generated scenes and a folder without photos, through one batch.
+fn library() -> Option<&'static Library> {
+    static LIBRARY: OnceLock<Option<Library>> = OnceLock::new();
+    let make = || {
+        if !run::ready() {
+            return None;
+        }
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let (photos, scenes) = (dir.path().join("photos"), dir.path().join("scenes"));
+        for kind in ["room", "table"] {
+            json(&["synth", kind, "-o", text(&photos.join(kind)), "--views", "24", "--size", "240x180"]);
+        }
+        std::fs::create_dir(photos.join("empty")).expect("a folder");
+        let folders = ["room", "empty", "table"].map(|name| photos.join(name));
+        let [a, b, c] = folders.each_ref().map(|f| text(f));
+        let report = dir.path().join("report.json");
+        let args = [
+            "batch",
+            a,
+            b,
+            c,
+            "-o",
+            text(&scenes),
+            "--preprocess",
+            PREPROCESS,
+            "--train",
+            TRAIN,
+            "--device",
+            "cpu",
+            "--json",
+            text(&report),
+        ];
+        let line = complaint(&args, &fastlgs(&args));
+        assert!(line.contains("1 of 3 scenes"), "{line}");
+        let rows: Value = serde_json::from_slice(&std::fs::read(&report).expect("a report")).expect("JSON");
+        let states: Vec<&str> = rows["scenes"].as_array().expect("rows").iter().map(|r| r["state"].as_str().expect("a state")).collect();
+        assert_eq!(states, ["failed", "made", "made"], "{rows}");
+        assert!(rows["scenes"][0]["error"].as_str().is_some_and(|e| e.contains("empty")), "{rows}");
+        Some(Library { dir, photos, scenes })
+    };
+    LIBRARY.get_or_init(make).as_ref()
+}
+
+#[test]
+fn a_batch_keeps_what_is_there_and_makes_what_changed() {
+    let Some(l) = library() else { return };
+    let scenes = l.dir.path().join("kept");
+    copy_folder(&l.scenes, &scenes);
+    let stamp = |name: &str| std::fs::metadata(scenes.join(name).join("scene.ply")).expect("a scene").modified().expect("a time");
+    let before = (stamp("room"), stamp("table"));
+    let (room, table) = (l.photos.join("room"), l.photos.join("table"));
+    let batch = |train: &str| {
+        json(&["batch", text(&room), text(&table), "-o", text(&scenes), "--preprocess", PREPROCESS, "--train", train, "--device", "cpu"])
+    };
+    let kept = batch(TRAIN);
+    assert!(kept["scenes"].as_array().expect("rows").iter().all(|r| r["state"] == "kept" && r["objects"].as_u64() > Some(0)), "{kept}");
+    assert_eq!(before, (stamp("room"), stamp("table")));
+    let made = batch("--iterations 50 --budget 5000");
+    assert_eq!((made["failed"].as_u64(), made["scenes"][0]["state"].as_str()), (Some(0), Some("made")));
+    assert_ne!(before.0, stamp("room"));
+    fails(&["batch", text(&room), text(&room), "-o", text(&scenes)], &["room", "would both become"]);
+}
+
+#[test]
+fn a_library_names_the_scenes_that_hold_a_thing() {
+    let Some(l) = library() else { return };
+    let scenes = l.dir.path().join("library");
+    copy_folder(&l.scenes, &scenes);
+    let library = text(&scenes);
+    let found = json(&["query", "--library", library, "cat"]);
+    assert_eq!((found["found"].as_bool(), found["scenes"][0]["scene"].as_str()), (Some(true), Some("room")), "{found}");
+    assert_eq!(found["searched"]["scenes"], 2);
+    // The scene itself says the same of that object.
+    let own = json(&["query", text(&scenes.join("room")), "cat", "--device", "cpu"]);
+    let same = own["candidates"].as_array().expect("hits").iter().find(|c| c["id"] == found["scenes"][0]["object"]).expect("the object");
+    assert!(
+        (same["score"].as_f64().expect("a score") - found["scenes"][0]["score"].as_f64().expect("a score")).abs() < 0.01,
+        "{own} {found}"
+    );
+
+    let absent = fastlgs(&["query", "--library", library, "aircraft carrier", "--json", "-"]);
+    assert_eq!(absent.status.code(), Some(3), "{}", String::from_utf8_lossy(&absent.stdout));
+
+    // A scene that is new is found without being told of; one that is no scene is named.
+    let index = scenes.join("library.index");
+    let stamp = std::fs::metadata(&index).expect("an index").modified().expect("a time");
+    json(&["query", "--library", library, "cat"]);
+    assert_eq!(stamp, std::fs::metadata(&index).expect("an index").modified().expect("a time"), "nothing changed");
+    copy_folder(&scenes.join("room"), &scenes.join("more/room again"));
+    std::fs::create_dir(scenes.join("broken")).expect("a folder");
+    std::fs::write(scenes.join("broken/scene.json"), "{").expect("a file");
+    let mut lines = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+        .args(["query", "--library", library, "-"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .expect("the binary starts");
+    std::io::Write::write_all(&mut lines.stdin.take().expect("piped"), b"cat\n\ncoffee\n").expect("written");
+    let output = lines.wait_with_output().expect("it ends");
+    let answers: Vec<Value> = String::from_utf8_lossy(&output.stdout).lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
+    assert_eq!(answers.len(), 2);
+    let names: Vec<&str> = answers[0]["scenes"].as_array().expect("rows").iter().filter_map(|r| r["scene"].as_str()).collect();
+    assert!(names.contains(&"room") && names.contains(&"more/room again"), "{names:?}");
+    assert_eq!(answers[0]["skipped"][0]["scene"], "broken");
+
+    // A damaged index is made anew.
+    std::fs::write(&index, b"nonsense").expect("a file");
+    assert_eq!(json(&["query", "--library", library, "cat"])["scenes"][0]["scene"].as_str().map(|s| s.contains("room")), Some(true));
+    fails(&["query", "--library", text(&l.photos), "cat"], &["no trained scenes"]);
+    fails(&["query", "--library", library], &["say what to look for"]);
+    fails(&["query", "--library", library, "cat", "--point", "1,1"], &["--library"]);
+}
+
+#[test]
+fn scenes_of_other_programs_get_objects() {
+    let Some(l) = library() else { return };
+    let scene = l.dir.path().join("foreign");
+    copy_folder(&l.scenes.join("room"), &scene);
+    let gaussians = ply::read(&scene.join("scene.ply")).expect("a scene");
+    let own = json(&["info", text(&scene)])["objects"].as_u64().expect("objects");
+
+    // As Brush and gsplat write it: other order, no normals, no features; quaternions that are not of unit length.
+    let (dc, rest) = (["f_dc_0", "f_dc_1", "f_dc_2"], gaussians.sh_rest.len() / gaussians.len() * 3);
+    let mut names: Vec<String> =
+        ["rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2"].map(str::to_owned).to_vec();
+    names.extend(dc.map(str::to_owned));
+    names.extend((0..rest).map(|k| format!("f_rest_{k}")));
+    let header: String = names.iter().map(|n| format!("property float {n}\n")).collect();
+    let mut data = format!(
+        "ply\nformat binary_little_endian 1.0\ncomment Exported from elsewhere\nelement vertex {}\n{header}end_header\n",
+        gaussians.len()
+    )
+    .into_bytes();
+    for i in 0..gaussians.len() {
+        let (q, m, s, c) = (gaussians.rotations[i], gaussians.means[i], gaussians.log_scales[i], gaussians.sh_dc[i]);
+        let mut row =
+            vec![2.0 * q[0], 2.0 * q[1], 2.0 * q[2], 2.0 * q[3], m.x, m.y, m.z, gaussians.opacity_logits[i], s.x, s.y, s.z, c.x, c.y, c.z];
+        row.extend((0..3).flat_map(|color| gaussians.rest(i).iter().map(move |v| v[color])));
+        data.extend(row.iter().flat_map(|v| v.to_le_bytes()));
+    }
+    let path = l.dir.path().join("other.ply");
+    std::fs::write(&path, data).expect("a file");
+    let report = json(&["train", text(&scene), "--init-ply", text(&path), "--iterations", "0", "--device", "cpu"]);
+    let lifted = report["objects"].as_u64().expect("objects");
+    assert!(lifted.abs_diff(own) <= own / 5 + 1, "{lifted} objects, {own} before");
+    assert_eq!(json(&["query", text(&scene), "cat", "--device", "cpu"])["found"], true);
+}
+
+#[test]
+fn selections_and_camera_paths_go_out_and_in() {
+    let Some(l) = library() else { return };
+    let room = l.scenes.join("room");
+    let out = l.dir.path().join("exchange");
+    for ending in ["ply", "spz", "glb"] {
+        let file = out.join(format!("cat.{ending}"));
+        let answer = json(&["query", text(&room), "cat", "--export", text(&file), "--device", "cpu"]);
+        assert_eq!(answer["found"], true);
+        let magic: &[u8] = match ending {
+            "ply" => b"ply\n",
+            "spz" => &[0x1f, 0x8b],
+            _ => b"glTF",
+        };
+        assert!(std::fs::read(&file).expect("the selection").starts_with(magic), "{ending}");
+    }
+    let selected = ply::read(&out.join("cat.ply")).expect("a scene").len();
+    json(&["query", text(&room), "cat", "--export-rest", text(&out.join("rest.ply")), "--device", "cpu"]);
+    let rest = ply::read(&out.join("rest.ply")).expect("a scene").len();
+    assert_eq!(selected + rest, ply::read(&room.join("scene.ply")).expect("a scene").len());
+    fails(&["query", text(&room), "cat", "--export", text(&out.join("cat.obj")), "--device", "cpu"], &["cat.obj", ".glb"]);
+    let whole = out.join("room.glb");
+    assert!(json(&["export", text(&room), text(&whole), "--device", "cpu"])["bytes"].as_u64() > Some(100_000));
+
+    let path = out.join("cameras.json");
+    let report = json(&["export", text(&room), text(&path)]);
+    let cameras: Vec<Camera> = camera_path::read(&path).expect("a path");
+    assert_eq!(report["frames"].as_u64(), Some(cameras.len() as u64));
+    // Two frames of it, as nerfstudio writes them: without names.
+    let mut file: Value = serde_json::from_slice(&std::fs::read(&path).expect("the path")).expect("JSON");
+    let frames = file["camera_path"].as_array_mut().expect("frames");
+    frames.truncate(2);
+    frames.iter_mut().for_each(|f| drop(f.as_object_mut().expect("a frame").remove("name")));
+    std::fs::write(&path, file.to_string()).expect("a file");
+    let pictures = out.join("pictures");
+    json(&["render", text(&room), "--path", text(&path), "-o", text(&pictures), "--device", "cpu"]);
+    json(&["render", text(&room), "--view", "001", "-o", text(&pictures), "--device", "cpu"]);
+    let own = fastlgs_core::image_io::load_rgb(&pictures.join("001.png.color.png")).expect("a picture");
+    let by_path = fastlgs_core::image_io::load_rgb(&pictures.join("frame_00001.color.png")).expect("a picture");
+    let far = own.as_raw().iter().zip(by_path.as_raw()).filter(|(a, b)| a.abs_diff(**b) > 2).count();
+    assert!(far * 1000 < own.as_raw().len(), "{far} values differ");
+}
+
+#[test]
+fn shells_and_manuals() {
+    for (shell, word) in [("bash", "complete"), ("zsh", "#compdef"), ("fish", "complete -c fastlgs")] {
+        let output = fastlgs(&["completions", shell]);
+        let script = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success() && script.contains(word) && script.contains("preprocess"), "{shell}");
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    assert!(fastlgs(&["man", "-o", text(dir.path())]).status.success());
+    let page = std::fs::read_to_string(dir.path().join("fastlgs-query.1")).expect("a page");
+    assert!(page.contains("tau\\-ac") && dir.path().join("fastlgs.1").is_file());
+}
+
+/// The examples that `cargo test` has built, on a trained scene; and the one in Python.
+#[test]
+fn examples_run() {
+    let Some(l) = library() else { return };
+    let (room, out) = (l.scenes.join("room"), l.dir.path().join("examples"));
+    std::fs::create_dir(&out).expect("a folder");
+    let built = Path::new(env!("CARGO_BIN_EXE_fastlgs")).with_file_name("examples");
+    let run = |name: &str, args: &[&str]| -> String {
+        let program = built.join(name);
+        if !program.is_file() {
+            assert!(
+                std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(),
+                "{} is missing; run 'cargo build --release --examples'",
+                program.display()
+            );
+            eprintln!("SKIPPED: {} is not built", program.display());
+            return String::new();
+        }
+        let output = Command::new(program).args(args).output().expect("it starts");
+        assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    let picture = l.photos.join("room/images/000.png");
+    let (scene, rendered, labelled) = (room.join("scene.ply"), out.join("p.png"), out.join("l.ply"));
+    for (name, args, word) in [
+        ("read_dataset", vec![text(&l.photos.join("room")).to_owned()], "24 photos"),
+        ("render_ply", vec![text(&scene).to_owned(), text(&rendered).to_owned(), "cpu".to_owned()], "Gaussians"),
+        ("lift_labels", vec![text(&room).to_owned(), text(&labelled).to_owned()], "have a label"),
+        ("map_masks", vec![], "object 2"),
+        ("query", vec![text(&room).to_owned(), "1".to_owned()], "the answer"),
+        ("name_photo", vec![text(&picture).to_owned(), "cat".to_owned(), "coffee".to_owned()], "region"),
+    ] {
+        let said = run(name, &args.iter().map(String::as_str).collect::<Vec<_>>());
+        assert!(said.is_empty() || said.contains(word), "{name}: {said}");
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/find.py");
+    let python =
+        Command::new("python3").arg(script).args([text(&room), "cat", "bicycle"]).env("FASTLGS", env!("CARGO_BIN_EXE_fastlgs")).output();
+    let python = python.expect("python3");
+    let said = String::from_utf8_lossy(&python.stdout).into_owned();
+    assert!(python.status.success(), "{}", String::from_utf8_lossy(&python.stderr));
+    assert!(said.contains("cat: object") && said.contains("bicycle: not found"), "{said}");
+}
+
+/// The workflow over two scenes. FASTLGS_SNAKEMAKE names the program.
+#[test]
+fn a_workflow_engine_spreads_scenes() {
+    let Some(snakemake) = std::env::var_os("FASTLGS_SNAKEMAKE") else {
+        eprintln!("SKIPPED: FASTLGS_SNAKEMAKE does not name snakemake");
+        return;
+    };
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    for kind in ["room", "table"] {
+        json(&["synth", kind, "-o", text(&dir.path().join("photos").join(kind)), "--views", "16", "--size", "160x120"]);
+    }
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../workflows/Snakefile");
+    let snake = |more: &[&str]| {
+        let output = Command::new(&snakemake)
+            .current_dir(dir.path())
+            .args(["-s", text(&file), "--cores", "2", "--quiet", "all"])
+            .args(more)
+            .args(["--config", &format!("fastlgs={}", env!("CARGO_BIN_EXE_fastlgs")), "device=cpu"])
+            .args(["preprocess=--segmenter import", "train=--iterations 300 --budget 6000"])
+            .output()
+            .expect("snakemake starts");
+        assert!(output.status.success(), "{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    };
+    snake(&[]);
+    let reports = dir.path().join("scenes/reports");
+    let report = |name: &str| -> Value { serde_json::from_slice(&std::fs::read(reports.join(name)).expect("a report")).expect("JSON") };
+    assert!(report("room.train.json")["objects"].as_u64() > Some(0));
+    assert!(report("table.eval.json").is_object());
+    assert_eq!(report("library.json")["searched"]["scenes"], 2);
+    // A second run has nothing to do.
+    let stamp = std::fs::metadata(reports.join("room.train.json")).expect("a report").modified().expect("a time");
+    snake(&[]);
+    assert_eq!(stamp, std::fs::metadata(reports.join("room.train.json")).expect("a report").modified().expect("a time"));
+}
