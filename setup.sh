@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Installs what FastLGS needs on Debian or Ubuntu and builds it. Safe to run again: it skips what is there.
+# With --tests also what only the tests need: Chromium with its driver, Snakemake, and a standard library for wasm32.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -13,6 +14,12 @@ as_root() {
 
 # Vulkan on the CPU, OpenCV with its headers, libclang for its bindings, Python for the one-time weight conversion.
 packages="mesa-vulkan-drivers libvulkan1 libopencv-dev clang libclang-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
+if [ "${1:-}" = --tests ]; then
+    packages="$packages chromium chromium-driver"
+    # Where rustup cannot reach its server, Debian's compiler with its library's source builds for wasm32.
+    if command -v rustup >/dev/null; then timeout 60 rustup target add wasm32-unknown-unknown >/dev/null 2>&1 || true; fi
+    [ -d "$(rustc --print sysroot 2>/dev/null)/lib/rustlib/wasm32-unknown-unknown" ] || packages="$packages rustc-web rust-web-src"
+fi
 if command -v dpkg-query >/dev/null; then
     missing=""
     for p in $packages; do
@@ -45,4 +52,8 @@ say "building (the first build takes some minutes)"
 cargo build --release --locked --features fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
 say "installing the offline encoders"
 ./target/release/fastlgs models install-offline --quiet || fail "the offline encoders could not be installed; the message is above"
+if [ "${1:-}" = --tests ] && [ ! -x target/snakemake/bin/snakemake ]; then
+    say "installing Snakemake"
+    python3 -m venv target/snakemake && target/snakemake/bin/pip install --quiet "snakemake>=9,<10" || fail "Snakemake could not be installed with pip"
+fi
 say "ready: $(./target/release/fastlgs --version), devices: $(./target/release/fastlgs info --json - | tr -d '\n ' | sed 's/.*"adapters":\[\([^]]*\)\].*/\1/')"

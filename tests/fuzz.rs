@@ -6,7 +6,7 @@
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Camera, Gaussians, dataset, fs, image_io, labels, npy, ply, spz};
+use fastlgs_core::{Camera, Gaussians, camera_path, dataset, fs, image_io, labels, npy, ply, spz};
 use glam::Vec3;
 use image::{GrayImage, Luma, RgbImage};
 use std::collections::BTreeSet;
@@ -112,8 +112,12 @@ fn npy_file(shape: &str, values: &[f64]) -> Vec<u8> {
     bytes(&[b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes(), header.as_bytes(), &doubles(values)])
 }
 
+fn some_camera() -> Camera {
+    Camera::look_at("a.png", Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::Y, 8, 6, 0.8)
+}
+
 fn targets() -> Vec<Target> {
-    let camera = Camera::look_at("a.png", Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::Y, 8, 6, 0.8);
+    let camera = some_camera();
     let target = |name, file, prepare, seed, parse| Target { name, file, prepare, seed, parse };
     let photos = |folder: &Path| dataset::load(folder).map(|_| ());
     let llff = [1.0, 0.0, 0.0, 0.1, 6.0, 0.0, 1.0, 0.0, 0.2, 8.0, 0.0, 0.0, 1.0, 0.3, 7.0, 1.0, 10.0];
@@ -128,6 +132,9 @@ fn targets() -> Vec<Target> {
         }),
         target("npy", "a.npy", nothing, npy_file("(2, 3)", &[0.5; 6]), |f| npy::read(&f.join("a.npy")).map(|_| ())),
         target("camera", "camera.json", nothing, serde_json::to_vec(&camera).expect("JSON"), |f| Camera::load(&f.join("camera.json")).map(|_| ())),
+        target("camera_path", "path.json", nothing, written(|p| camera_path::write(p, &[some_camera()]).expect("a file")), |f| {
+            camera_path::read(&f.join("path.json")).map(|_| ())
+        }),
         target(
             "lerf_labels",
             "a.json",
