@@ -182,9 +182,16 @@ fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
 /// # Errors
 /// Truncation, missing columns and values that are not finite are [`Error::Format`].
 pub fn read(path: &Path) -> Result<Gaussians> {
-    let data = fs::read(path)?;
-    let header = header(path, &data)?;
-    let table = columns(path, &data, &header)?;
+    parse(path, &fs::read(path)?)
+}
+
+/// As [`read`], for a file that is in memory; `path` is what errors call it.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse(path: &Path, data: &[u8]) -> Result<Gaussians> {
+    let header = header(path, data)?;
+    let table = columns(path, data, &header)?;
     let find = |name: &str| header.columns.iter().position(|c| c.0 == name).map(|i| table[i].as_slice());
     let need = |name: &str| find(name).ok_or_else(|| Error::format(path, format!("no column '{name}': this is not a Gaussian scene")));
     let vec3 = |a: &[f64], b: &[f64], c: &[f64]| -> Vec<Vec3> {

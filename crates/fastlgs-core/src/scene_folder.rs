@@ -276,8 +276,15 @@ pub fn save_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])]) -> Resu
 /// # Errors
 /// Truncated or damaged files, and tensors of another type.
 pub fn load_tensors(path: &Path) -> Result<Tensors> {
-    let data = fs::read(path)?;
-    let file = SafeTensors::deserialize(&data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
+    parse_tensors(path, &fs::read(path)?)
+}
+
+/// As [`load_tensors`], for a file that is in memory; `path` is what errors call it.
+///
+/// # Errors
+/// As [`load_tensors`].
+pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
+    let file = SafeTensors::deserialize(data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
     file.tensors()
         .into_iter()
         .map(|(name, view)| {

@@ -2,10 +2,11 @@
 
 use crate::mapping::Mask;
 use crate::{Result, codes};
-use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use fastlgs_core::scene_folder::{parse_tensors, save_tensors};
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::path::Path;
 
 /// One object.
 #[derive(Clone, Debug, PartialEq)]
@@ -138,9 +139,19 @@ impl Grid {
     /// # Errors
     /// Missing or damaged files.
     pub fn load(folder: &SceneFolder) -> Result<Self> {
-        let rows: Vec<Row> = fs::read_json(&folder.root.join("grid.json"))?;
-        let path = folder.root.join("grid.safetensors");
-        let tensors = load_tensors(&path)?;
+        let file = |name: &str| fs::read(&folder.root.join(name));
+        Self::parse(&folder.root, &file("grid.json")?, &file("grid.safetensors")?)
+    }
+
+    /// As [`Self::load`], for files that are in memory; `root` is what errors call their folder.
+    ///
+    /// # Errors
+    /// Damaged files.
+    pub fn parse(root: &Path, rows: &[u8], tensors: &[u8]) -> Result<Self> {
+        let rows: Vec<Row> =
+            serde_json::from_slice(rows).map_err(|e| Error::format(root.join("grid.json"), format!("not the expected JSON: {e}")))?;
+        let path = root.join("grid.safetensors");
+        let tensors = parse_tensors(&path, tensors)?;
         let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing")));
         let (embeddings, areas) = (get("embeddings")?, get("areas")?);
         let dimension = embeddings.0.get(1).copied().unwrap_or(0);

@@ -407,7 +407,9 @@ mod tests {
         let scenes = scenes(1_000, 300, &concepts);
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("library.index");
+        let started = std::time::Instant::now();
         write(&path, &scenes).unwrap();
+        let built = started.elapsed().as_secs_f64();
         drop(scenes);
         let library = Library::open(&path).unwrap();
         let mut milliseconds: Vec<f64> = (0..20)
@@ -420,7 +422,12 @@ mod tests {
             .collect();
         milliseconds.sort_by(f64::total_cmp);
         let bytes = std::fs::metadata(&path).unwrap().len();
-        println!("{} objects, {bytes} bytes: {:.1} ms (median), {:.1} ms (slowest)", library.len(), milliseconds[10], milliseconds[19]);
+        println!(
+            "{} objects, {bytes} bytes, written in {built:.1} s: {:.1} ms (median), {:.1} ms (slowest)",
+            library.len(),
+            milliseconds[10],
+            milliseconds[19]
+        );
         assert!(milliseconds[10] < 60.0, "{milliseconds:?}");
     }
 }

@@ -103,12 +103,15 @@ fn print(answer: &Value) {
     }
 }
 
+/// A scene of a library with what made it.
+type Scene = (Entry, Manifest);
+
 /// Trained scenes of one encoder below a folder, sorted by path, with the stamp of their tables; and what was passed over, with why.
-fn scenes_below(root: &Path) -> Result<(Vec<(Entry, Manifest)>, Vec<Value>)> {
+fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Value>)> {
     let mut folders = Vec::new();
     collect(root, DEPTH, &mut folders)?;
     folders.sort();
-    let (mut scenes, mut skipped): (Vec<(Entry, Manifest)>, Vec<Value>) = (Vec::new(), Vec::new());
+    let (mut scenes, mut skipped): (Vec<Scene>, Vec<Value>) = (Vec::new(), Vec::new());
     for folder in folders {
         let path = folder.strip_prefix(root).unwrap_or(&folder).to_string_lossy().into_owned();
         let manifest = SceneFolder::new(&folder).manifest();
@@ -161,7 +164,7 @@ fn stamp(folder: &Path) -> Result<String> {
 }
 
 /// The library's index, made anew where a scene came, went or changed.
-fn up_to_date(root: &Path, scenes: &[(Entry, Manifest)], common: &ui::Common) -> Result<Library> {
+fn up_to_date(root: &Path, scenes: &[Scene], common: &ui::Common) -> Result<Library> {
     let path = root.join(INDEX);
     let entries: Vec<&Entry> = scenes.iter().map(|s| &s.0).collect();
     if path.is_file() {
