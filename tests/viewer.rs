@@ -382,6 +382,10 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     assert_ne!(first, turned, "{way}: arrow keys turn");
     browser.drag([300, 300], [360, 330]);
     assert_ne!(turned, eye(), "{way}: the mouse turns");
+    let distance = || browser.run("return fastlgs.stage.camera.distance;").as_f64().expect("a number");
+    let before = distance();
+    browser.pinch([300, 300], 40, 120);
+    assert!(distance() < 0.6 * before, "{way}: spreading two fingers comes nearer");
     browser.keys("][");
     assert_eq!(first, eye(), "{way}: photos can be stepped through");
     browser.keys("pc3");

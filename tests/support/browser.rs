@@ -91,6 +91,21 @@ impl Browser {
         self.post("/actions", &json!({ "actions": [{ "type": "pointer", "id": "mouse", "actions": actions }] }));
     }
 
+    /// Puts two fingers on the page, this far left and right of a place, and moves them to another distance.
+    pub fn pinch(&self, at: [i32; 2], from: i32, to: i32) {
+        let finger = |id: &str, side: i32| {
+            let to_place = |far: i32, ms: u32| json!({ "type": "pointerMove", "duration": ms, "x": at[0] + side * far, "y": at[1] });
+            let actions = [
+                to_place(from, 0),
+                json!({ "type": "pointerDown", "button": 0 }),
+                to_place(to, 100),
+                json!({ "type": "pointerUp", "button": 0 }),
+            ];
+            json!({ "type": "pointer", "id": id, "parameters": { "pointerType": "touch" }, "actions": actions })
+        };
+        self.post("/actions", &json!({ "actions": [finger("left", -1), finger("right", 1)] }));
+    }
+
     /// A data URL's bytes.
     pub fn decode(url: &Value) -> Vec<u8> {
         let url = url.as_str().expect("a data URL");
