@@ -23,6 +23,7 @@ export async function openPictures(canvas) {
   }
 
   return {
+    lost: new Promise(() => {}),
     setSplats() {},
     setObjects() {},
     setOrder() {},

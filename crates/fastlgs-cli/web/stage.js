@@ -22,6 +22,7 @@ export class Stage {
   async open(wish) {
     // The server renders no pictures of a scene in training.
     this.renderer = await openRenderer(this.elements.canvas, wish, this.scene.stage === "training");
+    this.renderer.lost.then(() => this.failed(new Error("the browser lost its graphics device; reload the page")));
     this.sorter = new Worker("/sorter.js");
     this.sorter.onmessage = ({ data }) => this.sorted(data);
     new ResizeObserver(() => this.resize()).observe(this.elements.stage);
@@ -73,7 +74,8 @@ export class Stage {
       else this.sort();
     }
     this.draw();
-    if (this.renderer?.name === "pictures" || !this.splats) this.finish();
+    // Nothing to sort, nothing to wait for.
+    if (!this.splats?.count) this.finish();
   }
 
   sort() {

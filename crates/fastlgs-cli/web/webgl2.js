@@ -71,6 +71,7 @@ export async function openWebGl2(canvas, evenSlow) {
   }
 
   return {
+    lost: new Promise((lost) => canvas.addEventListener("webglcontextlost", lost)),
     setSplats(next) {
       if (next.rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error("the scene is too large for this browser's textures");
       splats = next;

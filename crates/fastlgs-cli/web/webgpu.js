@@ -64,6 +64,7 @@ export async function openWebGpu(canvas, evenSlow) {
   }
 
   return {
+    lost: device.lost,
     setSplats(next) {
       if (next.rows > device.limits.maxTextureDimension2D) throw new Error("the scene is too large for this browser's textures");
       splats = next;

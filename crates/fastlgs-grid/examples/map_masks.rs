@@ -6,7 +6,7 @@ use fastlgs_grid::codes;
 use fastlgs_grid::grid::Grid;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig, paper};
 
-fn main() {
+fn main() -> Result<(), Box<dyn std::error::Error>> {
     // Three photos. A mug and a book look different; the book has turned so far in the last photo that only key points tell.
     let mask = |view, label, embedding: [f32; 3], red: f32| Mask {
         view,
@@ -27,7 +27,7 @@ fn main() {
     // (later mask, earlier mask) -> pairs of key points.
     let pairs = Correspondences::from([((5, 2), 7)]);
 
-    let mapped = paper(&masks, &pairs, &PaperConfig::default());
+    let mapped = paper(&masks, &pairs, &PaperConfig::default())?;
     for (mask, object) in masks.iter().zip(&mapped.object_of) {
         println!("photo {}, mask {}: object {object}", mask.view, mask.label);
     }
@@ -38,4 +38,5 @@ fn main() {
     for object in &grid.objects {
         println!("object {}: code {:.2}, {} embeddings from {} photos", object.id, object.code, object.embeddings.len(), object.views);
     }
+    Ok(())
 }

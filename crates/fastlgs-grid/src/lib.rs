@@ -19,6 +19,9 @@ pub enum Error {
     /// Files.
     #[error(transparent)]
     Core(#[from] fastlgs_core::Error),
+    /// Ids have 16 bits.
+    #[error("there would be more than 65,535 objects: lower --theta or --tau, or use --mapping global")]
+    TooManyObjects,
 }
 
 /// Result of the grid crate.

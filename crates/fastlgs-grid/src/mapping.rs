@@ -1,5 +1,6 @@
 //! Cross-view grid mapping (paper, Algorithm 1): which masks of different photos show the same object.
 
+use crate::{Error, Result};
 use std::collections::BTreeMap;
 
 /// One mask of one photo.
@@ -68,9 +69,9 @@ pub struct Mapped {
 /// earlier one but with each object's representatives, of which none is more than 0.98 like another one. An object that
 /// is seen for the hundredth time adds none, so that the work grows with the photos, not with their square.
 ///
-/// # Panics
-/// If there are more than 65,535 objects.
-pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Mapped {
+/// # Errors
+/// More than 65,535 objects: a Gaussian's id has 16 bits.
+pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Result<Mapped> {
     let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
     let mut representatives: Vec<usize> = Vec::new();
     // Those of the photo at hand are not yet to be compared with.
@@ -86,20 +87,20 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> M
         let sims = representatives.iter().map(|&k| (similarity(mask, &masks[k], config.alpha), k));
         let most_alike = sims.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
         let same = by_key_points.or(most_alike.filter(|(sim, _)| *sim >= config.theta).map(|(_, k)| k));
-        let object = same.map_or_else(
-            || {
-                mapped.count = mapped.count.checked_add(1).expect("at most 65,535 objects");
+        let object = match same {
+            Some(k) => mapped.object_of[k],
+            None => {
+                mapped.count = mapped.count.checked_add(1).ok_or(Error::TooManyObjects)?;
                 mapped.count
-            },
-            |k| mapped.object_of[k],
-        );
+            }
+        };
         // One of the same object that is as good as the mask itself makes it superfluous.
         if most_alike.is_none_or(|(sim, k)| sim < ALIKE || mapped.object_of[k] != object) {
             fresh.push(j);
         }
         mapped.object_of.push(object);
     }
-    mapped
+    Ok(mapped)
 }
 
 #[cfg(test)]
@@ -123,7 +124,7 @@ mod tests {
             mask(2, 1, [0.8, -0.6], [0.2, 0.8]),
         ];
         let pairs = Correspondences::from([((2, 0), 4), ((2, 1), 2), ((5, 0), 3)]);
-        let map = |config: PaperConfig| paper(&masks, &pairs, &config);
+        let map = |config: PaperConfig| paper(&masks, &pairs, &config).unwrap();
         let found = map(PaperConfig::default());
         assert_eq!((found.object_of, found.count), (vec![1, 2, 1, 2, 3, 4], 4));
         assert_eq!(map(PaperConfig { tau: 3, ..PaperConfig::default() }).object_of[5], 1, "tau is an option");
@@ -150,7 +151,7 @@ mod tests {
     fn work_grows_with_the_photos_and_not_with_their_square() {
         let [few, many] = [250, 1000].map(|views| {
             let masks = walk(views);
-            let mapped = paper(&masks, &Correspondences::new(), &PaperConfig { theta: 0.9, ..PaperConfig::default() });
+            let mapped = paper(&masks, &Correspondences::new(), &PaperConfig { theta: 0.9, ..PaperConfig::default() }).unwrap();
             assert_eq!(mapped.count, 40, "every thing is one object");
             assert!(
                 masks.iter().zip(&mapped.object_of).all(|(m, o)| masks
@@ -164,5 +165,12 @@ mod tests {
         let exponent = (many / few).ln() / 4f64.ln();
         println!("comparisons grow with the {exponent:.2}th power of the number of photos, up to 1,000");
         assert!(exponent < 1.3, "{exponent}");
+    }
+
+    #[test]
+    fn ids_have_sixteen_bits() {
+        let masks: Vec<Mask> = (0..=u16::MAX).map(|label| mask(0, label, [1.0, 0.0], [1.0, 0.0])).collect();
+        assert_eq!(paper(&masks[1..], &Correspondences::new(), &PaperConfig::default()).unwrap().count, u16::MAX);
+        assert!(paper(&masks, &Correspondences::new(), &PaperConfig::default()).unwrap_err().to_string().contains("65,535"));
     }
 }

@@ -30,7 +30,7 @@ const EMBEDDED_VIEWS: usize = 5;
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
 pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Grid> {
     let (masks, pairs) = evidence::load(folder)?;
-    let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config);
+    let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
     let mut contacts = BTreeSet::new();
     for (view, camera) in training.iter().enumerate() {

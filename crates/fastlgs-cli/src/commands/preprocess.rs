@@ -9,8 +9,8 @@ use fastlgs_core::dataset::{self, Dataset, PosedPhoto};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::undistort::{undistort, undistort_gray};
 use fastlgs_core::{Camera, LabelMap, SceneFolder, image_io, labels};
-use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig};
+use fastlgs_grid::{Grid, evidence};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
 use fastlgs_vision::triangulate::{self, PairMatches};
@@ -166,7 +166,15 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     evidence::save(&folder, &masks, &pairs)?;
     lap("points");
     // Without Gaussians only Algorithm 1 can map the masks; `train` maps again with what it learns, or with its options.
-    let mapped = objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), common.seed)?;
+    let mapped = match objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), common.seed) {
+        // The default mapping needs none of this.
+        Err(error) if matches!(error.downcast_ref(), Some(fastlgs_grid::Error::TooManyObjects)) => {
+            tracing::warn!("Algorithm 1: {error}");
+            warnings.push(format!("Algorithm 1: {error}"));
+            Grid::default()
+        }
+        other => other?,
+    };
     mapped.save(&folder)?;
     lap("mapping");
 
