@@ -8,16 +8,20 @@ use std::path::Path;
 use std::{env, fs};
 
 const SOURCE: &str = "web/splat.wgsl";
+/// What the rasteriser's passes share with the viewer.
+const SHARED: &str = "../../shaders/shared";
 
 fn main() {
-    valid("web/present.wgsl");
-    let (module, info) = valid(SOURCE);
+    let out = env::var("OUT_DIR").expect("cargo sets OUT_DIR");
+    valid("web/present.wgsl", &read("web/present.wgsl"));
+    let source = assembled();
+    let (module, info) = valid(SOURCE, &source);
+    fs::write(Path::new(&out).join("splat.wgsl"), &source).expect("writable OUT_DIR");
     let options = glsl::Options {
         version: glsl::Version::Embedded { version: 300, is_webgl: true },
         writer_flags: glsl::WriterFlags::empty(),
         ..Default::default()
     };
-    let out = env::var("OUT_DIR").expect("cargo sets OUT_DIR");
     for (stage, entry) in [(naga::ShaderStage::Vertex, "corner"), (naga::ShaderStage::Fragment, "pixel")] {
         let pipeline = glsl::PipelineOptions { shader_stage: stage, entry_point: entry.to_owned(), multiview: None };
         let mut text = String::new();
@@ -28,11 +32,25 @@ fn main() {
     }
 }
 
-fn valid(path: &str) -> (Module, ModuleInfo) {
+fn read(path: &str) -> String {
     println!("cargo::rerun-if-changed={path}");
-    let source = fs::read_to_string(path).expect("web/ is in the crate");
-    let module = naga::front::wgsl::parse_str(&source).unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(&source)));
+    fs::read_to_string(path).unwrap_or_else(|e| panic!("{path}: {e}"))
+}
+
+/// The shader with the shared files that it imports in their place; what those import it imports itself.
+fn assembled() -> String {
+    let line = |line: &str| match line.strip_prefix("#import ") {
+        Some(name) => {
+            read(&format!("{SHARED}/{name}.wgsl")).lines().filter(|l| !l.starts_with("#import")).map(|l| format!("{l}\n")).collect()
+        }
+        None => format!("{line}\n"),
+    };
+    read(SOURCE).lines().map(line).collect()
+}
+
+fn valid(path: &str, source: &str) -> (Module, ModuleInfo) {
+    let module = naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(source)));
     let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);
-    let info = info.unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(&source)));
+    let info = info.unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(source)));
     (module, info)
 }

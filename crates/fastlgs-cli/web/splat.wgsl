@@ -1,10 +1,14 @@
-// Draws one Gaussian as a quad, for browsers: WebGPU takes this file as it is, WebGL2 its translation (build.rs).
-// The picture is that of shaders/project.wgsl and shaders/blend.wgsl but for the eight bits of a canvas.
+// Draws one Gaussian as a quad, for browsers: WebGPU takes this with what it imports, WebGL2 its translation (build.rs).
+// The picture is that of shaders/project.wgsl and shaders/blend.wgsl, from which its geometry and colour come.
 //
 // splats   [n][2 + ceil(rest / 4)] texels of four u32, row by row (src/serve/splats.rs):
 //          (mean.xyz, log-scales xy) (log-scale z and opacity, colour, rotation, rotation and object id) (SH coefficients ...)
 // objects  [512][256] texels: rows 0..256 the state of object id = 256 row + column: relevancy, selected, hidden;
 //          rows 256.. its colour
+#import view
+#import rotation
+#import covariance
+#import harmonics
 
 struct Frame {
     world_to_camera: mat4x4<f32>,
@@ -24,11 +28,6 @@ const OBJECTS: u32 = 2u;
 const IDS: u32 = 3u;
 
 const ROW: u32 = 2048u;
-const NEAR: f32 = 0.05;
-const DILATION: f32 = 0.3;
-const ALPHA_MIN: f32 = 0.00392156862745098;
-const ALPHA_MAX: f32 = 0.99;
-const SH_C0: f32 = 0.28209479;
 const LOG_SCALE_LOW: f32 = -20.0;
 const LOG_SCALE_RANGE: f32 = 30.0;
 
@@ -57,47 +56,11 @@ fn unpack_rotation(low: u32, high: u32) -> vec4<f32> {
     }
 }
 
-fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
-    let w = q.x;
-    let x = q.y;
-    let y = q.z;
-    let z = q.w;
-    return mat3x3<f32>(
-        vec3<f32>(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)),
-        vec3<f32>(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)),
-        vec3<f32>(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)),
-    );
-}
-
-// Real spherical harmonics above degree 0, with the signs of 3DGS.
-fn harmonic(k: u32, d: vec3<f32>) -> f32 {
-    let xx = d.x * d.x;
-    let yy = d.y * d.y;
-    let zz = d.z * d.z;
-    switch k {
-        case 0u: { return -0.48860251 * d.y; }
-        case 1u: { return 0.48860251 * d.z; }
-        case 2u: { return -0.48860251 * d.x; }
-        case 3u: { return 1.0925484 * d.x * d.y; }
-        case 4u: { return -1.0925484 * d.y * d.z; }
-        case 5u: { return 0.31539157 * (2.0 * zz - xx - yy); }
-        case 6u: { return -1.0925484 * d.x * d.z; }
-        case 7u: { return 0.54627422 * (xx - yy); }
-        case 8u: { return -0.59004359 * d.y * (3.0 * xx - yy); }
-        case 9u: { return 2.8906114 * d.x * d.y * d.z; }
-        case 10u: { return -0.45704579 * d.y * (4.0 * zz - xx - yy); }
-        case 11u: { return 0.37317633 * d.z * (2.0 * zz - 3.0 * xx - 3.0 * yy); }
-        case 12u: { return -0.45704579 * d.x * (4.0 * zz - xx - yy); }
-        case 13u: { return 1.4453057 * d.z * (xx - yy); }
-        default: { return -0.59004359 * d.x * (xx - 3.0 * yy); }
-    }
-}
-
 fn color_of(first: u32, packed: u32, direction: vec3<f32>) -> vec3<f32> {
     var color = vec3<f32>(0.5) + SH_C0 * frame.size.z * unit10(packed);
-    let rest = (frame.mode.y + 1u) * (frame.mode.y + 1u) - 1u;
-    for (var k = 0u; k < rest; k++) {
-        color += harmonic(k, direction) * frame.size.w * unit10(texel(first + 2u + k / 4u)[k % 4u]);
+    var b = basis(direction);
+    for (var k = 0u; k < rest_of(frame.mode.y); k++) {
+        color += b[k] * frame.size.w * unit10(texel(first + 2u + k / 4u)[k % 4u]);
     }
     return max(color, vec3<f32>(0.0));
 }
@@ -149,41 +112,36 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
     if hidden || !(t.z > NEAR) {
         return out;
     }
-    let lens = frame.lens;
-    let size = frame.size.xy;
+    var view: View;
+    view.world_to_camera = frame.world_to_camera;
+    view.focal = frame.lens.xy;
+    view.centre = frame.lens.zw;
+    view.size = vec2<u32>(frame.size.xy);
+    view.antialias = u32(frame.camera.w);
     let last = unpack2x16unorm(b.x);
     let s = exp(vec3<f32>(unpack2x16unorm(a.w), last.x) * LOG_SCALE_RANGE + LOG_SCALE_LOW);
     let r = rotation_matrix(unpack_rotation(b.z, b.w & 0xffffu));
-    let slope = clamp(t.xy / t.z, -1.3 * lens.zw / lens.xy, 1.3 * (size - lens.zw) / lens.xy);
-    let rows = transpose(mat3x3<f32>(frame.world_to_camera[0].xyz, frame.world_to_camera[1].xyz, frame.world_to_camera[2].xyz));
-    let ax = ((lens.x / t.z * (rows[0] - slope.x * rows[2])) * r) * s;
-    let ay = ((lens.y / t.z * (rows[1] - slope.y * rows[2])) * r) * s;
-    let xx = dot(ax, ax) + DILATION;
-    let xy = dot(ax, ay);
-    let yy = dot(ay, ay) + DILATION;
-    let det = xx * yy - xy * xy;
-    var opacity = last.y;
-    if frame.camera.w > 0.5 {
-        opacity *= sqrt(max(((xx - DILATION) * (yy - DILATION) - xy * xy) / det, 1e-6));
-    }
+    let jw = affine(t, view);
+    let cov = dilated((jw.x * r) * s, (jw.y * r) * s);
+    let opacity = last.y * compensation(cov, view);
     if !(opacity >= ALPHA_MIN) {
         return out;
     }
     // Half axes of the ellipse on which alpha falls to ALPHA_MIN.
-    let middle = 0.5 * (xx + yy);
-    let spread = length(vec2<f32>(0.5 * (xx - yy), xy));
+    let middle = 0.5 * (cov.x + cov.z);
+    let spread = length(vec2<f32>(0.5 * (cov.x - cov.z), cov.y));
     var axis = vec2<f32>(1.0, 0.0);
-    if abs(xy) > 1e-6 {
-        axis = normalize(vec2<f32>(xy, middle + spread - xx));
-    } else if yy > xx {
+    if abs(cov.y) > 1e-6 {
+        axis = normalize(vec2<f32>(cov.y, middle + spread - cov.x));
+    } else if cov.z > cov.x {
         axis = vec2<f32>(0.0, 1.0);
     }
     let reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
     out.place = reach * (vec2<f32>(f32(number & 1u), f32(number >> 1u)) * 2.0 - 1.0);
     let long = sqrt(middle + spread) * out.place.x * axis;
     let short = sqrt(max(middle - spread, 0.01)) * out.place.y * vec2<f32>(-axis.y, axis.x);
-    let pixel = lens.xy * t.xy / t.z + lens.zw + long + short;
-    out.position = vec4<f32>(pixel / size * vec2<f32>(2.0, -2.0) + vec2<f32>(-1.0, 1.0), 0.0, 1.0);
+    let pixel = view.focal * t.xy / t.z + view.centre + long + short;
+    out.position = vec4<f32>(pixel / frame.size.xy * vec2<f32>(2.0, -2.0) + vec2<f32>(-1.0, 1.0), 0.0, 1.0);
     let color = color_of(first, b.y, normalize(mean - frame.camera.xyz));
     out.color = vec4<f32>(shown(color, id), min(opacity, ALPHA_MAX));
     return out;

@@ -21,7 +21,7 @@ const FILES: [(&str, &str, &str); 18] = [
     ("/webgl2.js", SCRIPT, include_str!("../../web/webgl2.js")),
     ("/pictures.js", SCRIPT, include_str!("../../web/pictures.js")),
     ("/sorter.js", SCRIPT, include_str!("../../web/sorter.js")),
-    ("/splat.wgsl", TEXT, include_str!("../../web/splat.wgsl")),
+    ("/splat.wgsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/splat.wgsl"))),
     ("/present.wgsl", TEXT, include_str!("../../web/present.wgsl")),
     ("/corner.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/corner.glsl"))),
     ("/pixel.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/pixel.glsl"))),
