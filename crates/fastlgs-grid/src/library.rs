@@ -13,7 +13,7 @@ use nalgebra::DMatrix;
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, Metadata, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -66,12 +66,11 @@ pub struct Library {
 }
 
 /// The best object of a scene.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Found {
     /// Index into [`Library::scenes`].
     pub scene: usize,
     /// The object and its relevancy.
-    #[serde(flatten)]
     pub hit: Hit,
     /// How well masks bear it out.
     pub support: f32,
@@ -180,12 +179,10 @@ impl Library {
         let metadata: Metadata = serde_json::from_slice(&header[8..]).map_err(|e| bad(&format!("not a library ({e})")))?;
         let info: BTreeMap<String, (Vec<usize>, (usize, usize))> =
             metadata.tensors().into_iter().map(|(name, i)| (name, (i.shape.clone(), i.data_offsets))).collect();
-        let place = |name: &str| info.get(name).ok_or_else(|| bad(&format!("tensor '{name}' is missing")));
+        let whole_file = |(_, (from, to)): &&(Vec<usize>, (usize, usize))| from <= to && head_length.saturating_add(*to as u64) <= length;
+        let place = |name: &str| info.get(name).filter(whole_file).ok_or_else(|| bad(&format!("truncated, or tensor '{name}' is missing")));
         let mut bytes = |name: &str| -> Result<Vec<u8>> {
             let (_, (from, to)) = place(name)?;
-            if head_length + *to as u64 > length {
-                return Err(bad("truncated"));
-            }
             let mut data = vec![0; to - from];
             file.seek(SeekFrom::Start(head_length + *from as u64)).and_then(|_| file.read_exact(&mut data)).map_err(io)?;
             Ok(data)
@@ -207,7 +204,6 @@ impl Library {
             && short.len() == n * COMPONENTS
             && basis.len() == COMPONENTS * dimension
             && to - from == n * dimension
-            && head_length + *to as u64 <= length
             && rows.iter().all(|r| r.first + r.count <= n && (r.scene as usize) < scenes.len());
         if !fits {
             return Err(bad("its parts do not fit together"));
@@ -240,8 +236,6 @@ impl Library {
             );
             return Err(Error::Core(CoreError::Invalid(reason)));
         }
-        let mut best: Vec<Found> = Vec::new();
-        let mut place: HashMap<u32, usize> = HashMap::new();
         let mut objects: Vec<(f32, Found)> = self
             .in_full(&self.nearest(&query.text))?
             .into_iter()
@@ -252,14 +246,9 @@ impl Library {
             })
             .collect();
         objects.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.scene.cmp(&b.1.scene)).then(a.1.hit.id.cmp(&b.1.hit.id)));
-        for (_, found) in objects {
-            place.entry(found.scene as u32).or_insert_with(|| {
-                best.push(found);
-                best.len()
-            });
-        }
-        best.truncate(scenes);
-        Ok(best)
+        let mut named = HashSet::new();
+        let best_of_scene = objects.into_iter().map(|o| o.1).filter(|found| named.insert(found.scene));
+        Ok(best_of_scene.take(scenes).collect())
     }
 
     /// The objects whose short embeddings come nearest to the text, in the order of the file.

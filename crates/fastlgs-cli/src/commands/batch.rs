@@ -94,10 +94,9 @@ fn make(args: &Args, photos: &Path, scene: &Path, common: &ui::Common) -> Result
     }
     let text = |path: &Path| path.to_str().map(str::to_owned).with_context(|| format!("{}: its name is not UTF-8", path.display()));
     let (photos, place) = (text(&photos)?, text(scene)?);
-    let options = |own: &str| own.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
     let call = |command: &str, first: &[&str], own: &str| {
-        let all: Vec<String> = first.iter().map(|a| (*a).to_owned()).chain(options(own)).collect();
-        again::call(common, common.seed, command, &all.iter().map(String::as_str).collect::<Vec<_>>())
+        let all: Vec<&str> = first.iter().copied().chain(own.split_whitespace()).collect();
+        again::call(common, common.seed, command, &all)
     };
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
     let begun = known.is_some() && folder.root.join("checkpoints/train").exists();

@@ -1,12 +1,12 @@
 //! `fastlgs export`: a trained scene for other programs, or a small folder with just what a query needs.
 
+use super::query::selection;
 use crate::scene::Scene;
 use crate::{Outcome, report, ui};
 use anyhow::{Context, Result, bail};
-use fastlgs_core::camera::mean_up;
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, glb, image_io, ply, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, image_io, ply, spz};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -43,18 +43,15 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
     let ending = args.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let (written, precision) = match ending {
-        "ply" => {
-            ply::write(&args.output, &scene.gaussians)?;
-            (ply::read(&args.output)?, None)
-        }
-        "spz" => {
-            spz::write(&args.output, &scene.gaussians)?;
-            (spz::read(&args.output)?, None)
-        }
-        // What it holds are the same floats as before.
-        "glb" => {
-            glb::write(&args.output, &scene.gaussians, mean_up(&scene.cameras))?;
-            (scene.gaussians.clone(), None)
+        "ply" | "spz" | "glb" => {
+            selection::write(&args.output, &scene.gaussians, &scene.cameras)?;
+            let written = match ending {
+                "ply" => ply::read(&args.output)?,
+                "spz" => spz::read(&args.output)?,
+                // It holds the same floats as before.
+                _ => scene.gaussians.clone(),
+            };
+            (written, None)
         }
         _ => {
             let (written, precision) = small_folder(&mut scene, &args.output)?;

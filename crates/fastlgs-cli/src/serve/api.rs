@@ -16,7 +16,6 @@ use base64::Engine as _;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::query::{self, QueryConfig};
-use glam::Vec3;
 use image::{DynamicImage, Rgb, RgbImage};
 use serde::Deserialize;
 use serde_json::{Value, json};
@@ -178,7 +177,6 @@ pub async fn objects(State(app): App) -> Answer {
 pub async fn thumbnail(State(app): App, Path(id): Path<u16>) -> Answer<Response> {
     let made = app.ready()?.ask(move |desk| Ok(thumbnails::png(desk, id)?)).await?;
     let data = made.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
-    // Pictures of a scene do not change while it is served.
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
@@ -394,20 +392,6 @@ pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejecti
     headers.insert(header::CONTENT_DISPOSITION, disposition.parse().map_err(|e| anyhow::anyhow!("{disposition}: {e}"))?);
     headers.insert(header::CONTENT_TYPE, header::HeaderValue::from_static("application/octet-stream"));
     Ok((headers, Bytes::from(data)).into_response())
-}
-
-/// Distance from each camera to what it looks at: the median depth of what lies in the middle of its picture.
-pub fn focus(means: &[Vec3], camera: &Camera) -> f32 {
-    const SAMPLES: usize = 4_000;
-    let middle = |m: &Vec3| {
-        let p = camera.world_to_camera.transform_point3(*m);
-        let pixel = camera.to_pixel(p);
-        let near = |v: f32, size: u32| (v / size as f32 - 0.5).abs() < 0.2;
-        (p.z > 0.05 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
-    };
-    let mut depths: Vec<f32> = means.iter().step_by(means.len().div_ceil(SAMPLES).max(1)).filter_map(middle).collect();
-    depths.sort_by(f32::total_cmp);
-    depths.get(depths.len() / 2).copied().unwrap_or(1.0)
 }
 
 /// `GET` of anything else.

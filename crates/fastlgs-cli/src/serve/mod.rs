@@ -16,6 +16,7 @@ use axum::routing::{get, post};
 use axum::{Router, middleware};
 use desk::{Bell, Desk};
 use fastlgs_core::{Camera, SceneFolder};
+use glam::Vec3;
 use guard::Guard;
 pub use live::{Live, Point};
 use serde_json::{Value, json};
@@ -103,8 +104,8 @@ impl Server {
     }
 
     /// Tells the page how far the cameras' subjects are.
-    pub fn set_focus(&self, means: &[glam::Vec3]) {
-        let _ = self.shared.focus.set(self.shared.cameras.iter().map(|c| api::focus(means, c)).collect());
+    pub fn set_focus(&self, means: &[Vec3]) {
+        let _ = self.shared.focus.set(self.shared.cameras.iter().map(|c| focus(means, c)).collect());
     }
 
     /// Opens the trained scene for questions.
@@ -149,4 +150,18 @@ fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
         .layer(DefaultBodyLimit::max(LARGEST_BODY))
         .layer(middleware::from_fn_with_state(guard, guard::check))
         .with_state(shared)
+}
+
+/// Distance from each camera to what it looks at: the median depth of what lies in the middle of its picture.
+fn focus(means: &[Vec3], camera: &Camera) -> f32 {
+    const SAMPLES: usize = 4_000;
+    let middle = |m: &Vec3| {
+        let p = camera.world_to_camera.transform_point3(*m);
+        let pixel = camera.to_pixel(p);
+        let near = |v: f32, size: u32| (v / size as f32 - 0.5).abs() < 0.2;
+        (p.z > 0.05 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
+    };
+    let mut depths: Vec<f32> = means.iter().step_by(means.len().div_ceil(SAMPLES).max(1)).filter_map(middle).collect();
+    depths.sort_by(f32::total_cmp);
+    depths.get(depths.len() / 2).copied().unwrap_or(1.0)
 }

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
-use fastlgs_grid::library::{self, Entry, Library};
+use fastlgs_grid::library::{self, Entry, Found, Library};
 use serde_json::{Value, json};
 use std::io::{BufRead, Write};
 use std::path::{Path, PathBuf};
@@ -25,11 +25,12 @@ pub fn run(args: &Args, root: &Path, texts: &[String], common: &ui::Common) -> R
     }
     let started = Instant::now();
     let (scenes, skipped) = scenes_below(root)?;
-    let Some((first, _)) = scenes.first() else { bail!("{}: no trained scenes are in it", root.display()) };
-    let first = SceneFolder::new(root.join(&first.path));
-    let library = up_to_date(root, &scenes, common)?;
+    let Some((first, manifest)) = scenes.first() else { bail!("{}: no trained scenes are in it", root.display()) };
+    let first_folder = SceneFolder::new(root.join(&first.path));
+    let index = up_to_date(root, &scenes, common)?;
     let index_ms = started.elapsed().as_secs_f64() * 1e3;
-    let session = Session { args, texts: Texts::load(&first, &first.manifest()?, args.clip_text.as_deref())?, library, skipped, index_ms };
+    let encoder = Texts::load(&first_folder, manifest, args.clip_text.as_deref())?;
+    let session = Session { args, texts: encoder, index, skipped, index_ms };
     session.search("warm up")?;
     if texts == ["-"] {
         let mut out = std::io::stdout();
@@ -57,7 +58,7 @@ pub fn run(args: &Args, root: &Path, texts: &[String], common: &ui::Common) -> R
 struct Session<'a> {
     args: &'a Args,
     texts: Texts,
-    library: Library,
+    index: Library,
     skipped: Vec<Value>,
     index_ms: f64,
 }
@@ -71,17 +72,19 @@ impl Session<'_> {
         }
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
-        let most = self.args.scenes;
-        let best = self.library.search(&query, most)?;
+        let best = self.index.search(&query, self.args.scenes)?;
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
         let least = self.args.min_score.unwrap_or(self.texts.min_score());
-        let row = |f: &library::Found| json!({ "scene": self.library.scenes[f.scene].path, "object": f.hit.id, "score": f.hit.score, "support": f.support, "found": f.hit.score >= least });
+        let row = |f: &Found| {
+            let scene = &self.index.scenes[f.scene].path;
+            json!({ "scene": scene, "object": f.hit.id, "score": f.hit.score, "support": f.support, "found": f.hit.score >= least })
+        };
         let rows: Vec<Value> = best.iter().map(row).collect();
         Ok(json!({
             "text": text,
             "found": rows.iter().any(|r| r["found"] == true),
             "scenes": rows,
-            "searched": { "scenes": self.library.scenes.len(), "objects": self.library.len() },
+            "searched": { "scenes": self.index.scenes.len(), "objects": self.index.len() },
             "skipped": self.skipped,
             "ms": { "index": self.index_ms, "encode": encode_ms, "search": search_ms },
         }))

@@ -25,11 +25,11 @@ use std::time::Instant;
 )]
 pub struct Args {
     /// Trained scene folder; not with --library.
-    #[arg(required_unless_present = "library")]
+    #[arg(required_unless_present = "scenes_below")]
     scene: Option<PathBuf>,
     /// What to look for; several texts are answered one after the other. "wheel of the bicycle" asks for a part. `-` reads
     /// texts from standard input and answers each line at once with a line of JSON.
-    #[arg(required_unless_present_any = ["image", "point", "library"])]
+    #[arg(required_unless_present_any = ["image", "point", "scenes_below"])]
     text: Vec<String>,
     /// A picture of what to look for.
     #[arg(long, value_name = "FILE")]
@@ -41,8 +41,8 @@ pub struct Args {
     #[arg(long, value_name = "TEXT")]
     negative: Vec<String>,
     /// Ask all scenes below DIR which of them hold it; the index that this needs is kept there as library.index.
-    #[arg(long, value_name = "DIR")]
-    library: Option<PathBuf>,
+    #[arg(long = "library", value_name = "DIR")]
+    scenes_below: Option<PathBuf>,
     /// Most scenes that --library names.
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
     scenes: usize,
@@ -108,7 +108,7 @@ struct Session<'a> {
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    if let Some(root) = &args.library {
+    if let Some(root) = &args.scenes_below {
         // What stands in the scene's place is the first text.
         let first = args.scene.iter().map(|text| text.to_string_lossy().into_owned());
         let texts: Vec<String> = first.chain(args.text.iter().cloned()).collect();
