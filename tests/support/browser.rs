@@ -8,6 +8,9 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+/// Nothing takes so long, even drawn in software on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(180);
+
 /// A browser with one page; it ends with this value.
 pub struct Browser {
     driver: Child,
@@ -31,12 +34,12 @@ impl Browser {
             .filter_map(|l| l.split("on port ").nth(1).map(|p| p.trim_end_matches('.').to_owned()))
             .find(|p| p.parse::<u16>().is_ok_and(|p| p > 0));
         let base = format!("http://127.0.0.1:{}/session", port.expect("chromedriver tells its port"));
-        let agent = ureq::Agent::config_builder().timeout_global(Some(Duration::from_secs(180))).http_status_as_error(false).build().into();
+        let agent = ureq::Agent::config_builder().timeout_global(Some(2 * PATIENCE)).http_status_as_error(false).build().into();
         let size = format!("--window-size={width},{height}");
         let mut args = vec!["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", &size];
         args.extend(flags);
         let options = json!({ "args": args });
-        let always = json!({ "browserName": "chrome", "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" } });
+        let always = json!({ "browserName": "chrome", "timeouts": { "script": PATIENCE.as_millis() as u64 }, "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" } });
         let mut browser = Self { driver, session: base, agent };
         let made = browser.post("", &json!({ "capabilities": { "alwaysMatch": always } }));
         browser.session = format!("{}/{}", browser.session, made["sessionId"].as_str().expect("a session"));
@@ -67,11 +70,11 @@ impl Browser {
     }
 
     /// Waits until an expression is true.
-    pub fn wait_for(&self, expression: &str, at_most: Duration) {
+    pub fn wait_for(&self, expression: &str) {
         let began = Instant::now();
         while self.run(&format!("return Boolean({expression});")) != true {
             let problem = self.run("return document.getElementById('problem')?.textContent ?? '';");
-            assert!(began.elapsed() < at_most, "'{expression}' did not come true; the page says: {problem}");
+            assert!(began.elapsed() < PATIENCE, "'{expression}' did not come true; the page says: {problem}");
             std::thread::sleep(Duration::from_millis(200));
         }
     }

@@ -1,6 +1,7 @@
 //! The HTTP interface: what each address does. `web/openapi.json` describes it for programs.
 
 use super::desk::{Choice, Desk};
+use super::guard::LARGEST_BODY;
 use super::{Shared, thumbnails};
 use crate::commands::query::answer::{CANDIDATES, Question, heatmap, mask_picture, overlay};
 use crate::commands::query::ask::Ask;
@@ -72,12 +73,7 @@ impl From<fastlgs_core::Error> for Failure {
 
 impl From<JsonRejection> for Failure {
     fn from(rejection: JsonRejection) -> Self {
-        match rejection.status() {
-            StatusCode::PAYLOAD_TOO_LARGE => {
-                Self::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {} bytes", super::LARGEST_BODY))
-            }
-            status => Self::new(status, rejection.body_text()),
-        }
+        Self::new(rejection.status(), rejection.body_text())
     }
 }
 
@@ -97,7 +93,7 @@ pub async fn scene(State(app): App) -> Answer {
         "views": app.views()?,
         "trained_here": app.live.is_some(),
         "up": mean_up(&app.cameras).to_array(),
-        "limits": { "pixels": MOST_PIXELS, "text": LONGEST_TEXT, "body": super::LARGEST_BODY },
+        "limits": { "pixels": MOST_PIXELS, "text": LONGEST_TEXT, "body": LARGEST_BODY },
     });
     let more = match app.bell() {
         None => {

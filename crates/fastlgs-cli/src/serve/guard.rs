@@ -1,16 +1,27 @@
 //! Who may ask: on the loopback any program of this machine that calls the server by a loopback name; elsewhere who knows the token.
+//! And how much: at most so many requests at a time, of at most so many bytes.
 
 use super::api::Failure;
+use axum::body::Body;
 use axum::extract::{Request, State};
+use axum::http::request::Parts;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use http_body_util::BodyExt;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 use tokio::sync::Semaphore;
 
 /// Requests that are worked on at the same time; more are told to come back.
 const AT_ONCE: usize = 64;
+/// Largest body of a request, in bytes.
+pub const LARGEST_BODY: usize = 8 << 20;
+/// So much of a body is listened to before the connection is closed instead of answered.
+const PATIENCE: usize = 64 << 20;
+/// And so long.
+const PATIENT_FOR: Duration = Duration::from_secs(60);
 
 /// What every request is checked against.
 pub struct Guard {
@@ -32,9 +43,9 @@ impl Guard {
     }
 
     /// Whether a request may pass. A foreign page that had its name resolve to this machine would send that name as host.
-    fn refusal(&self, request: &Request) -> Option<Failure> {
+    fn refusal(&self, request: &Parts) -> Option<Failure> {
         if self.loopback {
-            let host = request.headers().get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or_default();
+            let host = request.headers.get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or_default();
             let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
             let bare = name.trim_start_matches('[').trim_end_matches(']');
             let own = bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
@@ -42,11 +53,11 @@ impl Guard {
         }
         let wanted = self.token.as_deref()?;
         // The page itself holds no secret; it passes the token on with what it asks for.
-        if !request.uri().path().starts_with("/api/") {
+        if !request.uri.path().starts_with("/api/") {
             return None;
         }
-        let by_header = request.headers().get(header::AUTHORIZATION).and_then(|h| h.to_str().ok()).and_then(|h| h.strip_prefix("Bearer "));
-        let by_query = request.uri().query().and_then(|q| q.split('&').find_map(|p| p.strip_prefix("token=")));
+        let by_header = request.headers.get(header::AUTHORIZATION).and_then(|h| h.to_str().ok()).and_then(|h| h.strip_prefix("Bearer "));
+        let by_query = request.uri.query().and_then(|q| q.split('&').find_map(|p| p.strip_prefix("token=")));
         // Every byte is looked at, so that time tells nothing about the first wrong one.
         let same = |given: &str| given.len() == wanted.len() && given.bytes().zip(wanted.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0;
         let known = by_header.is_some_and(same) || by_query.is_some_and(same);
@@ -54,12 +65,38 @@ impl Guard {
     }
 }
 
+/// The bytes of a body, or why it is not taken; what is more than `most` is listened to but not kept. An answer that is sent before
+/// its request has arrived is lost to whoever is still sending.
+async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
+    let (mut kept, mut arrived) = (Vec::new(), 0);
+    let listen = async {
+        while let Some(frame) = body.frame().await {
+            let data = frame.ok()?.into_data().unwrap_or_default();
+            arrived += data.len();
+            if arrived <= most {
+                kept.extend_from_slice(&data);
+            } else if arrived > PATIENCE {
+                break;
+            }
+        }
+        Some(())
+    };
+    match tokio::time::timeout(PATIENT_FOR, listen).await {
+        Ok(Some(())) if arrived <= most => Ok(kept),
+        Ok(Some(())) => Err(Failure::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {LARGEST_BODY} bytes"))),
+        Ok(None) | Err(_) => Err(Failure::new(StatusCode::REQUEST_TIMEOUT, "the request did not arrive whole")),
+    }
+}
+
 /// Checks a request, counts it, and adds what browsers need to know to every answer.
 pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
-    let mut response = match (guard.refusal(&request), guard.places.try_acquire()) {
-        (Some(refusal), _) => refusal.into_response(),
-        (None, Err(_)) => Failure::busy().into_response(),
-        (None, Ok(_place)) => next.run(request).await,
+    let (parts, body) = request.into_parts();
+    let place = guard.places.try_acquire();
+    let refusal = guard.refusal(&parts).or_else(|| place.is_err().then(Failure::busy));
+    let body = receive(body, if refusal.is_none() { LARGEST_BODY } else { 0 }).await;
+    let mut response = match (refusal, body) {
+        (Some(refusal), _) | (None, Err(refusal)) => refusal.into_response(),
+        (None, Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
     };
     let policy = "default-src 'self'; img-src 'self' blob: data:; style-src 'self'; frame-ancestors 'none'; base-uri 'none'";
     for (name, value) in [

@@ -26,9 +26,6 @@ use std::sync::{Arc, OnceLock};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
-/// Largest request in bytes: a picture to look for.
-const LARGEST_BODY: usize = 8 << 20;
-
 /// What all requests share.
 pub struct Shared {
     name: String,
@@ -147,7 +144,8 @@ fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
         .route("/api/export", get(api::export))
         .fallback(api::unknown)
         .method_not_allowed_fallback(api::wrong_method)
-        .layer(DefaultBodyLimit::max(LARGEST_BODY))
+        // The guard has limited bodies already.
+        .layer(DefaultBodyLimit::disable())
         .layer(middleware::from_fn_with_state(guard, guard::check))
         .with_state(shared)
 }
