@@ -97,6 +97,45 @@ fn the_papers_mapping_and_trained_features_work_too() {
     assert!(report["adapter"].as_str().is_some_and(|a| a.starts_with("cpu")), "{report}");
 }
 
+/// Lifting and descent start from each other's scenes, with the same objects.
+#[test]
+fn either_feature_mode_refines_the_other() {
+    let Some(f) = fixture() else { return };
+    let scene = f.dir.path().join("refined");
+    copy_folder(&f.scene, &scene);
+    let ply_path = scene.join("scene.ply");
+    let refine = |mode: &str, iterations: &str, more: &[&str]| {
+        let start = ["train", text(&scene), "--init-ply", text(&ply_path), "--mapping", "keep", "--device", "cpu"];
+        json(&[&start, ["--feature-mode", mode, "--iterations", iterations].as_slice(), more].concat())
+    };
+    let coffee = || {
+        let out = f.dir.path().join("refined-out");
+        let answer = json(&["query", text(&scene), "coffee", "--view", "008", "--device", "cpu", "-o", text(&out)]);
+        let mask = LabelMap::load(Path::new(answer["mask"].as_str().expect("a path"))).expect("the mask is a grey PNG");
+        let truth = LabelMap::load(&f.photos.join("masks/008.png.png")).expect("exact masks");
+        let both = mask.labels.iter().zip(&truth.labels).filter(|(m, t)| **m > 0 && **t == 2).count();
+        let either = mask.labels.iter().zip(&truth.labels).filter(|(m, t)| **m > 0 || **t == 2).count();
+        (answer["objects"][0]["id"].as_u64(), both as f64 / either as f64)
+    };
+    let lifted = coffee();
+    let before = ply::read(&ply_path).expect("the scene");
+    let report = refine("train", "150", &["--freeze"]);
+    let trained = coffee();
+    let between = ply::read(&ply_path).expect("the scene");
+    assert_eq!((&before.means, &before.sh_dc), (&between.means, &between.sh_dc), "{report}");
+    assert_ne!(before.features, between.features);
+    refine("lift", "0", &[]);
+    let again = coffee();
+    println!("IoU of the coffee: lifted {:.3}, refined by descent {:.3}, lifted again {:.3}", lifted.1, trained.1, again.1);
+    assert!(lifted.0 == trained.0 && lifted.0 == again.0, "{lifted:?} {trained:?} {again:?}");
+    assert!(trained.1 > 0.5 && again.1 > 0.9 * lifted.1, "{lifted:?} {trained:?} {again:?}");
+    std::fs::remove_file(scene.join("masks/objects").join("001.png.png")).expect("an object map");
+    fails(
+        &["train", text(&scene), "--mapping", "keep", "--iterations", "0", "--init-ply", text(&ply_path)],
+        &["001.png.png", "train it first"],
+    );
+}
+
 #[test]
 fn exports_keep_what_queries_need() {
     let Some(f) = fixture() else { return };

@@ -60,7 +60,8 @@ impl Texts {
 
     /// Prepares a text.
     pub fn query(&self, text: &str) -> Result<TextQuery> {
-        Ok(TextQuery { text: self.encoder.embed(&[text])?.remove(0), canonical: self.canonical.clone(), anything: self.anything })
+        let anything = self.anything + self.encoder.advantage(text);
+        Ok(TextQuery { text: self.encoder.embed(&[text])?.remove(0), canonical: self.canonical.clone(), anything })
     }
 
     /// Relevancy from which an object counts as found.

@@ -37,6 +37,9 @@ const NEUTRAL: f32 = 0.25;
 const MASK_WEIGHT: f32 = 0.1;
 /// Weight of a mask's attribute against the cosine of meanings, when a text names it.
 const WEIGHT: f32 = 0.25;
+/// What things of the named colour gain by it although they are something else. Without it three in ten of the absent "purple umbrella"s
+/// were found.
+const ADVANTAGE: f32 = 0.07;
 
 /// For each basic colour, whether a Lab colour is nearest to one of its focal colours.
 fn nearest(color: [f32; 3]) -> usize {
@@ -72,6 +75,12 @@ pub fn of_masks(photo: &RgbImage, masks: &LabelMap) -> Vec<[f32; COUNT]> {
     }
     let share = |(counts, area): ([f32; COUNT], f32)| counts.map(|n| MASK_WEIGHT * (n / area.max(1.0) - NEUTRAL));
     counts.into_iter().zip(areas).map(share).collect()
+}
+
+/// By how much the cosine that unrelated masks reach is higher for a text that names an attribute.
+pub fn advantage(text: &str) -> f32 {
+    let named = of_text(text).0.iter().any(|n| *n > 0.0);
+    if named { ADVANTAGE } else { 0.0 }
 }
 
 /// Attributes that a text names, and the text without them; the whole text where nothing else is left.
@@ -112,5 +121,6 @@ mod tests {
         }
         assert_eq!(of_text("fox"), ([0.0; COUNT], "fox".to_owned()));
         assert_eq!(of_text("Red").1, "Red");
+        assert_eq!(["fox", "purple umbrella", "Red"].map(advantage), [0.0, ADVANTAGE, ADVANTAGE]);
     }
 }

@@ -22,6 +22,11 @@ pub trait TextEncoder {
     /// # Errors
     /// When inference fails.
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>>;
+
+    /// By how much the cosine that unrelated masks reach with this text exceeds what they reach with others.
+    fn advantage(&self, _text: &str) -> f32 {
+        0.0
+    }
 }
 
 /// Scales a vector to length 1; a zero vector stays.

@@ -75,4 +75,8 @@ impl TextEncoder for OfflineText {
         let meanings = self.0.embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
         Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named].concat()).collect())
     }
+
+    fn advantage(&self, text: &str) -> f32 {
+        attributes::advantage(text)
+    }
 }

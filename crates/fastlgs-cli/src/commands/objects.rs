@@ -1,4 +1,4 @@
-//! From masks to objects, for `train`: Algorithm 1 before training, or the views' consensus after it.
+//! From masks to objects, for `train`: Algorithm 1 before training, the views' consensus after it, or those of an earlier run.
 
 use crate::{eyes, ui};
 use anyhow::{Context, Result, bail};
@@ -46,6 +46,20 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         contacts.extend(map.contacts());
     }
     Ok(Grid::build(&masks, &object_of, codes::separated(usize::from(count), &contacts, seed)))
+}
+
+/// The objects that an earlier run found, whose maps must be there for all training views.
+pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
+    let advice = || format!("{}: --mapping keep needs the objects of a trained scene; train it first", folder.root.display());
+    let grid = Grid::load(folder).with_context(advice)?;
+    for camera in training {
+        let highest = folder.objects(&camera.name).with_context(advice)?.max();
+        if usize::from(highest) > grid.objects.len() {
+            let (path, count) = (folder.objects_path(&camera.name), grid.objects.len());
+            bail!("{}: it shows object {highest} of {count}; train the scene again with --mapping global or paper", path.display());
+        }
+    }
+    Ok(grid)
 }
 
 /// Gives every Gaussian the object of the views' object maps that most of its blending weight falls on, and that object's code.

@@ -52,8 +52,9 @@ pub struct Args {
     /// Start from an existing 3DGS scene instead of points.
     #[arg(long, value_name = "FILE")]
     init_ply: Option<PathBuf>,
-    /// How masks become objects: `global` (the views vote over the trained Gaussians) or `paper` (Algorithm 1).
-    #[arg(long, default_value = "global", value_parser = ["global", "paper"])]
+    /// How masks become objects: `global` (the views vote over the trained Gaussians), `paper` (Algorithm 1), or `keep` (those that
+    /// the scene has; with --init-ply of the trained scene, either feature mode refines what the other made).
+    #[arg(long, default_value = "global", value_parser = ["global", "paper", "keep"])]
     mapping: String,
     /// How Gaussians get their codes: `lift` (one pass of votes) or `train` (gradient descent, as in the paper).
     #[arg(long, default_value = "lift", value_parser = ["lift", "train"])]
@@ -108,21 +109,25 @@ const WORTH_TUNING: u32 = 500;
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let by_descent = args.feature_mode == "train";
     if by_descent && args.mapping == "global" {
-        bail!("--feature-mode train needs the objects before training: add --mapping paper");
+        bail!(
+            "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
+        );
     }
     let folder = SceneFolder::open(&args.scene)?;
     let mut manifest = folder.manifest()?;
     let cameras = folder.cameras()?;
     let training = manifest.training(&cameras);
-    let paper = if args.mapping == "paper" {
-        let cue = |name: &str| args.cues.iter().any(|c| c == name);
-        let alpha = if cue("color") { args.alpha } else { 0.0 };
-        let config = PaperConfig { tau: args.tau, theta: args.theta, alpha, key_points: cue("keypoints") };
-        Some(objects::by_algorithm_1(&folder, &training, &config, common.seed)?)
-    } else {
-        None
+    let known = match args.mapping.as_str() {
+        "paper" => {
+            let cue = |name: &str| args.cues.iter().any(|c| c == name);
+            let alpha = if cue("color") { args.alpha } else { 0.0 };
+            let config = PaperConfig { tau: args.tau, theta: args.theta, alpha, key_points: cue("keypoints") };
+            Some(objects::by_algorithm_1(&folder, &training, &config, common.seed)?)
+        }
+        "keep" => Some(objects::kept(&folder, &training)?),
+        _ => None,
     };
-    let codes = paper.as_ref().filter(|_| by_descent);
+    let codes = known.as_ref().filter(|_| by_descent);
     let targets = training.iter().map(|c| target(&folder, c, codes, &args.background)).collect::<Result<Vec<_>>>()?;
     let held_out = manifest.held_out(&cameras).iter().map(|c| target(&folder, c, None, &args.background)).collect::<Result<Vec<_>>>()?;
     let (preset, preset_degree, preset_most) = match args.preset.as_str() {
@@ -133,7 +138,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let budget = args.budget.map_or(Budget::Auto(preset_most), Budget::Fixed);
     let first = first_gaussians(args, &folder, &training, budget, common.seed)?;
     if args.freeze && !by_descent {
-        bail!("--freeze trains features: add --feature-mode train --mapping paper; or, to lift objects only, use --iterations 0");
+        bail!(
+            "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
+        );
     }
     let channels = match (args.freeze, by_descent, args.feature_moves_geometry) {
         (true, ..) => Channels::Feature,
@@ -203,7 +210,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
     let started = Instant::now();
     let mut summary = None;
-    let grid = match paper {
+    let grid = match known {
         Some(found) if by_descent => {
             for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
                 *id = found.nearest(*feature).map_or(0, |(id, _)| id);
