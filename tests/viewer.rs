@@ -168,7 +168,7 @@ fn the_interface_answers_as_the_query_command_does() {
         ("/api/query", r#"{"image":"AAAA"}"#, 400, "picture"),
         ("/api/query", huge.as_str(), 413, "large"),
         ("/api/render", r#"{"what":"smell"}"#, 400, "smell"),
-        ("/api/render", r#"{"only":[60000]}"#, 500, "nothing would be left"),
+        ("/api/render", r#"{"only":[60000]}"#, 400, "nothing would be left"),
         ("/api/scene", "{}", 405, "openapi"),
     ] {
         let said = served.refusal(path, Some(body), status);

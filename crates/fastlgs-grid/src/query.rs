@@ -228,6 +228,17 @@ mod tests {
     }
 
     #[test]
+    fn one_view_that_fools_the_encoder_counts_little() {
+        let query = TextQuery { text: vec![1.0, 0.0], canonical: Vec::new(), anything: 0.6 };
+        let seen = |recognised: usize| {
+            let view = |k: usize| if k < recognised { vec![1.0, 0.0] } else { vec![0.0, 1.0] };
+            object_score(&Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() }, &query)
+        };
+        assert!(seen(1) < 0.5, "{}", seen(1));
+        assert!(seen(3) > 0.95, "recognised from most sides: {}", seen(3));
+    }
+
+    #[test]
     fn parts_are_looked_for_inside_their_object() {
         let query = |text: [f32; 2]| TextQuery { text: text.to_vec(), canonical: Vec::new(), anything: 0.0 };
         let targets = [Hit { id: 1, score: 0.9 }];

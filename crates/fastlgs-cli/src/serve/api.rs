@@ -319,7 +319,9 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
     }
     let choice = Choice { hidden: wanted.hidden, only: wanted.only };
     let work = move |desk: &mut Desk| {
-        desk.choose(&choice)?;
+        if !desk.choose(&choice)? {
+            return Err(Failure::bad("nothing would be left to show"));
+        }
         let frame = desk.scene.render(&camera)?;
         let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
         let picture = if what == "objects" {

@@ -4,7 +4,7 @@ use super::api::Failure;
 use super::splats;
 use super::thumbnails::Thumbnails;
 use crate::scene::Scene;
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Context, Result, anyhow};
 use axum::body::Bytes;
 use axum::http::StatusCode;
 use fastlgs_core::{Camera, Gaussians};
@@ -99,10 +99,10 @@ impl Desk {
         self.seen.as_ref().map(|s| &s.1).context("no view was looked at")
     }
 
-    /// Shows some objects in the pictures that follow.
-    pub fn choose(&mut self, choice: &Choice) -> Result<()> {
+    /// Shows some objects in the pictures that follow; `false`, and all stays as it was, where nothing would be left to show.
+    pub fn choose(&mut self, choice: &Choice) -> Result<bool> {
         if self.choice == *choice {
-            return Ok(());
+            return Ok(true);
         }
         let all = self.all.take().unwrap_or_else(|| self.scene.gaussians.clone());
         if *choice == Choice::default() {
@@ -114,13 +114,13 @@ impl Desk {
             let places: Vec<usize> = (0..all.len()).filter(shown).collect();
             if places.is_empty() {
                 self.all = Some(all);
-                bail!("nothing would be left to show");
+                return Ok(false);
             }
             self.scene.show(all.select(&places))?;
             self.all = Some(all);
         }
         self.choice = choice.clone();
-        Ok(())
+        Ok(true)
     }
 
     /// How many Gaussians there are, hidden ones included.
