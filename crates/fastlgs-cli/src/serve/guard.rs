@@ -91,12 +91,15 @@ async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
 /// Checks a request, counts it, and adds what browsers need to know to every answer.
 pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let (parts, body) = request.into_parts();
-    let place = guard.places.try_acquire();
-    let refusal = guard.refusal(&parts).or_else(|| place.is_err().then(Failure::busy));
-    let body = receive(body, if refusal.is_none() { LARGEST_BODY } else { 0 }).await;
-    let mut response = match (refusal, body) {
-        (Some(refusal), _) | (None, Err(refusal)) => refusal.into_response(),
-        (None, Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
+    // Who is refused takes no place.
+    let place = match guard.refusal(&parts) {
+        Some(refusal) => Err(refusal),
+        None => guard.places.try_acquire().map_err(|_| Failure::busy()),
+    };
+    let body = receive(body, if place.is_ok() { LARGEST_BODY } else { 0 }).await;
+    let mut response = match (place, body) {
+        (Err(refusal), _) | (Ok(_), Err(refusal)) => refusal.into_response(),
+        (Ok(_place), Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
     };
     let policy = "default-src 'self'; img-src 'self' blob: data:; style-src 'self'; frame-ancestors 'none'; base-uri 'none'";
     for (name, value) in [
