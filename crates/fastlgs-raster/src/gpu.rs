@@ -43,6 +43,8 @@ pub struct Gpu {
     pub name: String,
     /// How the blending kernels divide a tile: what was measured to be fastest ([`crate::tuning`]), else a guess.
     pub shape: Shape,
+    /// What its kind of adapter is mostly fastest with.
+    pub(crate) guess: Shape,
     /// Shapes that the adapter can run.
     pub shapes: Vec<Shape>,
     /// The adapter with its driver's version: what measurements hold for.
@@ -139,6 +141,7 @@ impl Gpu {
             queue,
             name: info.name,
             shape,
+            guess,
             shapes,
             identity,
             software,
