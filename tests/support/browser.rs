@@ -39,7 +39,9 @@ impl Browser {
         let mut args = vec!["--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", &size];
         args.extend(flags);
         let options = json!({ "args": args });
-        let always = json!({ "browserName": "chrome", "timeouts": { "script": PATIENCE.as_millis() as u64 }, "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" } });
+        let timeouts = json!({ "script": PATIENCE.as_millis() as u64 });
+        let logs = json!({ "browser": "ALL" });
+        let always = json!({ "browserName": "chrome", "timeouts": timeouts, "goog:chromeOptions": options, "goog:loggingPrefs": logs });
         let mut browser = Self { driver, session: base, agent };
         let made = browser.post("", &json!({ "capabilities": { "alwaysMatch": always } }));
         browser.session = format!("{}/{}", browser.session, made["sessionId"].as_str().expect("a session"));

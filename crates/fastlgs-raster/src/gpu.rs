@@ -43,8 +43,6 @@ pub struct Gpu {
     pub name: String,
     /// How the blending kernels divide a tile: what was measured to be fastest ([`crate::tuning`]), else a guess.
     pub shape: Shape,
-    /// What its kind of adapter is mostly fastest with.
-    pub(crate) guess: Shape,
     /// Shapes that the adapter can run.
     pub shapes: Vec<Shape>,
     /// The adapter with its driver's version: what measurements hold for.
@@ -141,7 +139,6 @@ impl Gpu {
             queue,
             name: info.name,
             shape,
-            guess,
             shapes,
             identity,
             software,

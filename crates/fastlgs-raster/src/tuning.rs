@@ -75,9 +75,7 @@ fn tune_at(path: &Path, device: &str, again: bool) -> Result<Option<Tuning>> {
     }
     let gpu = Gpu::open(device)?;
     let key = key(&gpu.identity);
-    let known = table(path).remove(&key);
-    let present = known.as_ref().map_or(gpu.guess, |k| k.shape);
-    if let Some(known) = known.filter(|_| !again) {
+    if let Some(known) = table(path).remove(&key).filter(|_| !again) {
         return Ok(Some(known));
     }
     tracing::info!("measuring which kernels '{}' is fastest with; this is done once", gpu.name);
@@ -87,7 +85,7 @@ fn tune_at(path: &Path, device: &str, again: bool) -> Result<Option<Tuning>> {
         gpu.shape = shape;
         step_ms.insert(shape, measure(GpuEngine::new(gpu))?);
     }
-    let tuning = Tuning { shape: chosen(present, &step_ms), step_ms };
+    let tuning = Tuning { shape: chosen(gpu.shape, &step_ms), step_ms };
     tracing::debug!(?tuning, "measured");
     let mut table = table(path);
     table.insert(key, tuning.clone());

@@ -37,8 +37,8 @@ const NEUTRAL: f32 = 0.25;
 const MASK_WEIGHT: f32 = 0.1;
 /// Weight of a mask's attribute against the cosine of meanings, when a text names it.
 const WEIGHT: f32 = 0.25;
-/// What things of the named colour gain by it although they are something else. Without it three in ten of the absent "purple umbrella"s
-/// were found.
+/// What things of the named colour gain by it although they are something else. Without it more than a third of
+/// absent things with a colour ("purple umbrella") were found.
 const ADVANTAGE: f32 = 0.07;
 
 /// For each basic colour, whether a Lab colour is nearest to one of its focal colours.

@@ -297,17 +297,19 @@ fn absent_scores(args: &Args, scene: &Scene, grid: &Grid, views: &[LabelledView]
     if views.is_empty() {
         return Ok(Vec::new());
     }
-    texts
-        .iter()
-        .filter(|t| !t.trim().is_empty() && !named(t))
-        .map(|text| Ok((text.clone(), best_score(&query::rank(grid, &scene.text_query(text)?)))))
-        .collect()
+    texts.iter().filter(|t| !t.trim().is_empty() && !named(t)).map(|text| scored(scene, grid, text.clone())).collect()
 }
 
 /// The same for these texts with a colour before them.
 fn colored_absent_scores(absent: &[(String, f64)], scene: &Scene, grid: &Grid) -> Result<Vec<(String, f64)>> {
     let texts = absent.iter().flat_map(|(text, _)| COLORS.map(|color| format!("{color} {text}")));
-    texts.map(|text| scene.text_query(&text).map(|query| (text, best_score(&query::rank(grid, &query))))).collect()
+    texts.map(|text| scored(scene, grid, text)).collect()
+}
+
+/// A text with its best score.
+fn scored(scene: &Scene, grid: &Grid, text: String) -> Result<(String, f64)> {
+    let score = best_score(&query::rank(grid, &scene.text_query(&text)?));
+    Ok((text, score))
 }
 
 /// What decides whether a text is found: the best score of any object, which need not be the first-ranked one's.

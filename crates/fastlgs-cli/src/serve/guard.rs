@@ -18,7 +18,7 @@ use tokio::sync::Semaphore;
 const AT_ONCE: usize = 64;
 /// Largest body of a request, in bytes.
 pub const LARGEST_BODY: usize = 8 << 20;
-/// So much of a body is listened to before the connection is closed instead of answered.
+/// So much of a body is listened to; who sends more may not hear the answer.
 const PATIENCE: usize = 64 << 20;
 /// And so long.
 const PATIENT_FOR: Duration = Duration::from_secs(60);
