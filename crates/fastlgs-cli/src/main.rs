@@ -1,15 +1,13 @@
-//! The `fastlgs` binary: wiring of the stages, progress, logging and exit codes.
+//! The `fastlgs` binary: arguments, words, progress, and exit codes around the pipeline's library.
 
-mod again;
-mod cache;
 mod commands;
-mod eyes;
+mod console;
+mod outcome;
 mod report;
-mod scene;
-mod serve;
 mod ui;
 
 use clap::{CommandFactory, Parser, Subcommand};
+use outcome::Outcome;
 use std::process::ExitCode;
 
 /// Posed photos in, a 3-D scene that answers text out.
@@ -25,25 +23,32 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// Photos (with poses) -> masks, embeddings, key points and the object grid.
-    Preprocess(commands::preprocess::Args),
+    #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
+    Preprocess(fastlgs::preprocess::Config),
     /// Trains Gaussians: colour and semantic field together.
     Train(commands::train::Args),
     /// Makes scenes of several folders of photos.
     Batch(commands::batch::Args),
     /// Renders views: colour PNG, depth, feature and objects.
-    Render(commands::render::Args),
+    #[command(after_help = "Example: fastlgs render scenes/fox --view 0027.jpg --what color,depth,feature,objects -o pictures")]
+    Render(fastlgs::render::Config),
     /// Finds what a text names: mask, heat map, JSON.
     Query(commands::query::Args),
     /// Shows a scene in the browser, with an HTTP interface.
     Serve(commands::serve::Args),
     /// Measures accuracy on held-out views against labels.
-    Eval(commands::eval::Args),
+    #[command(after_help = "Example: fastlgs eval scenes/fox --labels photos/fox/labels --json -")]
+    Eval(fastlgs::eval::Config),
     /// Measures speed.
-    Bench(commands::bench::Args),
+    Bench(fastlgs_bench::Args),
     /// Writes a trained scene as PLY or SPZ, or as a small folder for queries.
-    Export(commands::export::Args),
+    #[command(
+        after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox\n          fastlgs export scenes/fox cameras.json"
+    )]
+    Export(fastlgs::export::Config),
     /// Makes a scene with exact poses, depths and masks.
-    Synth(commands::synth::Args),
+    #[command(after_help = "Example: fastlgs synth table -o photos/table --views 40 --size 320x240")]
+    Synth(fastlgs::synth::Config),
     /// Lists or installs encoders.
     Models(commands::models::Args),
     /// Shows the machine's devices, or what is in a scene.
@@ -54,54 +59,39 @@ enum Command {
     Man(commands::shell::Man),
 }
 
-/// How a command ended when it did not fail.
-pub enum Outcome {
-    /// Done.
-    Done,
-    /// A query that nothing in the scene matches.
-    NotFound,
-}
-
 fn main() -> ExitCode {
     // SAFETY: nothing else runs yet; no other thread can read the environment.
     // Mesa's device chooser talks to a desktop session and complains on stderr where there is none.
     unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     let cli = Cli::parse();
     ui::start_logging(&cli.common);
-    let common = cli.common;
-    let result = match cli.command {
-        Command::Preprocess(args) => commands::preprocess::run(&args, &common),
-        Command::Train(args) => commands::train::run(&args, &common),
-        Command::Batch(args) => commands::batch::run(&args, &common),
-        Command::Render(args) => commands::render::run(&args, &common),
-        Command::Query(args) => commands::query::run(&args, &common),
-        Command::Serve(args) => commands::serve::run(&args, &common),
-        Command::Eval(args) => commands::eval::run(&args, &common),
-        Command::Bench(args) => commands::bench::run(&args, &common),
-        Command::Export(args) => commands::export::run(&args, &common),
-        Command::Synth(args) => commands::synth::run(&args, &common),
-        Command::Models(args) => commands::models::run(&args, &common),
-        Command::Info(args) => commands::info::run(&args, &common),
-        Command::Completions(args) => commands::shell::completions(&args, Cli::command()),
-        Command::Man(args) => commands::shell::man(&args, Cli::command()),
-    };
-    match result {
+    match run(cli.command, &cli.common) {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::NotFound) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {}", one_sentence(&error));
+            eprintln!("error: {}", fastlgs::one_sentence(error.as_ref()));
             ExitCode::from(1)
         }
     }
 }
 
-/// The chain of causes in one line; a cause that its parent already quotes is not repeated.
-fn one_sentence(error: &anyhow::Error) -> String {
-    let mut text = error.to_string();
-    for cause in error.chain().skip(1).map(ToString::to_string) {
-        if !text.contains(&cause) {
-            text = format!("{text}: {cause}");
-        }
+fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
+    let console = console::Console::new(common);
+    let run = &common.run(&console);
+    match command {
+        Command::Preprocess(config) => report::give(common, &fastlgs::preprocess(&config, run)?),
+        Command::Train(args) => commands::train::run(&args, common, &console),
+        Command::Batch(args) => commands::batch::run(&args, common, run),
+        Command::Render(config) => report::give(common, &fastlgs::render(&config, run)?),
+        Command::Query(args) => commands::query::run(&args, common, run),
+        Command::Serve(args) => commands::serve::run(&args, common),
+        Command::Eval(config) => report::give(common, &fastlgs::eval(&config, run)?),
+        Command::Bench(args) => report::give(common, &fastlgs_bench::run(&args, run)?),
+        Command::Export(config) => report::give(common, &fastlgs::export(&config, run)?),
+        Command::Synth(config) => report::give(common, &fastlgs::synth(&config, run)?),
+        Command::Models(args) => commands::models::run(&args, common, run),
+        Command::Info(args) => commands::info::run(&args, common),
+        Command::Completions(args) => commands::shell::completions(&args, Cli::command()),
+        Command::Man(args) => commands::shell::man(&args, Cli::command()),
     }
-    text
 }

@@ -1,19 +1,22 @@
 //! Reports: a table for people, JSON for programs.
 
+use crate::outcome::Outcome;
 use crate::ui::Common;
 use anyhow::{Context, Result};
+use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
 
-/// Writes `value` where `--json` says, else as `name value` lines to standard output.
-pub fn give(common: &Common, value: &Value) -> Result<()> {
+/// Writes a report where `--json` says, else as `name value` lines to standard output.
+pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
+    let value = &serde_json::to_value(report)?;
     match common.json.as_deref() {
         Some(path) if path == Path::new("-") => println!("{}", serde_json::to_string_pretty(value)?),
         Some(path) => fastlgs_core::fs::write_json(path, value).context("writing the report")?,
         None if common.quiet => {}
         None => print_table(value, 0),
     }
-    Ok(())
+    Ok(Outcome::Done)
 }
 
 fn print_table(value: &Value, indent: usize) {

@@ -1,7 +1,7 @@
-//! Options that every command has, progress bars, and logging.
+//! Options that every command has, and logging.
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use std::io::IsTerminal;
+use fastlgs::Run;
+use fastlgs::progress::Sink;
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
 
@@ -25,6 +25,13 @@ pub struct Common {
     pub device: String,
 }
 
+impl Common {
+    /// A run of a stage that `progress` watches.
+    pub fn run<'a>(&'a self, progress: &'a dyn Sink) -> Run<'a> {
+        Run { device: &self.device, seed: self.seed, progress }
+    }
+}
+
 /// Logs go to stderr; `FASTLGS_LOG` overrides the flags.
 pub fn start_logging(common: &Common) {
     let level = match (common.quiet, common.verbose) {
@@ -36,16 +43,4 @@ pub fn start_logging(common: &Common) {
     let level = if common.verbose == 0 { format!("{level},wgpu_hal=error,ort=error") } else { level.to_owned() };
     let filter = EnvFilter::try_from_env("FASTLGS_LOG").unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).without_time().init();
-}
-
-/// A bar on a terminal; nothing elsewhere or with `--quiet`.
-pub fn bar(common: &Common, length: u64, what: &str) -> ProgressBar {
-    let bar = ProgressBar::new(length).with_message(what.to_owned());
-    if common.quiet || !std::io::stderr().is_terminal() {
-        bar.set_draw_target(ProgressDrawTarget::hidden());
-    }
-    bar.set_style(
-        ProgressStyle::with_template("{msg:32!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})").expect("a fixed template"),
-    );
-    bar
 }

@@ -16,7 +16,9 @@ pub fn write(path: &Path, width: usize, height: usize, channels: &[(&str, &[f32]
     let layer = Layer::new((width, height), LayerAttributes::named("fastlgs"), Encoding::FAST_LOSSLESS, AnyChannels::sort(list.into()));
     let mut data = Vec::new();
     let image = Image::from_layer(layer);
-    image.write().to_buffered(std::io::Cursor::new(&mut data)).map_err(|e| Error::format(path, format!("cannot encode EXR: {e}")))?;
+    // In parallel, blocks land in the file in the order in which threads finish.
+    let write = image.write().non_parallel().to_buffered(std::io::Cursor::new(&mut data));
+    write.map_err(|e| Error::format(path, format!("cannot encode EXR: {e}")))?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 

@@ -5,7 +5,7 @@ use crate::grid::{Grid, Object};
 use crate::relevancy::TextQuery;
 use fastlgs_core::{LabelMap, Shares};
 use glam::Vec3;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// How objects are chosen.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +34,7 @@ impl Default for QueryConfig {
 }
 
 /// An object with its score.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Hit {
     /// Object id.
     pub id: u16,

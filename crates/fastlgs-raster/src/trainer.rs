@@ -315,8 +315,12 @@ impl Trainer {
     /// Runs to the end. `report` is called every 20 steps; `checkpoint`, where given, is written every 500 steps.
     ///
     /// # Errors
-    /// When the device fails, the scene degenerates, or a checkpoint cannot be written.
-    pub fn run(&mut self, checkpoint: Option<&Path>, mut report: impl FnMut(&Progress, &mut Self) -> Result<()>) -> Result<TrainReport> {
+    /// When the device fails, the scene degenerates, or a checkpoint cannot be written; and whatever `report` returns, which ends the run.
+    pub fn run<E: From<Error>>(
+        &mut self,
+        checkpoint: Option<&Path>,
+        mut report: impl FnMut(&Progress, &mut Self) -> Result<(), E>,
+    ) -> Result<TrainReport, E> {
         let first = self.course.iteration;
         let mut started = Instant::now();
         // Time of what `report` does is not the run's.

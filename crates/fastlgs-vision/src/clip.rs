@@ -202,7 +202,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
         toy_models::clip(&image, &text, 32);
-        if let Err(e) = crate::models::runtime_library() {
+        if let Err(e) = crate::places::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
             eprintln!("SKIPPED: {e}");
             return;
@@ -242,7 +242,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (image, text) = (dir.path().join("image.onnx"), dir.path().join("text.onnx"));
         toy_models::clip(&image, &text, 32);
-        if crate::models::runtime_library().is_err() {
+        if crate::places::runtime_library().is_err() {
             return;
         }
         assert!(ClipImage::load(&text).err().unwrap().to_string().contains("text.onnx"));

@@ -1,6 +1,6 @@
 //! CLIP's byte-pair tokenizer: from the `tokenizer.json` beside a model, else from the merges that OpenAI published.
 
-use crate::{Error, Result, models};
+use crate::{Error, Result, places};
 use fastlgs_core::fs;
 use flate2::read::GzDecoder;
 use serde_json::json;
@@ -34,7 +34,7 @@ impl ClipTokens {
         let folders = model.ancestors().skip(1).take(2);
         match folders.map(|f| f.join("tokenizer.json")).find(|f| f.is_file()) {
             Some(path) => Self::new(Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?, &path),
-            None => Self::published(&models::offline_dir().join(models::CLIP_MERGES)),
+            None => Self::published(&places::offline_dir().join(places::CLIP_MERGES)),
         }
     }
 
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     fn tokens() -> Option<ClipTokens> {
-        match ClipTokens::published(&models::offline_dir().join(models::CLIP_MERGES)) {
+        match ClipTokens::published(&places::offline_dir().join(places::CLIP_MERGES)) {
             Ok(tokens) => Some(tokens),
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
             Err(e) => {

@@ -6,7 +6,7 @@ use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, normalise};
 use crate::exposure;
 use crate::runtime::{Array, Model};
-use crate::{Result, models, names};
+use crate::{Result, names, places};
 use fastlgs_core::LabelMap;
 use fastlgs_core::rng::Rng;
 use image::RgbImage;
@@ -50,7 +50,7 @@ impl Conse {
     /// # Errors
     /// When they are not installed.
     pub fn load() -> Result<Self> {
-        let folder = models::offline_dir();
+        let folder = places::offline_dir();
         let classifier = Model::load(&folder.join("classifier.onnx"))?;
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");

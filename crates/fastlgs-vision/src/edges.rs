@@ -1,7 +1,7 @@
 //! Learned edges: HED (Xie & Tu 2015).
 
 use crate::runtime::{Array, Model};
-use crate::{Result, models};
+use crate::{Result, places};
 use image::RgbImage;
 
 /// Mean of the training pictures, BGR.
@@ -16,7 +16,7 @@ impl Hed {
     /// # Errors
     /// When it is not installed.
     pub fn load() -> Result<Self> {
-        Ok(Self(Model::load(&models::offline_dir().join("edges.onnx"))?))
+        Ok(Self(Model::load(&places::offline_dir().join("edges.onnx"))?))
     }
 
     /// Edge probability of each pixel, row-major.

@@ -18,6 +18,7 @@ pub mod masks;
 pub mod models;
 pub mod names;
 pub mod photo_quality;
+pub mod places;
 pub mod pose_check;
 pub mod pull;
 pub mod regions;

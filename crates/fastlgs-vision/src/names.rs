@@ -1,23 +1,22 @@
 //! What the classifier's 1,000 things are called, as MiniLM understands it: embedded once and kept beside the models.
 
 use crate::encoder::{TextEncoder, normalise};
-use crate::{MiniLm, Result, models};
+use crate::places::{NAMES, offline_dir};
+use crate::{MiniLm, Result};
 use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 
 /// Names of a class that describe it: the later ones are rarer, at last Latin.
 const SYNONYMS: usize = 3;
-/// What was computed once, beside the models.
-pub(crate) const FILE: &str = "names.safetensors";
 
 /// Embeddings of the class names `[1000][384]`, L2-normalised.
 ///
 /// # Errors
 /// When the offline models are not installed.
 pub fn embeddings() -> Result<Vec<Vec<f32>>> {
-    let folder = models::offline_dir();
+    let folder = offline_dir();
     let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
-    let path = folder.join(FILE);
+    let path = folder.join(NAMES);
     let known = load_tensors(&path).ok().and_then(|mut t| t.remove("names"));
     if let Some((shape, values)) = known.filter(|(shape, _)| shape.len() == 2 && shape[0] == lists.len() && shape[1] > 0) {
         return Ok(values.chunks_exact(shape[1]).map(<[f32]>::to_vec).collect());

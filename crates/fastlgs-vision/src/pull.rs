@@ -3,7 +3,7 @@
 //! What a file must be comes from the host itself: large files of a model repository lie behind pointers (Git LFS) that
 //! name their length and SHA-256. What was pulled is recorded in `pulled.json`, and a later pull must give the same.
 
-use crate::models::digest;
+use crate::places::digest;
 use crate::{Error, Result};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_core::{Error as CoreError, fs};

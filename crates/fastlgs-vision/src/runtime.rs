@@ -1,6 +1,6 @@
 //! ONNX Runtime, loaded at run time from a shared library, or linked in (`--features download-ort`).
 
-use crate::{Error, Result, models};
+use crate::{Error, Result, places};
 use ort::environment::Environment;
 use ort::session::Session;
 use ort::value::{DynValue, Tensor, TensorElementType, ValueType};
@@ -15,7 +15,7 @@ fn environment() -> Result<Environment> {
     if let Some(environment) = slot.as_ref() {
         return Ok(environment.clone());
     }
-    let library = models::runtime_library()?;
+    let library = places::runtime_library()?;
     let failed = |e: &dyn std::fmt::Display| Error::Missing(format!("{}: ONNX Runtime cannot be loaded: {e}", library.display()));
     #[cfg(feature = "load-ort")]
     let builder = ort::init_from(&library).map_err(|e| failed(&e))?;

@@ -385,7 +385,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (encoder, decoder) = (dir.path().join("encoder.onnx"), dir.path().join("decoder.onnx"));
         toy_models::sam(export, &encoder, &decoder);
-        if let Err(e) = crate::models::runtime_library() {
+        if let Err(e) = crate::places::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
             eprintln!("SKIPPED: {e}");
             return None;

@@ -3,7 +3,7 @@
 use crate::attributes;
 use crate::encoder::TextEncoder;
 use crate::runtime::{Array, Model};
-use crate::{Error, Result, models};
+use crate::{Error, Result, places};
 use tokenizers::Tokenizer;
 
 /// Longest text in tokens.
@@ -21,7 +21,7 @@ impl MiniLm {
     /// # Errors
     /// When it is not installed.
     pub fn load() -> Result<Self> {
-        let folder = models::offline_dir();
+        let folder = places::offline_dir();
         let model = Model::load(&folder.join("text.onnx"))?;
         let path = folder.join("tokenizer.json");
         let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;

@@ -1,10 +1,14 @@
 //! `fastlgs batch`: several folders of photos to trained scenes, in one call.
 
-use crate::{Outcome, again, report, ui};
-use anyhow::{Context, Result, bail};
+use crate::outcome::Outcome;
+use crate::{report, ui};
+use anyhow::{Context, Result, anyhow, bail};
+use clap::Parser;
+use fastlgs::{Run, preprocess, train};
 use fastlgs_core::SceneFolder;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -29,7 +33,7 @@ pub struct Args {
 /// Note of the manifest: what a scene was made with.
 const NOTE: &str = "batch";
 
-pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let mut names: BTreeMap<String, &Path> = BTreeMap::new();
     for photos in &args.photos {
         let own = photos.canonicalize().with_context(|| format!("{}: this folder of photos cannot be opened", photos.display()))?;
@@ -38,31 +42,32 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             bail!("{} and {} would both become the scene '{name}'; call one of them otherwise", other.display(), photos.display());
         }
     }
-    let bar = ui::bar(common, names.len() as u64, "scenes");
+    let work = run.work("scenes", names.len() as u64);
     let mut rows = Vec::new();
     for (name, photos) in &names {
-        bar.set_message(name.clone());
+        work.note(name);
         let scene = args.output.join(name);
         let mut row = json!({ "photos": photos, "scene": scene });
-        match make(args, photos, &scene, common) {
+        match make(args, photos, &scene, run) {
             Ok((state, train)) => {
                 row["state"] = json!(state);
-                for key in ["objects", "gaussians", "psnr_held_out", "seconds"] {
-                    row[key] = train[key].clone();
-                }
+                row["objects"] = json!(train.objects);
+                row["gaussians"] = json!(train.gaussians);
+                row["psnr_held_out"] = json!(train.psnr_held_out);
+                row["seconds"] = json!(train.seconds);
             }
             Err(error) => {
                 row["state"] = json!("failed");
-                row["error"] = json!(crate::one_sentence(&error));
+                row["error"] = json!(fastlgs::one_sentence(error.as_ref()));
             }
         }
         if common.json.is_none() && !common.quiet {
-            bar.suspend(|| println!("{}", line(&row)));
+            println!("{}", line(&row));
         }
         rows.push(row);
-        bar.inc(1);
+        work.advance()?;
     }
-    bar.finish_and_clear();
+    drop(work);
     let failed = rows.iter().filter(|r| r["state"] == "failed").count();
     if common.json.is_some() {
         report::give(common, &json!({ "scenes": rows, "failed": failed }))?;
@@ -83,30 +88,55 @@ fn line(row: &Value) -> String {
     }
 }
 
+/// Options of one step, as they are typed for the whole batch.
+#[derive(Parser)]
+#[command(no_binary_name = true)]
+struct Options<C: clap::Args> {
+    #[command(flatten)]
+    config: C,
+    #[command(flatten)]
+    common: ui::Common,
+}
+
+impl<C: clap::Args> Options<C> {
+    /// Parses `first`, which the batch gives, and the user's own options.
+    fn parse(command: &str, first: &[&Path], own: &str, run: &Run) -> Result<Self> {
+        let (seed, device) = (run.seed.to_string(), run.device);
+        let shared = ["--seed", &seed, "--device", device].map(OsString::from);
+        let words = shared.into_iter().chain(first.iter().map(|p| p.into())).chain(own.split_whitespace().map(OsString::from));
+        Self::try_parse_from(words).map_err(|error| {
+            let said = error.to_string();
+            let line = said.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned();
+            anyhow!("--{command} \"{own}\": {line}")
+        })
+    }
+
+    fn run<'a>(&'a self, run: &Run<'a>) -> Run<'a> {
+        Run { device: &self.common.device, seed: self.common.seed, progress: run.progress }
+    }
+}
+
 /// Makes a scene unless it is there; whether it was made or kept, and the report of its training.
-fn make(args: &Args, photos: &Path, scene: &Path, common: &ui::Common) -> Result<(&'static str, Value)> {
+fn make(args: &Args, photos: &Path, scene: &Path, run: &Run) -> Result<(&'static str, train::Report)> {
     let photos = photos.canonicalize()?;
-    let with = json!([env!("CARGO_PKG_VERSION"), photos, args.preprocess, args.train, common.seed]);
+    let with = json!([env!("CARGO_PKG_VERSION"), photos, args.preprocess, args.train, run.seed]);
     let folder = SceneFolder::new(scene);
     let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(NOTE) == Some(&with));
-    if let Some(train) = known.as_ref().and_then(|manifest| manifest.notes.get("train")) {
-        return Ok(("kept", train.clone()));
+    if let Some(train) = known.as_ref().and_then(train::Report::of) {
+        return Ok(("kept", train));
     }
-    let text = |path: &Path| path.to_str().map(str::to_owned).with_context(|| format!("{}: its name is not UTF-8", path.display()));
-    let (photos, place) = (text(&photos)?, text(scene)?);
-    let call = |command: &str, first: &[&str], own: &str| {
-        let all: Vec<&str> = first.iter().copied().chain(own.split_whitespace()).collect();
-        again::call(common, common.seed, command, &all)
-    };
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
     let begun = known.is_some() && folder.root.join("checkpoints/train").exists();
-    if !begun {
-        call("preprocess", &[&photos, "-o", &place], &args.preprocess)?;
+    let mut training: Options<train::Config> = Options::parse("train", &[scene], &args.train, run)?;
+    if begun {
+        training.config.resume = true;
+    } else {
+        let options: Options<preprocess::Config> = Options::parse("preprocess", &[&photos, Path::new("-o"), scene], &args.preprocess, run)?;
+        fastlgs::preprocess(&options.config, &options.run(run))?;
         let mut manifest = folder.manifest()?;
         manifest.notes.insert(NOTE.to_owned(), with);
         folder.save_manifest(&manifest)?;
     }
-    let first: &[&str] = if begun { &[&place, "--resume"] } else { &[&place] };
-    let train = call("train", first, &args.train)?;
-    Ok(("made", train))
+    let report = fastlgs::train(&training.config, &training.run(run))?;
+    Ok(("made", report))
 }

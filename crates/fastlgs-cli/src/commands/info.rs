@@ -1,6 +1,7 @@
 //! `fastlgs info`: devices, or what is in a scene.
 
-use crate::{Outcome, report, ui};
+use crate::outcome::Outcome;
+use crate::{report, ui};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
 use std::path::PathBuf;
@@ -38,6 +39,5 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             })
         }
     };
-    report::give(common, &value)?;
-    Ok(Outcome::Done)
+    report::give(common, &value)
 }

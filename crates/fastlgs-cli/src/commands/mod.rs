@@ -1,16 +1,11 @@
-//! One module a command.
+//! One module a command that does more than call the pipeline.
 
 pub mod batch;
-pub mod bench;
-pub mod eval;
-pub mod export;
+mod bind;
 pub mod info;
+mod library;
 pub mod models;
-mod objects;
-pub mod preprocess;
 pub mod query;
-pub mod render;
 pub mod serve;
 pub mod shell;
-pub mod synth;
 pub mod train;

@@ -1,10 +1,12 @@
 //! `fastlgs models`: encoders and segmenters, and where they come from.
 
-use crate::{Outcome, report, ui};
+use crate::outcome::Outcome;
+use crate::{report, ui};
 use anyhow::Result;
+use fastlgs::Run;
 use fastlgs_core::scene_folder::ModelFile;
-use fastlgs_vision::models;
 use fastlgs_vision::pull::{self, HOST, NAMED, Named};
+use fastlgs_vision::{models, places};
 use std::collections::BTreeMap;
 
 #[derive(clap::Args)]
@@ -30,7 +32,7 @@ enum Action {
     },
 }
 
-pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
+pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     match &args.action {
         Action::List => {}
         Action::InstallOffline => models::install_offline(|line| {
@@ -40,20 +42,16 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         })?,
         Action::Pull { name, base_url } => {
             let model = Named::find(name)?;
-            let bar = ui::bar(common, 0, "bytes");
-            let pulled = pull::pull(&model, base_url, &model.folder(), |file, done, total| {
-                bar.set_message(file.to_owned());
-                bar.set_length(total.unwrap_or(done));
-                bar.set_position(done);
-            })?;
-            bar.finish_and_clear();
-            report::give(common, &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }))?;
-            return Ok(Outcome::Done);
+            let work = run.work("download", 0);
+            let tell = |file: &str, done: u64, total: Option<u64>| work.set(done, total.unwrap_or(done), file);
+            let pulled = pull::pull(&model, base_url, &model.folder(), tell)?;
+            drop(work);
+            return report::give(common, &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }));
         }
     }
     let mut files = Vec::new();
     for file in models::OFFLINE_FILES {
-        let found = models::digest(&models::offline_dir().join(file)).ok();
+        let found = places::digest(&places::offline_dir().join(file)).ok();
         files.push(serde_json::json!({ "file": file, "bytes": found.as_ref().map(|f| f.0), "sha256": found.map(|f| f.1) }));
     }
     let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
@@ -62,13 +60,12 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files })
     });
     let value = serde_json::json!({
-        "folder": models::offline_dir(),
+        "folder": places::offline_dir(),
         "installed": models::offline_installed(),
-        "runtime": models::runtime_library().ok(),
+        "runtime": places::runtime_library().ok(),
         "packages": packages,
         "files": files,
         "can_be_pulled": named,
     });
-    report::give(common, &value)?;
-    Ok(Outcome::Done)
+    report::give(common, &value)
 }

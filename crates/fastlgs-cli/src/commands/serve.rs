@@ -1,15 +1,14 @@
 //! `fastlgs serve`: a page in the browser where a scene is looked at and asked.
 
-use crate::serve::Server;
-use crate::{Outcome, ui};
+use super::bind::{DEFAULT_BIND, parse_bind};
+use crate::outcome::Outcome;
+use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs_core::SceneFolder;
+use fastlgs_serve::Server;
 use std::io::Write;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::path::PathBuf;
-
-/// Where the page is unless `--bind` says otherwise.
-pub const DEFAULT_BIND: &str = "127.0.0.1:8742";
 
 #[derive(clap::Args)]
 #[command(
@@ -42,19 +41,11 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 }
 
 /// Tells where the page is, at once: who starts the server reads this line.
-pub fn announce(server: &Server, common: &ui::Common) -> Result<()> {
+fn announce(server: &Server, common: &ui::Common) -> Result<()> {
     if common.json.is_some() {
-        crate::report::give(common, &serde_json::json!({ "url": server.url }))?;
+        report::give(common, &serde_json::json!({ "url": server.url }))?;
     } else {
         println!("open {} in a browser", server.url);
     }
     Ok(std::io::stdout().flush()?)
-}
-
-/// Parses `0.0.0.0:8000`, `::1`, or `8000`.
-pub fn parse_bind(text: &str) -> Result<SocketAddr, String> {
-    let own: SocketAddr = DEFAULT_BIND.parse().expect("a fixed address");
-    let by_port = || text.parse::<u16>().ok().map(|port| SocketAddr::new(own.ip(), port));
-    let by_ip = || text.parse::<IpAddr>().ok().map(|ip| SocketAddr::new(ip, own.port()));
-    text.parse().ok().or_else(by_port).or_else(by_ip).ok_or_else(|| format!("'{text}' is not an address like 127.0.0.1:8742"))
 }

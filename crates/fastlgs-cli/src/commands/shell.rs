@@ -1,6 +1,6 @@
 //! `fastlgs completions` and `fastlgs man`: what packages install beside the binary.
 
-use crate::Outcome;
+use crate::outcome::Outcome;
 use anyhow::{Context, Result};
 use clap_complete::Shell;
 use std::path::PathBuf;

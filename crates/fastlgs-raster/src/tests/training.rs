@@ -19,7 +19,7 @@ fn trainer(engine: Box<dyn Engine>, config: TrainConfig) -> Trainer {
 
 fn run(config: TrainConfig) -> (Trainer, TrainReport) {
     let mut trainer = trainer(Box::new(CpuEngine::new()), config);
-    let report = trainer.run(None, |_, _| Ok(())).unwrap();
+    let report = trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     (trainer, report)
 }
 
@@ -45,13 +45,13 @@ fn resumes_to_the_same_bytes() {
         };
         let checkpoint = dir.path().join("train");
         let mut whole = start();
-        whole.run(Some(&checkpoint), |_, _| Ok(())).unwrap();
+        whole.run(Some(&checkpoint), |_, _| Ok::<_, crate::Error>(())).unwrap();
         let mut again = start();
-        again.run(None, |_, _| Ok(())).unwrap();
+        again.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
         assert_eq!(bytes(&whole, "a.ply"), bytes(&again, "b.ply"), "{strategy:?}: twice in a row");
         let mut resumed = start();
         assert!(resumed.resume(&checkpoint).unwrap(), "a checkpoint was left at step 500");
-        let report = resumed.run(None, |_, _| Ok(())).unwrap();
+        let report = resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
         assert_eq!(report.steps_here, 100);
         assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "{strategy:?}: resumed");
         assert_eq!(whole.exposures(), resumed.exposures());
@@ -90,7 +90,7 @@ fn exposure_and_background_are_learned() {
     let config = TrainConfig { iterations: 600, exposure: true, learn_background: true, background: [0.5; 3], ..TrainConfig::default() };
     let config = TrainConfig { refine_until: 0.0, ..config };
     let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &scene, targets, config).unwrap();
-    let report = trainer.run(None, |_, _| Ok(())).unwrap();
+    let report = trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     let seen = |k: usize| trainer.exposures()[k].gain[0] * report.background[0] + trainer.exposures()[k].offset[0];
     assert!((seen(0) - 100.0 / 255.0).abs() < 0.01 && (seen(1) - 110.0 / 255.0).abs() < 0.01, "{} {}", seen(0), seen(1));
 }

@@ -1,0 +1,365 @@
+//! `fastlgs bench baseline`: other ways to a field of language, on the same Gaussians, masks and embeddings.
+//!
+//! Each gives every Gaussian a vector by the views' votes, renders the vectors three numbers at a time, and decides pixel by pixel.
+
+use crate::autoencoder::Autoencoder;
+use anyhow::{Context, Result, bail};
+use fastlgs::session::covered;
+use fastlgs::{Run, Session, eval, eyes};
+use fastlgs_core::labels::{self, LabelledView};
+use fastlgs_core::rng::Rng;
+use fastlgs_core::shares::{Shares, pack, unpack};
+use fastlgs_core::{Camera, LabelMap, metrics};
+use fastlgs_grid::query::{self, Field, QueryConfig};
+use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_grid::{Grid, codes};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, View, lift};
+use fastlgs_vision::{Encoder, Level};
+use glam::Vec3;
+use ndarray::{Array2, Axis};
+use serde_json::{Value, json};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench baseline scenes/fox --method raw --device cpu")]
+pub struct Args {
+    /// Trained scene whose photos have labels/ beside them.
+    scene: PathBuf,
+    /// `raw`: the mean embedding of the masks that each Gaussian is seen in, without a grid (the paper's ablation). `lerf`: embeddings of
+    /// tiles at three scales, the most relevant scale of each pixel. `langsplat`: embeddings of whole and part masks through a
+    /// scene-wise autoencoder with three numbers. `code1` to `code4`: the grid with codes of this dimension, decided by the nearest one; `separated`:
+    /// with codes of three numbers of which no blend of two neighbours comes near a third.
+    #[arg(long, value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4", "separated"])]
+    method: String,
+}
+
+/// What vectors of all Gaussians may take.
+const MOST_BYTES: usize = 4 << 30;
+
+/// Sides of LERF's tiles, as shares of the photo's shorter side.
+const TILES: [f32; 3] = [0.5, 0.25, 0.125];
+
+/// One vector a Gaussian, row by row.
+type Vectors = Array2<f32>;
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let mut scene = Session::open(&args.scene, run.device)?;
+    let grid = scene.grid()?;
+    let views = labels::load(&Path::new(&scene.manifest.photos).join("labels"), None)?;
+    let started = Instant::now();
+    let field = match args.method.as_str() {
+        "raw" => PerPixel::raw(&scene)?,
+        "lerf" => PerPixel::lerf(&scene, run)?,
+        "langsplat" => PerPixel::langsplat(&scene, run)?,
+        "separated" => PerPixel::of_codes(&scene, separated(&scene, &grid, run.seed)?),
+        code => PerPixel::of_codes(&scene, lattice(grid.objects.len(), code[4..].parse().context("a dimension")?, run.seed)),
+    };
+    let seconds = started.elapsed().as_secs_f64();
+    let bytes: usize = field.layers.iter().map(|v| 4 * v.len()).sum();
+    let (mut oracle, mut text, mut localised, mut milliseconds, mut wrong) = (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for view in &views {
+        let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
+        let started = Instant::now();
+        let pictures = field.layers.iter().map(|v| rendered(&mut scene, &camera, v)).collect::<Result<Vec<_>>>()?;
+        milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
+        wrong.extend(field.wrong(&mut scene, &grid, &camera, &pictures[0])?);
+        for score in field.score(&scene, &grid, view, &camera, pictures)? {
+            oracle.push(score[0]);
+            text.push(score[1]);
+            localised.push(score[2]);
+        }
+    }
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+    let camera = &scene.cameras[0];
+    let value = json!({
+        "scene": args.scene,
+        "method": args.method,
+        "oracle_miou": mean(&oracle),
+        "miou": mean(&text),
+        "loc_acc": mean(&localised),
+        "wrong_pixels": (!wrong.is_empty()).then(|| mean(&wrong)),
+        "labels_scored": oracle.len(),
+        "seconds": seconds,
+        "render_ms": mean(&milliseconds),
+        "field_bytes": bytes,
+        "gaussians": scene.gaussians.len(),
+        "objects": grid.objects.len(),
+        "size": format!("{}x{}", camera.width, camera.height),
+        "adapter": scene.engine.name(),
+    });
+    Ok(value)
+}
+
+/// How rendered vectors answer a text.
+enum Meaning {
+    /// Each is an embedding.
+    Embedding,
+    /// Each is an autoencoder's code of one.
+    Encoded(Autoencoder),
+    /// Each is an object's code.
+    Object(Vectors),
+}
+
+/// A field that is decided pixel by pixel.
+struct PerPixel {
+    /// One for each scale or level.
+    layers: Vec<Vectors>,
+    meaning: Meaning,
+}
+
+impl PerPixel {
+    fn raw(scene: &Session) -> Result<Self> {
+        let (masks, _) = fastlgs_grid::evidence::load(&scene.folder)?;
+        let lifted = lifted(scene, |view, camera| {
+            let map = LabelMap::load(&scene.folder.masks_path(Level::Whole.name(), &camera.name))?;
+            let own = masks.iter().filter(|m| m.view == view);
+            Ok((map, own.map(|m| (m.label, m.embedding.clone())).collect()))
+        })?;
+        Ok(Self { layers: vec![lifted], meaning: Meaning::Embedding })
+    }
+
+    fn lerf(scene: &Session, run: &Run) -> Result<Self> {
+        let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
+        let progress = run.work("tiles", (TILES.len() * scene.manifest.training(&scene.cameras).len()) as u64);
+        let of_scale = |share: &f32| {
+            lifted(scene, |_, camera| {
+                let side = ((share * camera.width.min(camera.height) as f32) as u32).max(8);
+                let columns = camera.width.div_ceil(side);
+                let labels =
+                    (0..camera.width * camera.height).map(|p| (p / camera.width / side * columns + p % camera.width / side + 1) as u16);
+                let map = LabelMap { width: camera.width, height: camera.height, labels: labels.collect() };
+                progress.advance()?;
+                embedded(scene, encoder.as_ref(), camera, map)
+            })
+        };
+        let layers = TILES.iter().map(of_scale).collect::<Result<_>>()?;
+        Ok(Self { layers, meaning: Meaning::Embedding })
+    }
+
+    fn langsplat(scene: &Session, run: &Run) -> Result<Self> {
+        let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
+        let training = scene.manifest.training(&scene.cameras);
+        let progress = run.work("embeddings", 2 * training.len() as u64);
+        let mut levels: [Vec<Labelled>; 2] = Default::default();
+        for (level, found) in [Level::Whole, Level::Part].into_iter().zip(&mut levels) {
+            for camera in &training {
+                let path = scene.folder.masks_path(level.name(), &camera.name);
+                // Scenes of one level have no parts.
+                let path = if path.is_file() { path } else { scene.folder.masks_path(Level::Whole.name(), &camera.name) };
+                found.push(embedded(scene, encoder.as_ref(), camera, LabelMap::load(&path)?)?);
+                progress.advance()?;
+            }
+        }
+        let all: Vec<&Vec<f32>> = levels.iter().flatten().flat_map(|l| &l.1).map(|e| &e.1).collect();
+        let coder = Autoencoder::learn(&rows(&all)?, run.seed);
+        let layers = levels.iter().map(|views| {
+            lifted(scene, |view, _| {
+                let (map, embeddings) = &views[view];
+                let encoded = coder.encode(rows(&embeddings.iter().map(|e| &e.1).collect::<Vec<_>>())?);
+                Ok((map.clone(), embeddings.iter().zip(encoded.rows()).map(|(e, code)| (e.0, code.to_vec())).collect()))
+            })
+        });
+        Ok(Self { layers: layers.collect::<Result<_>>()?, meaning: Meaning::Encoded(coder) })
+    }
+
+    /// Each Gaussian has its object's code; those of none the origin, which is no code.
+    fn of_codes(scene: &Session, codes: Vectors) -> Self {
+        let own = |g: usize, axis: usize| match scene.gaussians.object_ids[g] {
+            0 => 0.0,
+            id => codes[[usize::from(id) - 1, axis]],
+        };
+        let layer = Vectors::from_shape_fn((scene.gaussians.len(), codes.ncols()), |(g, axis)| own(g, axis));
+        Self { layers: vec![layer], meaning: Meaning::Object(codes) }
+    }
+
+    /// Share of the pixels of a view whose code is that of an object which is not there: neither among the ids that were blended, nor
+    /// around one of them. A blend of two codes can come near a third.
+    fn wrong(&self, scene: &mut Session, grid: &Grid, camera: &Camera, picture: &Vectors) -> Result<Option<f64>> {
+        let (Meaning::Object(codes), Field::Shares(shares)) = (&self.meaning, scene.field(camera, None)?) else { return Ok(None) };
+        let there = |ids: &[u32; 4], id: u16| ids.iter().any(|s| grid.chain(unpack(*s).0).any(|a| a == id));
+        let decided = picture.rows().into_iter().map(|p| nearest(&p.to_vec(), codes));
+        let wrong = decided.zip(&shares.pixels).filter(|(id, ids)| *id > 0 && !there(ids, *id)).count();
+        Ok(Some(wrong as f64 / shares.pixels.len() as f64))
+    }
+
+    /// Oracle IoU, IoU of the text's mask, and whether the peak is right, of each label.
+    fn score(&self, scene: &Session, grid: &Grid, view: &LabelledView, camera: &Camera, pictures: Vec<Vectors>) -> Result<Vec<[f64; 3]>> {
+        let (w, h) = (camera.width, camera.height);
+        let config = QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() };
+        let localised =
+            |relevancy: &[f32], label: &labels::Label| f64::from(u8::from(metrics::localised(relevancy, w, h, &view.boxes(label, w, h))));
+        if let Meaning::Object(codes) = &self.meaning {
+            let pixels = pictures[0].rows().into_iter().map(|p| [pack(nearest(&p.to_vec(), codes), 1.0), 0, 0, 0]).collect();
+            let field = Field::Shares(Shares { width: w, height: h, pixels });
+            let score = |label: &labels::Label| -> Result<[f64; 3]> {
+                let truth = view.mask(label, w, h);
+                let ranked = query::rank(grid, &scene.text_query(&label.category)?);
+                let mask = field.mask(grid, &query::select(grid, &ranked, &config));
+                Ok([
+                    eval::best_object(grid, &field, &truth).0,
+                    metrics::iou(&mask, &truth),
+                    localised(&field.relevancy(grid, &ranked), label),
+                ])
+            };
+            return view.labels.iter().map(score).collect();
+        }
+        let decoded = pictures.into_iter().map(|picture| match &self.meaning {
+            Meaning::Encoded(coder) => coder.decode(picture),
+            _ => picture,
+        });
+        let embeddings: Vec<Vectors> = decoded.map(normalised).collect();
+        let score = |label: &labels::Label| {
+            let truth = view.mask(label, w, h);
+            let text = scene.text_query(&label.category)?;
+            let relevancy = relevancy(&embeddings, &text);
+            let above = |threshold: f32| metrics::iou(&relevancy.iter().map(|r| *r >= threshold).collect::<Vec<_>>(), &truth);
+            Ok([thresholds(&relevancy).into_iter().map(above).fold(0.0, f64::max), above(config.min_score), localised(&relevancy, label)])
+        };
+        view.labels.iter().map(score).collect()
+    }
+}
+
+/// Objects' codes on the lattice of side K^(-1/d) in d dimensions (paper, semantic feature grid), dealt out at random.
+fn lattice(count: usize, dimension: u32, seed: u64) -> Vectors {
+    let side = (1usize..).find(|s| s.pow(dimension) >= count).unwrap_or(1);
+    let mut cells: Vec<usize> = (0..side.pow(dimension)).collect();
+    Rng::new(seed, "codes of any dimension").shuffle(&mut cells);
+    Vectors::from_shape_fn((count, dimension as usize), |(k, axis)| ((cells[k] / side.pow(axis as u32) % side) as f32 + 0.5) / side as f32)
+}
+
+/// Codes that take into account which objects touch in the training views.
+fn separated(scene: &Session, grid: &Grid, seed: u64) -> Result<Vectors> {
+    let mut contacts = BTreeSet::new();
+    for camera in scene.manifest.training(&scene.cameras) {
+        contacts.extend(scene.folder.objects(&camera.name)?.contacts());
+    }
+    let codes = codes::separated(grid.objects.len(), &contacts, seed);
+    Ok(Vectors::from_shape_fn((codes.len(), 3), |(k, axis)| codes[k][axis]))
+}
+
+/// A label map, and the vectors of its labels.
+type Labelled = (LabelMap, Vec<(u16, Vec<f32>)>);
+
+/// The embeddings of a map's labels; those that show nothing are left out.
+fn embedded(scene: &Session, encoder: &dyn Encoder, camera: &Camera, map: LabelMap) -> Result<Labelled> {
+    let found = encoder.embed_masks(&camera.name, &scene.folder.photo(&camera.name)?, &map)?;
+    let own = found.into_iter().enumerate().map(|(k, e)| (k as u16 + 1, e)).filter(|(_, e)| e.iter().any(|v| *v != 0.0)).collect();
+    Ok((map, own))
+}
+
+fn rows(vectors: &[&Vec<f32>]) -> Result<Vectors> {
+    let width = vectors.first().map_or(0, |v| v.len());
+    Ok(Vectors::from_shape_vec((vectors.len(), width), vectors.iter().flat_map(|v| v.iter().copied()).collect())?)
+}
+
+/// The mean vector of each Gaussian over what the training views show it in, by blending weights. `shown` gives a view's labels.
+fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -> Result<Vectors> {
+    let mut sums = Vectors::zeros((0, 0));
+    let mut weights = vec![0.0f32; scene.gaussians.len()];
+    for (view, camera) in scene.manifest.training(&scene.cameras).iter().enumerate() {
+        let (map, vectors) = shown(view, camera)?;
+        let width = vectors.first().map_or(sums.ncols(), |v| v.1.len());
+        if sums.is_empty() {
+            let bytes = 4 * width * scene.gaussians.len();
+            if bytes > MOST_BYTES {
+                bail!(
+                    "vectors of {width} numbers for {} Gaussians take {} MB, more than the {} MB that are allowed",
+                    scene.gaussians.len(),
+                    bytes >> 20,
+                    MOST_BYTES >> 20
+                );
+            }
+            sums = Vectors::zeros((scene.gaussians.len(), width));
+        }
+        let mut place = vec![None; usize::from(map.max()) + 1];
+        for (k, (label, _)) in vectors.iter().enumerate() {
+            if let Some(place) = place.get_mut(usize::from(*label)) {
+                *place = Some(k);
+            }
+        }
+        for vote in lift::votes(&scene.gaussians, camera, &map) {
+            if let Some(k) = place[usize::from(vote.label)] {
+                let mut row = sums.row_mut(vote.gaussian as usize);
+                row.iter_mut().zip(&vectors[k].1).for_each(|(sum, v)| *sum += vote.weight * v);
+                weights[vote.gaussian as usize] += vote.weight;
+            }
+        }
+    }
+    sums.rows_mut().into_iter().zip(weights).filter(|(_, w)| *w > 0.0).for_each(|(mut row, w)| row /= w);
+    Ok(sums)
+}
+
+/// Blended vectors of a view, one a pixel: three numbers a pass.
+fn rendered(scene: &mut Session, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
+    let (pixels, width) = ((camera.width * camera.height) as usize, vectors.ncols());
+    let mut out = Vectors::zeros((pixels, width));
+    let before = scene.gaussians.features.clone();
+    for first in (0..width).step_by(3) {
+        let at = |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
+        scene.gaussians.features = vectors.rows().into_iter().map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2))).collect();
+        scene.engine.set_state(&State::of(&scene.gaussians))?;
+        let frame = scene.engine.render(View::new(camera, scene.gaussians.len(), scene.gaussians.sh_degree), Channels::Feature)?;
+        for (k, channel) in covered(&frame).into_iter().enumerate().take(width - first) {
+            out.column_mut(first + k).iter_mut().zip(channel).for_each(|(o, v)| *o = v);
+        }
+    }
+    scene.gaussians.features = before;
+    Ok(out)
+}
+
+/// Rows of length 1; those of length 0 stay.
+fn normalised(mut vectors: Vectors) -> Vectors {
+    for mut row in vectors.axis_iter_mut(Axis(0)) {
+        let length = row.dot(&row).sqrt();
+        if length > 1e-6 {
+            row /= length;
+        }
+    }
+    vectors
+}
+
+/// Relevancy of each pixel: that of the layer where it is highest.
+fn relevancy(layers: &[Vectors], text: &TextQuery) -> Vec<f32> {
+    let pixels = layers[0].nrows();
+    let of = |p: usize| layers.iter().map(|l| text.relevancy(&l.row(p).to_vec())).fold(0.0, f32::max);
+    (0..pixels).map(of).collect()
+}
+
+/// Thresholds that an oracle may choose from: 64 values between the lowest and the highest.
+fn thresholds(values: &[f32]) -> Vec<f32> {
+    let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+    (0..64).map(|k| low + (high - low) * k as f32 / 64.0).collect()
+}
+
+/// The object whose code lies nearest; 0 where the origin does, the code of no object. A bound on the distance, as the paper has it for
+/// codes that were trained, leaves hardly a pixel: what shines through moves every blend.
+fn nearest(rendered: &[f32], codes: &Vectors) -> u16 {
+    let distance = |code: ndarray::ArrayView1<f32>| code.iter().zip(rendered).map(|(c, r)| (c - r).powi(2)).sum::<f32>();
+    let none = rendered.iter().map(|r| r * r).sum::<f32>();
+    let all = codes.rows().into_iter().map(distance).enumerate();
+    all.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, d)| *d < none).map_or(0, |(k, _)| k as u16 + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_nearest_code_decides() {
+        let codes = Vectors::from_shape_vec((2, 1), vec![0.25, 0.75]).expect("a shape");
+        assert_eq!((nearest(&[0.26], &codes), nearest(&[0.6], &codes), nearest(&[0.1], &codes)), (1, 2, 0));
+    }
+
+    #[test]
+    fn the_most_relevant_layer_counts() {
+        let layer = |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
+        let layers = [layer([1.0, 0.0, 0.0, 2.0]), layer([0.0, 1.0, 3.0, 0.0])];
+        let text = TextQuery { text: vec![1.0, 0.0], canonical: Vec::new(), anything: 0.5 };
+        let found = relevancy(&layers, &text);
+        assert!(found[0] > 0.9 && found[1] > 0.9);
+        assert_eq!(thresholds(&found).len(), 64);
+    }
+}

@@ -1,0 +1,62 @@
+//! The program's own commands, so that every figure can be had again by hand: words as a user would type them, run here.
+
+use crate::baseline;
+use anyhow::{Context, Result, bail};
+use clap::Parser;
+use fastlgs::progress::{Message, Sink};
+use fastlgs::{Run, eval, export, preprocess, synth, train};
+use serde_json::Value;
+
+/// `fastlgs COMMAND ARGUMENTS`, as far as benches need it.
+#[derive(Parser)]
+#[command(name = "fastlgs", no_binary_name = true)]
+enum Command {
+    Synth(synth::Config),
+    Preprocess(preprocess::Config),
+    Train(train::Config),
+    Eval(eval::Config),
+    Export(export::Config),
+    #[command(subcommand)]
+    Bench(Bench),
+}
+
+#[derive(clap::Subcommand)]
+enum Bench {
+    Baseline(baseline::Args),
+}
+
+/// Is as patient as the bench's own watcher, and says nothing: a trial's bars would cover the bench's.
+struct Quiet<'a>(&'a dyn Sink);
+
+impl Sink for Quiet<'_> {
+    fn tell(&self, message: Message<'_>) {
+        if let Message::Warning(text) = message {
+            tracing::debug!("{text}");
+        }
+    }
+
+    fn cancelled(&self) -> bool {
+        self.0.cancelled()
+    }
+}
+
+/// Runs `fastlgs COMMAND ARGS` on the same device, with `seed`; returns its report.
+pub fn call(run: &Run, seed: u64, command: &str, args: &[&str]) -> Result<Value> {
+    let words = std::iter::once(&command).chain(args);
+    let Ok(parsed) = Command::try_parse_from(words) else { bail!("fastlgs {command} {}: not a command", args.join(" ")) };
+    let quiet = Quiet(run.progress);
+    let run = &Run { seed, progress: &quiet, ..*run };
+    let report = match parsed {
+        Command::Synth(config) => to_value(fastlgs::synth(&config, run)),
+        Command::Preprocess(config) => to_value(fastlgs::preprocess(&config, run)),
+        Command::Train(config) => to_value(fastlgs::train(&config, run)),
+        Command::Eval(config) => to_value(fastlgs::eval(&config, run)),
+        Command::Export(config) => to_value(fastlgs::export(&config, run)),
+        Command::Bench(Bench::Baseline(args)) => baseline::run(&args, run),
+    };
+    report.with_context(|| format!("fastlgs {command} {}", args.join(" ")))
+}
+
+fn to_value(report: fastlgs::Result<impl serde::Serialize>) -> Result<Value> {
+    Ok(serde_json::to_value(report?)?)
+}

@@ -1,0 +1,151 @@
+//! `fastlgs bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` stops.
+
+use crate::command::call;
+use crate::plot::{self, Axes, Scatter, Spot};
+use crate::table::{self, number};
+use crate::trial::{self, Trial, text};
+use anyhow::Result;
+use fastlgs::Run;
+use fastlgs_core::{Gaussians, SceneFolder, ply};
+use fastlgs_raster::lift::largest_weights;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench size scenes/fox scenes/bonsai -o out --device cpu")]
+pub struct Args {
+    /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table.
+    scenes: Vec<PathBuf>,
+    /// Preset of both trainings.
+    #[arg(long, default_value = "quick")]
+    preset: String,
+    /// Iterations, instead of the preset's.
+    #[arg(long)]
+    iterations: Option<u32>,
+    /// Fewer sizes and a short training.
+    #[arg(long)]
+    quick: bool,
+    /// Folder for size.md, .csv, .json, and two charts as SVG and PNG.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// Shares of the Gaussians that are kept, those first that some view sees best.
+const KEPT: [f64; 7] = [0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05];
+
+/// What `--budget auto` may lose against the full model: dB, and points of oracle mIoU.
+const LOSS: (f64, f64) = (0.1, 0.5);
+
+/// More Gaussians than any of these trainings makes.
+const UNLIMITED: &str = "1000000";
+
+const COLUMNS: [&str; 8] = ["scene", "model", "gaussians", "scene_bytes", "psnr", "oracle_miou", "miou", "seconds"];
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let work = trial::workshop(&args.output)?;
+    let mut scenes = args.scenes.clone();
+    if scenes.is_empty() {
+        let (views, size) = trial::QUICK;
+        scenes.push(trial::generated(run, &work, "table", views, size)?);
+    }
+    let mut training = vec!["--preset".to_owned(), args.preset.clone()];
+    if let Some(iterations) = args.iterations.or(args.quick.then_some(1000)) {
+        training.extend(["--iterations".to_owned(), iterations.to_string()]);
+    }
+    let training: Vec<&str> = training.iter().map(String::as_str).collect();
+    let kept: Vec<f64> = KEPT.into_iter().enumerate().filter(|(k, _)| !args.quick || k % 3 == 1).map(|(_, share)| share).collect();
+    let progress = run.work("models", (scenes.len() * (kept.len() + 6)) as u64);
+    let (mut rows, mut verdicts) = (Vec::new(), Vec::new());
+    for scene in &scenes {
+        let name = trial::name(scene);
+        let trial = Trial::new(scene, &work, run)?;
+        let mut add = |model: String, scored: &Value, seconds: f64| -> Result<()> {
+            rows.push(json!({
+                "scene": name, "model": model, "gaussians": scored["gaussians"], "scene_bytes": scored["scene_bytes"], "psnr": scored["psnr"],
+                "oracle_miou": scored["oracle_miou"], "miou": scored["miou"], "seconds": seconds,
+                "size": scored["size"], "adapter": scored["adapter"],
+            }));
+            Ok(progress.advance()?)
+        };
+        let made = |args: &[&str]| -> Result<(Value, f64)> {
+            let [trained, scored] = trial.train_and_eval(&[&training, args].concat())?;
+            Ok((scored, number(&trained, "seconds") + number(&trained, "mapping_seconds")))
+        };
+        let (auto, seconds) = made(&[])?;
+        add("auto".to_owned(), &auto, seconds)?;
+        add("auto, compact".to_owned(), &compact(run, &work, &trial)?, 0.0)?;
+        let (full, seconds) = made(&["--budget", UNLIMITED])?;
+        add("full".to_owned(), &full, seconds)?;
+        add("full, compact".to_owned(), &compact(run, &work, &trial)?, 0.0)?;
+        let folder = trial.scene();
+        let whole = folder.gaussians()?;
+        for degree in (0..whole.sh_degree).rev() {
+            ply::write(&folder.ply_path(), &whole.clone().with_sh_degree(degree))?;
+            add(format!("degree {degree}"), &trial.eval(&[])?, 0.0)?;
+        }
+        let order = by_largest_weight(&folder, &whole)?;
+        for share in &kept {
+            let most = (share * whole.len() as f64).round() as usize;
+            let mut keep = order[..most].to_vec();
+            keep.sort_unstable();
+            ply::write(&folder.ply_path(), &whole.select(&keep))?;
+            add(format!("{:.0} % kept", 100.0 * share), &trial.eval(&[])?, 0.0)?;
+        }
+        let lost = [number(&full, "psnr") - number(&auto, "psnr"), 100.0 * (number(&full, "oracle_miou") - number(&auto, "oracle_miou"))];
+        let ratio = |what: &str| number(&auto, what) / number(&full, what);
+        verdicts.push(json!({
+            "scene": name, "lost_db": lost[0], "lost_points": lost[1], "bound": LOSS, "gaussians": ratio("gaussians"), "bytes": ratio("scene_bytes"),
+            "verdict": if lost[0] <= LOSS.0 && lost[1] <= LOSS.1 { "holds" } else { "fails" },
+        }));
+    }
+    std::fs::remove_dir_all(&work)?;
+    for (what, label, title) in [
+        ("psnr", "PSNR of held-out views, dB", "Colour against size: filled is --budget auto"),
+        ("oracle_miou", "oracle mIoU of held-out labels", "Accuracy against size: filled is --budget auto"),
+    ] {
+        let spots: Vec<Spot> = rows.iter().map(|row| spot(row, what)).collect();
+        let axes = Axes { title, x: "megabytes of everything that a query needs", y: label };
+        plot::save(&args.output, &format!("size-{}", what.replace('_', "-")), &Scatter { axes, spots: &spots })?;
+    }
+    let mut value = table::write(&args.output, "size", &COLUMNS, &rows)?;
+    value["auto"] = json!(verdicts);
+    fastlgs_core::fs::write_json(&args.output.join("size.json"), &value)?;
+    Ok(value)
+}
+
+/// Gaussians by their largest blending weight over all training views, greatest first.
+fn by_largest_weight(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
+    let mut largest = vec![0.0f32; scene.len()];
+    for camera in folder.manifest()?.training(&folder.cameras()?) {
+        largest.iter_mut().zip(largest_weights(scene, &camera)).for_each(|(l, w)| *l = l.max(w));
+    }
+    let mut order: Vec<usize> = (0..scene.len()).collect();
+    order.sort_by(|a, b| largest[*b].total_cmp(&largest[*a]).then(a.cmp(b)));
+    Ok(order)
+}
+
+/// The trial's scene in as few bytes as its views allow, evaluated.
+fn compact(run: &Run, work: &Path, trial: &Trial) -> Result<Value> {
+    let folder = tempfile::tempdir_in(work)?;
+    let (scene, small) = (trial.scene(), folder.path().join("small"));
+    call(run, run.seed, "export", &[text(&scene.root), text(&small)])?;
+    // Held-out photos, to measure colour with.
+    for camera in scene.manifest()?.held_out(&scene.cameras()?) {
+        let photo = SceneFolder::new(&small).photo_path(&camera.name);
+        std::fs::create_dir_all(photo.parent().unwrap_or(&small))?;
+        std::fs::copy(scene.photo_path(&camera.name), photo)?;
+    }
+    trial.eval_of(&small)
+}
+
+fn spot(row: &Value, what: &str) -> Spot {
+    let model = row["model"].as_str().unwrap_or_default().to_owned();
+    let front = model.starts_with("auto");
+    Spot {
+        series: row["scene"].as_str().unwrap_or_default().to_owned(),
+        name: model,
+        x: number(row, "scene_bytes") / 1e6,
+        y: number(row, what),
+        front,
+    }
+}

@@ -1,0 +1,399 @@
+//! `fastlgs bench stability`: what remains of accuracy when the input is disturbed, and on scenes that methods fail at.
+
+use crate::command::call;
+use crate::disturb::{self, Album, Masks, Photos};
+use crate::plot::{self, Cell, Heat};
+use crate::table::{self, number};
+use crate::trial::{self, Trial, text};
+use anyhow::{Context, Result, bail};
+use fastlgs::Run;
+use fastlgs::progress::Work;
+use fastlgs_core::SceneFolder;
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::synth::{KINDS, Kind};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench stability scenes/fox -o out --device cpu")]
+pub struct Args {
+    /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table is disturbed.
+    scenes: Vec<PathBuf>,
+    /// Kinds of generated scenes that are tried as they are, separated by commas; `none` for none.
+    #[arg(long, value_delimiter = ',', default_value = "table,twins,nested,thin,mirror,glass,dark,sparse,long,big")]
+    kinds: Vec<String>,
+    /// Runs of each random disturbance, and of the row "seed" at least five.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
+    seeds: u64,
+    /// Iterations of each training.
+    #[arg(long, default_value_t = 1000)]
+    iterations: u32,
+    /// One strength of each disturbance on a small table and twins: minutes instead of an hour.
+    #[arg(long)]
+    quick: bool,
+    /// Folder for stability.md, .csv, .json, and a heat map of each scene as SVG and PNG.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// What is done to a scene.
+#[derive(Clone)]
+enum Change {
+    /// The whole way from disturbed photos.
+    Photos(Photos),
+    /// The whole way with other seeds.
+    Seed,
+    /// Other masks, the same Gaussians.
+    Masks(Masks),
+    /// Noise on the objects' embeddings.
+    Embeddings(f32),
+    /// Mapped with other options, the same Gaussians.
+    Map(&'static [&'static str]),
+    /// Evaluated with other options, after Algorithm 1.
+    Eval(&'static [&'static str]),
+}
+
+/// A row of the table.
+struct Case {
+    disturbance: &'static str,
+    strength: &'static str,
+    change: Change,
+    /// Which figure the bound is for: `oracle_miou` where masks and mapping are disturbed, `miou` where texts are.
+    measure: &'static str,
+    /// Points that may be lost.
+    bound: f64,
+    /// Whether the quick suite tries it.
+    quick: bool,
+}
+
+/// All disturbances, three strengths each. Bounds: 5 points for what happens to careful users, 15 for what is plainly bad input; those of
+/// order, 2 px of pose noise, a fifth of the masks, half of the views and seeds are the project's goals.
+fn cases() -> Vec<Case> {
+    let case = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "oracle_miou", bound, quick };
+    let text = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "miou", bound, quick };
+    let photos = |disturbance, strength, change, bound, quick| case(disturbance, strength, Change::Photos(change), bound, quick);
+    let masks = |disturbance, strength, change, bound, quick| case(disturbance, strength, Change::Masks(change), bound, quick);
+    let map = |disturbance, strength, args, quick| case(disturbance, strength, Change::Map(args), 10.0, quick);
+    vec![
+        photos("photos shuffled", "", Photos::Shuffled, 3.0, true),
+        photos("pose noise", "1 px", Photos::Pose(1.0), 3.0, false),
+        photos("pose noise", "2 px", Photos::Pose(2.0), 3.0, true),
+        photos("pose noise", "4 px", Photos::Pose(4.0), 15.0, false),
+        photos("views missing", "25 %", Photos::Missing(0.25), 5.0, false),
+        photos("views missing", "50 %", Photos::Missing(0.5), 5.0, true),
+        photos("views missing", "75 %", Photos::Missing(0.75), 15.0, false),
+        photos("exposure", "0.25 stops", Photos::Exposure(0.25), 5.0, false),
+        photos("exposure", "0.5 stops", Photos::Exposure(0.5), 5.0, true),
+        photos("exposure", "1 stop", Photos::Exposure(1.0), 15.0, false),
+        photos("white balance", "5 %", Photos::WhiteBalance(0.05), 5.0, false),
+        photos("white balance", "10 %", Photos::WhiteBalance(0.1), 5.0, true),
+        photos("white balance", "20 %", Photos::WhiteBalance(0.2), 15.0, false),
+        photos("blur", "0.5 px", Photos::Blur(0.5), 5.0, false),
+        photos("blur", "1 px", Photos::Blur(1.0), 5.0, true),
+        photos("blur", "2 px", Photos::Blur(2.0), 15.0, false),
+        photos("JPEG", "quality 70", Photos::Jpeg(70), 5.0, false),
+        photos("JPEG", "quality 40", Photos::Jpeg(40), 5.0, true),
+        photos("JPEG", "quality 15", Photos::Jpeg(15), 15.0, false),
+        photos("focal length", "1 %", Photos::Focal(0.01), 5.0, false),
+        photos("focal length", "3 %", Photos::Focal(0.03), 5.0, true),
+        photos("focal length", "10 %", Photos::Focal(0.1), 15.0, false),
+        case("seed", "spread", Change::Seed, 1.0, true),
+        masks("masks eroded", "1 px", Masks::Eroded(1), 5.0, false),
+        masks("masks eroded", "2 px", Masks::Eroded(2), 5.0, true),
+        masks("masks eroded", "4 px", Masks::Eroded(4), 15.0, false),
+        masks("masks split", "10 %", Masks::Split(0.1), 5.0, false),
+        masks("masks split", "20 %", Masks::Split(0.2), 5.0, true),
+        masks("masks split", "40 %", Masks::Split(0.4), 15.0, false),
+        masks("masks merged", "10 %", Masks::Merged(0.1), 5.0, false),
+        masks("masks merged", "20 %", Masks::Merged(0.2), 5.0, true),
+        masks("masks merged", "40 %", Masks::Merged(0.4), 15.0, false),
+        masks("masks dropped", "10 %", Masks::Dropped(0.1), 5.0, false),
+        masks("masks dropped", "20 %", Masks::Dropped(0.2), 5.0, true),
+        masks("masks dropped", "40 %", Masks::Dropped(0.4), 15.0, false),
+        text("embedding noise", "25 %", Change::Embeddings(0.25), 5.0, false),
+        text("embedding noise", "50 %", Change::Embeddings(0.5), 5.0, true),
+        text("embedding noise", "100 %", Change::Embeddings(1.0), 15.0, false),
+        map("agreement", "0.15", &["--agreement", "0.15"], false),
+        map("agreement", "0.9", &["--agreement", "0.9"], false),
+        map("support", "0.1", &["--support", "0.1"], false),
+        map("support", "0.7", &["--support", "0.7"], false),
+        map("paper: tau", "1", &["--mapping", "paper", "--tau", "1"], false),
+        map("paper: tau", "10", &["--mapping", "paper", "--tau", "10"], true),
+        map("paper: tau", "30", &["--mapping", "paper", "--tau", "30"], false),
+        map("paper: theta", "0.3", &["--mapping", "paper", "--theta", "0.3"], false),
+        map("paper: theta", "0.8", &["--mapping", "paper", "--theta", "0.8"], true),
+        map("paper: theta", "0.98", &["--mapping", "paper", "--theta", "0.98"], false),
+        map("paper: alpha", "0.05", &["--mapping", "paper", "--alpha", "0.05"], false),
+        map("paper: alpha", "0.2", &["--mapping", "paper", "--alpha", "0.2"], true),
+        map("paper: alpha", "0.5", &["--mapping", "paper", "--alpha", "0.5"], false),
+        case("paper: tau_ac", "1", Change::Eval(&["--tau-ac", "1"]), 10.0, false),
+        case("paper: tau_ac", "3", Change::Eval(&["--tau-ac", "3"]), 10.0, true),
+        case("paper: tau_ac", "10", Change::Eval(&["--tau-ac", "10"]), 10.0, false),
+        case("paper: tau_ac", "30", Change::Eval(&["--tau-ac", "30"]), 10.0, false),
+    ]
+}
+
+/// Least oracle mIoU of each generated scene, and least share of pixels of the right one of two twins.
+const KIND_BOUND: f64 = 0.8;
+const TWINS_APART: f64 = 0.95;
+
+const COLUMNS: [&str; 14] = [
+    "scene",
+    "disturbance",
+    "strength",
+    "runs",
+    "measure",
+    "change",
+    "worst",
+    "bound",
+    "verdict",
+    "oracle_miou",
+    "miou",
+    "psnr",
+    "objects",
+    "gaussians",
+];
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let kinds: Vec<Kind> = args
+        .kinds
+        .iter()
+        .filter(|k| *k != "none")
+        .map(|k| Kind::of(k).with_context(|| format!("--kinds: '{k}' is none")))
+        .collect::<Result<_>>()?;
+    let kinds: Vec<Kind> = if args.quick { vec![Kind::Twins] } else { kinds };
+    let work = trial::workshop(&args.output)?;
+    let bench = Bench { args, run, work: &work, iterations: args.iterations };
+    let cases: Vec<Case> = cases().into_iter().filter(|c| c.quick || !args.quick).collect();
+    let count = cases.len() * args.scenes.len().max(1) + kinds.len();
+    let progress = run.work("trials", count as u64);
+    let mut rows = Vec::new();
+    let mut scenes = args.scenes.clone();
+    if scenes.is_empty() {
+        scenes.push(bench.generated(Kind::Table, "table")?);
+    }
+    for scene in &scenes {
+        let name = trial::name(scene);
+        let own = bench.disturb(scene, &name, &cases, &progress)?;
+        plot::save(
+            &args.output,
+            &format!("stability-{name}"),
+            &Heat { title: &format!("Stability: {name}"), columns: &HEAT, rows: &heat(&own) },
+        )?;
+        rows.extend(own);
+    }
+    for kind in kinds {
+        rows.push(bench.kind(kind)?);
+        progress.advance()?;
+    }
+    std::fs::remove_dir_all(&work)?;
+    let verdicts = |what: &str| rows.iter().filter(|r| r["verdict"] == what).count();
+    let (holds, fails) = (verdicts("holds"), verdicts("fails"));
+    let mut value = table::write(&args.output, "stability", &COLUMNS, &rows)?;
+    (value["holds"], value["fails"]) = (json!(holds), json!(fails));
+    Ok(value)
+}
+
+struct Bench<'a> {
+    args: &'a Args,
+    run: &'a Run<'a>,
+    work: &'a Path,
+    iterations: u32,
+}
+
+impl Bench<'_> {
+    /// A generated scene, preprocessed.
+    fn generated(&self, kind: Kind, name: &str) -> Result<PathBuf> {
+        let (views, size) = match kind {
+            _ if self.args.quick => trial::QUICK,
+            // Each of its thousand things is embedded in each photo.
+            Kind::Big => (24, "480x360"),
+            _ => (kind.views(), "480x360"),
+        };
+        trial::generated(self.run, self.work, name, views, size)
+    }
+
+    /// A generated scene as it is.
+    fn kind(&self, kind: Kind) -> Result<Value> {
+        let name = KINDS.iter().find(|k| k.1 == kind).map_or("", |k| k.0);
+        let scene = self.generated(kind, name)?;
+        let trial = Trial::new(&scene, self.work, self.run)?;
+        let [trained, scored] = trial.train_and_eval(&["--iterations", &self.iterations.to_string()])?;
+        let (measure, bound) = if kind == Kind::Twins { ("apart", TWINS_APART) } else { ("oracle_miou", KIND_BOUND) };
+        let reached = number(&scored, measure);
+        Ok(json!({
+            "scene": name, "disturbance": "none", "strength": "", "runs": 1, "measure": measure, "change": reached, "worst": reached, "bound": bound,
+            "verdict": if reached >= bound { "holds" } else { "fails" },
+            "oracle_miou": scored["oracle_miou"], "miou": scored["miou"], "psnr": scored["psnr"], "apart": scored["apart"],
+            "objects": scored["objects"], "gaussians": scored["gaussians"], "seconds": number(&trained, "seconds") + number(&trained, "mapping_seconds"),
+            "size": scored["size"], "adapter": scored["adapter"],
+        }))
+    }
+
+    /// The whole way from photos with a change to a scene; returns what `eval` says, with the seconds of all.
+    fn whole(&self, album: &Album, like: &Manifest, change: Photos, seed: u64, photos: &Path, scene: &Path) -> Result<Value> {
+        album.write(photos, change, seed)?;
+        let (labels, iterations) = (photos.join("labels"), self.iterations.to_string());
+        let mut args = vec![text(photos), "-o", text(scene), "--holdout-labels", text(&labels)];
+        args.extend(["--segmenter", &like.segmenter, "--encoder", &like.encoder]);
+        like.models.iter().for_each(|(role, file)| args.extend([option_of(role), text(&file.path)]));
+        let before = call(self.run, seed, "preprocess", &args)?;
+        let trained = call(self.run, seed, "train", &[text(scene), "--iterations", &iterations])?;
+        let mut scored = call(self.run, seed, "eval", &[text(scene), "--labels", text(&labels)])?;
+        scored["seconds"] = json!(number(&before, "seconds_total") + number(&trained, "seconds") + number(&trained, "mapping_seconds"));
+        Ok(scored)
+    }
+
+    /// All cases on a scene.
+    fn disturb(&self, scene: &Path, name: &str, cases: &[Case], progress: &Work) -> Result<Vec<Value>> {
+        let folder = SceneFolder::open(scene)?;
+        let manifest = folder.manifest()?;
+        if manifest.encoder == "import" {
+            bail!("{}: embeddings of disturbed photos cannot be imported; preprocess with another encoder", scene.display());
+        }
+        let album = Album::of(&folder, &Path::new(&manifest.photos).join("labels"))?;
+        let seed = self.run.seed;
+        // What everything is compared with goes the same way as the disturbed photos.
+        let [base, photos] = ["base", "undisturbed"].map(|n| self.work.join(name).join(n));
+        let undisturbed = self.whole(&album, &manifest, Photos::Unchanged, seed, &photos, &base)?;
+        const REMAP: [&str; 4] = ["--init-ply", "SCENE/scene.ply", "--iterations", "0"];
+        let paper = Trial::new(&base, self.work, self.run)?;
+        let [_, paper_scored] = paper.train_and_eval(&[&REMAP[..], &["--mapping", "paper"]].concat())?;
+        let mut rows = Vec::new();
+        for case in cases {
+            let mut reference = &undisturbed;
+            let mut runs = Vec::new();
+            let count = if matches!(case.change, Change::Seed) { self.args.seeds.max(5) } else { self.args.seeds };
+            for run in 0..count {
+                let seed = seed + 1 + run;
+                let same_gaussians = || Trial::new(&base, self.work, self.run);
+                let scored = match &case.change {
+                    Change::Photos(change) => {
+                        // A copy of the base, so that what did not change is there already.
+                        let (trial, photos) = (same_gaussians()?, tempfile::tempdir_in(self.work)?);
+                        self.whole(&album, &manifest, *change, seed, photos.path(), &trial.scene().root)?
+                    }
+                    Change::Seed => {
+                        let trial = same_gaussians()?;
+                        trial.train(&["--iterations", &self.iterations.to_string()], seed)?;
+                        trial.eval(&[])?
+                    }
+                    Change::Masks(change) => {
+                        let trial = same_gaussians()?;
+                        disturb::masks(&trial.scene(), *change, seed)?;
+                        trial.train_and_eval(&REMAP)?[1].clone()
+                    }
+                    Change::Embeddings(noise) => {
+                        let trial = same_gaussians()?;
+                        disturb::embeddings(&trial.scene(), *noise, seed)?;
+                        trial.eval(&[])?
+                    }
+                    Change::Map(args) => {
+                        if args.contains(&"paper") {
+                            reference = &paper_scored;
+                        }
+                        same_gaussians()?.train_and_eval(&[&REMAP[..], args].concat())?[1].clone()
+                    }
+                    Change::Eval(args) => {
+                        reference = &paper_scored;
+                        paper.eval(args)?
+                    }
+                };
+                runs.push(scored);
+                // Options know no chance.
+                if matches!(case.change, Change::Map(_) | Change::Eval(_)) {
+                    break;
+                }
+            }
+            let row = row(name, case, reference, &runs);
+            tracing::info!(%row, "trial");
+            rows.push(row);
+            progress.advance()?;
+        }
+        Ok(rows)
+    }
+}
+
+/// The option of `preprocess` that names a model file.
+fn option_of(role: &str) -> &'static str {
+    match role {
+        "clip_image" => "--clip-image",
+        "clip_text" => "--clip-text",
+        "sam_encoder" => "--sam-encoder",
+        _ => "--sam-decoder",
+    }
+}
+
+fn mean(runs: &[Value], name: &str) -> f64 {
+    runs.iter().map(|r| number(r, name)).sum::<f64>() / runs.len() as f64
+}
+
+/// Mean and worst of the runs against the reference. For seeds, the spread between the best and the worst run.
+fn row(scene: &str, case: &Case, reference: &Value, runs: &[Value]) -> Value {
+    let points = |run: &Value| 100.0 * (number(run, case.measure) - number(reference, case.measure));
+    let worst = runs.iter().map(points).fold(f64::INFINITY, f64::min);
+    let best = runs.iter().map(points).fold(f64::NEG_INFINITY, f64::max);
+    let (change, worst) = match case.change {
+        Change::Seed => (worst - best, worst - best),
+        _ => (100.0 * (mean(runs, case.measure) - number(reference, case.measure)), worst),
+    };
+    let relative = |name: &str| mean(runs, name) - number(reference, name);
+    json!({
+        "scene": scene, "disturbance": case.disturbance, "strength": case.strength, "runs": runs.len(), "measure": case.measure,
+        "change": change, "worst": worst, "bound": -case.bound, "verdict": if change >= -case.bound { "holds" } else { "fails" },
+        "oracle_miou": mean(runs, "oracle_miou"), "miou": mean(runs, "miou"), "psnr": mean(runs, "psnr"),
+        "objects": mean(runs, "objects").round() as u64, "gaussians": mean(runs, "gaussians").round() as u64, "seconds": mean(runs, "seconds"),
+        "changes": {
+            "oracle_miou": 100.0 * relative("oracle_miou"), "miou": 100.0 * relative("miou"), "psnr": relative("psnr"),
+            "objects": relative("objects"), "gaussians": relative("gaussians"),
+            "seconds": if runs.iter().all(|r| r["seconds"].is_number()) { json!(relative("seconds")) } else { Value::Null },
+        },
+        "size": reference["size"], "adapter": reference["adapter"],
+    })
+}
+
+/// Columns of the heat map.
+const HEAT: [&str; 7] = ["oracle, points", "text, points", "PSNR, dB", "objects", "Gaussians", "seconds", "verdict"];
+
+fn heat(rows: &[Value]) -> Vec<(String, Vec<Cell>)> {
+    let cells = |row: &Value| {
+        let changes = &row["changes"];
+        // What counts as fully red or green.
+        let full = [("oracle_miou", 20.0), ("miou", 20.0), ("psnr", 4.0)];
+        let mut cells: Vec<Cell> = full
+            .iter()
+            .map(|(name, full)| Cell { text: format!("{:+.1}", number(changes, name)), shade: number(changes, name) / full })
+            .collect();
+        for name in ["objects", "gaussians", "seconds"] {
+            let text = if changes[name].is_null() { String::new() } else { format!("{:+.0}", number(changes, name)) };
+            cells.push(Cell { text, shade: 0.0 });
+        }
+        let holds = row["verdict"] == "holds";
+        cells.push(Cell {
+            text: format!("{} {:+.0}", if holds { "holds" } else { "fails" }, number(row, "bound")),
+            shade: if holds { 0.6 } else { -0.8 },
+        });
+        cells
+    };
+    let name =
+        |row: &Value| format!("{} {}", row["disturbance"].as_str().unwrap_or_default(), row["strength"].as_str().unwrap_or_default());
+    rows.iter().map(|row| (name(row), cells(row))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn verdicts_follow_the_mean_and_seeds_their_spread() {
+        let case = |change, bound| Case { disturbance: "d", strength: "s", change, measure: "oracle_miou", bound, quick: true };
+        let run = |iou: f64| json!({ "oracle_miou": iou, "miou": 0.5, "psnr": 30.0, "objects": 3, "gaussians": 10 });
+        let reference = run(0.9);
+        let of =
+            |change, bound, runs: &[f64]| row("x", &case(change, bound), &reference, &runs.iter().map(|r| run(*r)).collect::<Vec<_>>());
+        let blurred = of(Change::Photos(Photos::Blur(1.0)), 5.0, &[0.88, 0.84]);
+        assert!((number(&blurred, "change") + 4.0).abs() < 1e-9 && (number(&blurred, "worst") + 6.0).abs() < 1e-9);
+        assert_eq!((blurred["verdict"].as_str(), of(Change::Seed, 1.0, &[0.9, 0.92])["verdict"].as_str()), (Some("holds"), Some("fails")));
+        assert_eq!(heat(&[blurred])[0].1.len(), HEAT.len());
+    }
+}

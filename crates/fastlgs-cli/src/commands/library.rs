@@ -1,0 +1,49 @@
+//! `fastlgs query --library`: which scenes of a folder hold what a text names.
+
+use crate::outcome::Outcome;
+use crate::{report, ui};
+use anyhow::Result;
+use fastlgs::Run;
+use fastlgs::library::{Config, Report, Search};
+use serde_json::json;
+use std::io::{BufRead, Write};
+use std::path::Path;
+
+/// Answers all texts; `texts` may be `-` for lines of standard input.
+pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, run: &Run) -> Result<Outcome> {
+    let search = Search::open(root, config, run)?;
+    if texts == ["-"] {
+        let mut out = std::io::stdout();
+        for line in std::io::stdin().lock().lines() {
+            let line = line?;
+            let text = line.trim();
+            if !text.is_empty() {
+                let answer = match search.ask(text) {
+                    Ok(report) => serde_json::to_value(&report)?,
+                    Err(error) => json!({ "text": text, "error": fastlgs::one_sentence(&error) }),
+                };
+                writeln!(out, "{answer}")?;
+                out.flush()?;
+            }
+        }
+        return Ok(Outcome::Done);
+    }
+    let mut answers = texts.iter().map(|text| Ok(search.ask(text)?)).collect::<Result<Vec<_>>>()?;
+    let found = answers.iter().any(|a| a.found);
+    if common.json.is_some() && answers.len() == 1 {
+        report::give(common, &answers.remove(0))?;
+    } else if common.json.is_some() {
+        report::give(common, &answers)?;
+    } else if !common.quiet {
+        answers.iter().for_each(print);
+    }
+    Ok(if found { Outcome::Done } else { Outcome::NotFound })
+}
+
+fn print(answer: &Report) {
+    let found = answer.scenes.iter().filter(|row| row.found);
+    println!("\"{}\": in {} of {} scenes ({:.1} ms)", answer.text, found.clone().count(), answer.searched.scenes, answer.ms.search);
+    for row in found {
+        println!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
+    }
+}

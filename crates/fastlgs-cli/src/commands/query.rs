@@ -1,0 +1,231 @@
+//! `fastlgs query`: what a text, a picture or a point names, as masks and as Gaussians (paper, querying features).
+
+use super::library;
+use crate::outcome::Outcome;
+use crate::{report, ui};
+use anyhow::{Result, bail};
+use fastlgs::session::answer::{CANDIDATES, Question, Report};
+use fastlgs::session::ask::Ask;
+use fastlgs::session::{ViewChoice, parse_size, selection};
+use fastlgs::{Run, Session};
+use fastlgs_core::{Camera, image_io};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{Field, QueryConfig};
+use fastlgs_raster::Frame;
+use serde_json::json;
+use std::io::{BufRead, Write};
+use std::path::PathBuf;
+use std::time::Instant;
+
+#[derive(clap::Args)]
+#[command(
+    after_help = "Examples: fastlgs query scenes/fox \"fox\" --view 0027.jpg --heatmap -o answers\n          fastlgs query --library scenes \"fox\"\n\nExit code 3 means that nothing in the scene matches."
+)]
+pub struct Args {
+    /// Trained scene folder; not with --library.
+    #[arg(required_unless_present = "scenes_below")]
+    scene: Option<PathBuf>,
+    /// What to look for; several texts are answered one after the other. "wheel of the bicycle" asks for a part. `-` reads
+    /// texts from standard input and answers each line at once with a line of JSON.
+    #[arg(required_unless_present_any = ["image", "point", "scenes_below"])]
+    text: Vec<String>,
+    /// A picture of what to look for.
+    #[arg(long, value_name = "FILE")]
+    image: Vec<PathBuf>,
+    /// A pixel of the view: the object that it shows.
+    #[arg(long, value_name = "X,Y", value_parser = parse_point)]
+    point: Vec<(u32, u32)>,
+    /// A text that the object must not be nearer to than to what is looked for; may be given several times.
+    #[arg(long, value_name = "TEXT")]
+    negative: Vec<String>,
+    /// Ask all scenes below DIR which of them hold it; the index that this needs is kept there as library.index.
+    #[arg(long = "library", value_name = "DIR")]
+    scenes_below: Option<PathBuf>,
+    /// Most scenes that --library names.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
+    scenes: usize,
+    #[command(flatten)]
+    views: ViewChoice,
+    /// Folder for mask, overlay and heat map; without it only the report is given.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// Most objects that together form the answer.
+    #[arg(long, default_value_t = QueryConfig::default().top_k, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
+    top_k: usize,
+    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.6 offline, 0.55 CLIP).
+    #[arg(long)]
+    min_score: Option<f32>,
+    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[arg(long, value_name = "FILE")]
+    clip_text: Option<PathBuf>,
+    /// Further objects must score within this of the best.
+    #[arg(long, default_value_t = QueryConfig::default().margin)]
+    margin: f32,
+    /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
+    /// Without it, lifted scenes take the objects that have most of a pixel's weight.
+    #[arg(long)]
+    tau_ac: Option<f32>,
+    /// Also write the relevancy of every pixel in turbo colours.
+    #[arg(long)]
+    heatmap: bool,
+    /// Widen the masks by a kernel, as inpainting wants them.
+    #[arg(long, value_name = "WxH", num_args = 0..=1, default_missing_value = "5x5", value_parser = parse_size)]
+    dilate: Option<(u32, u32)>,
+    /// How often the kernel of --dilate is applied.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    dilate_times: u32,
+    /// Write the selected Gaussians as a scene of their own: FILE.ply, FILE.spz or FILE.glb.
+    #[arg(long, value_name = "FILE", alias = "export-ply")]
+    export: Option<PathBuf>,
+    /// Write the scene without the selected Gaussians, in the same formats.
+    #[arg(long, value_name = "FILE", alias = "remove-ply")]
+    export_rest: Option<PathBuf>,
+}
+
+/// Parses `120,45`.
+fn parse_point(text: &str) -> Result<(u32, u32), String> {
+    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+    numbers.ok_or_else(|| format!("'{text}' is not a pixel like 120,45"))
+}
+
+/// A view as it was last rendered.
+struct Shown {
+    place: usize,
+    field: Field,
+    color: Option<Frame>,
+}
+
+/// What questions are put to, and how.
+struct Asker<'a> {
+    args: &'a Args,
+    scene: Session,
+    grid: Grid,
+    cameras: Vec<Camera>,
+    config: QueryConfig,
+    shown: Option<Shown>,
+}
+
+pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
+    if let Some(root) = &args.scenes_below {
+        // What stands in the scene's place is the first text.
+        let first = args.scene.iter().map(|text| text.to_string_lossy().into_owned());
+        let texts: Vec<String> = first.chain(args.text.iter().cloned()).collect();
+        if texts.is_empty() {
+            bail!("--library: say what to look for, or '-' for lines of standard input");
+        }
+        if !args.image.is_empty() || !args.point.is_empty() || args.output.is_some() || args.export.is_some() || args.export_rest.is_some()
+        {
+            bail!("--library answers texts with scenes; ask one of these scenes for pictures, points and selections");
+        }
+        let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
+        let config = fastlgs::library::Config { scenes: args.scenes, min_score: args.min_score, negatives, clip_text };
+        return library::run(root, config, &texts, common, run);
+    }
+    let lines = args.text.iter().any(|t| t == "-");
+    if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {
+        bail!("'-' reads all questions from standard input: leave out other texts, --image and --point");
+    }
+    let Some(path) = &args.scene else { bail!("name a trained scene") };
+    let mut scene = Session::open(path, run.device)?;
+    let grid = scene.grid()?;
+    let cameras = args.views.cameras(&scene.folder, &scene.cameras)?;
+    scene.clip_text.clone_from(&args.clip_text);
+    let config = QueryConfig { min_score: args.min_score.unwrap_or(scene.min_score()), top_k: args.top_k, margin: args.margin };
+    if !args.text.is_empty() || !args.negative.is_empty() {
+        // The text encoder is loaded once, before the first query is timed.
+        scene.text_query("warm up")?;
+    }
+    scene.warm_up()?;
+    let mut asker = Asker { args, scene, grid, cameras, config, shown: None };
+    if lines { asker.answer_lines() } else { asker.answer_arguments(common) }
+}
+
+impl Asker<'_> {
+    fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
+        let texts = self.args.text.iter().cloned().map(Ask::Text);
+        let picture = |path: &PathBuf| -> Result<Ask> {
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            Ok(Ask::Image(name, image_io::load_rgb(path)?))
+        };
+        let pictures = self.args.image.iter().map(picture).collect::<Result<Vec<_>>>()?;
+        let points = self.args.point.iter().map(|&(x, y)| Ask::Point(x, y));
+        let asks: Vec<Ask> = texts.chain(pictures).chain(points).collect();
+        if asks.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
+            bail!("--export and --export-rest write the answer to one question: ask only one");
+        }
+        let mut answers = Vec::new();
+        for place in 0..self.cameras.len() {
+            for ask in &asks {
+                answers.push(self.answer(ask, place)?);
+            }
+        }
+        let found = answers.iter().any(|a| a.found);
+        let single = answers.len() == 1;
+        if single {
+            report::give(common, &answers.remove(0))?;
+        } else if common.json.is_some() {
+            report::give(common, &answers)?;
+        } else {
+            answers.iter().try_for_each(|answer| report::give(common, answer).map(|_| ()))?;
+        }
+        if !found && !common.quiet {
+            let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
+            eprintln!("nothing in this scene matches {}", names.join(", "));
+        }
+        Ok(if found { Outcome::Done } else { Outcome::NotFound })
+    }
+
+    /// Each line of standard input is a text; each answer a line of JSON, also where something is wrong with the question.
+    fn answer_lines(&mut self) -> Result<Outcome> {
+        let mut out = std::io::stdout();
+        for line in std::io::stdin().lock().lines() {
+            let line = line?;
+            let text = line.trim();
+            if text.is_empty() {
+                continue;
+            }
+            for place in 0..self.cameras.len() {
+                let answer = self.answer(&Ask::Text(text.to_owned()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
+                let answer = answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
+                writeln!(out, "{answer}")?;
+            }
+            out.flush()?;
+        }
+        Ok(Outcome::Done)
+    }
+
+    /// Renders a view unless it is the one that was rendered last; milliseconds, 0 where nothing was to do.
+    fn show(&mut self, place: usize) -> Result<f64> {
+        if self.shown.as_ref().is_some_and(|s| s.place == place) {
+            return Ok(0.0);
+        }
+        let started = Instant::now();
+        let field = self.scene.field(&self.cameras[place], self.args.tau_ac)?;
+        let ms = started.elapsed().as_secs_f64() * 1e3;
+        let color = self.args.output.as_ref().map(|_| self.scene.render(&self.cameras[place])).transpose()?;
+        self.shown = Some(Shown { place, field, color });
+        Ok(ms)
+    }
+
+    /// One question in one view.
+    fn answer(&mut self, ask: &Ask, place: usize) -> Result<Report> {
+        let render_ms = self.show(place)?;
+        let Some(Shown { field, color, .. }) = &self.shown else { bail!("no view was rendered") };
+        let (args, scene, grid, camera) = (self.args, &self.scene, &self.grid, &self.cameras[place]);
+        let dilate = args.dilate.map(|(w, h)| [w / 2 * args.dilate_times, h / 2 * args.dilate_times]);
+        let question = Question { ask, negatives: &args.negative, config: self.config, dilate, candidates: CANDIDATES };
+        let (answer, mut report) = question.put(scene, grid, field, camera, render_ms)?;
+        let targets = &answer.found.targets;
+        if let (Some(folder), Some(color)) = (&args.output, color) {
+            answer.write(folder, color, args.heatmap, &mut report)?;
+        }
+        for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
+            if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
+                let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
+                let selected = selection::gaussians(&scene.gaussians, grid, &ids);
+                selection::export(path, &scene.gaussians, &scene.cameras, &selected, keep)?;
+            }
+        }
+        Ok(report)
+    }
+}

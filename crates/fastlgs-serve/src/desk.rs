@@ -1,0 +1,159 @@
+//! The one thread that holds the opened scene. Requests leave their work on its desk and wait.
+
+use crate::failure::Failure;
+use crate::splats;
+use crate::thumbnails::Thumbnails;
+use anyhow::{Context, Result, anyhow};
+use axum::body::Bytes;
+use axum::http::StatusCode;
+use fastlgs::Session;
+use fastlgs_core::{Camera, Gaussians};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::Field;
+use std::path::PathBuf;
+use std::time::Instant;
+use tokio::sync::{mpsc, oneshot};
+
+/// Pieces of work that may wait; who comes later is told to come back.
+const WAITING: usize = 32;
+
+/// The opened scene with what is worth keeping between requests.
+pub struct Desk {
+    /// The scene.
+    pub scene: Session,
+    /// Its objects.
+    pub grid: Grid,
+    /// Pictures of the objects.
+    thumbnails: Thumbnails,
+    /// The view that was last looked at, with what it tells about objects.
+    seen: Option<(Camera, Field)>,
+    /// Which Gaussians are on the device, and all of them while these are not.
+    choice: Choice,
+    all: Option<Gaussians>,
+    /// What browsers draw, once one has asked for it.
+    splats: Option<Bytes>,
+}
+
+/// Which objects pictures show; each with all that lies in it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Choice {
+    /// Objects that are left out.
+    pub hidden: Vec<u16>,
+    /// Objects that are shown alone; all where there are none.
+    pub only: Vec<u16>,
+}
+
+type Work = Box<dyn FnOnce(&mut Desk) + Send>;
+
+/// Where work is left.
+#[derive(Clone)]
+pub struct Bell(mpsc::Sender<Work>);
+
+impl Desk {
+    /// Opens a scene on a thread of its own; returns once it can be asked.
+    pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<Bell> {
+        let (bell, mut work) = mpsc::channel::<Work>(WAITING);
+        let (opened, wait) = std::sync::mpsc::channel();
+        std::thread::Builder::new().name("scene".into()).spawn(move || {
+            let open = || -> Result<Desk> {
+                let mut scene = Session::open(&root, &device)?;
+                scene.clip_text = clip_text;
+                let grid = scene.grid()?;
+                scene.warm_up()?;
+                // The first question should not wait for the encoder. Without it the page still shows the scene.
+                if let Err(error) = scene.text_query("warm up") {
+                    tracing::warn!("texts cannot be asked for: {error:#}");
+                }
+                Ok(Desk { scene, grid, thumbnails: Thumbnails::default(), seen: None, choice: Choice::default(), all: None, splats: None })
+            };
+            match open() {
+                Ok(mut desk) => {
+                    let _ = opened.send(Ok(()));
+                    while let Some(work) = work.blocking_recv() {
+                        work(&mut desk);
+                    }
+                }
+                Err(error) => {
+                    let _ = opened.send(Err(error));
+                }
+            }
+        })?;
+        wait.recv().map_err(|_| anyhow!("the scene's thread ended before it was opened"))??;
+        Ok(Bell(bell))
+    }
+
+    /// What a view tells about objects, rendered unless it is the last one; with the milliseconds it took.
+    pub fn look(&mut self, camera: &Camera) -> Result<f64> {
+        self.choose(&Choice::default())?;
+        if self.seen.as_ref().is_some_and(|(seen, _)| seen == camera) {
+            return Ok(0.0);
+        }
+        let started = Instant::now();
+        let field = self.scene.field(camera, None)?;
+        self.seen = Some((camera.clone(), field));
+        Ok(started.elapsed().as_secs_f64() * 1e3)
+    }
+
+    /// What [`Self::look`] last saw.
+    pub fn seen(&self) -> Result<&Field> {
+        self.seen.as_ref().map(|s| &s.1).context("no view was looked at")
+    }
+
+    /// Shows some objects in the pictures that follow; `false`, and all stays as it was, where nothing would be left to show.
+    pub fn choose(&mut self, choice: &Choice) -> Result<bool> {
+        if self.choice == *choice {
+            return Ok(true);
+        }
+        let all = self.all.take().unwrap_or_else(|| self.scene.gaussians.clone());
+        if *choice == Choice::default() {
+            self.scene.show(all)?;
+        } else {
+            let (hidden, only) = (self.grid.members(&choice.hidden), self.grid.members(&choice.only));
+            let among = |members: &[bool], i: usize| members.get(usize::from(all.object_ids[i])) == Some(&true);
+            let shown = |i: &usize| !among(&hidden, *i) && (choice.only.is_empty() || among(&only, *i));
+            let places: Vec<usize> = (0..all.len()).filter(shown).collect();
+            if places.is_empty() {
+                self.all = Some(all);
+                return Ok(false);
+            }
+            self.scene.show(all.select(&places))?;
+            self.all = Some(all);
+        }
+        self.choice = choice.clone();
+        Ok(true)
+    }
+
+    /// The PNG of an object; nothing for one that no view shows.
+    pub fn thumbnail(&mut self, id: u16) -> Result<Option<Vec<u8>>> {
+        self.choose(&Choice::default())?;
+        self.thumbnails.png(&mut self.scene, &self.grid, id)
+    }
+
+    /// How many Gaussians there are, hidden ones included.
+    pub fn gaussians(&self) -> usize {
+        self.all.as_ref().unwrap_or(&self.scene.gaussians).len()
+    }
+
+    /// All Gaussians as browsers draw them.
+    pub fn splats(&mut self) -> Bytes {
+        let all = self.all.as_ref().unwrap_or(&self.scene.gaussians);
+        self.splats.get_or_insert_with(|| Bytes::from(splats::pack(all))).clone()
+    }
+}
+
+impl Bell {
+    /// Leaves work and waits for what comes of it. Work whose asker has gone is not begun.
+    pub async fn ask<T: Send + 'static>(&self, work: impl FnOnce(&mut Desk) -> Result<T, Failure> + Send + 'static) -> Result<T, Failure> {
+        let (reply, answer) = oneshot::channel();
+        let work: Work = Box::new(move |desk| {
+            if !reply.is_closed() {
+                // A panic must cost one request, not the server.
+                let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(desk)));
+                let failed = || Failure::new(StatusCode::INTERNAL_SERVER_ERROR, "this request failed inside; the log says where");
+                let _ = reply.send(done.unwrap_or_else(|_| Err(failed())));
+            }
+        });
+        self.0.try_send(work).map_err(|_| Failure::busy())?;
+        answer.await.map_err(|_| Failure::busy())?
+    }
+}

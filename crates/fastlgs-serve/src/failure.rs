@@ -1,0 +1,68 @@
+//! Answers that say why there is none.
+
+use axum::Json;
+use axum::extract::rejection::{JsonRejection, QueryRejection};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use serde_json::json;
+
+/// An answer that says why there is none.
+#[derive(Debug)]
+pub struct Failure {
+    status: StatusCode,
+    reason: String,
+}
+
+impl Failure {
+    /// A refusal with its reason in one sentence.
+    pub fn new(status: StatusCode, reason: impl Into<String>) -> Self {
+        Self { status, reason: reason.into() }
+    }
+
+    /// Too much is waiting.
+    pub fn busy() -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "the server is busy; ask again in a moment")
+    }
+
+    /// The asker's mistake.
+    pub fn bad(reason: impl Into<String>) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, reason)
+    }
+}
+
+impl IntoResponse for Failure {
+    fn into_response(self) -> Response {
+        (self.status, Json(json!({ "error": self.reason }))).into_response()
+    }
+}
+
+impl From<anyhow::Error> for Failure {
+    fn from(error: anyhow::Error) -> Self {
+        tracing::error!("{error:#}");
+        Self::new(StatusCode::INTERNAL_SERVER_ERROR, fastlgs::one_sentence(error.as_ref()))
+    }
+}
+
+impl From<fastlgs_core::Error> for Failure {
+    fn from(error: fastlgs_core::Error) -> Self {
+        anyhow::Error::from(error).into()
+    }
+}
+
+impl From<JsonRejection> for Failure {
+    fn from(rejection: JsonRejection) -> Self {
+        Self::new(rejection.status(), rejection.body_text())
+    }
+}
+
+impl From<QueryRejection> for Failure {
+    fn from(rejection: QueryRejection) -> Self {
+        Self::new(rejection.status(), rejection.body_text())
+    }
+}
+
+impl From<fastlgs::Error> for Failure {
+    fn from(error: fastlgs::Error) -> Self {
+        anyhow::Error::from(error).into()
+    }
+}

@@ -1,0 +1,40 @@
+//! The files of the page; all of them are in the binary.
+
+use crate::shared::Shared;
+use axum::Router;
+use axum::http::header;
+use axum::routing::get;
+use std::sync::Arc;
+
+/// Address, kind, and content.
+const FILES: [(&str, &str, &str); 18] = [
+    ("/", HTML, include_str!("../web/index.html")),
+    ("/style.css", "text/css; charset=utf-8", include_str!("../web/style.css")),
+    ("/app.js", SCRIPT, include_str!("../web/app.js")),
+    ("/stage.js", SCRIPT, include_str!("../web/stage.js")),
+    ("/objects.js", SCRIPT, include_str!("../web/objects.js")),
+    ("/training.js", SCRIPT, include_str!("../web/training.js")),
+    ("/server.js", SCRIPT, include_str!("../web/server.js")),
+    ("/camera.js", SCRIPT, include_str!("../web/camera.js")),
+    ("/renderer.js", SCRIPT, include_str!("../web/renderer.js")),
+    ("/webgpu.js", SCRIPT, include_str!("../web/webgpu.js")),
+    ("/webgl2.js", SCRIPT, include_str!("../web/webgl2.js")),
+    ("/pictures.js", SCRIPT, include_str!("../web/pictures.js")),
+    ("/sorter.js", SCRIPT, include_str!("../web/sorter.js")),
+    ("/splat.wgsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/splat.wgsl"))),
+    ("/present.wgsl", TEXT, include_str!("../web/present.wgsl")),
+    ("/corner.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/corner.glsl"))),
+    ("/pixel.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/pixel.glsl"))),
+    ("/api/openapi.json", "application/json", include_str!("../web/openapi.json")),
+];
+
+const HTML: &str = "text/html; charset=utf-8";
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+const TEXT: &str = "text/plain; charset=utf-8";
+
+/// One route a file.
+pub fn routes() -> Router<Arc<Shared>> {
+    FILES.into_iter().fold(Router::new(), |router, (address, kind, content)| {
+        router.route(address, get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }))
+    })
+}

@@ -1,0 +1,46 @@
+//! What all requests share.
+
+use crate::desk::Bell;
+use crate::failure::Failure;
+use crate::live::Live;
+use anyhow::Result;
+use axum::http::StatusCode;
+use fastlgs_core::{Camera, SceneFolder};
+use serde_json::{Value, json};
+use std::sync::{Arc, OnceLock};
+
+/// What all requests share.
+pub struct Shared {
+    pub name: String,
+    pub folder: SceneFolder,
+    pub cameras: Vec<Camera>,
+    pub live: Option<Arc<Live>>,
+    pub bell: OnceLock<Bell>,
+    pub focus: OnceLock<Vec<f32>>,
+}
+
+impl Shared {
+    /// The opened scene, once there is one.
+    pub fn bell(&self) -> Option<Bell> {
+        self.bell.get().cloned()
+    }
+
+    /// The opened scene, or why there is none yet.
+    pub fn ready(&self) -> Result<Bell, Failure> {
+        self.bell().ok_or_else(|| Failure::new(StatusCode::CONFLICT, "the scene is still in training; ask again when it has objects"))
+    }
+
+    /// All views as the page wants them.
+    pub fn views(&self) -> Result<Vec<Value>> {
+        let manifest = self.folder.manifest()?;
+        let distances = self.focus.get();
+        let view = |(k, camera): (usize, &Camera)| {
+            let mut value = serde_json::to_value(camera)?;
+            value["held_out"] = json!(manifest.is_held_out(k, &camera.name));
+            value["photo"] = json!(self.folder.photo_path(&camera.name).is_file());
+            value["focus"] = json!(distances.and_then(|d| d.get(k)).copied().unwrap_or(1.0));
+            Ok(value)
+        };
+        self.cameras.iter().enumerate().map(view).collect()
+    }
+}

@@ -1,0 +1,90 @@
+//! Small pictures of objects: each as the training view that shows most of it does.
+
+use anyhow::Result;
+use fastlgs::Session;
+use fastlgs_core::{Camera, image_io};
+use fastlgs_grid::Grid;
+use image::RgbImage;
+use image::imageops::{FilterType, crop_imm, resize};
+use std::collections::BTreeMap;
+
+/// Views that are searched, spread over all.
+const VIEWS: usize = 16;
+/// Longer side of these views.
+const VIEW_SIDE: u32 = 400;
+/// Longer side of a thumbnail.
+const SIDE: u32 = 96;
+/// Share of its box that is shown around an object.
+const MARGIN: f32 = 0.15;
+
+/// Pictures that were made, and where to make more from.
+#[derive(Default)]
+pub struct Thumbnails {
+    views: Vec<RgbImage>,
+    best: Vec<Option<Best>>,
+    made: BTreeMap<u16, Vec<u8>>,
+}
+
+/// Where an object is largest: view, pixels, and box (left, top, right, bottom; the last two excluded).
+#[derive(Clone, Copy)]
+struct Best {
+    view: usize,
+    pixels: u32,
+    bounds: [u32; 4],
+}
+
+impl Thumbnails {
+    /// The PNG of an object; nothing for one that no view shows.
+    pub fn png(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
+        if self.best.is_empty() {
+            self.search(scene, grid)?;
+        }
+        let Some(Best { view, bounds: [left, top, right, bottom], .. }) = self.best.get(usize::from(id)).copied().flatten() else {
+            return Ok(None);
+        };
+        if !self.made.contains_key(&id) {
+            let picture = &self.views[view];
+            let margin = (MARGIN * (right - left).max(bottom - top) as f32).ceil() as u32 + 2;
+            let (left, top) = (left.saturating_sub(margin), top.saturating_sub(margin));
+            let (right, bottom) = ((right + margin).min(picture.width()), (bottom + margin).min(picture.height()));
+            let (w, h) = (right - left, bottom - top);
+            let scale = SIDE as f32 / w.max(h) as f32;
+            let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
+            let small = resize(&*crop_imm(picture, left, top, w, h), size(w), size(h), FilterType::Triangle);
+            self.made.insert(id, image_io::encode_png(small)?);
+        }
+        Ok(self.made.get(&id).cloned())
+    }
+
+    /// Looks through some views for the place where each object is largest.
+    fn search(&mut self, scene: &mut Session, grid: &Grid) -> Result<()> {
+        let step = scene.cameras.len().div_ceil(VIEWS).max(1);
+        let cameras: Vec<Camera> = scene.cameras.iter().step_by(step).map(|c| c.shrunk_to(VIEW_SIDE)).collect();
+        let mut best: Vec<Option<Best>> = vec![None; grid.objects.len() + 1];
+        let mut views = Vec::new();
+        for (view, camera) in cameras.iter().enumerate() {
+            let owners = scene.field(camera, None)?.owners(grid);
+            let mut here: BTreeMap<u16, Best> = BTreeMap::new();
+            for (p, id) in (0u32..).zip(&owners.labels) {
+                let (x, y) = (p % owners.width, p / owners.width);
+                for id in grid.chain(*id) {
+                    let own = here.entry(id).or_insert(Best { view, pixels: 0, bounds: [x, y, x, y] });
+                    let b = own.bounds;
+                    own.pixels += 1;
+                    own.bounds = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
+                }
+            }
+            for (id, own) in here {
+                let known = &mut best[usize::from(id)];
+                if known.is_none_or(|known| known.pixels < own.pixels) {
+                    *known = Some(own);
+                }
+            }
+            let frame = scene.render(camera)?;
+            views.push(image_io::from_planar(frame.channels(0, 3), frame.width, frame.height));
+        }
+        self.views = views;
+        self.best = best;
+        Ok(())
+    }
+}

@@ -1,0 +1,68 @@
+//! Where models lie on this machine, and which files they are.
+
+use crate::{Error, Result};
+use fastlgs_core::fs::cache_dir;
+use sha2::{Digest, Sha256};
+use std::path::{Path, PathBuf};
+
+/// CLIP's published merges, for text towers that come without tokenizer.
+pub const CLIP_MERGES: &str = "bpe_simple_vocab_16e6.txt.gz";
+
+/// What is computed once from the classes' names, beside the offline models.
+pub(crate) const NAMES: &str = "names.safetensors";
+
+/// Folder of the converted offline models.
+pub fn offline_dir() -> PathBuf {
+    cache_dir().join("offline")
+}
+
+/// File name of ONNX Runtime on this system.
+pub(crate) const RUNTIME: &str = if cfg!(windows) {
+    "onnxruntime.dll"
+} else if cfg!(target_os = "macos") {
+    "libonnxruntime.dylib"
+} else {
+    "libonnxruntime.so"
+};
+
+/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked; this program itself where it is
+/// linked in.
+///
+/// # Errors
+/// When there is none.
+pub fn runtime_library() -> Result<PathBuf> {
+    if !cfg!(feature = "load-ort") {
+        return std::env::current_exe().map_err(|e| Error::Missing(format!("this program's own file: {e}")));
+    }
+    let installed = cache_dir().join(RUNTIME);
+    let path = std::env::var_os("ORT_DYLIB_PATH").map_or(installed, PathBuf::from);
+    if path.is_file() {
+        return Ok(path);
+    }
+    Err(Error::Missing(format!("{}: ONNX Runtime is not installed; run 'fastlgs models install-offline'", path.display())))
+}
+
+/// Length and SHA-256 (hexadecimal) of a file.
+///
+/// # Errors
+/// When it cannot be read.
+pub fn digest(path: &Path) -> Result<(u64, String)> {
+    let mut hash = Sha256::new();
+    let file = std::fs::File::open(path).map_err(fastlgs_core::Error::io(path))?;
+    let bytes = std::io::copy(&mut std::io::BufReader::with_capacity(1 << 16, file), &mut HashWriter(&mut hash));
+    let bytes = bytes.map_err(fastlgs_core::Error::io(path))?;
+    Ok((bytes, hash.finalize().iter().map(|b| format!("{b:02x}")).collect()))
+}
+
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl std::io::Write for HashWriter<'_> {
+    fn write(&mut self, data: &[u8]) -> std::io::Result<usize> {
+        self.0.update(data);
+        Ok(data.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,403 @@
+//! Accuracy on held-out views. The rules are in `docs/evaluation.md`.
+
+use crate::error::{Context, bail};
+use crate::{Result, Run, Session};
+use fastlgs_core::labels::{Label, LabelledView};
+use fastlgs_core::{Camera, image_io, labels, metrics};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// What is measured.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Trained scene folder.
+    pub scene: PathBuf,
+    /// Folder of labels in the layout of LERF-OVS, 3D-OVS or SPIn-NeRF; without it only colour is measured.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub labels: Option<PathBuf>,
+    /// What names the thing in SPIn-NeRF's masks, instead of their folder's name.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "TEXT"))]
+    pub label_text: Option<String>,
+    /// Decide pixels as in the paper: by the distance of the rendered code to the object's, on the 0..255 scale.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "DISTANCE"))]
+    pub tau_ac: Option<f32>,
+    /// Relevancy from which an object counts as found, instead of the program's constant.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "SCORE"))]
+    pub min_score: Option<f32>,
+    /// Texts that must not be found, one a line; a list of everyday things is built in.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
+    pub absent: Option<PathBuf>,
+}
+
+/// What was measured. Figures are means over all labels of all views, unless said otherwise; `docs/evaluation.md` defines them.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Report {
+    /// The scene folder.
+    pub scene: PathBuf,
+    /// Labelled views.
+    pub views_scored: usize,
+    /// Labels that were scored.
+    pub labels_scored: usize,
+    /// Labels that there are.
+    pub labels_total: usize,
+    /// IoU of the texts' masks.
+    pub miou: Option<f64>,
+    /// The same by label.
+    pub miou_by_label: BTreeMap<String, Option<f64>>,
+    /// Recall of the texts' masks.
+    pub macc: Option<f64>,
+    /// Boundary IoU of the texts' masks.
+    pub boundary_iou: Option<f64>,
+    /// Whether the relevancy's peak lies in a box of the label.
+    pub loc_acc: Option<f64>,
+    /// IoU of the object that fits each label best.
+    pub oracle_miou: Option<f64>,
+    /// Share of a label's pixels that no best object of another label claims.
+    pub apart: Option<f64>,
+    /// Whether the first-ranked object lies in the label.
+    pub text_top1: Option<f64>,
+    /// Area under the curve of present against absent texts.
+    pub absent_auroc: Option<f64>,
+    /// Absent texts that were asked.
+    pub absent_texts: usize,
+    /// Those that were not found.
+    pub absent_rejected: usize,
+    /// Share of these, with colours before them, that were not found.
+    pub absent_colored_rejected: Option<f64>,
+    /// The absent text that scored highest.
+    pub absent_best: Option<Absent>,
+    /// Best score of each label's text.
+    pub present_scores: BTreeMap<String, f64>,
+    /// PSNR of the held-out views in dB.
+    pub psnr: Option<f64>,
+    /// SSIM of the held-out views.
+    pub ssim: Option<f64>,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Objects and parts.
+    pub objects: usize,
+    /// Bytes of everything that queries need.
+    pub scene_bytes: u64,
+    /// Milliseconds of the first text in a view.
+    pub query_ms_first: Option<f64>,
+    /// Milliseconds of the next ones.
+    pub query_ms_next: Option<f64>,
+    /// Size of the views.
+    pub size: String,
+    /// The device's name.
+    pub adapter: String,
+}
+
+/// A text that names nothing in the scene.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Absent {
+    /// The text.
+    pub text: String,
+    /// Its best score.
+    pub score: f64,
+}
+
+/// Things that are in neither of the project's scenes; those that a label names are left out.
+const ABSENT: [&str; 40] = [
+    "elephant",
+    "airplane",
+    "pizza",
+    "submarine",
+    "toothbrush",
+    "volcano",
+    "guitar",
+    "penguin",
+    "traffic light",
+    "banana",
+    "helicopter",
+    "snowman",
+    "tractor",
+    "sushi",
+    "lighthouse",
+    "giraffe",
+    "microwave oven",
+    "jellyfish",
+    "castle",
+    "sailboat",
+    "hamburger",
+    "parachute",
+    "cactus",
+    "ice cream",
+    "fire engine",
+    "octopus",
+    "washing machine",
+    "canoe",
+    "trombone",
+    "strawberry",
+    "tank",
+    "rocket",
+    "goldfish",
+    "bulldozer",
+    "sunglasses",
+    "stethoscope",
+    "ambulance",
+    "zebra",
+    "broccoli",
+    "umbrella",
+];
+
+/// Each of these goes before each absent thing as well: a colour that is there makes nothing else be there.
+const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "brown", "wooden"];
+
+#[derive(Default)]
+struct Sums {
+    iou: Vec<f64>,
+    oracle: Vec<f64>,
+    apart: Vec<f64>,
+    recall: Vec<f64>,
+    boundary: Vec<f64>,
+    localised: Vec<f64>,
+    top1: Vec<f64>,
+    present: Vec<f64>,
+    labels: Vec<String>,
+    by_label: BTreeMap<String, Vec<f64>>,
+    first_ms: Vec<f64>,
+    next_ms: Vec<f64>,
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// Measures accuracy on held-out views.
+///
+/// # Errors
+/// A scene that was never trained, labels that fit no held-out view, or a device that fails.
+pub fn eval(config: &Config, run: &Run) -> Result<Report> {
+    let mut scene = Session::open(&config.scene, run.device)?;
+    let grid = scene.grid()?;
+    let (psnr, ssim) = color_quality(&mut scene)?;
+    let label_text = config.label_text.as_deref();
+    let views = config.labels.as_deref().map(|folder| labels::load(folder, label_text)).transpose()?.unwrap_or_default();
+    let query = QueryConfig { min_score: config.min_score.unwrap_or(scene.min_score()), ..QueryConfig::default() };
+    let total: usize = views.iter().map(|v| v.labels.len()).sum();
+    let mut sums = Sums::default();
+    for view in &views {
+        let index = scene.folder.view_index(&scene.cameras, &view.name).context("labels")?;
+        let camera = scene.cameras[index].clone();
+        if !scene.manifest.is_held_out(index, &camera.name) {
+            bail!("'{}' is labelled but was trained on; preprocess with --holdout or --holdout-labels so that it is held out", camera.name);
+        }
+        scene.field(&camera, config.tau_ac)?; // compiles the kernels
+        let started = Instant::now();
+        let field = scene.field(&camera, config.tau_ac)?;
+        let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        let mut best = Vec::new();
+        for (k, label) in view.labels.iter().enumerate() {
+            let (ms, masks) = score_label(&scene, &grid, &query, view, label, &camera, &field, &mut sums)?;
+            if k == 0 {
+                sums.first_ms.push(render_ms + ms)
+            } else {
+                sums.next_ms.push(ms)
+            }
+            best.push(masks);
+        }
+        sums.apart.extend(apart(&best));
+    }
+    let absent = absent_scores(config, &scene, &grid, &views)?;
+    let rejected = |absent: &[(String, f64)]| absent.iter().filter(|a| a.1 < f64::from(query.min_score)).count();
+    let colored = colored_absent_scores(&absent, &scene, &grid)?;
+    let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
+    let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
+    let auroc = metrics::auroc(&sums.present, &absent_scores);
+    let camera = &scene.cameras[0];
+    Ok(Report {
+        scene: config.scene.clone(),
+        views_scored: views.len(),
+        labels_scored: sums.iou.len(),
+        labels_total: total,
+        miou: mean(&sums.iou),
+        miou_by_label: sums.by_label.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
+        macc: mean(&sums.recall),
+        boundary_iou: mean(&sums.boundary),
+        loc_acc: mean(&sums.localised),
+        oracle_miou: mean(&sums.oracle),
+        apart: mean(&sums.apart),
+        text_top1: mean(&sums.top1),
+        absent_auroc: (!auroc.is_nan()).then_some(auroc),
+        absent_texts: absent.len(),
+        absent_rejected: rejected(&absent),
+        absent_colored_rejected: (!colored.is_empty()).then(|| rejected(&colored) as f64 / colored.len() as f64),
+        absent_best: loudest.map(|(text, score)| Absent { text: text.clone(), score: *score }),
+        present_scores: sums.labels.iter().cloned().zip(sums.present.iter().copied()).collect(),
+        psnr,
+        ssim,
+        gaussians: scene.gaussians.len(),
+        objects: grid.objects.len(),
+        scene_bytes: crate::session::bytes(&config.scene),
+        query_ms_first: mean(&sums.first_ms),
+        query_ms_next: mean(&sums.next_ms),
+        size: format!("{}x{}", camera.width, camera.height),
+        adapter: scene.engine.name(),
+    })
+}
+
+/// Mean PSNR and SSIM over the held-out views.
+fn color_quality(scene: &mut Session) -> Result<(Option<f64>, Option<f64>)> {
+    let (mut psnr, mut ssim) = (Vec::new(), Vec::new());
+    for camera in scene.manifest.held_out(&scene.cameras) {
+        let frame = scene.render(&camera)?;
+        let photo = image_io::to_planar(&scene.folder.photo(&camera.name)?);
+        psnr.push(metrics::psnr(frame.channels(0, 3), &photo));
+        ssim.push(metrics::ssim(frame.channels(0, 3), &photo, camera.width as usize, camera.height as usize));
+    }
+    Ok((mean(&psnr), mean(&ssim)))
+}
+
+/// A label's true pixels, and those of the object that fits it best.
+struct Best {
+    truth: Vec<bool>,
+    found: Vec<bool>,
+}
+
+/// For each label, the share of its pixels that no best object of a label elsewhere claims: 1 where things are told apart, even where
+/// they are not found. Objects that two labels share tell neither apart.
+fn apart(best: &[Best]) -> Vec<f64> {
+    let pixels = best.first().map_or(0, |b| b.truth.len());
+    let at = |p: usize, mask: fn(&Best) -> &Vec<bool>| (0..best.len()).filter(|&k| mask(&best[k])[p]).collect::<Vec<_>>();
+    let there: Vec<[Vec<usize>; 2]> = (0..pixels).into_par_iter().map(|p| [at(p, |b| &b.truth), at(p, |b| &b.found)]).collect();
+    let overlapping: BTreeSet<(usize, usize)> =
+        there.iter().flat_map(|[truth, _]| truth.iter().flat_map(move |a| truth.iter().map(move |b| (*a, *b)))).collect();
+    let mut counts = vec![[0usize; 2]; best.len()];
+    for [truth, found] in &there {
+        for &own in truth {
+            let mixed = found.iter().any(|other| !overlapping.contains(&(own, *other)));
+            counts[own][0] += usize::from(mixed);
+            counts[own][1] += 1;
+        }
+    }
+    counts.iter().map(|[mixed, all]| 1.0 - *mixed as f64 / (*all).max(1) as f64).collect()
+}
+
+/// Scores one label; returns the milliseconds of the query beyond rendering, and the masks.
+fn score_label(
+    scene: &Session,
+    grid: &Grid,
+    config: &QueryConfig,
+    view: &LabelledView,
+    label: &Label,
+    camera: &Camera,
+    field: &Field,
+    sums: &mut Sums,
+) -> Result<(f64, Best)> {
+    let (w, h) = (camera.width, camera.height);
+    let truth = view.mask(label, w, h);
+    if !truth.contains(&true) {
+        bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
+    }
+    // The text encoder is loaded once, before the first query is timed.
+    scene.text_query("warm up")?;
+    let started = Instant::now();
+    let text_query = scene.text_query(&label.category)?;
+    let ranked = query::rank(grid, &text_query);
+    let targets = query::select(grid, &ranked, config);
+    let mask = field.mask(grid, &targets);
+    let ms = started.elapsed().as_secs_f64() * 1e3;
+    let iou = metrics::iou(&mask, &truth);
+    sums.iou.push(iou);
+    sums.by_label.entry(label.category.clone()).or_default().push(iou);
+    sums.recall.push(metrics::recall(&mask, &truth));
+    // 2 % of the diagonal, as Cheng et al. propose.
+    let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
+    sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
+    let relevancy = field.relevancy(grid, &ranked);
+    sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &view.boxes(label, w, h)))));
+    sums.labels.push(label.category.clone());
+    sums.present.push(best_score(&ranked));
+    // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
+    let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
+    let (oracle, found) = best_object(grid, field, &truth);
+    sums.oracle.push(oracle);
+    let inside = |mask: Vec<bool>| {
+        let (hit, all) = mask.iter().zip(&truth).filter(|(m, _)| **m).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+        all > 0 && 2 * hit > all
+    };
+    sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(object_mask(r.id))))));
+    Ok((ms, Best { truth, found }))
+}
+
+/// IoU and mask of the object that fits a mask best.
+pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool>) {
+    let masks = candidates(grid, field, truth).into_iter().map(|id| field.mask(grid, &[Hit { id, score: 0.0 }]));
+    let tried = masks.map(|mask| (metrics::iou(&mask, truth), mask));
+    tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()]))
+}
+
+/// The objects that come nearest to a mask by their owned pixels: one of them is the best.
+fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
+    const MOST: usize = 5;
+    let owners = field.owners(grid).labels;
+    let mut counts = vec![[0usize; 2]; grid.objects.len() + 1];
+    for (owner, inside) in owners.iter().zip(truth) {
+        for id in grid.chain(*owner) {
+            counts[usize::from(id)][usize::from(*inside)] += 1;
+        }
+    }
+    let all = truth.iter().filter(|t| **t).count();
+    let iou = |id: &u16| {
+        let [outside, inside] = counts[usize::from(*id)];
+        inside as f64 / (all + outside) as f64
+    };
+    let mut ids: Vec<u16> = (1..=grid.objects.len() as u16).collect();
+    ids.sort_by(|a, b| iou(b).total_cmp(&iou(a)).then(a.cmp(b)));
+    ids.truncate(MOST);
+    ids
+}
+
+/// Best scores of texts that name nothing in the scene.
+fn absent_scores(options: &Config, scene: &Session, grid: &Grid, views: &[LabelledView]) -> Result<Vec<(String, f64)>> {
+    let texts: Vec<String> = match &options.absent {
+        Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
+        None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
+    };
+    let named = |text: &String| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(text.as_str()));
+    if views.is_empty() {
+        return Ok(Vec::new());
+    }
+    texts.iter().filter(|t| !t.trim().is_empty() && !named(t)).map(|text| scored(scene, grid, text.clone())).collect()
+}
+
+/// The same for these texts with a colour before them.
+fn colored_absent_scores(absent: &[(String, f64)], scene: &Session, grid: &Grid) -> Result<Vec<(String, f64)>> {
+    let texts = absent.iter().flat_map(|(text, _)| COLORS.map(|color| format!("{color} {text}")));
+    texts.map(|text| scored(scene, grid, text)).collect()
+}
+
+/// A text with its best score.
+fn scored(scene: &Session, grid: &Grid, text: String) -> Result<(String, f64)> {
+    let score = best_score(&query::rank(grid, &scene.text_query(&text)?));
+    Ok((text, score))
+}
+
+/// What decides whether a text is found: the best score of any object, which need not be the first-ranked one's.
+fn best_score(ranked: &[Hit]) -> f64 {
+    ranked.iter().map(|hit| f64::from(hit.score)).fold(0.0, f64::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn twins_are_apart_where_each_has_its_own_object() {
+        let mask = |pixels: &str| pixels.bytes().map(|b| b == b'x').collect::<Vec<_>>();
+        let best = |truth: &str, found: &str| Best { truth: mask(truth), found: mask(found) };
+        // One pixel of the left twin is claimed by the right one's object; the pair around both claims all and is not compared.
+        let both = [best("xx....", "x....."), best("....xx", ".x..xx"), best("xx..xx", "xxxxxx")];
+        assert_eq!(apart(&both), [0.5, 1.0, 1.0]);
+        // One object for both twins.
+        assert_eq!(apart(&[best("xx..", "xxxx"), best("..xx", "xxxx")]), [0.0, 0.0]);
+    }
+}

@@ -1,0 +1,301 @@
+//! Which segmenter and encoders a command works with: chosen by options in `preprocess`, remembered in `scene.json`.
+
+use crate::Result;
+use crate::error::{Context, bail};
+use fastlgs_core::scene_folder::{Manifest, ModelFile};
+use fastlgs_core::{LabelMap, SceneFolder};
+use fastlgs_grid::evidence;
+use fastlgs_grid::mapping::Mask;
+use fastlgs_vision::import::{self, Import, Lens};
+use fastlgs_vision::pull::Named;
+use fastlgs_vision::sam::{self, Sam};
+use fastlgs_vision::{
+    ClipImage, ClipText, Conse, Encoder, Level, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, models, places,
+};
+use image::RgbImage;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// What finds masks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum SegmenterKind {
+    /// Learned edges, merged into regions.
+    #[default]
+    Offline,
+    /// ONNX exports of SAM.
+    Sam,
+    /// Masks beside the photos, made by other programs; docs/formats.md lists the layouts.
+    Import,
+}
+
+impl SegmenterKind {
+    /// What `scene.json` calls it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Offline => "offline",
+            Self::Sam => "sam",
+            Self::Import => "import",
+        }
+    }
+}
+
+/// What embeds masks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum EncoderKind {
+    /// A classifier of 1,000 things.
+    #[default]
+    Offline,
+    /// ONNX exports of CLIP.
+    Clip,
+    /// Embeddings beside the photos.
+    Import,
+}
+
+impl EncoderKind {
+    /// What `scene.json` calls it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Offline => "offline",
+            Self::Clip => "clip",
+            Self::Import => "import",
+        }
+    }
+}
+
+/// Which segmenter and encoder `preprocess` works with.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Eyes {
+    /// What finds masks.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub segmenter: SegmenterKind,
+    /// What embeds masks.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub encoder: EncoderKind,
+    /// Levels of masks that are kept, separated by commas; objects are made of the whole ones.
+    #[cfg_attr(feature = "clap", arg(long, value_delimiter = ',', default_value = "whole,part,subpart", value_parser = ["whole", "part", "subpart"]))]
+    pub levels: Vec<String>,
+    /// SAM by the name that `models pull` knows it by.
+    #[cfg_attr(feature = "clap", arg(long, default_value = "slimsam", value_name = "NAME"))]
+    pub sam: String,
+    /// SAM's image encoder, instead of --sam.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_decoder"))]
+    pub sam_encoder: Option<PathBuf>,
+    /// SAM's prompt decoder, instead of --sam.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_encoder"))]
+    pub sam_decoder: Option<PathBuf>,
+    /// Point prompts along each side of a photo.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_points, value_parser = clap::value_parser!(u32).range(1..=128)))]
+    pub sam_points: u32,
+    /// Least IoU that SAM predicts for its own mask.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_iou))]
+    pub sam_iou: f32,
+    /// Least stability of SAM's masks.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_stability))]
+    pub sam_stability: f32,
+    /// CLIP by the name that `models pull` knows it by.
+    #[cfg_attr(feature = "clap", arg(long, default_value = "clip-vit-b16", value_name = "NAME"))]
+    pub clip: String,
+    /// CLIP's image tower, instead of --clip.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "clip_text"))]
+    pub clip_image: Option<PathBuf>,
+    /// CLIP's text tower, instead of --clip; with imported embeddings the tower that belongs to them.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
+    pub clip_text: Option<PathBuf>,
+}
+
+impl Default for Eyes {
+    fn default() -> Self {
+        let sam = sam::Config::default();
+        Self {
+            segmenter: SegmenterKind::default(),
+            encoder: EncoderKind::default(),
+            levels: Level::ALL.map(|level| level.name().to_owned()).to_vec(),
+            sam: "slimsam".to_owned(),
+            sam_encoder: None,
+            sam_decoder: None,
+            sam_points: sam.points_per_side,
+            sam_iou: sam.predicted_iou,
+            sam_stability: sam.stability,
+            clip: "clip-vit-b16".to_owned(),
+            clip_image: None,
+            clip_text: None,
+        }
+    }
+}
+
+impl Eyes {
+    fn sam_files(&self) -> Result<[PathBuf; 2]> {
+        Ok(match (&self.sam_encoder, &self.sam_decoder) {
+            (Some(encoder), Some(decoder)) => [encoder.clone(), decoder.clone()],
+            _ => Named::find(&self.sam)?.pair()?,
+        })
+    }
+
+    fn clip_files(&self) -> Result<[PathBuf; 2]> {
+        Ok(match (&self.clip_image, &self.clip_text) {
+            (Some(image), Some(text)) => [image.clone(), text.clone()],
+            _ => Named::find(&self.clip)?.pair()?,
+        })
+    }
+
+    /// The segmenter.
+    pub fn segmenter(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Segmenter>> {
+        Ok(match self.segmenter {
+            SegmenterKind::Sam => {
+                let [encoder, decoder] = self.sam_files()?;
+                let (predicted_iou, stability) = (self.sam_iou, self.sam_stability);
+                let config = sam::Config { points_per_side: self.sam_points, predicted_iou, stability, ..sam::Config::default() };
+                Box::new(Sam::load(&encoder, &decoder, config)?)
+            }
+            SegmenterKind::Import => Box::new(Import::open(photos, lenses.clone())?),
+            SegmenterKind::Offline => Box::new(OfflineSegmenter::load()?),
+        })
+    }
+
+    /// The image encoder.
+    pub fn encoder(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Encoder>> {
+        Ok(match self.encoder {
+            EncoderKind::Clip => {
+                let [image, text] = self.clip_files()?;
+                let image = ClipImage::load(&image)?;
+                // A pair that does not belong together would only show in the first query.
+                clip::check_pair(&image, &ClipText::load(&text)?)?;
+                Box::new(image)
+            }
+            EncoderKind::Import => Box::new(Import::open(photos, lenses.clone())?),
+            EncoderKind::Offline => Box::new(Conse::load()?),
+        })
+    }
+
+    /// The text tower that belongs to the image encoder.
+    pub fn text_encoder(&self) -> Result<Box<dyn TextEncoder>> {
+        Ok(match (self.encoder, &self.clip_text) {
+            (EncoderKind::Clip, _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
+            (EncoderKind::Import, Some(text)) => Box::new(ClipText::load(text)?),
+            (EncoderKind::Import, None) => bail!("imported embeddings need the text tower that belongs to them: --clip-text FILE"),
+            (EncoderKind::Offline, _) => Box::new(OfflineText::load()?),
+        })
+    }
+
+    /// The files of the models, for the record.
+    pub fn files(&self) -> Result<BTreeMap<String, ModelFile>> {
+        let mut files = BTreeMap::new();
+        let mut add = |role: &str, path: PathBuf| -> Result<()> {
+            let path = path.canonicalize().unwrap_or(path);
+            let (bytes, sha256) = places::digest(&path)?;
+            files.insert(role.to_owned(), ModelFile { path, bytes, sha256 });
+            Ok(())
+        };
+        if self.segmenter == SegmenterKind::Sam {
+            let [encoder, decoder] = self.sam_files()?;
+            add("sam_encoder", encoder)?;
+            add("sam_decoder", decoder)?;
+        }
+        match (self.encoder, &self.clip_text) {
+            (EncoderKind::Clip, _) => {
+                let [image, text] = self.clip_files()?;
+                add("clip_image", image)?;
+                add("clip_text", text)?;
+            }
+            (EncoderKind::Import, Some(text)) => add("clip_text", text.clone())?,
+            _ => {}
+        }
+        Ok(files)
+    }
+
+    /// What masks depend on beside the photo; nothing where they come from files that may change unseen.
+    pub fn segmenter_identity(&self) -> Result<Option<String>> {
+        Ok(match self.segmenter {
+            SegmenterKind::Import => None,
+            SegmenterKind::Sam => {
+                let files = self.files()?;
+                let sums: Vec<&str> = files.values().map(|f| f.sha256.as_str()).collect();
+                Some(format!("sam {} {} {} {}", self.sam_points, self.sam_iou, self.sam_stability, sums.join(" ")))
+            }
+            SegmenterKind::Offline => Some(format!("offline {}", models::offline_stamp())),
+        })
+    }
+
+    /// What embeddings depend on beside photo and masks.
+    pub fn encoder_identity(&self) -> Result<Option<String>> {
+        Ok(match self.encoder {
+            EncoderKind::Import => None,
+            EncoderKind::Clip => Some(self.files()?.values().map(|f| f.sha256.clone()).collect::<Vec<_>>().join(" ")),
+            EncoderKind::Offline => Some(format!("offline {}", models::offline_stamp())),
+        })
+    }
+
+    /// Whether masks of a level are kept.
+    pub fn keeps(&self, level: Level) -> bool {
+        level == Level::Whole || self.levels.iter().any(|l| l == level.name())
+    }
+}
+
+/// The model file of a role, as the manifest remembers it.
+fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
+    let what = role.replace('_', " ");
+    let file = manifest.models.get(role).with_context(|| format!("the scene does not say which {what} it was made with"))?;
+    let bytes = std::fs::metadata(&file.path).with_context(|| format!("the {what} of the scene, {}", file.path.display()))?.len();
+    if bytes != file.bytes {
+        bail!("{}: not the {what} that the scene was made with ({} bytes then, {bytes} now)", file.path.display(), file.bytes);
+    }
+    Ok(&file.path)
+}
+
+/// The encoder that made a scene's embeddings, for masks that come later.
+pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn Encoder>> {
+    Ok(match manifest.encoder.as_str() {
+        "offline" => Box::new(Conse::load()?),
+        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?),
+        "import" => Box::new(Recorded::load(folder, manifest)?),
+        other => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
+    })
+}
+
+/// The text tower of the encoder that made a scene's embeddings; `clip_text` stands in for a CLIP tower.
+pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<Box<dyn TextEncoder>> {
+    Ok(match (manifest.encoder.as_str(), clip_text) {
+        ("offline", _) => Box::new(OfflineText::load()?),
+        (_, Some(path)) => Box::new(ClipText::load(path)?),
+        ("clip", None) => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
+        ("import", None) if manifest.models.contains_key("clip_text") => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
+        ("import", None) => bail!("the scene's embeddings were imported: name the text tower that belongs to them with --clip-text FILE"),
+        (other, None) => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
+    })
+}
+
+/// Imported embeddings as `preprocess` left them in the scene folder: those of the masks that fit.
+struct Recorded {
+    folder: SceneFolder,
+    views: Vec<String>,
+    masks: Vec<Mask>,
+}
+
+impl Recorded {
+    fn load(folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
+        let views = manifest.training(&folder.cameras()?).into_iter().map(|c| c.name).collect();
+        Ok(Self { folder: folder.clone(), views, masks: evidence::load(folder)?.0 })
+    }
+}
+
+impl Encoder for Recorded {
+    fn name(&self) -> &'static str {
+        "import"
+    }
+
+    fn embed_masks(&self, view: &str, _photo: &RgbImage, masks: &LabelMap) -> fastlgs_vision::Result<Vec<Vec<f32>>> {
+        let whole = LabelMap::load(&self.folder.masks_path(Level::Whole.name(), view))?;
+        let index = self.views.iter().position(|v| v == view);
+        let row = |label: u16| self.masks.iter().find(|m| Some(m.view) == index && m.label == label).map(|m| m.embedding.clone());
+        let dimension = self.masks.first().map_or(0, |m| m.embedding.len());
+        let fitting = import::fitting(masks, &whole).into_iter();
+        Ok(fitting.map(|label| label.and_then(row).unwrap_or_else(|| vec![0.0; dimension])).collect())
+    }
+}

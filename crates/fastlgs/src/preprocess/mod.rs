@@ -1,0 +1,152 @@
+//! Everything that is done once, before training.
+
+mod config;
+mod masks;
+mod matches;
+mod photos;
+mod poses;
+
+use crate::cache::Cache;
+use crate::error::{Context, bail};
+use crate::{Result, Run, objects};
+use config::BRIGHTNESS_SPREAD;
+pub use config::{Config, Report, brightness_spread};
+use fastlgs_core::scene_folder::{Manifest, view_of};
+use fastlgs_core::{Camera, SceneFolder, dataset, labels};
+use fastlgs_grid::mapping::PaperConfig;
+use fastlgs_grid::{Grid, evidence};
+use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::{brightness, import, triangulate};
+use photos::Known;
+pub use photos::{Photo, load_photo};
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+/// Photos to masks, embeddings, key points, poses and points, all in the scene folder `config.output`.
+///
+/// # Errors
+/// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing models, or a cancelled run. What was
+/// made until then is kept, and found again by the next run.
+pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
+    let started = Instant::now();
+    let mut seconds = BTreeMap::new();
+    let mut clock = Instant::now();
+    let mut lap = |stage: &str| {
+        seconds.insert(format!("preprocess.{stage}"), clock.elapsed().as_secs_f64());
+        clock = Instant::now();
+    };
+    if config.max_side < 64 {
+        bail!("--max-side {} is too small: 64 pixels are the least", config.max_side);
+    }
+    if config.photos.join("images").is_dir() && !dataset::has_poses(&config.photos) {
+        poses::find(&config.photos, run)?;
+        lap("poses");
+    }
+    let dataset = dataset::load(&config.photos)?;
+    let lenses = import::lenses(&dataset);
+    // Opened first: a missing model should not cost the minutes before.
+    let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
+    let encoder = config.eyes.encoder(&config.photos, &lenses)?;
+    dataset.warnings.iter().for_each(|warning| run.warn(warning));
+    let folder = SceneFolder::new(&config.output);
+    let cache = Cache::new(&folder);
+    let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
+    lap("photos");
+    let mut warnings = dataset.warnings.clone();
+    photos::warn_of_bad_photos(&known, run, &mut warnings);
+    let checked = poses::check(&mut known, &folder, &cache, run, &mut warnings)?;
+    let cameras: Vec<Camera> = known.iter().map(|p| p.camera.clone()).collect();
+    folder.save_cameras(&cameras)?;
+    let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
+    let held_out_views = labelled_views(config, &cameras)?;
+    let mut manifest = Manifest {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        photos: config.photos.clone(),
+        holdout: if config.holdout_labels.is_some() { 0 } else { config.holdout },
+        held_out_views,
+        segmenter: config.eyes.segmenter.name().to_owned(),
+        encoder: config.eyes.encoder.name().to_owned(),
+        models: config.eyes.files()?,
+        seed: run.seed,
+        warnings: warnings.clone(),
+        excluded,
+        seconds: BTreeMap::new(),
+        notes: BTreeMap::new(),
+    };
+    let usable = |i: usize| !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i);
+    let training: Vec<Known> = known.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
+    if training.len() < 2 {
+        bail!("{}: only {} photos are left for training; at least 2 are needed", config.photos.display(), training.len());
+    }
+    lap("pose_check");
+
+    let mask_counts = masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
+    drop(segmenter);
+    lap("masks");
+    let masks = masks::describe(config, encoder.as_ref(), &training, &folder, &cache, run)?;
+    drop(encoder);
+    lap("embeddings");
+    let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+    let matches = matches::match_photos(&training, &poses, config.neighbours, &cache, run)?;
+    lap("matches");
+    let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
+    let spread = brightness::spread(&colors, &matches);
+
+    // Points of moved cameras lie where those cameras were.
+    let points = if dataset.points.is_empty() || !checked.moved.is_empty() {
+        triangulate::triangulate(&poses, &keypoints, &colors, &matches)
+    } else {
+        dataset.points.clone()
+    };
+    folder.save_points(&points)?;
+    let pairs = matches::correspondences(&masks, &folder, &poses, &keypoints, &matches)?;
+    evidence::save(&folder, &masks, &pairs)?;
+    lap("points");
+    // Without Gaussians only Algorithm 1 can map the masks; `train` maps again with what it learns, or with its options.
+    let mapped = match objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), run.seed) {
+        // The default mapping needs none of this.
+        Err(crate::Error::Grid(error @ fastlgs_grid::Error::TooManyObjects)) => {
+            let warning = format!("Algorithm 1: {error}");
+            run.warn(&warning);
+            warnings.push(warning);
+            Grid::default()
+        }
+        other => other?,
+    };
+    mapped.save(&folder)?;
+    lap("mapping");
+
+    manifest.seconds = seconds.clone();
+    manifest.notes.insert(BRIGHTNESS_SPREAD.to_owned(), spread.into());
+    folder.save_manifest(&manifest)?;
+    cache.tidy();
+    Ok(Report {
+        scene: config.output.clone(),
+        photos: cameras.len(),
+        training_photos: poses.len(),
+        held_out: cameras.len() - poses.len(),
+        size: format!("{}x{}", cameras[0].width, cameras[0].height),
+        masks: masks.len(),
+        masks_per_photo: mask_counts,
+        objects_by_algorithm_1: mapped.objects.len(),
+        key_point_matches: matches.iter().map(|m| m.pairs.len()).sum(),
+        points: points.len(),
+        sift: keypoints::backend().to_owned(),
+        moved_cameras: checked.moved.len(),
+        warnings,
+        brightness_spread_stops: spread,
+        cached: cache.counts().into_iter().map(|(stage, counts)| (stage.to_owned(), counts)).collect(),
+        seconds,
+        seconds_total: started.elapsed().as_secs_f64(),
+    })
+}
+
+/// Names of the views that `--holdout-labels` keeps out.
+fn labelled_views(config: &Config, cameras: &[Camera]) -> Result<Vec<String>> {
+    let Some(folder) = &config.holdout_labels else { return Ok(Vec::new()) };
+    let index = |name: &str| {
+        let index = view_of(cameras.iter().map(|c| c.name.as_str()), name);
+        index.with_context(|| format!("{}: the labelled view '{name}' is none of the photos", folder.display()))
+    };
+    labels::load(folder, None)?.iter().map(|view| Ok(cameras[index(&view.name)?].name.clone())).collect()
+}

@@ -1,0 +1,126 @@
+//! Reading photos: undistorted, shrunk, written into the scene folder, and looked at once.
+
+use super::config::Config;
+use crate::cache::{self, Cache, Key};
+use crate::error::{Context, bail};
+use crate::{Result, Run};
+use fastlgs_core::dataset::{Dataset, PosedPhoto};
+use fastlgs_core::undistort::{undistort, undistort_gray};
+use fastlgs_core::{Camera, SceneFolder, image_io};
+use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::photo_quality::{self, Impression};
+use glam::Vec2;
+use image::{GrayImage, RgbImage};
+use rayon::prelude::*;
+
+/// A working photo: undistorted and scaled.
+pub struct Photo {
+    /// Its camera at the working size.
+    pub camera: Camera,
+    /// Its pixels.
+    pub pixels: RgbImage,
+    /// Coverage of photos with an alpha channel.
+    alpha: Option<GrayImage>,
+    /// Black where nothing counts.
+    ignore: Option<GrayImage>,
+}
+
+/// What is kept in memory of a photo; its pixels lie in the scene folder, so that thousands of photos fit.
+pub(super) struct Known {
+    pub camera: Camera,
+    /// Fingerprint of the pixels.
+    pub key: Key,
+    impression: Impression,
+    pub points: Keypoints,
+    /// Colour at each key point.
+    pub colors: Vec<[u8; 3]>,
+}
+
+/// Blurred and repeated photos are used all the same, but the user hears of them.
+pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec<String>) {
+    let seen: Vec<Impression> = photos.iter().map(|p| p.impression.clone()).collect();
+    for (list, what) in
+        [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "show the same as the photo before them")]
+    {
+        if !list.is_empty() {
+            let names: Vec<&str> = list.iter().map(|&i| photos[i].camera.name.as_str()).collect();
+            let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), names.join(", "));
+            run.warn(&warning);
+            warnings.push(warning);
+        }
+    }
+}
+
+/// Bytes that a photo takes while it is read, for each of its file's pixels: decoded, shrunk, undistorted, encoded again.
+const BYTES_A_PIXEL: u64 = 12;
+
+/// Reads the photos, writes them into the scene folder, and looks at each once.
+pub(super) fn load(dataset: &Dataset, config: &Config, folder: &SceneFolder, cache: &Cache, run: &Run) -> Result<Vec<Known>> {
+    let work = run.work("photos", dataset.photos.len() as u64);
+    let largest = dataset.photos.iter().map(|p| u64::from(p.camera.width) * u64::from(p.camera.height)).max().unwrap_or(1);
+    let together = (config.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
+    let mut photos = Vec::with_capacity(dataset.photos.len());
+    for some in dataset.photos.chunks(together) {
+        let loaded: Vec<Result<Known>> = some
+            .par_iter()
+            .map(|posed| {
+                let photo = load_photo(posed, config.max_side)?;
+                save_photo(&photo, folder)?;
+                work.advance()?;
+                known(photo, cache)
+            })
+            .collect();
+        for photo in loaded {
+            photos.push(photo?);
+        }
+    }
+    Ok(photos)
+}
+
+/// What stays in memory of a photo.
+fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
+    let key = cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()]);
+    let inputs = cache::key(&[&key, keypoints::backend().as_bytes()]);
+    let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
+    let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
+    let colors = points.positions.iter().map(color).collect();
+    Ok(Known { impression: Impression::of(&pixels), camera, key, points, colors })
+}
+
+/// Writes a working photo with its masks into the scene folder.
+fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
+    let name = &photo.camera.name;
+    image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
+    for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
+        match mask {
+            Some(mask) => image_io::save_png(&path, mask.clone())?,
+            // A mask that an earlier run left would now be wrong.
+            None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
+            None => {}
+        }
+    }
+    Ok(())
+}
+
+/// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
+pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
+    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path)?;
+    // The file decides the true size; some tools scale photos and leave the poses' file as it was.
+    let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
+    let aspect = f64::from(posed.camera.width) / f64::from(posed.camera.height) * f64::from(raw.height()) / f64::from(raw.width());
+    if (aspect - 1.0).abs() > 0.02 {
+        bail!(
+            "{}: the photo is {}x{}, but its camera is {}x{}; was it rotated or cropped after the poses were made?",
+            posed.path.display(),
+            raw.width(),
+            raw.height(),
+            posed.camera.width,
+            posed.camera.height
+        );
+    }
+    let small = image_io::resize(&raw, camera.width, camera.height);
+    let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
+    let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
+    let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
+    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
+}

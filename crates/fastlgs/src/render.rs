@@ -1,0 +1,110 @@
+//! Pictures of a trained scene.
+
+use crate::error::bail;
+use crate::session::ViewChoice;
+use crate::{Result, Run, Session};
+use fastlgs_core::{exr_image, image_io, turbo};
+use image::{Rgb, RgbImage};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+use std::time::Instant;
+
+/// What a picture shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum What {
+    /// Colour, as PNG.
+    Color,
+    /// Expected depth in world units, as EXR.
+    Depth,
+    /// The three features, as EXR.
+    Feature,
+    /// Object ids as colours, as PNG.
+    Objects,
+}
+
+/// Which pictures are made.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Trained scene folder.
+    pub scene: PathBuf,
+    /// From where.
+    #[serde(flatten)]
+    #[cfg_attr(feature = "clap", command(flatten))]
+    pub views: ViewChoice,
+    /// What to write, separated by commas.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value = "color", value_delimiter = ','))]
+    pub what: Vec<What>,
+    /// Folder to write to.
+    #[cfg_attr(feature = "clap", arg(short, long))]
+    pub output: PathBuf,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { scene: PathBuf::new(), views: ViewChoice::default(), what: vec![What::Color], output: PathBuf::new() }
+    }
+}
+
+/// What was rendered.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Report {
+    /// The scene.
+    pub scene: PathBuf,
+    /// The pictures.
+    pub files: Vec<PathBuf>,
+    /// Size of the first one.
+    pub size: String,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Milliseconds of colour and feature of each view.
+    pub render_ms: Vec<f64>,
+    /// The device's name.
+    pub adapter: String,
+}
+
+/// Writes pictures of a trained scene.
+///
+/// # Errors
+/// A scene that was never trained, an unknown view, a device that fails, or the system's refusal.
+pub fn render(config: &Config, run: &Run) -> Result<Report> {
+    let mut scene = Session::open(&config.scene, run.device)?;
+    let cameras = config.views.cameras(&scene.folder, &scene.cameras)?;
+    let Some(first) = cameras.first() else { bail!("{}: the scene has no views", config.scene.display()) };
+    let size = format!("{}x{}", first.width, first.height);
+    let work = run.work("render", cameras.len() as u64);
+    let (mut files, mut milliseconds) = (Vec::new(), Vec::new());
+    for camera in &cameras {
+        let started = Instant::now();
+        let frame = scene.render(camera)?;
+        milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
+        let (w, h) = (frame.width as usize, frame.height as usize);
+        let mut path = |what: &str, ending: &str| {
+            let path = config.output.join(format!("{}.{what}.{ending}", camera.name));
+            files.push(path.clone());
+            path
+        };
+        if config.what.contains(&What::Color) {
+            image_io::save_png(&path("color", "png"), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
+        }
+        if config.what.contains(&What::Feature) {
+            let channels = [("feature.0", frame.channels(3, 4)), ("feature.1", frame.channels(4, 5)), ("feature.2", frame.channels(5, 6))];
+            exr_image::write(&path("feature", "exr"), w, h, &channels)?;
+        }
+        if config.what.contains(&What::Depth) {
+            let depth = scene.render_depth(camera)?;
+            exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
+        }
+        if config.what.contains(&What::Objects) {
+            let ids = scene.field(camera, None)?.owners(&scene.grid()?);
+            let picture = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
+            image_io::save_png(&path("objects", "png"), picture)?;
+        }
+        work.advance()?;
+    }
+    let (scene_root, gaussians, adapter) = (config.scene.clone(), scene.gaussians.len(), scene.engine.name());
+    Ok(Report { scene: scene_root, files, size, gaussians, render_ms: milliseconds, adapter })
+}

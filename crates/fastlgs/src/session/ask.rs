@@ -1,0 +1,117 @@
+//! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
+
+use super::Session;
+use crate::Result;
+use crate::error::{Context, bail};
+use fastlgs_core::{Camera, LabelMap};
+use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
+use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_grid::{Grid, relevancy};
+use image::RgbImage;
+
+/// One question.
+pub enum Ask {
+    /// Words; "A of B" means the part A of B where there is one.
+    Text(String),
+    /// A picture of the thing, with its name.
+    Image(String, RgbImage),
+    /// A pixel of the view.
+    Point(u32, u32),
+}
+
+/// What a question means, before any view is looked at.
+pub enum Meaning {
+    /// Embedded words or pictures: first what is looked for; then, for "A of B", A.
+    Embedded(TextQuery, Option<TextQuery>),
+    /// A pixel of the view.
+    Point(u32, u32),
+}
+
+impl Ask {
+    /// What reports and file names call it.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Text(text) => text.clone(),
+            Self::Image(name, _) => name.clone(),
+            Self::Point(x, y) => format!("{x},{y}"),
+        }
+    }
+
+    /// Embeds what needs embedding; `negatives` are texts that the object must not be nearer to.
+    pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
+        let with_negatives = |mut query: TextQuery| -> Result<TextQuery> {
+            for text in negatives {
+                query.canonical.push(session.text_query(text)?.text);
+            }
+            Ok(query)
+        };
+        Ok(match self {
+            Self::Point(x, y) => Meaning::Point(*x, *y),
+            Self::Image(name, photo) => Meaning::Embedded(with_negatives(picture(session, name, photo)?)?, None),
+            Self::Text(text) => {
+                let whole = |text: &str| with_negatives(session.text_query(text)?);
+                match part_of(text) {
+                    Some((part, object)) => Meaning::Embedded(whole(object)?, Some(whole(part)?)),
+                    None => Meaning::Embedded(whole(text)?, None),
+                }
+            }
+        })
+    }
+}
+
+/// "flower pot of the bonsai" is the part "flower pot" of "bonsai".
+fn part_of(text: &str) -> Option<(&str, &str)> {
+    let (part, object) = text.split_once(" of ")?;
+    let object = ["the ", "a ", "an "].iter().find_map(|article| object.strip_prefix(article)).unwrap_or(object);
+    let (part, object) = (part.trim(), object.trim());
+    (!part.is_empty() && !object.is_empty()).then_some((part, object))
+}
+
+/// A picture as a query: the whole of it is embedded like a mask.
+fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result<TextQuery> {
+    let (width, height) = photo.dimensions();
+    let everything = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
+    let encoder = session.image_encoder()?;
+    let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
+    let embedding =
+        embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
+    Ok(TextQuery { text: embedding, canonical: Vec::new(), anything: relevancy::IMAGE_ANYTHING })
+}
+
+impl Meaning {
+    /// The objects that are meant.
+    pub fn find(&self, grid: &Grid, field: &Field, camera: &Camera, config: &QueryConfig) -> Result<Found> {
+        match self {
+            Self::Embedded(query, None) => {
+                let ranked = query::rank(grid, query);
+                Ok(Found { targets: query::select(grid, &ranked, config), ranked })
+            }
+            Self::Embedded(object, Some(part)) => {
+                let targets = query::select(grid, &query::rank(grid, object), config);
+                Ok(query::part(grid, &targets, part, config))
+            }
+            Self::Point(x, y) => {
+                if *x >= camera.width || *y >= camera.height {
+                    bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
+                }
+                let nested: Vec<u16> = grid.chain(field.owners(grid).at(*x, *y)).collect();
+                let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
+                let targets = query::borne_out(grid, &nested).map(hit).into_iter().collect();
+                Ok(Found { ranked: nested.into_iter().map(hit).collect(), targets })
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_are_named_by_of() {
+        assert_eq!(part_of("flower pot of the bonsai"), Some(("flower pot", "bonsai")));
+        assert_eq!(part_of("wheel of a bicycle"), Some(("wheel", "bicycle")));
+        assert_eq!(part_of("fox"), None);
+        assert_eq!(part_of("top of "), None);
+    }
+}

@@ -1,0 +1,146 @@
+//! An opened, trained scene that renders and answers.
+
+pub mod answer;
+pub mod ask;
+pub mod pictures;
+pub mod selection;
+mod texts;
+mod views;
+
+use crate::error::{Context, bail};
+use crate::{Result, eyes, train};
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_grid::query::Field;
+use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_grid::{Grid, codes};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, Engine, Frame, View};
+use fastlgs_vision::Encoder;
+use std::cell::OnceCell;
+use std::path::{Path, PathBuf};
+pub use texts::Texts;
+pub use views::{ViewChoice, parse_size};
+
+/// A trained scene on a device.
+pub struct Session {
+    /// Its folder.
+    pub folder: SceneFolder,
+    /// What made it.
+    pub manifest: Manifest,
+    /// All views, sorted by name.
+    pub cameras: Vec<Camera>,
+    /// The Gaussians.
+    pub gaussians: Gaussians,
+    /// The device, holding the Gaussians.
+    pub engine: Box<dyn Engine>,
+    /// A CLIP text tower that is used instead of the one the scene remembers.
+    pub clip_text: Option<PathBuf>,
+    /// How it was trained.
+    pub trained: train::Report,
+    texts: OnceCell<Texts>,
+}
+
+impl Session {
+    /// Loads SCENE and puts it on the device.
+    pub fn open(root: &Path, device: &str) -> Result<Self> {
+        let folder = SceneFolder::open(root)?;
+        let manifest = folder.manifest()?;
+        let mut gaussians = folder.gaussians()?;
+        let Some(trained) = train::Report::of(&manifest) else {
+            let root = root.display();
+            bail!("{root}: its photos were preprocessed again after it was trained; run 'fastlgs train {root}' again");
+        };
+        if folder.is_compact() {
+            Grid::load(&folder).context("the object grid cannot be read; export the scene again")?.set_codes(&mut gaussians);
+        }
+        let mut engine = fastlgs_raster::open_engine(device)?;
+        engine.set_state(&State::of(&gaussians))?;
+        let cameras = folder.cameras()?;
+        Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, trained, texts: OnceCell::new() })
+    }
+
+    /// Puts other Gaussians in the place of the scene's.
+    pub fn show(&mut self, gaussians: Gaussians) -> Result<()> {
+        self.engine.set_state(&State::of(&gaussians))?;
+        self.gaussians = gaussians;
+        Ok(())
+    }
+
+    /// Renders once in passing: drivers compile kernels when they first run, which no query should wait for.
+    pub fn warm_up(&mut self) -> Result<()> {
+        match self.cameras.first().map(|c| c.resized(16, 16)) {
+            Some(small) => self.field(&small, None).map(|_| ()),
+            None => Ok(()),
+        }
+    }
+
+    /// The object table.
+    pub fn grid(&self) -> Result<Grid> {
+        Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
+    }
+
+    /// Renders colour, feature and transmittance.
+    pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
+        Ok(self.engine.render(self.view(camera), Channels::Both)?)
+    }
+
+    /// The frame of a camera, rendered in the way the scene was trained.
+    fn view(&self, camera: &Camera) -> View {
+        let mut view = View::new(camera, self.gaussians.len(), self.gaussians.sh_degree);
+        view.antialias = u32::from(self.trained.antialias);
+        view.background_color[..3].copy_from_slice(&self.trained.background);
+        view
+    }
+
+    /// Renders the expected depth (sum of w z / sum of w), infinite where nothing is.
+    pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
+        let frame = self.engine.render(View { depth_as_feature: 1, ..self.view(camera) }, Channels::Feature)?;
+        let solid = |(z, t): (&f32, &f32)| if *t < 0.999 { z / (1.0 - t) } else { f32::INFINITY };
+        Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
+    }
+
+    /// What a view tells about objects, in the way the scene was trained, unless `tau_ac` asks for the paper's.
+    pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
+        let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
+        if lifted && tau_ac.is_none() {
+            return Ok(Field::Shares(self.engine.render_ids(self.view(camera), &self.gaussians.object_ids)?));
+        }
+        let frame = self.engine.render(self.view(camera), Channels::Feature)?;
+        let (width, height) = (frame.width, frame.height);
+        // Codes that were trained make up for what passes through; those that were lifted do not.
+        let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
+        Ok(Field::Features { width, height, values, tau_ac: tau_ac.unwrap_or(codes::TAU_AC) })
+    }
+
+    /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.
+    pub fn text_query(&self, text: &str) -> Result<TextQuery> {
+        if self.texts.get().is_none() {
+            let _ = self.texts.set(Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?);
+        }
+        self.texts.get().expect("set above").query(text)
+    }
+
+    /// The image tower that made the scene's embeddings.
+    pub fn image_encoder(&self) -> Result<Box<dyn Encoder>> {
+        eyes::encoder_of(&self.folder, &self.manifest)
+    }
+
+    /// Relevancy from which an object counts as found, with the scene's encoder.
+    pub fn min_score(&self) -> f32 {
+        texts::min_score(&self.manifest)
+    }
+}
+
+/// The three features of each pixel as a mean over what covers it: blended ones over 1 - transmittance.
+pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
+    let over = |(v, t): (&f32, &f32)| if *t < 0.999 { v / (1.0 - t) } else { 0.0 };
+    [3, 4, 5].map(|k| frame.channels(k, k + 1).iter().zip(frame.channels(6, 7)).map(over).collect())
+}
+
+/// Bytes of everything that a query needs.
+pub fn bytes(root: &Path) -> u64 {
+    let model = if root.join("scene.ply").is_file() { "scene.ply" } else { "scene.safetensors" };
+    let files = [model, "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"].into_iter();
+    files.filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
+}

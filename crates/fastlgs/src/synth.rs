@@ -1,0 +1,85 @@
+//! Scenes with exact poses, depths and masks.
+
+use crate::error::{Context, bail};
+#[cfg(feature = "clap")]
+use crate::session::parse_size;
+use crate::{Result, Run};
+use fastlgs_core::synth::{self, KINDS, Kind};
+use fastlgs_vision::models;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// What is generated.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Kind of scene.
+    #[cfg_attr(feature = "clap", arg(value_parser = kinds()))]
+    pub kind: String,
+    /// Folder to write: images/, transforms.json, masks/ of three levels, depth/, labels/.
+    #[cfg_attr(feature = "clap", arg(short, long))]
+    pub output: PathBuf,
+    /// Number of photos; by default 40 for most kinds.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub views: Option<usize>,
+    /// Size of the photos.
+    #[cfg_attr(feature = "clap", arg(long, default_value = "320x240", value_parser = parse_size))]
+    pub size: (u32, u32),
+    /// Folder of the room's pictures, instead of the installed ones.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub pictures: Option<PathBuf>,
+    /// Every N-th view is labelled, to be held out.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
+    pub holdout: usize,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { kind: KINDS[0].0.to_owned(), output: PathBuf::new(), views: None, size: (320, 240), pictures: None, holdout: 8 }
+    }
+}
+
+#[cfg(feature = "clap")]
+fn kinds() -> Vec<clap::builder::PossibleValue> {
+    KINDS.iter().map(|(name, _, about)| clap::builder::PossibleValue::new(name).help(about)).collect()
+}
+
+/// What was generated.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Report {
+    /// Kind of scene.
+    pub kind: String,
+    /// Where its photos are.
+    pub photos: PathBuf,
+    /// Number of photos.
+    pub views: usize,
+    /// Their size.
+    pub size: String,
+    /// Names of the things in it.
+    pub objects: Vec<String>,
+}
+
+/// Writes a generated scene.
+///
+/// # Errors
+/// An unknown kind, fewer than four views, missing pictures, or the system's refusal.
+pub fn synth(config: &Config, run: &Run) -> Result<Report> {
+    let kind = Kind::of(&config.kind).with_context(|| format!("'{}' is no kind of generated scene", config.kind))?;
+    let views = config.views.unwrap_or(kind.views());
+    if views < 4 {
+        bail!("--views {views}: at least 4 are needed");
+    }
+    let pictures = config.pictures.clone().unwrap_or_else(models::pictures_dir);
+    let world = kind.world(&pictures, views, config.size, run.seed)?;
+    let work = run.work("synth", views as u64);
+    synth::write(&config.output, &world, config.holdout, || drop(work.advance()))?;
+    work.check()?;
+    Ok(Report {
+        kind: config.kind.clone(),
+        photos: config.output.clone(),
+        views,
+        size: format!("{}x{}", config.size.0, config.size.1),
+        objects: world.things.iter().map(|t| t.name.to_string()).collect(),
+    })
+}

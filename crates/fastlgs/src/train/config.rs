@@ -1,0 +1,357 @@
+//! What `train` is asked for, and what it reports.
+
+use crate::objects;
+use crate::progress::TrainStep;
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_grid::mapping::PaperConfig;
+use fastlgs_grid::{consensus, tree};
+use fastlgs_raster::Budget;
+use fastlgs_raster::budget::Removal;
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// How long is trained, and towards how large a scene.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Preset {
+    /// 2,000 iterations.
+    Quick,
+    /// 7,000 iterations.
+    #[default]
+    Standard,
+    /// 30,000 iterations.
+    Paper,
+}
+
+impl Preset {
+    /// Iterations, highest SH degree, and most Gaussians with an automatic budget.
+    pub(super) fn values(self) -> (u32, u32, usize) {
+        match self {
+            Self::Quick => (2_000, 2, 200_000),
+            Self::Standard => (7_000, 2, 300_000),
+            Self::Paper => (30_000, 3, 1_000_000),
+        }
+    }
+}
+
+/// How the number of Gaussians is controlled.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Strategy {
+    /// Clone, split, prune, opacity reset.
+    #[default]
+    Classic,
+    /// Relocation and noise.
+    Mcmc,
+}
+
+/// Whether each training photo has an affine exposure of its own.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Exposures {
+    /// Where the photos' brightness varies.
+    #[default]
+    Auto,
+    /// Learned.
+    On,
+    /// None.
+    Off,
+}
+
+/// How masks become objects.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Mapping {
+    /// The views vote over the trained Gaussians.
+    #[default]
+    Global,
+    /// Algorithm 1 of the paper.
+    Paper,
+    /// Those that the scene has; with --init-ply of the trained scene, either feature mode refines what the other made.
+    Keep,
+}
+
+/// How Gaussians get their codes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum FeatureMode {
+    /// One pass of votes.
+    #[default]
+    Lift,
+    /// Gradient descent, as in the paper.
+    Train,
+}
+
+/// What Algorithm 1 compares beside the embeddings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Cue {
+    /// Pairs of key points.
+    Keypoints,
+    /// Colour distributions.
+    Color,
+    /// Nothing.
+    None,
+}
+
+/// What lies behind everything.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Background {
+    /// Its colour, 0 to 1; where training starts if it is learned.
+    pub color: [f32; 3],
+    /// Whether it is learned.
+    pub learn: bool,
+}
+
+impl Background {
+    /// Parses `0,0.5,1` or `learn`.
+    ///
+    /// # Errors
+    /// Anything else.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        if text == "learn" {
+            return Ok(Self { color: [0.5; 3], learn: true });
+        }
+        let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
+        let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1"))?;
+        Ok(Self { color, learn: false })
+    }
+}
+
+/// So many Gaussians; nothing for `auto`.
+type BudgetChoice = Option<usize>;
+
+/// Parses `auto` or a number.
+#[cfg(feature = "clap")]
+fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
+    if text == "auto" {
+        return Ok(None);
+    }
+    text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
+}
+
+/// What is trained, and how.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Scene folder that `preprocess` made.
+    pub scene: PathBuf,
+    /// How long is trained.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub preset: Preset,
+    /// Iterations, instead of the preset's.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub iterations: Option<u32>,
+    /// Gaussians: `auto` (as many as pay for themselves; at most 200,000 with the preset quick, 300,000 with standard, a
+    /// million with paper), or exactly how many there may be.
+    #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
+    pub budget: BudgetChoice,
+    /// How their number is controlled.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub strategy: Strategy,
+    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init-ply, else the preset's.
+    #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
+    pub sh_degree: Option<u32>,
+    /// Anti-aliasing by the 2-D Mip filter.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub antialias: bool,
+    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`.
+    #[cfg_attr(feature = "clap", arg(long, default_value = "0,0,0", value_parser = Background::parse))]
+    pub background: Background,
+    /// Learn an affine exposure for each training photo.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t, num_args = 0..=1, default_missing_value = "on", require_equals = true))]
+    pub exposure: Exposures,
+    /// Keep geometry and colour as --init-ply gives them; train features only.
+    #[cfg_attr(feature = "clap", arg(long, requires = "init_ply"))]
+    pub freeze: bool,
+    /// Start from an existing 3DGS scene instead of points.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
+    pub init_ply: Option<PathBuf>,
+    /// How masks become objects.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub mapping: Mapping,
+    /// How Gaussians get their codes.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub feature_mode: FeatureMode,
+    /// Paper mapping: fewest key-point pairs that make two masks one object.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PaperConfig::default().tau))]
+    pub tau: u32,
+    /// Paper mapping: least similarity that makes two masks one object.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PaperConfig::default().theta))]
+    pub theta: f32,
+    /// Paper mapping: weight of colour in the similarity.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PaperConfig::default().alpha))]
+    pub alpha: f32,
+    /// Paper mapping: what is compared beside the embeddings, separated by commas (the paper's ablation).
+    #[cfg_attr(feature = "clap", arg(long, value_enum, value_delimiter = ',', default_value = "keypoints,color"))]
+    pub cues: Vec<Cue>,
+    /// Global mapping: share of the views that must show two regions in one mask to join them.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = consensus::Config::default().agreement))]
+    pub agreement: f32,
+    /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = tree::Config::default().min_support))]
+    pub support: f32,
+    /// Global mapping: smallest object, as the mean share of the pixels of the views that show it.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = tree::Config::default().min_share))]
+    pub min_share: f32,
+    /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
+    pub curve: Option<u32>,
+    /// Weight of the feature loss.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = 1.0))]
+    pub feature_weight: f32,
+    /// Let the feature loss move geometry as well.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub feature_moves_geometry: bool,
+    /// Continue from the last checkpoint.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub resume: bool,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        let (paper, objects) = (PaperConfig::default(), tree::Config::default());
+        Self {
+            scene: PathBuf::new(),
+            preset: Preset::default(),
+            iterations: None,
+            budget: None,
+            strategy: Strategy::default(),
+            sh_degree: None,
+            antialias: false,
+            background: Background::default(),
+            exposure: Exposures::default(),
+            freeze: false,
+            init_ply: None,
+            mapping: Mapping::default(),
+            feature_mode: FeatureMode::default(),
+            tau: paper.tau,
+            theta: paper.theta,
+            alpha: paper.alpha,
+            cues: vec![Cue::Keypoints, Cue::Color],
+            agreement: consensus::Config::default().agreement,
+            support: objects.min_support,
+            min_share: objects.min_share,
+            curve: None,
+            feature_weight: 1.0,
+            feature_moves_geometry: false,
+            resume: false,
+        }
+    }
+}
+
+impl Config {
+    /// Iterations of the run.
+    pub fn iterations(&self) -> u32 {
+        self.iterations.unwrap_or(self.preset.values().0)
+    }
+
+    /// How many Gaussians there may be.
+    pub(super) fn budget(&self) -> Budget {
+        self.budget.map_or(Budget::Auto(self.preset.values().2), Budget::Fixed)
+    }
+
+    /// Constants of Algorithm 1.
+    pub(super) fn paper(&self) -> PaperConfig {
+        let alpha = if self.cues.contains(&Cue::Color) { self.alpha } else { 0.0 };
+        PaperConfig { tau: self.tau, theta: self.theta, alpha, key_points: self.cues.contains(&Cue::Keypoints) }
+    }
+
+    /// Constants of global mapping.
+    pub(super) fn global(&self) -> objects::Config {
+        // Regions may be smaller than objects, which are made of them.
+        let of_regions = consensus::Config::default().min_share * self.min_share / tree::Config::default().min_share;
+        objects::Config {
+            consensus: consensus::Config { agreement: self.agreement, min_share: of_regions, ..consensus::Config::default() },
+            objects: tree::Config { min_support: self.support, min_share: self.min_share, ..tree::Config::default() },
+        }
+    }
+}
+
+/// What training found; also the manifest's note of it.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Report {
+    /// The scene folder.
+    pub scene: PathBuf,
+    /// As asked for.
+    pub preset: Preset,
+    /// As asked for.
+    pub mapping: Mapping,
+    /// As asked for.
+    pub feature_mode: FeatureMode,
+    /// Objects and parts.
+    pub objects: usize,
+    /// Seconds from Gaussians to objects.
+    pub mapping_seconds: f64,
+    /// What global mapping found.
+    pub mapping_summary: Option<objects::Summary>,
+    /// Steps done.
+    pub iterations: u32,
+    /// Seconds of training.
+    pub seconds: f64,
+    /// Steps a second.
+    pub iterations_per_second: f64,
+    /// Gaussians at the end.
+    pub gaussians: usize,
+    /// What the automatic budget removed.
+    pub removals: Vec<Removal>,
+    /// SH degree of the written scene.
+    pub sh_degree: u32,
+    /// Whether exposures were learned.
+    pub exposure: bool,
+    /// Whether the 2-D Mip filter was on.
+    pub antialias: bool,
+    /// Colour behind everything.
+    pub background: [f32; 3],
+    /// Size of the first view.
+    pub size: String,
+    /// Mean PSNR of the held-out views in dB.
+    pub psnr_held_out: Option<f64>,
+    /// Where `curve` asked for it.
+    pub curve: Vec<CurvePoint>,
+    /// The device's name.
+    pub adapter: String,
+}
+
+/// A point of the curve of held-out PSNR.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
+pub struct CurvePoint {
+    /// Steps done.
+    pub iteration: u32,
+    /// Seconds of training.
+    pub seconds: f64,
+    /// Mean PSNR of the held-out views in dB.
+    pub psnr: Option<f64>,
+    /// Gaussians.
+    pub gaussians: usize,
+}
+
+impl From<TrainStep> for CurvePoint {
+    fn from(step: TrainStep) -> Self {
+        Self { iteration: step.iteration, seconds: step.seconds, psnr: step.psnr_held_out, gaussians: step.gaussians }
+    }
+}
+
+/// The manifest's note of training.
+const NOTE: &str = "train";
+
+impl Report {
+    /// How a scene was trained; nothing where it was not, or was preprocessed again since.
+    pub fn of(manifest: &Manifest) -> Option<Self> {
+        manifest.notes.get(NOTE).map(|note| serde_json::from_value(note.clone()).unwrap_or_default())
+    }
+
+    /// Notes it in the manifest.
+    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {
+        manifest.notes.insert(NOTE.to_owned(), serde_json::to_value(self)?);
+        Ok(())
+    }
+}

@@ -1,0 +1,177 @@
+//! Colour and semantic field together (paper, training features for Gaussians), and the objects on them.
+
+mod config;
+mod start;
+
+use crate::error::{Context, bail};
+use crate::progress::{Message, TrainStep};
+use crate::{Result, Run, objects, preprocess};
+pub use config::{Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
+use fastlgs_core::{Gaussians, SceneFolder, ply};
+use fastlgs_grid::Grid;
+use fastlgs_raster::{Channels, TrainConfig, Trainer};
+use std::time::Instant;
+
+/// Difference of two photos in stops from which exposures are learned.
+const VARYING: f64 = 0.15;
+
+/// Iterations from which it pays to find out first which kernels the device is fastest with.
+const WORTH_TUNING: u32 = 500;
+
+/// Trains the scene folder `config.scene`: Gaussians, their objects, and the table of these.
+///
+/// # Errors
+/// Options that contradict each other, a scene that was not preprocessed, a device that fails, or a cancelled run, after which the
+/// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
+pub fn train(config: &Config, run: &Run) -> Result<Report> {
+    let by_descent = config.feature_mode == FeatureMode::Train;
+    if by_descent && config.mapping == Mapping::Global {
+        bail!(
+            "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
+        );
+    }
+    let folder = SceneFolder::open(&config.scene)?;
+    let mut manifest = folder.manifest()?;
+    let cameras = folder.cameras()?;
+    let training = manifest.training(&cameras);
+    let known = match config.mapping {
+        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(), run.seed)?),
+        Mapping::Keep => Some(objects::kept(&folder, &training)?),
+        Mapping::Global => None,
+    };
+    let codes = known.as_ref().filter(|_| by_descent);
+    let targets = training.iter().map(|c| start::target(&folder, c, codes, &config.background)).collect::<Result<Vec<_>>>()?;
+    let held_out = manifest.held_out(&cameras);
+    let held_out = held_out.iter().map(|c| start::target(&folder, c, None, &config.background)).collect::<Result<Vec<_>>>()?;
+    let first = start::gaussians(config, &folder, &training, run)?;
+    if config.freeze && !by_descent {
+        bail!(
+            "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
+        );
+    }
+    let spread = preprocess::brightness_spread(&manifest);
+    let settings = settings(config, &first, spread, run.seed);
+    if settings.iterations >= WORTH_TUNING {
+        fastlgs_raster::tuning::tune(run.device, false)?;
+    }
+    let engine = fastlgs_raster::open_engine(run.device)?;
+    let work = run.work("train", u64::from(settings.iterations));
+    let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
+    let checkpoint = folder.root.join("checkpoints/train");
+    if config.resume && !trainer.resume(&checkpoint)? {
+        run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
+    }
+    run.progress.tell(Message::TrainingBegins(&first));
+    let mut curve = Vec::new();
+    let result = trainer.run(Some(&checkpoint), |p, trainer| {
+        work.check()?;
+        let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
+        let (iteration, seconds, psnr, gaussians) = (p.iteration, p.seconds, p.psnr, p.gaussians);
+        let mut step = TrainStep { iteration, seconds, loss, psnr, psnr_held_out: None, gaussians };
+        if config.curve.is_some_and(|every| iteration % every.next_multiple_of(20) == 0) {
+            step.psnr_held_out = trainer.quality(&held_out, None)?;
+            tracing::info!(iteration, seconds, psnr_held_out = step.psnr_held_out, gaussians, "curve");
+            curve.push(CurvePoint::from(step));
+        }
+        run.progress.tell(Message::Trained { step, total: settings.iterations, scene: &|| Ok(trainer.gaussians()?) });
+        if iteration % 200 == 0 {
+            tracing::info!(iteration, loss, psnr, feature_l1 = p.losses.feature_l1, gaussians);
+        }
+        Ok::<_, crate::Error>(())
+    })?;
+    drop(work);
+
+    let degree = trainer.needed_degree()?;
+    let psnr = trainer.quality(&held_out, Some(degree))?;
+    let mut scene = trainer.gaussians()?.with_sh_degree(degree);
+    run.progress.tell(Message::TrainingEnds(&scene));
+    let started = Instant::now();
+    let mut summary = None;
+    let grid = match known {
+        Some(found) if by_descent => {
+            nearest_codes(&mut scene, &found);
+            found
+        }
+        Some(found) => {
+            objects::lift(&mut scene, &folder, &training, &found)?;
+            found
+        }
+        None => {
+            let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, &config.global(), run)?;
+            summary = Some(found);
+            grid
+        }
+    };
+    let mapping_seconds = started.elapsed().as_secs_f64();
+    grid.save(&folder)?;
+    ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
+    let [r, g, b, ..] = result.background;
+    let report = Report {
+        scene: config.scene.clone(),
+        preset: config.preset,
+        mapping: config.mapping,
+        feature_mode: config.feature_mode,
+        objects: grid.objects.len(),
+        mapping_seconds,
+        mapping_summary: summary,
+        iterations: result.iterations,
+        seconds: result.seconds,
+        iterations_per_second: result.iterations_per_second,
+        gaussians: result.gaussians,
+        removals: result.removals,
+        sh_degree: scene.sh_degree,
+        exposure: settings.exposure,
+        antialias: settings.antialias,
+        background: [r, g, b],
+        size: format!("{}x{}", cameras[0].width, cameras[0].height),
+        psnr_held_out: psnr,
+        curve,
+        adapter: result.adapter,
+    };
+    manifest.seconds.insert("train".to_owned(), result.seconds);
+    report.note(&mut manifest)?;
+    folder.save_manifest(&manifest)?;
+    // Checkpoints serve a broken run only.
+    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
+    Ok(report)
+}
+
+/// What the trainer is told: options, else what the preset says.
+fn settings(config: &Config, first: &Gaussians, brightness_spread: Option<f64>, seed: u64) -> TrainConfig {
+    let (_, preset_degree, _) = config.preset.values();
+    let by_descent = config.feature_mode == FeatureMode::Train;
+    TrainConfig {
+        iterations: config.iterations(),
+        seed,
+        budget: config.budget(),
+        strategy: match config.strategy {
+            Strategy::Classic => fastlgs_raster::Strategy::Classic,
+            Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
+        },
+        channels: match (config.freeze, by_descent, config.feature_moves_geometry) {
+            (true, ..) => Channels::Feature,
+            (_, false, _) => Channels::Color,
+            (_, true, false) => Channels::Both,
+            (_, true, true) => Channels::Coupled,
+        },
+        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { preset_degree }),
+        first_degree: first.sh_degree,
+        feature_weight: config.feature_weight,
+        antialias: config.antialias,
+        background: config.background.color,
+        learn_background: config.background.learn,
+        exposure: match config.exposure {
+            Exposures::Auto => brightness_spread.is_some_and(|stops| stops >= VARYING),
+            Exposures::On => true,
+            Exposures::Off => false,
+        },
+        ..TrainConfig::default()
+    }
+}
+
+/// Gives every Gaussian the object whose code is nearest to its trained feature.
+fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
+    for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
+        *id = grid.nearest(*feature).map_or(0, |(id, _)| id);
+    }
+}
