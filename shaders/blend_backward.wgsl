@@ -1,4 +1,4 @@
-// Gradients of blending, front to back from the stored final picture: one slot for each pair.
+// Gradients of blending, front to back from the stored final picture: one slot for each pair; docs/gradients.md, section 1.
 //
 // With R the light still to come behind Gaussian i (background included), dL/dalpha_i = T_i c_i.g - (R.g) / (1 - alpha_i).
 // Only the scalar R.g is carried, so the pass needs one value a pixel whatever the number of channels.
@@ -23,8 +23,8 @@
 
 struct Quad {
     transmittance: vec4<f32>,
-    // R.g: what the light behind is worth.
-    behind: vec4<f32>,
+    // R.g of what lies behind the Gaussians that were walked so far.
+    r_dot_g: vec4<f32>,
     gr: vec4<f32>,
     gg: vec4<f32>,
     gb: vec4<f32>,
@@ -57,14 +57,14 @@ fn load_quad(x: u32, y: u32) -> Quad {
     quad.gr = gradient[quad_at(0u, x, y, view)];
     quad.gg = gradient[quad_at(1u, x, y, view)];
     quad.gb = gradient[quad_at(2u, x, y, view)];
-    quad.behind = frame[quad_at(0u, x, y, view)] * quad.gr + frame[quad_at(1u, x, y, view)] * quad.gg + frame[quad_at(2u, x, y, view)] * quad.gb;
+    quad.r_dot_g = frame[quad_at(0u, x, y, view)] * quad.gr + frame[quad_at(1u, x, y, view)] * quad.gg + frame[quad_at(2u, x, y, view)] * quad.gb;
 #endif
 #ifdef WITH_FEATURE
     quad.g0 = gradient[quad_at(3u, x, y, view)];
     quad.g1 = gradient[quad_at(4u, x, y, view)];
     quad.g2 = gradient[quad_at(5u, x, y, view)];
 #ifdef FEATURE_MOVES
-    quad.behind += frame[quad_at(3u, x, y, view)] * quad.g0 + frame[quad_at(4u, x, y, view)] * quad.g1 + frame[quad_at(5u, x, y, view)] * quad.g2;
+    quad.r_dot_g += frame[quad_at(3u, x, y, view)] * quad.g0 + frame[quad_at(4u, x, y, view)] * quad.g1 + frame[quad_at(5u, x, y, view)] * quad.g2;
 #endif
 #endif
     return quad;
@@ -76,15 +76,15 @@ fn add(quad: ptr<function, Quad>, column: ptr<function, Column>, sums: ptr<funct
     let w = alpha * t;
     (*quad).transmittance = t - w;
 #ifdef WITH_COLOR
-    var worth = fma(vec4<f32>(s1.z), (*quad).gr, fma(vec4<f32>(s1.w), (*quad).gg, s2.x * (*quad).gb));
+    var c_dot_g = fma(vec4<f32>(s1.z), (*quad).gr, fma(vec4<f32>(s1.w), (*quad).gg, s2.x * (*quad).gb));
 #ifdef FEATURE_MOVES
-    worth = fma(vec4<f32>(s2.y), (*quad).g0, fma(vec4<f32>(s2.z), (*quad).g1, fma(vec4<f32>(s2.w), (*quad).g2, worth)));
+    c_dot_g = fma(vec4<f32>(s2.y), (*quad).g0, fma(vec4<f32>(s2.z), (*quad).g1, fma(vec4<f32>(s2.w), (*quad).g2, c_dot_g)));
 #endif
-    let gain = w * worth;
-    let behind = (*quad).behind - gain;
-    (*quad).behind = behind;
+    let w_c_dot_g = w * c_dot_g;
+    let r_dot_g = (*quad).r_dot_g - w_c_dot_g;
+    (*quad).r_dot_g = r_dot_g;
     // p = dL/d(exponent) = alpha dL/dalpha.
-    let p = gain - behind * (alpha / (1.0 - alpha));
+    let p = w_c_dot_g - r_dot_g * (alpha / (1.0 - alpha));
     (*column).p += p;
     (*column).py = fma(p, vec4<f32>(dy), (*column).py);
     (*column).pyy = fma(p, vec4<f32>(dy * dy), (*column).pyy);

@@ -1,4 +1,5 @@
-// Sums each Gaussian's gradient slots and carries them through the projection to the trained values.
+// Sums each Gaussian's gradient slots and carries them through the projection to the trained values: docs/gradients.md, sections 2 to 6, whose
+// symbols the names follow (d_x is dL/dx).
 //
 // Invocations take the Gaussians in depth order: neighbours then touch about as many tiles, and their slots lie in a row.
 //
@@ -39,24 +40,24 @@ fn put3(channel: u32, i: u32, value: vec3<f32>) {
     put(channel + 2u, i, value.z);
 }
 
-// Colour's gradient to the SH coefficients; returns what it asks of the mean, which turns the viewing direction.
+// Section 6: colour's gradient to the SH coefficients; returns that of the mean, on which the viewing direction depends.
 fn color_backward(i: u32, mean: vec3<f32>, splat_color: vec3<f32>, gradient: vec3<f32>) -> vec3<f32> {
     // Colour is cut off at 0 from below.
-    let d = select(vec3<f32>(0.0), gradient, splat_color > vec3<f32>(0.0));
-    put3(COLOR, i, SH_C0 * d);
+    let d_color = select(vec3<f32>(0.0), gradient, splat_color > vec3<f32>(0.0));
+    put3(COLOR, i, SH_C0 * d_color);
 #ifdef WITH_SH
     let ray = mean - view.camera.xyz;
     let distance = length(ray);
     let direction = ray / distance;
-    let b = basis(direction);
+    let y = basis(direction);
     let slopes = basis_slopes(direction);
     let rest = rest_of(view.sh_degree);
     var d_direction = vec3<f32>(0.0);
     // Written out, so that the basis stays in registers.
 #each K 15
     if $Ku < rest {
-        put3(SH_REST + 3u * $Ku, i, b[$K] * d);
-        d_direction += dot(param3(SH_REST + 3u * $Ku, i), d) * slopes[$K];
+        put3(SH_REST + 3u * $Ku, i, y[$K] * d_color);
+        d_direction += dot(param3(SH_REST + 3u * $Ku, i), d_color) * slopes[$K];
     }
 #end
     return (d_direction - direction * dot(direction, d_direction)) / distance;
@@ -92,116 +93,117 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         put3(FEATURE, i, vec3<f32>(0.0));
         return;
     }
-    var a = vec4<f32>(0.0);
-    var b = vec4<f32>(0.0);
-    var c = vec4<f32>(0.0);
+    // Sums of section 1 over all pixels: (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, dL/dr, dL/dg) (dL/db, dL/df).
+    var sum0 = vec4<f32>(0.0);
+    var sum1 = vec4<f32>(0.0);
+    var sum2 = vec4<f32>(0.0);
     for (var e = start - view.slot_first; e < start - view.slot_first + count; e++) {
 #ifdef WITH_COLOR
-        a += slots[SLOT * e];
-        b += slots[SLOT * e + 1u];
+        sum0 += slots[SLOT * e];
+        sum1 += slots[SLOT * e + 1u];
 #endif
-        c += slots[SLOT * e + SLOT - 1u];
+        sum2 += slots[SLOT * e + SLOT - 1u];
     }
-    put3(FEATURE, i, c.yzw);
+    put3(FEATURE, i, sum2.yzw);
 #ifdef WITH_COLOR
     let mean = param3(MEAN, i);
     let s0 = splats[3u * g];
     let s1 = splats[3u * g + 1u];
-    let d_mean_by_color = color_backward(i, mean, vec3<f32>(s1.zw, splats[3u * g + 2u].x), vec3<f32>(b.zw, c.x));
+    let d_mean_by_color = color_backward(i, mean, vec3<f32>(s1.zw, splats[3u * g + 2u].x), vec3<f32>(sum1.zw, sum2.x));
 
-    // Conic (natural exponent) from the base-2 exponent.
+    // Section 3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = 0.6931471805599453;
-    let qa = -2.0 * ln2 * s0.z;
-    let qb = -ln2 * s0.w;
-    let qc = -2.0 * ln2 * s1.x;
-    let d_mean = vec2<f32>(qa * a.x + qb * a.y, qb * a.x + qc * a.y);
+    let q_xx = -2.0 * ln2 * s0.z;
+    let q_xy = -ln2 * s0.w;
+    let q_yy = -2.0 * ln2 * s1.x;
+    let d_center = vec2<f32>(q_xx * sum0.x + q_xy * sum0.y, q_xy * sum0.x + q_yy * sum0.y);
     // Half-image units make the threshold of density control independent of the resolution.
-    stats[g] += length(d_mean * 0.5 * vec2<f32>(view.size));
+    stats[g] += length(d_center * 0.5 * vec2<f32>(view.size));
     stats[view.gaussians + g] += 1.0;
 
-    // dL/dQ = -1/2 sum p d d^T; dL/dcov = -Q (dL/dQ) Q.
-    let dq_xx = -0.5 * a.z;
-    let dq_xy = -0.5 * a.w;
-    let dq_yy = -0.5 * b.x;
-    let mxx = qa * dq_xx + qb * dq_xy;
-    let mxy = qa * dq_xy + qb * dq_yy;
-    let myx = qb * dq_xx + qc * dq_xy;
-    let myy = qb * dq_xy + qc * dq_yy;
-    var gxx = -(mxx * qa + mxy * qb);
-    var gxy = -(mxx * qb + mxy * qc);
-    var gyy = -(myx * qb + myy * qc);
+    // dL/dQ = -1/2 sum p d d^T; dL/dcov = -(Q dL/dQ) Q.
+    let d_q_xx = -0.5 * sum0.z;
+    let d_q_xy = -0.5 * sum0.w;
+    let d_q_yy = -0.5 * sum1.x;
+    let qdq_xx = q_xx * d_q_xx + q_xy * d_q_xy;
+    let qdq_xy = q_xx * d_q_xy + q_xy * d_q_yy;
+    let qdq_yx = q_xy * d_q_xx + q_yy * d_q_xy;
+    let qdq_yy = q_xy * d_q_xy + q_yy * d_q_yy;
+    var d_cov_xx = -(qdq_xx * q_xx + qdq_xy * q_xy);
+    var d_cov_xy = -(qdq_xx * q_xy + qdq_xy * q_yy);
+    var d_cov_yy = -(qdq_yx * q_xy + qdq_yy * q_yy);
 
     let t = (view.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
-    let q = vec4<f32>(param(ROTATION, i), param(ROTATION + 1u, i), param(ROTATION + 2u, i), param(ROTATION + 3u, i));
-    let q_length = max(length(q), 1e-12);
-    let unit = q / q_length;
+    let quaternion = vec4<f32>(param(ROTATION, i), param(ROTATION + 1u, i), param(ROTATION + 2u, i), param(ROTATION + 3u, i));
+    let quaternion_length = max(length(quaternion), 1e-12);
+    let unit = quaternion / quaternion_length;
     let r = rotation_matrix(unit);
     let s = exp(param3(LOG_SCALE, i));
     let jw = affine(t, view);
-    let ax = (jw.x * r) * s;
-    let ay = (jw.y * r) * s;
-    let cov = dilated(ax, ay);
-    // Opacity is clamped at ALPHA_MAX from above.
-    let whole_opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
-    let free_opacity = select(0.0, 1.0, whole_opacity * compensation(cov, view) < ALPHA_MAX);
-    put(OPACITY, i, b.y * (1.0 - whole_opacity) * free_opacity);
+    let a_x = (jw.x * r) * s;
+    let a_y = (jw.y * r) * s;
+    let cov = dilated(a_x, a_y);
+    // Section 2. Opacity is clamped at ALPHA_MAX from above.
+    let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
+    let unclamped_opacity = select(0.0, 1.0, opacity * compensation(cov, view) < ALPHA_MAX);
+    put(OPACITY, i, sum1.y * (1.0 - opacity) * unclamped_opacity);
     if view.antialias == 1u && determinant_share(cov) > 1e-6 {
         // d log(compensation) / d cov = (inverse before dilation - inverse after it) / 2.
         let before = vec3<f32>(cov.x - DILATION, cov.y, cov.z - DILATION);
         let det = before.x * before.z - before.y * before.y;
-        let half = 0.5 * b.y * free_opacity;
-        gxx += half * (before.z / det - qa);
-        gxy += half * (-before.y / det - qb);
-        gyy += half * (before.x / det - qc);
+        let half = 0.5 * sum1.y * unclamped_opacity;
+        d_cov_xx += half * (before.z / det - q_xx);
+        d_cov_xy += half * (-before.y / det - q_xy);
+        d_cov_yy += half * (before.x / det - q_yy);
     }
-    // cov = A A^T, A = (J W) (R S).
-    let d_ax = 2.0 * (gxx * ax + gxy * ay);
-    let d_ay = 2.0 * (gxy * ax + gyy * ay);
-    // d(R S)[:, k] = jw.x d_ax[k] + jw.y d_ay[k].
-    let v0 = jw.x * d_ax.x + jw.y * d_ay.x;
-    let v1 = jw.x * d_ax.y + jw.y * d_ay.y;
-    let v2 = jw.x * d_ax.z + jw.y * d_ay.z;
-    put3(LOG_SCALE, i, s * vec3<f32>(dot(r[0], v0), dot(r[1], v1), dot(r[2], v2)));
+    // Section 4: cov = A A^T + dilation, A = (J W) M, M = R S.
+    let d_a_x = 2.0 * (d_cov_xx * a_x + d_cov_xy * a_y);
+    let d_a_y = 2.0 * (d_cov_xy * a_x + d_cov_yy * a_y);
+    // Columns of dL/dM = (J W)^T dL/dA.
+    let d_m0 = jw.x * d_a_x.x + jw.y * d_a_y.x;
+    let d_m1 = jw.x * d_a_x.y + jw.y * d_a_y.y;
+    let d_m2 = jw.x * d_a_x.z + jw.y * d_a_y.z;
+    put3(LOG_SCALE, i, s * vec3<f32>(dot(r[0], d_m0), dot(r[1], d_m1), dot(r[2], d_m2)));
 
-    // Rotation: columns of dL/dR, then through the quaternion and its normalisation.
-    let r0 = v0 * s.x;
-    let r1 = v1 * s.y;
-    let r2 = v2 * s.z;
+    // Columns of dL/dR, then through the quaternion and its normalisation.
+    let d_r0 = d_m0 * s.x;
+    let d_r1 = d_m1 * s.y;
+    let d_r2 = d_m2 * s.z;
     let w = unit.x;
     let x = unit.y;
     let y = unit.z;
     let z = unit.w;
     let d_unit = 2.0 * vec4<f32>(
-        z * (r0.y - r1.x) + y * (r2.x - r0.z) + x * (r1.z - r2.y),
-        y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r1.z - r2.y) - 2.0 * x * (r1.y + r2.z),
-        x * (r0.y + r1.x) + z * (r1.z + r2.y) + w * (r2.x - r0.z) - 2.0 * y * (r0.x + r2.z),
-        x * (r0.z + r2.x) + y * (r1.z + r2.y) + w * (r0.y - r1.x) - 2.0 * z * (r0.x + r1.y),
+        z * (d_r0.y - d_r1.x) + y * (d_r2.x - d_r0.z) + x * (d_r1.z - d_r2.y),
+        y * (d_r0.y + d_r1.x) + z * (d_r0.z + d_r2.x) + w * (d_r1.z - d_r2.y) - 2.0 * x * (d_r1.y + d_r2.z),
+        x * (d_r0.y + d_r1.x) + z * (d_r1.z + d_r2.y) + w * (d_r2.x - d_r0.z) - 2.0 * y * (d_r0.x + d_r2.z),
+        x * (d_r0.z + d_r2.x) + y * (d_r1.z + d_r2.y) + w * (d_r0.y - d_r1.x) - 2.0 * z * (d_r0.x + d_r1.y),
     );
-    let d_rotation = (d_unit - unit * dot(unit, d_unit)) / q_length;
+    let d_rotation = (d_unit - unit * dot(unit, d_unit)) / quaternion_length;
     put(ROTATION, i, d_rotation.x);
     put(ROTATION + 1u, i, d_rotation.y);
     put(ROTATION + 2u, i, d_rotation.z);
     put(ROTATION + 3u, i, d_rotation.w);
 
-    // Mean: through the projected centre and through J.
-    let rs0 = r[0] * s.x;
-    let rs1 = r[1] * s.y;
-    let rs2 = r[2] * s.z;
-    let d_jwx = rs0 * d_ax.x + rs1 * d_ax.y + rs2 * d_ax.z;
-    let d_jwy = rs0 * d_ay.x + rs1 * d_ay.y + rs2 * d_ay.z;
+    // Section 5: the mean, through the projected centre and through J.
+    let m0 = r[0] * s.x;
+    let m1 = r[1] * s.y;
+    let m2 = r[2] * s.z;
+    let d_jw_x = m0 * d_a_x.x + m1 * d_a_x.y + m2 * d_a_x.z;
+    let d_jw_y = m0 * d_a_y.x + m1 * d_a_y.y + m2 * d_a_y.z;
     let world = mat3x3<f32>(view.world_to_camera[0].xyz, view.world_to_camera[1].xyz, view.world_to_camera[2].xyz);
     // Rows of dL/dJ = (dL/dJW) W^T.
-    let d_jx = world * d_jwx;
-    let d_jy = world * d_jwy;
-    let inv = 1.0 / t.z;
+    let d_j_x = world * d_jw_x;
+    let d_j_y = world * d_jw_y;
+    let inverse_z = 1.0 / t.z;
     let slope = clamped_slope(t, view);
-    let free = select(vec2<f32>(0.0), vec2<f32>(1.0), slope == t.xy / t.z);
+    let unclamped = select(vec2<f32>(0.0), vec2<f32>(1.0), slope == t.xy / t.z);
     // J = focal / z (1, 0, -slope.x; 0, 1, -slope.y); slope = xy / z where it is not clamped.
-    var d_t = vec3<f32>(view.focal * inv * d_mean, -dot(view.focal * t.xy * inv * inv, d_mean));
-    let d_slope = -view.focal * inv * vec2<f32>(d_jx.z, d_jy.z) * free;
-    d_t.x += d_slope.x * inv;
-    d_t.y += d_slope.y * inv;
-    d_t.z -= inv * inv * (dot(view.focal, vec2<f32>(d_jx.x - slope.x * d_jx.z, d_jy.y - slope.y * d_jy.z))) + inv * inv * dot(d_slope, t.xy);
+    var d_t = vec3<f32>(view.focal * inverse_z * d_center, -dot(view.focal * t.xy * inverse_z * inverse_z, d_center));
+    let d_slope = -view.focal * inverse_z * vec2<f32>(d_j_x.z, d_j_y.z) * unclamped;
+    d_t.x += d_slope.x * inverse_z;
+    d_t.y += d_slope.y * inverse_z;
+    d_t.z -= inverse_z * inverse_z * (dot(view.focal, vec2<f32>(d_j_x.x - slope.x * d_j_x.z, d_j_y.y - slope.y * d_j_y.z))) + inverse_z * inverse_z * dot(d_slope, t.xy);
     put3(MEAN, i, transpose(world) * d_t + d_mean_by_color);
 #endif
 }

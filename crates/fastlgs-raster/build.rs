@@ -1,9 +1,16 @@
-//! Puts the WGSL passes together, validates every permutation with naga, and writes `shaders.rs`: for each pass its
-//! sources and the kinds of its bindings.
+//! Puts the WGSL passes together, validates every permutation with naga, and writes `shaders.rs`: for each pass a type with its
+//! sources, its uniform, and its buffers by name.
 //!
-//! `#import NAME` takes in `shared/NAME.wgsl` once; `#ifdef FLAG`/`#else`/`#endif` choose by permutation; the lines between
-//! `#each K 8` and `#end` are repeated 8 times, `$K` being the number of the repetition. `#each Q` repeats for the pixel
-//! quads of an invocation, with `$C` as the quad's column.
+//! The shaders are WGSL with these lines beside, each alone on its line (`#` first, after spaces):
+//!
+//! * `#import NAME`: the text of `shared/NAME.wgsl`, the first time that it is asked for;
+//! * `#ifdef FLAG` ... `#else` ... `#endif`: one of both, by the flags of the permutation. Flags are `WITH_COLOR`, `WITH_FEATURE`,
+//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `SUBGROUPS` or `WIDE` (`Shape`; none of them: shared memory);
+//! * `#each K 8` ... `#end`: the lines 8 times, with 0 to 7 for `$K`: loops that must be unrolled for their values to stay in registers;
+//! * `#each Q` ... `#end`: once for each quad (four pixels of a row) of an invocation, with its number for `$Q` and its column of quads for
+//!   `$C`: 16 quads in 2 columns where one invocation owns the 8x8 tile (`WIDE`), else 2 in one column.
+//!
+//! Blocks of `#ifdef` may be nested, those of `#each` may not. `shared/lane.wgsl` says which pixels a lane's quads are.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -34,19 +41,11 @@ fn main() {
                 sources.push((flags, source));
             }
         }
-        let bindings = validate(&name, &sources[0].1);
+        let bound = validate(&name, &sources[0].1);
         for (_, source) in &sources[1..] {
-            assert_eq!(bindings, validate(&name, source), "{name}: all permutations bind the same");
+            assert_eq!(bound, validate(&name, source), "{name}: all permutations bind the same");
         }
-        let sources: Vec<String> = sources.iter().map(|(flags, source)| format!("(&{flags:?}, {source:?})")).collect();
-        writeln!(
-            out,
-            "/// `shaders/{name}.wgsl`\npub static {}: Shader = Shader {{ name: {name:?}, sources: &[{}], bindings: &[{}] }};",
-            name.to_uppercase(),
-            sources.join(", "),
-            bindings.join(", ")
-        )
-        .expect("writing to a string");
+        out.push_str(&rust_of(&name, &sources, &bound));
     }
     fs::write(Path::new(&env::var("OUT_DIR").expect("cargo sets OUT_DIR")).join("shaders.rs"), out).expect("writable OUT_DIR");
 }
@@ -114,15 +113,26 @@ fn expand(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>,
     }
 }
 
-/// Parses and validates; returns the kind of each binding in order.
-fn validate(name: &str, source: &str) -> Vec<String> {
+/// A variable that a shader binds.
+#[derive(Debug, PartialEq)]
+struct Bound {
+    place: u32,
+    /// Its name in the shader.
+    name: String,
+    kind: &'static str,
+    /// Name and size of its type, if that is a structure.
+    structure: Option<(String, u32)>,
+}
+
+/// Parses and validates; returns what is bound, in order.
+fn validate(name: &str, source: &str) -> Vec<Bound> {
     let module = naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
     naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
         .subgroup_stages(naga::valid::ShaderStages::COMPUTE)
         .subgroup_operations(naga::valid::SubgroupOperationSet::all())
         .validate(&module)
         .unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
-    let mut bindings: Vec<(u32, String)> = module
+    let mut bound: Vec<Bound> = module
         .global_variables
         .iter()
         .filter_map(|(_, variable)| {
@@ -132,9 +142,51 @@ fn validate(name: &str, source: &str) -> Vec<String> {
                 naga::AddressSpace::Storage { .. } => "Binding::Read",
                 _ => return None,
             };
-            Some((variable.binding.as_ref().expect("a binding number").binding, kind.to_owned()))
+            let own = &module.types[variable.ty];
+            Some(Bound {
+                place: variable.binding.as_ref().expect("a binding number").binding,
+                name: variable.name.clone().expect("a name"),
+                kind,
+                structure: own.name.clone().map(|structure| (structure, own.inner.size(module.to_ctx()))),
+            })
         })
         .collect();
-    bindings.sort();
-    bindings.into_iter().map(|b| b.1).collect()
+    bound.sort_by_key(|b| b.place);
+    assert!(bound.iter().enumerate().all(|(k, b)| b.place == k as u32), "{name}: bindings are 0, 1, 2, ...");
+    assert_eq!(bound[0].kind, "Binding::Uniform", "{name}: binding 0 is the uniform");
+    bound
+}
+
+/// A pass as Rust: a type with its shader, and its buffers by name.
+fn rust_of(name: &str, sources: &[(Vec<&str>, String)], bound: &[Bound]) -> String {
+    let title: String = name.split('_').map(|word| format!("{}{}", word[..1].to_uppercase(), &word[1..])).collect();
+    let (uniform, bytes) = bound[0].structure.as_ref().expect("a uniform is a structure");
+    let storages: Vec<&str> = bound[1..].iter().map(|b| b.name.as_str()).collect();
+    let fields: String = storages.iter().map(|s| format!("    pub {s}: &'a wgpu::Buffer,\n")).collect();
+    let in_order: String = storages.iter().map(|s| format!("buffers.{s}, ")).collect();
+    let kinds: Vec<&str> = bound.iter().map(|b| b.kind).collect();
+    let sources: Vec<String> = sources.iter().map(|(flags, source)| format!("(&{flags:?}, {source:?})")).collect();
+    let mut out = String::new();
+    write!(
+        out,
+        "/// `shaders/{name}.wgsl`
+pub enum {title} {{}}
+/// Buffers of `shaders/{name}.wgsl`, as it names them.
+pub struct {title}Buffers<'a> {{
+{fields}}}
+impl Kernel for {title} {{
+    const SHADER: &'static Shader = &Shader {{ name: {name:?}, sources: &[{sources}], bindings: &[{kinds}] }};
+    type Uniform = crate::view::{uniform};
+    type Buffers<'a> = {title}Buffers<'a>;
+    fn in_order<'a>(buffers: &Self::Buffers<'a>) -> Vec<&'a wgpu::Buffer> {{
+        vec![{in_order}]
+    }}
+}}
+const _: () = assert!(size_of::<crate::view::{uniform}>() == {bytes}, \"{uniform} has another size in shaders/{name}.wgsl\");
+",
+        sources = sources.join(", "),
+        kinds = kinds.join(", "),
+    )
+    .expect("writing to a string");
+    out
 }

@@ -25,6 +25,7 @@ pub mod ply;
 pub mod rng;
 pub mod scene_folder;
 pub mod shares;
+pub mod simd;
 pub mod spz;
 pub mod synth;
 pub mod turbo;

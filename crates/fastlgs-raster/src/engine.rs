@@ -1,11 +1,11 @@
 //! One interface for the GPU and the fast CPU backend.
 
+use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::density::State;
-use crate::native::CpuEngine;
-use crate::pass::Channels;
+
 use crate::view::{Plane, Step, View};
-use crate::{Error, GpuEngine, Result};
+use crate::{Error, Result};
 use fastlgs_core::Shares;
 use std::collections::BTreeMap;
 
@@ -218,21 +218,6 @@ pub struct Memory {
     pub frame: u64,
     /// Targets and cached lists of views.
     pub views: u64,
-}
-
-/// Opens `cpu` (the fast CPU backend), `auto`, or an adapter by name or index.
-///
-/// # Errors
-/// When there is no such adapter.
-pub fn open_engine(device: &str) -> Result<Box<dyn Engine>> {
-    if device == "cpu" {
-        return Ok(Box::new(CpuEngine::new()));
-    }
-    let gpu = crate::Gpu::open(device)?;
-    if gpu.software {
-        tracing::info!("'{}' is a software device; --device cpu does the same about twice as fast", gpu.name);
-    }
-    Ok(Box::new(GpuEngine::new(gpu)))
 }
 
 /// Loss planes of a step: colour channels 0..3 and feature channels 3..6, as far as they are trained.

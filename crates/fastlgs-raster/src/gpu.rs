@@ -1,37 +1,9 @@
 //! Adapters, the device, and buffers.
 
 use crate::profile::Profile;
-use crate::{Error, Result, tuning};
-use serde::{Deserialize, Serialize};
+use crate::shape::Shape;
+use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
-
-/// How the blending kernels divide an 8x8 tile; `shaders/shared/lane.wgsl`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Shape {
-    /// Eight invocations a tile, which add up their gradients in shared memory.
-    Shared,
-    /// The same with subgroup operations.
-    Subgroups,
-    /// One invocation a tile: for software rasterisers, whose invocations are vector lanes.
-    Wide,
-}
-
-impl Shape {
-    /// Flag of the shaders' permutations.
-    pub(crate) fn flag(self) -> Option<&'static str> {
-        match self {
-            Shape::Shared => None,
-            Shape::Subgroups => Some("SUBGROUPS"),
-            Shape::Wide => Some("WIDE"),
-        }
-    }
-
-    /// Workgroups that blend `tiles` tiles.
-    pub fn groups(self, tiles: u32) -> u32 {
-        if self == Shape::Wide { tiles.div_ceil(8) } else { tiles }
-    }
-}
 
 /// An opened device.
 pub struct Gpu {
@@ -41,7 +13,7 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name of the adapter.
     pub name: String,
-    /// How the blending kernels divide a tile: what was measured to be fastest ([`crate::tuning`]), else a guess.
+    /// How the blending kernels divide a tile: a guess, until [`crate::tuning`] knows better.
     pub shape: Shape,
     /// Shapes that the adapter can run.
     pub shapes: Vec<Shape>,
@@ -108,7 +80,6 @@ impl Gpu {
         }
         let guess = if software { Shape::Wide } else { shapes[shapes.len() - 1] };
         let identity = format!("{} ({} {})", info.name, info.driver, info.driver_info);
-        let shape = tuning::remembered(&identity).filter(|s| shapes.contains(s)).unwrap_or(guess);
         let mut features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         features.set(wgpu::Features::SUBGROUP, subgroups);
         let descriptor = wgpu::DeviceDescriptor {
@@ -138,7 +109,7 @@ impl Gpu {
             device,
             queue,
             name: info.name,
-            shape,
+            shape: guess,
             shapes,
             identity,
             software,

@@ -8,6 +8,7 @@
 //! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as vectorised Rust ([`CpuEngine`]).
 
 pub mod budget;
+mod channels;
 mod checkpoint;
 pub mod cpu;
 pub mod density;
@@ -18,9 +19,12 @@ mod gpu_engine;
 pub mod init;
 pub mod lift;
 mod native;
+mod open;
 mod pass;
 mod profile;
 mod schedule;
+mod shader;
+mod shape;
 mod trainer;
 pub mod tuning;
 mod view;
@@ -28,13 +32,15 @@ mod view;
 #[cfg(test)]
 mod tests;
 
-pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, open_engine, pack};
-pub use gpu::{Gpu, Shape, adapters};
+pub use channels::Channels;
+pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, pack};
+pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
-pub use pass::Channels;
+pub use open::{Choice, choice, open_engine};
 
 pub use schedule::{Budget, Strategy, TrainConfig};
+pub use shape::Shape;
 pub use trainer::{Progress, Target, TrainReport, Trainer};
 pub use view::{Rates, Step, View};
 

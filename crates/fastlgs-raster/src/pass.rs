@@ -1,82 +1,30 @@
-//! A compute pass made from an assembled shader.
+//! A compute pass made from an assembled shader, and the recording of passes one after the other.
 
+use crate::channels::Channels;
 use crate::gpu::Gpu;
+use crate::shader::{Binding, Kernel, Shader};
 use crate::{Result, cpu};
-
-/// How a shader uses a binding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Binding {
-    /// Uniform buffer.
-    Uniform,
-    /// Storage buffer, read only.
-    Read,
-    /// Storage buffer, read and written.
-    ReadWrite,
-}
-
-/// What a step renders and trains.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
-pub enum Channels {
-    /// Geometry and colour.
-    Color,
-    /// The feature alone, geometry being frozen.
-    Feature,
-    /// Both; the feature does not move geometry.
-    Both,
-    /// Both, and the feature moves geometry too.
-    Coupled,
-}
-
-impl Channels {
-    /// Whether geometry and colour are among them.
-    pub fn color(self) -> bool {
-        self != Self::Feature
-    }
-
-    /// Whether the feature is among them.
-    pub fn feature(self) -> bool {
-        self != Self::Color
-    }
-
-    /// Groups of four floats in a gradient slot.
-    pub(crate) fn slot(self) -> usize {
-        if self.color() { 3 } else { 1 }
-    }
-
-    fn flags(self) -> &'static [&'static str] {
-        match self {
-            Self::Color => &["WITH_COLOR"],
-            Self::Feature => &["WITH_FEATURE"],
-            Self::Both => &["WITH_COLOR", "WITH_FEATURE"],
-            Self::Coupled => &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"],
-        }
-    }
-}
-
-/// An assembled, validated shader; all permutations have the same bindings 0, 1, 2, ...
-pub struct Shader {
-    /// File name without ending: also that of the CPU twin.
-    pub name: &'static str,
-    /// Sources by the flags that they were assembled for.
-    pub sources: &'static [(&'static [&'static str], &'static str)],
-    /// Kind of each binding.
-    pub bindings: &'static [Binding],
-}
-
-/// All shaders of `shaders/`, by upper-case name.
-#[allow(missing_docs, reason = "generated: each item names its file")]
-pub mod shaders {
-    use super::{Binding, Shader};
-    include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
-}
+use std::marker::PhantomData;
 
 /// A pipeline with an explicit layout (an automatic one drops bindings that a permutation does not use).
 pub struct Pass {
-    name: &'static str,
-    kinds: &'static [Binding],
+    shader: &'static Shader,
     channels: Channels,
     pipeline: wgpu::ComputePipeline,
     layout: wgpu::BindGroupLayout,
+}
+
+/// A [`Pass`] that knows what it must be given.
+pub struct Typed<K: Kernel> {
+    pass: Pass,
+    kernel: PhantomData<K>,
+}
+
+impl<K: Kernel> Typed<K> {
+    /// As [`Pass::new`].
+    pub fn new(gpu: &Gpu, channels: Channels, harmonics: bool) -> Self {
+        Self { pass: Pass::new(gpu, K::SHADER, channels, harmonics), kernel: PhantomData }
+    }
 }
 
 /// Records passes one after the other. The first `on_cpu` of them run as their twins instead, which finds a wrong one.
@@ -92,14 +40,15 @@ impl<'a> Recorder<'a> {
     }
 
     /// One pass over its uniform and storage buffers.
-    pub fn run<U: bytemuck::Pod>(&mut self, pass: &Pass, uniform: &U, storages: &[&wgpu::Buffer], groups: u32) -> Result<()> {
+    pub fn run<K: Kernel>(&mut self, pass: &Typed<K>, uniform: &K::Uniform, buffers: K::Buffers<'_>, groups: u32) -> Result<()> {
+        let storages = K::in_order(&buffers);
         if self.on_cpu > 0 {
             self.on_cpu -= 1;
-            return self.run_twin(pass, bytemuck::bytes_of(uniform), storages);
+            return self.run_twin(&pass.pass, bytemuck::bytes_of(uniform), &storages);
         }
         let uniform = self.gpu.uniform(uniform);
-        let buffers: Vec<_> = std::iter::once(&uniform).chain(storages.iter().copied()).collect();
-        pass.record(self.gpu, &mut self.encoder, &buffers, groups);
+        let all: Vec<_> = std::iter::once(&uniform).chain(storages).collect();
+        pass.pass.record(self.gpu, &mut self.encoder, &all, groups);
         Ok(())
     }
 
@@ -107,8 +56,8 @@ impl<'a> Recorder<'a> {
         self.flush();
         let words = |b: &&wgpu::Buffer| self.gpu.read::<u32>(b, (b.size() / 4) as usize);
         let mut contents = storages.iter().map(words).collect::<Result<Vec<_>>>()?;
-        cpu::run(pass.name, pass.channels, uniform, &mut contents);
-        for ((buffer, content), kind) in storages.iter().zip(&contents).zip(&pass.kinds[1..]) {
+        cpu::run(pass.shader.name, pass.channels, uniform, &mut contents);
+        for ((buffer, content), kind) in storages.iter().zip(&contents).zip(&pass.shader.bindings[1..]) {
             if *kind == Binding::ReadWrite {
                 self.gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(content));
             }
@@ -142,7 +91,7 @@ const MAX_GROUPS: u32 = 65_535;
 
 impl Pass {
     /// Compiles the permutation for the device's shape and for `channels`, with colour that depends on the view or not.
-    pub fn new(gpu: &Gpu, shader: &Shader, channels: Channels, harmonics: bool) -> Self {
+    pub fn new(gpu: &Gpu, shader: &'static Shader, channels: Channels, harmonics: bool) -> Self {
         let wanted = |flag: &&str| gpu.shape.flag() == Some(*flag) || channels.flags().contains(flag) || (harmonics && *flag == "WITH_SH");
         // Of the permutations all of whose flags are wanted, the one with most: it leaves out only what the pass ignores.
         let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(&wanted));
@@ -184,7 +133,7 @@ impl Pass {
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             cache: None,
         });
-        Self { name: shader.name, kinds: shader.bindings, channels, pipeline, layout }
+        Self { shader, channels, pipeline, layout }
     }
 
     /// Records one dispatch of `groups` workgroups, split over y above the limit.
@@ -194,10 +143,13 @@ impl Pass {
         }
         let entries: Vec<_> =
             buffers.iter().enumerate().map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: b.as_entire_binding() }).collect();
-        let bindings =
-            gpu.device.create_bind_group(&wgpu::BindGroupDescriptor { label: Some(self.name), layout: &self.layout, entries: &entries });
-        let timestamp_writes = gpu.profile.as_ref().and_then(|p| p.next(self.name));
-        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(self.name), timestamp_writes });
+        let bindings = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: Some(self.shader.name),
+            layout: &self.layout,
+            entries: &entries,
+        });
+        let timestamp_writes = gpu.profile.as_ref().and_then(|p| p.next(self.shader.name));
+        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(self.shader.name), timestamp_writes });
         pass.set_pipeline(&self.pipeline);
         pass.set_bind_group(0, &bindings, &[]);
         let rows = groups.div_ceil(MAX_GROUPS);

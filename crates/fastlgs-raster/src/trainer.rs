@@ -1,11 +1,11 @@
 //! Training of scene and semantic field together (paper, "Training Features for Gaussians").
 
 use crate::budget::{self, Growth, Removal};
+use crate::channels::Channels;
 use crate::checkpoint::{self, Course};
 use crate::density::{self, State};
 use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions, TargetImage};
 use crate::exposure::{Learned, LearnedExposure, RATE};
-use crate::pass::Channels;
 use crate::schedule::{Budget, Strategy, TrainConfig};
 use crate::view::{Step, View};
 use crate::{Error, Result};

@@ -1,10 +1,14 @@
-//! Which kernel shape an adapter is fastest with: measured once by training a small generated scene with each, and
-//! remembered in the user's cache folder (`shapes.json`) for the adapter, its driver and this program's version.
+//! Which kernel shape an adapter is fastest with, and whether a software adapter is faster than the CPU backend: measured once by training
+//! a small generated scene with each, and remembered in the user's cache folder (`shapes.json`) for the adapter, its driver and this
+//! program's version.
 
 use crate::density::State;
 use crate::engine::{Engine, Exposure, StepOptions, TargetImage, pack};
-use crate::gpu::{Gpu, Shape};
-use crate::{Channels, GpuEngine, Result, Step, View};
+use crate::gpu::{Gpu, adapters};
+use crate::gpu_engine::GpuEngine;
+use crate::native::CpuEngine;
+use crate::shape::Shape;
+use crate::{Channels, Result, Step, View};
 use fastlgs_core::gaussians::BASE_CHANNELS;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, fs};
@@ -32,6 +36,9 @@ pub struct Tuning {
     pub shape: Shape,
     /// All that the adapter can run.
     pub step_ms: BTreeMap<Shape, f64>,
+    /// The CPU backend on the same machine, where the adapter is a software one.
+    #[serde(default)]
+    pub cpu_ms: Option<f64>,
 }
 
 type Table = BTreeMap<String, Tuning>;
@@ -60,8 +67,14 @@ pub(crate) fn remembered(identity: &str) -> Option<Shape> {
     table(&table_path()).get(&key(identity)).map(|t| t.shape)
 }
 
-/// Measures the adapter's shapes unless that was done before; engines opened later use the fastest. `None` for `cpu`,
-/// which has no shapes. `again` measures in any case.
+/// Milliseconds of a step on a software adapter, at its best, and on the CPU backend, if they were ever measured.
+pub(crate) fn against_cpu(identity: &str) -> Option<[f64; 2]> {
+    let tuning = table(&table_path()).remove(&key(identity))?;
+    Some([*tuning.step_ms.get(&tuning.shape)?, tuning.cpu_ms?])
+}
+
+/// Measures the adapter's shapes, and the CPU backend beside a software adapter, unless that was done before; engines opened later use
+/// the fastest. `None` for `cpu`, which has no shapes, and for `auto` where there is no adapter. `again` measures in any case.
 ///
 /// # Errors
 /// When there is no such adapter, or it fails.
@@ -70,22 +83,26 @@ pub fn tune(device: &str, again: bool) -> Result<Option<Tuning>> {
 }
 
 fn tune_at(path: &Path, device: &str, again: bool) -> Result<Option<Tuning>> {
-    if device == "cpu" {
+    if device == "cpu" || (device == "auto" && adapters().is_empty()) {
         return Ok(None);
     }
     let gpu = Gpu::open(device)?;
     let key = key(&gpu.identity);
-    if let Some(known) = table(path).remove(&key).filter(|_| !again) {
+    let known = table(path).remove(&key);
+    let complete = |t: &Tuning| t.cpu_ms.is_some() || !gpu.software;
+    if let Some(known) = known.clone().filter(|t| complete(t) && !again) {
         return Ok(Some(known));
     }
     tracing::info!("measuring which kernels '{}' is fastest with; this is done once", gpu.name);
     let mut step_ms = BTreeMap::new();
-    for shape in gpu.shapes {
+    for shape in &gpu.shapes {
         let mut gpu = Gpu::open(device)?;
-        gpu.shape = shape;
-        step_ms.insert(shape, measure(GpuEngine::new(gpu))?);
+        gpu.shape = *shape;
+        step_ms.insert(*shape, measure(&mut GpuEngine::new(gpu))?);
     }
-    let tuning = Tuning { shape: chosen(gpu.shape, &step_ms), step_ms };
+    let cpu_ms = if gpu.software { Some(measure(&mut CpuEngine::new())?) } else { None };
+    let present = known.map_or(gpu.shape, |t| t.shape);
+    let tuning = Tuning { shape: chosen(present, &step_ms), step_ms, cpu_ms };
     tracing::debug!(?tuning, "measured");
     let mut table = table(path);
     table.insert(key, tuning.clone());
@@ -103,7 +120,7 @@ fn chosen(present: Shape, step_ms: &BTreeMap<Shape, f64>) -> Shape {
 }
 
 /// Milliseconds of the fastest training step.
-fn measure(mut engine: GpuEngine) -> Result<f64> {
+fn measure(engine: &mut dyn Engine) -> Result<f64> {
     let mut rng = Rng::new(0, "tuning");
     let mut scene = Gaussians::default();
     for i in 0..GAUSSIANS {
@@ -144,6 +161,7 @@ mod tests {
         let first = tune_at(&path, "auto", false).unwrap().unwrap();
         assert_eq!(first.step_ms.len(), gpu.shapes.len());
         assert!(first.step_ms.values().all(|ms| CLEARLY * ms >= first.step_ms[&first.shape]));
+        assert_eq!(first.cpu_ms.is_some(), gpu.software, "a software adapter competes with the processor that it runs on");
         let known = table(&path).remove(&key(&gpu.identity)).unwrap();
         assert_eq!(known.shape, first.shape);
         assert_eq!(tune_at(&path, "auto", false).unwrap(), Some(known));

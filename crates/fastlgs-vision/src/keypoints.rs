@@ -1,10 +1,9 @@
-//! SIFT key points (Lowe 2004), nearest-neighbour matching with the ratio test, and the epipolar check.
+//! SIFT key points (Lowe 2004), and the epipolar check of their matches.
 
 use crate::{Error, Result};
 use fastlgs_core::Camera;
 use glam::{Mat3, Vec2, Vec3};
 use image::GrayImage;
-use rayon::prelude::*;
 
 /// Key points of one photo.
 #[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
@@ -31,8 +30,6 @@ mod descriptors {
 
 /// Most key points kept a photo, strongest first.
 pub const MAX_KEYPOINTS: usize = 2500;
-/// Lowe's ratio of the best to the second-best distance.
-const RATIO: f32 = 0.8;
 
 /// Detects and describes key points: with OpenCV where this build has it, else in pure Rust.
 ///
@@ -81,35 +78,6 @@ pub fn backend() -> &'static str {
     if cfg!(feature = "opencv") { "OpenCV" } else { "pure Rust" }
 }
 
-fn distance(a: &[u8; 128], b: &[u8; 128]) -> u32 {
-    a.iter().zip(b).map(|(a, b)| u32::from(a.abs_diff(*b)).pow(2)).sum()
-}
-
-/// Best match of each descriptor of `a` in `b` that passes the ratio test.
-fn nearest(a: &Keypoints, b: &Keypoints) -> Vec<Option<usize>> {
-    a.descriptors
-        .par_iter()
-        .map(|d| {
-            let (mut best, mut second, mut index) = (u32::MAX, u32::MAX, None);
-            for (j, other) in b.descriptors.iter().enumerate() {
-                let distance = distance(d, other);
-                if distance < best {
-                    (second, best, index) = (best, distance, Some(j));
-                } else if distance < second {
-                    second = distance;
-                }
-            }
-            index.filter(|_| (best as f32) < RATIO * RATIO * second as f32)
-        })
-        .collect()
-}
-
-/// Mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
-pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
-    let back = nearest(b, a);
-    nearest(a, b).into_iter().enumerate().filter_map(|(i, j)| j.map(|j| (i, j))).filter(|(i, j)| back[*j] == Some(*i)).collect()
-}
-
 /// Fundamental matrix: x_b^T F x_a = 0 for pixels of the same point.
 pub fn fundamental(a: &Camera, b: &Camera) -> Mat3 {
     let relative = b.world_to_camera * a.world_to_camera.inverse();
@@ -137,6 +105,7 @@ pub fn epipolar_residual(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::matching::matches;
 
     #[test]
     fn a_shifted_picture_matches_itself() {

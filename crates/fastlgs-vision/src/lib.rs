@@ -15,6 +15,7 @@ pub mod histogram;
 pub mod import;
 pub mod keypoints;
 pub mod masks;
+pub mod matching;
 pub mod models;
 pub mod names;
 pub mod photo_quality;

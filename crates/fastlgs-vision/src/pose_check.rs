@@ -3,7 +3,8 @@
 //! points match, and hardly any obeys the epipolar geometry of the poses. Such groups are moved back by the similarity
 //! that brings their matched points together.
 
-use crate::keypoints::{self, Keypoints, epipolar_residual, fundamental};
+use crate::keypoints::{Keypoints, epipolar_residual, fundamental};
+use crate::matching::matches;
 use crate::triangulate::{epipolar_filter, intersect, overlapping_pairs};
 use fastlgs_core::Camera;
 use fastlgs_core::rng::Rng;
@@ -284,7 +285,7 @@ fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
 
 fn matched(pairs: Vec<(usize, usize)>, cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
     let link = |(a, b): (usize, usize)| {
-        let all = keypoints::matches(&keypoints[a], &keypoints[b]);
+        let all = matches(&keypoints[a], &keypoints[b]);
         let right = right(cameras, keypoints, a, b, &all);
         Link { a, b, all, right }
     };

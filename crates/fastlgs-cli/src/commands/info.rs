@@ -18,6 +18,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         None => serde_json::json!({
             "version": env!("CARGO_PKG_VERSION"),
             "adapters": fastlgs_raster::adapters(),
+            "auto": fastlgs_raster::choice("auto"),
             "cores": std::thread::available_parallelism().map_or(1, usize::from),
             "sift": fastlgs_vision::keypoints::backend(),
             "offline_models": fastlgs_vision::models::offline_installed(),

@@ -1,6 +1,6 @@
 use super::{Splat, TRANSMITTANCE_MIN, alpha};
 use crate::View;
-use crate::pass::Channels;
+use crate::channels::Channels;
 use crate::view::TILE;
 use rayon::prelude::*;
 

@@ -1,11 +1,11 @@
 use super::blend::{pixels_of, shown};
 use super::{Splat, alpha};
 use crate::View;
-use crate::pass::Channels;
+use crate::channels::Channels;
 use crate::view::TILE;
 use rayon::prelude::*;
 
-/// Twin of `shaders/blend_backward.wgsl`. `slots` holds 12 floats a pair of the window, or 4 with frozen geometry.
+/// Twin of `shaders/blend_backward.wgsl` (docs/gradients.md, section 1). `slots` holds 12 floats a pair of the window, or 4 with frozen geometry.
 pub fn blend_backward(
     view: &View,
     channels: Channels,
@@ -35,8 +35,8 @@ pub fn blend_backward(
                 .map(|(x, y)| {
                     let at = view.at(x, y);
                     let g: [f32; 6] = std::array::from_fn(|c| if trained(c) { gradient[c * n + at] } else { 0.0 });
-                    let behind: f32 = (0..moving).map(|c| frame[c * n + at] * g[c]).sum();
-                    (x as f32 + 0.5, y as f32 + 0.5, shown(x, y, view), behind, g)
+                    let r_dot_g: f32 = (0..moving).map(|c| frame[c * n + at] * g[c]).sum();
+                    (x as f32 + 0.5, y as f32 + 0.5, shown(x, y, view), r_dot_g, g)
                 })
                 .collect();
             let backward = |(k, e): (usize, u32)| {
@@ -46,14 +46,14 @@ pub fn blend_backward(
                 }
                 let splat = &splats[pair_gaussians[e as usize] as usize];
                 let values = [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]];
-                for (x, y, transmittance, behind, g) in &mut pixels {
+                for (x, y, transmittance, r_dot_g, g) in &mut pixels {
                     let (dx, dy) = (*x - splat[0][0], *y - splat[0][1]);
                     let a = alpha(splat, dx, dy);
                     let w = a * *transmittance;
                     *transmittance -= w;
-                    let gain: f32 = w * (0..moving).map(|c| values[c] * g[c]).sum::<f32>();
-                    *behind -= gain;
-                    let p = gain - *behind * (a / (1.0 - a));
+                    let w_c_dot_g: f32 = w * (0..moving).map(|c| values[c] * g[c]).sum::<f32>();
+                    *r_dot_g -= w_c_dot_g;
+                    let p = w_c_dot_g - *r_dot_g * (a / (1.0 - a));
                     let add = [p * dx, p * dy, p * dx * dx, p * dx * dy, p * dy * dy, p];
                     for (sum, value) in slot.iter_mut().zip(add.into_iter().chain(g.iter().map(|g| w * g))) {
                         *sum += value;

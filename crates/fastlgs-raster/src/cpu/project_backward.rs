@@ -1,7 +1,7 @@
 use super::harmonics::{basis, basis_slopes};
 use super::{ALPHA_MAX, DILATION, Splat, covariance};
 use crate::View;
-use crate::pass::Channels;
+use crate::channels::Channels;
 use crate::view::stride;
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, Vec2, Vec3, Vec4};
@@ -52,7 +52,7 @@ fn sum_of(slots: &[f32], floats: usize, pairs: std::ops::Range<usize>) -> [f32; 
     slot
 }
 
-/// Carries one Gaussian's summed slot to its trained values, which `put(channel, gradient)` receives. Returns the length
+/// Carries one Gaussian's summed slot to its trained values (docs/gradients.md, sections 2 to 6, whose symbols the names follow), which `put(channel, gradient)` receives. Returns the length
 /// of the projected mean's gradient in half-image units for Gaussians that are drawn.
 pub(crate) fn backward_one(
     view: &View,
@@ -76,7 +76,7 @@ pub(crate) fn backward_one(
         return None;
     }
     let mean = param3(0);
-    // Colour is cut off at 0 from below.
+    // Section 6. Colour is cut off at 0 from below.
     let shown = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
     let d_color = Vec3::select(shown, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
     put3(11, SH_C0 * d_color);
@@ -84,76 +84,81 @@ pub(crate) fn backward_one(
     if view.sh_degree > 0 {
         let ray = mean - Vec3::from_slice(&view.camera);
         let (distance, direction) = (ray.length(), ray.normalize());
-        let (b, slopes) = (basis(direction), basis_slopes(direction));
+        let (y, slopes) = (basis(direction), basis_slopes(direction));
         let mut d_direction = Vec3::ZERO;
         for k in 0..rest_len(view.sh_degree) {
-            put3(BASE_CHANNELS + 3 * k, b[k] * d_color);
+            put3(BASE_CHANNELS + 3 * k, y[k] * d_color);
             d_direction += param3(BASE_CHANNELS + 3 * k).dot(d_color) * slopes[k];
         }
         d_mean_by_color = (d_direction - direction * direction.dot(d_direction)) / distance;
     }
 
+    // Section 3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = std::f32::consts::LN_2;
-    let (qa, qb, qc) = (-2.0 * ln2 * splat[0][2], -ln2 * splat[0][3], -2.0 * ln2 * splat[1][0]);
-    let d_center = Vec2::new(qa * slot[0] + qb * slot[1], qb * slot[0] + qc * slot[1]);
+    let (q_xx, q_xy, q_yy) = (-2.0 * ln2 * splat[0][2], -ln2 * splat[0][3], -2.0 * ln2 * splat[1][0]);
+    let d_center = Vec2::new(q_xx * slot[0] + q_xy * slot[1], q_xy * slot[0] + q_yy * slot[1]);
     let size = Vec2::new(view.size[0] as f32, view.size[1] as f32);
 
-    // dL/dQ = -1/2 sum p d d^T; dL/dcov = -Q (dL/dQ) Q.
-    let (dq_xx, dq_xy, dq_yy) = (-0.5 * slot[2], -0.5 * slot[3], -0.5 * slot[4]);
-    let (mxx, mxy) = (qa * dq_xx + qb * dq_xy, qa * dq_xy + qb * dq_yy);
-    let (myx, myy) = (qb * dq_xx + qc * dq_xy, qb * dq_xy + qc * dq_yy);
-    let (mut gxx, mut gxy, mut gyy) = (-(mxx * qa + mxy * qb), -(mxx * qb + mxy * qc), -(myx * qb + myy * qc));
+    // dL/dQ = -1/2 sum p d d^T; dL/dcov = -(Q dL/dQ) Q.
+    let (d_q_xx, d_q_xy, d_q_yy) = (-0.5 * slot[2], -0.5 * slot[3], -0.5 * slot[4]);
+    let (qdq_xx, qdq_xy) = (q_xx * d_q_xx + q_xy * d_q_xy, q_xx * d_q_xy + q_xy * d_q_yy);
+    let (qdq_yx, qdq_yy) = (q_xy * d_q_xx + q_yy * d_q_xy, q_xy * d_q_xy + q_yy * d_q_yy);
+    let (mut d_cov_xx, mut d_cov_xy, mut d_cov_yy) =
+        (-(qdq_xx * q_xx + qdq_xy * q_xy), -(qdq_xx * q_xy + qdq_xy * q_yy), -(qdq_yx * q_xy + qdq_yy * q_yy));
 
     let t = Mat4::from_cols_array(&view.world_to_camera).transform_point3(mean);
     let (q, r) = covariance::rotation(&param);
     let s = param3(3).map(f32::exp);
-    let [jx, jy] = covariance::affine(t, view);
-    let (ax, ay) = (r.transpose() * jx * s, r.transpose() * jy * s);
-    let cov = covariance::dilated(ax, ay);
+    let [jw_x, jw_y] = covariance::affine(t, view);
+    let (a_x, a_y) = (r.transpose() * jw_x * s, r.transpose() * jw_y * s);
+    let cov = covariance::dilated(a_x, a_y);
+    // Section 2. Opacity is clamped at ALPHA_MAX from above.
     let opacity = sigmoid(param(10));
-    let free_opacity = if opacity * covariance::compensation(cov, view) < ALPHA_MAX { 1.0 } else { 0.0 };
-    put(10, slot[5] * (1.0 - opacity) * free_opacity);
+    let unclamped_opacity = if opacity * covariance::compensation(cov, view) < ALPHA_MAX { 1.0 } else { 0.0 };
+    put(10, slot[5] * (1.0 - opacity) * unclamped_opacity);
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
     if view.antialias == 1 && covariance::determinant_share(cov) > 1e-6 {
         // d log(compensation) / d cov = (inverse before dilation - inverse after it) / 2.
         let (xx, yy) = (cov.x - DILATION, cov.z - DILATION);
         let det = xx * yy - cov.y * cov.y;
-        let half = 0.5 * slot[5] * free_opacity;
-        gxx += half * (yy / det - qa);
-        gxy += half * (-cov.y / det - qb);
-        gyy += half * (xx / det - qc);
+        let half = 0.5 * slot[5] * unclamped_opacity;
+        d_cov_xx += half * (yy / det - q_xx);
+        d_cov_xy += half * (-cov.y / det - q_xy);
+        d_cov_yy += half * (xx / det - q_yy);
     }
-    let (d_ax, d_ay) = (2.0 * (gxx * ax + gxy * ay), 2.0 * (gxy * ax + gyy * ay));
-    let v = [0, 1, 2].map(|k| jx * d_ax[k] + jy * d_ay[k]);
-    put3(3, s * Vec3::new(r.col(0).dot(v[0]), r.col(1).dot(v[1]), r.col(2).dot(v[2])));
+    // Section 4: cov = A A^T + dilation, A = (J W) M, M = R S.
+    let (d_a_x, d_a_y) = (2.0 * (d_cov_xx * a_x + d_cov_xy * a_y), 2.0 * (d_cov_xy * a_x + d_cov_yy * a_y));
+    let d_m = [0, 1, 2].map(|k| jw_x * d_a_x[k] + jw_y * d_a_y[k]);
+    put3(3, s * Vec3::new(r.col(0).dot(d_m[0]), r.col(1).dot(d_m[1]), r.col(2).dot(d_m[2])));
 
-    let [r0, r1, r2] = [v[0] * s.x, v[1] * s.y, v[2] * s.z];
+    let [d_r0, d_r1, d_r2] = [d_m[0] * s.x, d_m[1] * s.y, d_m[2] * s.z];
     let length = Vec4::from(q).length().max(1e-12);
     let unit = Vec4::from(q) / length;
     let (w, x, y, z) = (unit.x, unit.y, unit.z, unit.w);
     let d_unit = 2.0
         * Vec4::new(
-            z * (r0.y - r1.x) + y * (r2.x - r0.z) + x * (r1.z - r2.y),
-            y * (r0.y + r1.x) + z * (r0.z + r2.x) + w * (r1.z - r2.y) - 2.0 * x * (r1.y + r2.z),
-            x * (r0.y + r1.x) + z * (r1.z + r2.y) + w * (r2.x - r0.z) - 2.0 * y * (r0.x + r2.z),
-            x * (r0.z + r2.x) + y * (r1.z + r2.y) + w * (r0.y - r1.x) - 2.0 * z * (r0.x + r1.y),
+            z * (d_r0.y - d_r1.x) + y * (d_r2.x - d_r0.z) + x * (d_r1.z - d_r2.y),
+            y * (d_r0.y + d_r1.x) + z * (d_r0.z + d_r2.x) + w * (d_r1.z - d_r2.y) - 2.0 * x * (d_r1.y + d_r2.z),
+            x * (d_r0.y + d_r1.x) + z * (d_r1.z + d_r2.y) + w * (d_r2.x - d_r0.z) - 2.0 * y * (d_r0.x + d_r2.z),
+            x * (d_r0.z + d_r2.x) + y * (d_r1.z + d_r2.y) + w * (d_r0.y - d_r1.x) - 2.0 * z * (d_r0.x + d_r1.y),
         );
     let d_rotation = (d_unit - unit * unit.dot(d_unit)) / length;
 
-    let rs = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
-    let d_jwx = rs[0] * d_ax.x + rs[1] * d_ax.y + rs[2] * d_ax.z;
-    let d_jwy = rs[0] * d_ay.x + rs[1] * d_ay.y + rs[2] * d_ay.z;
+    let m = [r.col(0) * s.x, r.col(1) * s.y, r.col(2) * s.z];
+    // Section 5: the mean, through the projected centre and through J.
+    let d_jw_x = m[0] * d_a_x.x + m[1] * d_a_x.y + m[2] * d_a_x.z;
+    let d_jw_y = m[0] * d_a_y.x + m[1] * d_a_y.y + m[2] * d_a_y.z;
     let world = covariance::world(view);
-    let (d_jx, d_jy) = (world * d_jwx, world * d_jwy);
-    let (inv, focal) = (1.0 / t.z, Vec2::from(view.focal));
+    let (d_j_x, d_j_y) = (world * d_jw_x, world * d_jw_y);
+    let (inverse_z, focal) = (1.0 / t.z, Vec2::from(view.focal));
     let slope = covariance::clamped_slope(t, view);
-    let free = Vec2::select(slope.cmpeq(t.truncate() / t.z), Vec2::ONE, Vec2::ZERO);
-    let mut d_t = (focal * inv * d_center).extend(-(focal * t.truncate() * inv * inv).dot(d_center));
-    let d_slope = -focal * inv * Vec2::new(d_jx.z, d_jy.z) * free;
-    d_t.x += d_slope.x * inv;
-    d_t.y += d_slope.y * inv;
-    let d_rows = Vec2::new(d_jx.x - slope.x * d_jx.z, d_jy.y - slope.y * d_jy.z);
-    d_t.z -= inv * inv * focal.dot(d_rows) + inv * inv * d_slope.dot(t.truncate());
+    let unclamped = Vec2::select(slope.cmpeq(t.truncate() / t.z), Vec2::ONE, Vec2::ZERO);
+    let mut d_t = (focal * inverse_z * d_center).extend(-(focal * t.truncate() * inverse_z * inverse_z).dot(d_center));
+    let d_slope = -focal * inverse_z * Vec2::new(d_j_x.z, d_j_y.z) * unclamped;
+    d_t.x += d_slope.x * inverse_z;
+    d_t.y += d_slope.y * inverse_z;
+    let d_rows = Vec2::new(d_j_x.x - slope.x * d_j_x.z, d_j_y.y - slope.y * d_j_y.z);
+    d_t.z -= inverse_z * inverse_z * focal.dot(d_rows) + inverse_z * inverse_z * d_slope.dot(t.truncate());
     put3(0, world.transpose() * d_t + d_mean_by_color);
     (0..4).for_each(|k| put(6 + k, d_rotation[k]));
     Some((d_center * 0.5 * size).length())

@@ -1,7 +1,7 @@
 //! Any twin by its name, on raw buffers.
 
 use super::*;
-use crate::pass::Channels;
+use crate::channels::Channels;
 use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
 
 /// Runs the twin of the pass `name` on its uniform and its storage buffers, in the order of the bindings.

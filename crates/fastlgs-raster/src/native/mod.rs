@@ -6,10 +6,10 @@ mod lists;
 mod loss;
 mod simd;
 
+use crate::channels::Channels;
 use crate::cpu::{self, perturb_one};
 use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
-use crate::pass::Channels;
 use crate::view::{Perturb, Step, TILE, View};
 use crate::{Error, Result};
 use blend::{Blended, Given, Job, Tile};

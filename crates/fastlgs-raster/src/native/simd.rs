@@ -1,35 +1,6 @@
-//! One body, compiled for what the processor has: AVX-512, AVX2 with FMA, or the baseline.
+//! Arithmetic of the vectorised bodies ([`fastlgs_core::simd`]).
 
-/// `vectorised! { fn name<const ...>(args) -> T = body }`: `name` runs `body::<FMA, ...>` with the widest vectors there are.
-/// The body is an `#[inline(always)]` function whose first const parameter says whether a fused multiply-add is cheap.
-macro_rules! vectorised {
-    ($(#[$doc:meta])* fn $name:ident $(<$(const $p:ident: bool),+>)? ($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
-        $(#[$doc])*
-        pub fn $name $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
-                fn avx512 $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
-                    $body::<true $($(, $p)+)?>($($arg),*);
-                }
-                #[target_feature(enable = "avx2,fma")]
-                fn avx2 $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
-                    $body::<true $($(, $p)+)?>($($arg),*);
-                }
-                if is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
-                    // SAFETY: the features were found a line above; avx512dq implies avx512f.
-                    return unsafe { avx512 $(::<$($p),+>)? ($($arg),*) };
-                }
-                if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                    // SAFETY: the features were found a line above.
-                    return unsafe { avx2 $(::<$($p),+>)? ($($arg),*) };
-                }
-            }
-            $body::<{ cfg!(target_arch = "aarch64") } $($(, $p)+)?>($($arg),*);
-        }
-    };
-}
-pub(super) use vectorised;
+pub(super) use fastlgs_core::vectorised;
 
 /// a * b + c.
 #[inline(always)]

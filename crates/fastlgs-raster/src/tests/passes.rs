@@ -1,9 +1,10 @@
 //! Each WGSL pass against its twin, on the twins' own inputs.
 
 use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
+use crate::Shape;
 use crate::cpu::{self, CHUNKS};
-use crate::gpu::Shape;
-use crate::pass::{Pass, Shader, shaders};
+use crate::pass::Pass;
+use crate::shader::{Kernel, Shader, shaders};
 use crate::view::{Ceiling, Job, Perturb, Plane, Step, View, stride};
 use crate::{Channels, Gpu};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
@@ -29,7 +30,7 @@ fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mu
 /// Both results of a pass on the same buffers: the device's, then the twin's.
 fn both<U: bytemuck::Pod>(
     gpu: &Gpu,
-    shader: &Shader,
+    shader: &'static Shader,
     channels: Channels,
     harmonics: bool,
     uniform: &U,
@@ -122,7 +123,7 @@ fn project() {
         let params = page(&scene.to_channels(), n);
         let blank = zeros(12 * n);
         let buffers = [&params[..], &blank, &blank[..n], &blank[..8 * n], &blank[..n]];
-        let [device, twin] = both(&gpu, &shaders::PROJECT, Channels::Both, sh_degree > 0, &view, &buffers, (n as u32).div_ceil(64));
+        let [device, twin] = both(&gpu, shaders::Project::SHADER, Channels::Both, sh_degree > 0, &view, &buffers, (n as u32).div_ceil(64));
         let flips = device[4].iter().zip(&twin[4]).filter(|(a, b)| a != b).count();
         assert!(flips as f64 <= 0.002 * n as f64, "{flips} of {n} tile counts differ");
         assert!(device[4].iter().any(|t| *t > 0));
@@ -142,25 +143,25 @@ fn sorting_and_scanning() {
         let keys: Vec<u32> = (0..n).map(|_| rng.next_u64() as u32 & 0xffff).collect();
         let values: Vec<u32> = (0..n as u32).rev().collect();
         let job = Job { n: n as u32, shift: 8, first: 0, unused: 0 };
-        let exact = |shader: &Shader, job: &Job, buffers: &[&[u32]]| {
+        let exact = |shader: &'static Shader, job: &Job, buffers: &[&[u32]]| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, 4);
             assert_eq!(device, twin, "{} of {n}", shader.name);
             device
         };
-        let histogram = exact(&shaders::RADIX_COUNT, &job, &[&keys, &vec![7; 256 * CHUNKS]]).remove(1);
+        let histogram = exact(shaders::RadixCount::SHADER, &job, &[&keys, &vec![7; 256 * CHUNKS]]).remove(1);
         let scan = Job { n: histogram.len() as u32, ..job };
-        let totals = exact(&shaders::SCAN_CHUNKS, &scan, &[&histogram, &zeros(CHUNKS + 1)]).remove(1);
-        let scanned = exact(&shaders::SCAN_APPLY, &scan, &[&histogram, &totals]);
+        let totals = exact(shaders::ScanChunks::SHADER, &scan, &[&histogram, &zeros(CHUNKS + 1)]).remove(1);
+        let scanned = exact(shaders::ScanApply::SHADER, &scan, &[&histogram, &totals]);
         assert_eq!(scanned[1][CHUNKS] as usize, n);
-        let sorted = exact(&shaders::RADIX_SCATTER, &job, &[&keys, &values, &scanned[0], &zeros(n), &zeros(n)]);
+        let sorted = exact(shaders::RadixScatter::SHADER, &job, &[&keys, &values, &scanned[0], &zeros(n), &zeros(n)]);
         assert!(sorted[3].windows(2).all(|p| p[0] >> 8 <= p[1] >> 8));
         // Ties keep their order, which here is that of falling values.
         assert!((1..n).all(|i| sorted[3][i - 1] >> 8 != sorted[3][i] >> 8 || sorted[4][i - 1] > sorted[4][i]));
         // Sums beyond 32 bits stay at the largest value instead of starting anew.
         let huge = vec![u32::MAX / 2; 3 * CHUNKS];
         let job = Job { n: huge.len() as u32, ..job };
-        let totals = exact(&shaders::SCAN_CHUNKS, &job, &[&huge, &zeros(CHUNKS + 1)]).remove(1);
-        assert_eq!(exact(&shaders::SCAN_APPLY, &job, &[&huge, &totals])[1][CHUNKS], u32::MAX);
+        let totals = exact(shaders::ScanChunks::SHADER, &job, &[&huge, &zeros(CHUNKS + 1)]).remove(1);
+        assert_eq!(exact(shaders::ScanApply::SHADER, &job, &[&huge, &totals])[1][CHUNKS], u32::MAX);
     }
 }
 
@@ -170,19 +171,26 @@ fn listing() {
     for (n, w, h) in SIZES {
         let l = lists(n, w, h, 0, false);
         let b = |name: &str| &l.buffers[name][..];
-        let exact = |shader: &Shader, buffers: &[&[u32]], items: u32| {
+        let exact = |shader: &'static Shader, buffers: &[&[u32]], items: u32| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, &l.view, buffers, items.div_ceil(64));
             assert_eq!(device, twin, "{} of {n}", shader.name);
         };
-        exact(&shaders::GATHER_COUNTS, &[b("order"), b("touched"), b("offsets")], l.view.gaussians);
+        exact(shaders::GatherCounts::SHADER, &[b("order"), b("touched"), b("offsets")], l.view.gaussians);
         let (pairs, blank) = (l.view.pairs as usize, zeros((l.view.pairs + l.view.gaussians) as usize));
         let inputs =
             [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
-        exact(&shaders::EMIT, &inputs, l.view.gaussians);
-        exact(&shaders::TILE_RANGES, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
+        exact(shaders::Emit::SHADER, &inputs, l.view.gaussians);
+        exact(shaders::TileRanges::SHADER, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
         // log2 may differ in its last bit, and with it the key by one.
-        let [device, twin] =
-            both(&gpu, &shaders::TILE_LOAD, Channels::Both, false, &l.view, &[b("ranges"), b("loads")], l.view.tile_count().div_ceil(64));
+        let [device, twin] = both(
+            &gpu,
+            shaders::TileLoad::SHADER,
+            Channels::Both,
+            false,
+            &l.view,
+            &[b("ranges"), b("loads")],
+            l.view.tile_count().div_ceil(64),
+        );
         assert!(device[1].iter().zip(&twin[1]).all(|(a, b)| a.abs_diff(*b) <= 1));
     }
 }
@@ -206,7 +214,7 @@ fn blending_and_its_gradients() {
             let listed = [b("ranges"), b("tile_order"), b("sorted"), b("gaussians"), b("splats")];
             let pixels = view.padded_pixels();
             let frame = zeros(8 * pixels);
-            let [device, twin] = both(&gpu, &shaders::BLEND, channels, false, &view, &[&listed[..], &[&frame]].concat(), groups);
+            let [device, twin] = both(&gpu, shaders::Blend::SHADER, channels, false, &view, &[&listed[..], &[&frame]].concat(), groups);
             let [seen, expected] = [&device, &twin].map(|all| &floats(&all[5])[..7 * pixels]);
             if shape == Shape::Wide {
                 assert_close(&format!("frame, {what}"), seen, expected, 1e-3, 0.001);
@@ -221,14 +229,14 @@ fn blending_and_its_gradients() {
             let gradient: Vec<u32> = (0..6 * pixels).map(|_| rng.normal().to_bits()).collect();
             let slots = vec![9.0f32.to_bits(); 4 * channels.slot() * view.pairs as usize];
             let buffers = [&listed[..], &[frame, &gradient, &slots]].concat();
-            let [device, twin] = both(&gpu, &shaders::BLEND_BACKWARD, channels, false, &view, &buffers, groups);
+            let [device, twin] = both(&gpu, shaders::BlendBackward::SHADER, channels, false, &view, &buffers, groups);
             assert_close(&format!("slots, {what}"), floats(&device[7]), floats(&twin[7]), 0.02, 0.005);
 
             let count = view.gaussians as usize;
             let (gradients, stats) = (zeros(l.params.len()), zeros(2 * count));
             let buffers = [&l.params[..], b("splats"), b("order"), b("touched"), b("first"), &twin[7], &gradients, &stats];
             let groups = view.gaussians.div_ceil(64);
-            let [device, twin] = both(&gpu, &shaders::PROJECT_BACKWARD, channels, sh_degree > 0, &view, &buffers, groups);
+            let [device, twin] = both(&gpu, shaders::ProjectBackward::SHADER, channels, sh_degree > 0, &view, &buffers, groups);
             for c in 0..channels_of(sh_degree) {
                 let range = c * stride(count)..(c + 1) * stride(count);
                 let [device, twin] = [&device, &twin].map(|all| &floats(&all[6])[range.clone()]);
@@ -260,7 +268,7 @@ fn blending_ids() {
         for (objects, flips) in [(3, 0.002), (40, 0.01)] {
             let ids: Vec<u32> = (0..l.view.gaussians).map(|g| g % objects).collect();
             let buffers = [b("ranges"), b("sorted"), b("gaussians"), b("splats"), &ids, &zeros(4 * pixels)];
-            let [device, twin] = both(&gpu, &shaders::BLEND_IDS, Channels::Both, false, &l.view, &buffers, l.view.tile_count());
+            let [device, twin] = both(&gpu, shaders::BlendIds::SHADER, Channels::Both, false, &l.view, &buffers, l.view.tile_count());
             let shares = |all: &[Vec<u32>]| (0..pixels).map(|p| [0, 1, 2, 3].map(|k| all[5][k * pixels + p])).collect::<Vec<_>>();
             assert_same_shares(&format!("{objects} objects of {n}"), shares(&device).into_iter(), shares(&twin).into_iter(), flips);
         }
@@ -280,17 +288,17 @@ fn loss() {
         let plane = Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
         let (row_groups, column_groups) = ((quads / 2 * rows).div_ceil(64), (rows / 8 * quads).div_ceil(64));
         let sums = zeros(24 * (rows / 8 * quads * 4) as usize);
-        let run = |shader: &Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
+        let run = |shader: &'static Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, &plane, buffers, groups);
             for (k, tolerance) in tolerances {
                 assert_close(&format!("{} {k} at {w}x{h}", shader.name), floats(&device[*k]), floats(&twin[*k]), *tolerance, 0.0);
             }
             twin
         };
-        let blurred = run(&shaders::SSIM_ROWS, &[&frame, &targets, &zeros(5 * n)], row_groups, &[(2, 1e-4)]);
-        let ssim = run(&shaders::SSIM_COLUMNS, &[&blurred[2], &zeros(3 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
-        let back = run(&shaders::SSIM_BACKWARD_ROWS, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
-        run(&shaders::LOSS_GRADIENT, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
+        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(5 * n)], row_groups, &[(2, 1e-4)]);
+        let ssim = run(shaders::SsimColumns::SHADER, &[&blurred[2], &zeros(3 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
+        let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
+        run(shaders::LossGradient::SHADER, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
     }
 }
 
@@ -298,7 +306,7 @@ fn loss() {
 fn ceiling() {
     let Some(gpu) = gpu() else { return };
     let job = Ceiling { invocations: 100, rounds: 50, factor: 0.99, summand: 0.01 };
-    let [device, twin] = both(&gpu, &shaders::CEILING, Channels::Both, false, &job, &[&zeros(100)], 2);
+    let [device, twin] = both(&gpu, shaders::Ceiling::SHADER, Channels::Both, false, &job, &[&zeros(100)], 2);
     assert_close("ceiling", floats(&device[0]), floats(&twin[0]), 1e-4, 0.0);
 }
 
@@ -315,13 +323,13 @@ fn adam_and_perturb() {
         let step =
             Step { quads: stride(n) as u32 / 4, opacity_weight: 0.3, scale_weight: 0.2, ..Step::new(7, 3..channels_of(degree), &rates) };
         let [device, twin] =
-            both(&gpu, &shaders::ADAM, Channels::Both, false, &step, &[&gradients, &params, &m1, &m2], step.quads.div_ceil(64));
+            both(&gpu, shaders::Adam::SHADER, Channels::Both, false, &step, &[&gradients, &params, &m1, &m2], step.quads.div_ceil(64));
         for k in 1..4 {
             assert_close("adam", floats(&device[k]), floats(&twin[k]), 1e-3, 0.0);
         }
         assert_eq!(device[1][..3 * stride(n)], params[..3 * stride(n)], "channels that are not trained stay");
         let job = Perturb { n: n as u32, first: 77, seed: 5, amount: 0.1 };
-        let [device, twin] = both(&gpu, &shaders::PERTURB, Channels::Both, false, &job, &[&params], (n as u32).div_ceil(64));
+        let [device, twin] = both(&gpu, shaders::Perturb::SHADER, Channels::Both, false, &job, &[&params], (n as u32).div_ceil(64));
         assert_close("perturb", floats(&device[0]), floats(&twin[0]), 1e-3, 0.0);
     }
 }

@@ -6,6 +6,7 @@ use crate::{Error, Result, Run, masks};
 use fastlgs_core::{Camera, SceneFolder};
 use fastlgs_grid::mapping::{Correspondences, Mask};
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::matching;
 use fastlgs_vision::triangulate::{self, PairMatches};
 use glam::Vec2;
 use rayon::prelude::*;
@@ -26,7 +27,7 @@ pub(super) fn match_photos(
         let inputs = [&training[a].key, &training[b].key, described[a].as_slice(), &described[b], keypoints::backend().as_bytes()];
         let pairs = cache.get("matches", &cache::key(&inputs), || {
             let [pa, pb] = [a, b].map(|k| &training[k].points);
-            let pairs = keypoints::matches(pa, pb);
+            let pairs = matching::matches(pa, pb);
             Ok(triangulate::epipolar_filter((&cameras[a], pa), (&cameras[b], pb), &pairs))
         })?;
         work.advance()?;

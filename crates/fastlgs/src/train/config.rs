@@ -5,8 +5,8 @@ use crate::progress::TrainStep;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::{consensus, tree};
-use fastlgs_raster::Budget;
 use fastlgs_raster::budget::Removal;
+use fastlgs_raster::{Budget, Choice};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -319,6 +319,8 @@ pub struct Report {
     pub curve: Vec<CurvePoint>,
     /// The device's name.
     pub adapter: String,
+    /// What `--device` meant, and why.
+    pub device: Choice,
 }
 
 /// A point of the curve of held-out PSNR.

@@ -54,7 +54,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     if settings.iterations >= WORTH_TUNING {
         fastlgs_raster::tuning::tune(run.device, false)?;
     }
-    let engine = fastlgs_raster::open_engine(run.device)?;
+    let device = fastlgs_raster::choice(run.device);
+    let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
     let checkpoint = folder.root.join("checkpoints/train");
@@ -127,6 +128,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         psnr_held_out: psnr,
         curve,
         adapter: result.adapter,
+        device,
     };
     manifest.seconds.insert("train".to_owned(), result.seconds);
     report.note(&mut manifest)?;

@@ -1,0 +1,88 @@
+//! From the frame's gradient to that of the Gaussians, and the optimiser's step. Gradient slots of the pairs are bound window by window.
+
+use super::kernels::{Blending, GROUP, Training};
+use super::lists::Lists;
+use super::pages::Gaussians;
+use crate::channels::Channels;
+use crate::pass::Recorder;
+use crate::shader::shaders::{AdamBuffers, BlendBackwardBuffers, ProjectBackwardBuffers};
+use crate::view::{Step, View, stride};
+use crate::{Error, Gpu, Result};
+use wgpu::Buffer;
+
+/// Gradient slots of a window of pairs.
+#[derive(Default)]
+pub struct Slots(Option<Buffer>);
+
+/// Pairs whose Gaussians start in a window: the first of them, and their number.
+type Window = (u32, u32);
+
+impl Slots {
+    /// What they take.
+    pub fn bytes(&self) -> u64 {
+        self.0.as_ref().map_or(0, Buffer::size)
+    }
+
+    /// Room for all pairs, or for as many as one binding holds.
+    fn windows(&mut self, gpu: &Gpu, view: &View, channels: Channels) -> Result<(&Buffer, Vec<Window>)> {
+        let bytes = 16 * channels.slot();
+        let most = (gpu.max_binding as usize / bytes).min(u32::MAX as usize / 2);
+        let (pairs, spare) = (view.pairs as usize, view.tile_count() as usize);
+        let window = if pairs <= most { pairs } else { most.saturating_sub(spare) };
+        if window == 0 && pairs > 0 {
+            return Err(Error::TooLarge(format!("{spare} tiles are too many for '{}'; lower --size", gpu.name)));
+        }
+        let needed = (bytes * pairs.min(most)) as u64;
+        let slots = match self.0.take().filter(|slots| slots.size() >= needed) {
+            Some(slots) => slots,
+            None => gpu.storage("gradient slots of the tile list", (needed + needed / 4).min((bytes * most) as u64))?,
+        };
+        let slots = self.0.insert(slots);
+        if pairs <= most {
+            return Ok((slots, vec![(0, u32::MAX / 2)]));
+        }
+        let firsts: Vec<u32> = (0..pairs).step_by(window).map(|first| first as u32).collect();
+        let last = *firsts.last().expect("pairs > most");
+        let windows = firsts.iter().map(|&f| (f, if f == last { (pairs - f as usize) as u32 + 1 } else { window as u32 })).collect();
+        Ok((slots, windows))
+    }
+
+    /// Gradients of all Gaussians from that of the frame.
+    pub fn record(
+        &mut self,
+        gpu: &Gpu,
+        passes: &Blending,
+        r: &mut Recorder,
+        channels: Channels,
+        lists: &Lists,
+        g: &Gaussians,
+        frame: &Buffer,
+        gradient: &Buffer,
+    ) -> Result<()> {
+        let Lists { view, order, touched, first_pair, ranges, tile_order, sorted_pairs, pair_gaussians } = lists;
+        let Gaussians { splats, stats, .. } = g;
+        let (slots, windows) = self.windows(gpu, view, channels)?;
+        for (slot_first, slot_count) in windows {
+            let view = View { slot_first, slot_count, ..*view };
+            let of_frame = BlendBackwardBuffers { ranges, tile_order, sorted_pairs, pair_gaussians, splats, frame, gradient, slots };
+            r.run(&passes.blend_backward, &view, of_frame, gpu.shape.groups(view.tile_count()))?;
+            for page in &g.pages {
+                let view = View { first: page.first as u32, page: page.n as u32, ..view };
+                let (params, gradients) = (&page.params, &page.gradients);
+                let of_slots = ProjectBackwardBuffers { params, splats, order, touched, first_pair, slots, gradients, stats };
+                r.run(&passes.project_backward, &view, of_slots, view.gaussians.div_ceil(GROUP))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Adam on all pages.
+pub fn adam(passes: &Training, r: &mut Recorder, g: &Gaussians, step: &Step) -> Result<()> {
+    for page in &g.pages {
+        let step = Step { quads: stride(page.n) as u32 / 4, ..*step };
+        let (gradients, params, moment1, moment2) = (&page.gradients, &page.params, &page.moment1, &page.moment2);
+        r.run(&passes.adam, &step, AdamBuffers { gradients, params, moment1, moment2 }, step.quads.div_ceil(GROUP))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,210 @@
+//! From Gaussians to the lists of tiles: projection, depth order, (tile, Gaussian) pairs, and the order of the tiles.
+
+use super::kernels::{GROUP, Kernels, Kind};
+use super::pages::Gaussians;
+use super::sorting::{Scratch, Sort};
+use crate::engine::{Memory, tile_bits};
+use crate::pass::Recorder;
+use crate::shader::shaders::{EmitBuffers, GatherCountsBuffers, ProjectBuffers, TileLoadBuffers, TileRangesBuffers};
+use crate::view::View;
+use crate::{Error, Gpu, Result};
+use std::collections::HashMap;
+use wgpu::Buffer;
+
+/// Views' lists are kept for feature training as long as they take no more than this.
+const CACHE_LIMIT: u64 = 1 << 30;
+
+/// What blending walks through; buffers are handles, so that copies are cheap.
+#[derive(Clone)]
+pub struct Lists {
+    pub view: View,
+    pub order: Buffer,
+    pub touched: Buffer,
+    pub first_pair: Buffer,
+    pub ranges: Buffer,
+    pub tile_order: Buffer,
+    pub sorted_pairs: Buffer,
+    pub pair_gaussians: Buffer,
+}
+
+impl Lists {
+    fn bytes(&self) -> u64 {
+        let own = [&self.order, &self.touched, &self.first_pair, &self.ranges, &self.tile_order, &self.sorted_pairs, &self.pair_gaussians];
+        own.iter().map(|b| b.size()).sum()
+    }
+}
+
+/// Buffers with one item a tile.
+struct Tiles {
+    size: [u32; 2],
+    ranges: Buffer,
+    sort: Sort,
+}
+
+/// Buffers with one item a (tile, Gaussian) pair.
+struct Pairs {
+    capacity: usize,
+    gaussians: Buffer,
+    sort: Sort,
+}
+
+/// Makes lists, and keeps those of views whose geometry is frozen.
+pub struct ListMaker {
+    scratch: Scratch,
+    tiles: Option<Tiles>,
+    pairs: Option<Pairs>,
+    frozen: HashMap<usize, Lists>,
+}
+
+impl ListMaker {
+    /// Without any lists.
+    pub fn new(gpu: &Gpu) -> Self {
+        Self { scratch: Scratch::new(gpu), tiles: None, pairs: None, frozen: HashMap::new() }
+    }
+
+    /// Other Gaussians make all kept lists wrong.
+    pub fn forget(&mut self) {
+        self.frozen.clear();
+    }
+
+    /// A new target makes its view's kept lists wrong.
+    pub fn forget_view(&mut self, id: usize) {
+        self.frozen.remove(&id);
+    }
+
+    /// Projection and sorting: everything that blending needs.
+    pub fn lists(&mut self, gpu: &Gpu, kernels: &Kernels, g: &Gaussians, mut view: View, kind: Kind, on_cpu: &mut usize) -> Result<Lists> {
+        self.prepare_tiles(gpu, &view)?;
+        let n = g.n as u32;
+        let groups = n.div_ceil(GROUP);
+        let (sorting, listing) = (&kernels.sorting, &kernels.listing);
+        let Gaussians { touched, offsets, footprints, first_pair, .. } = g;
+        let mut r = Recorder::new(gpu, *on_cpu);
+        project(kernels, &mut r, g, &view, kind)?;
+        let side = self.scratch.sort(sorting, &mut r, &g.sort, n, 24)?;
+        let order = &g.sort.values[side];
+        r.run(&listing.gather_counts, &view, GatherCountsBuffers { order, touched, offsets }, groups)?;
+        self.scratch.scan(sorting, &mut r, offsets, n)?;
+        *on_cpu = r.submit();
+        // Counted before anything is written, so that no list can overflow.
+        view.pairs = self.scratch.total(gpu)?;
+        if view.pairs == u32::MAX {
+            let reason = "more than 4 billion pairs of tiles and Gaussians: the scene has huge Gaussians; prune them or lower --size";
+            return Err(Error::TooLarge(reason.to_owned()));
+        }
+        self.prepare_pairs(gpu, view.pairs as usize)?;
+        let (pairs, tiles) = (self.pairs.as_ref().expect("prepared"), self.tiles.as_ref().expect("prepared"));
+        let mut r = Recorder::new(gpu, *on_cpu);
+        let (pair_tiles, pair_gaussians, ranges) = (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
+        let emitted = EmitBuffers { order, offsets, footprints, touched, pair_tiles, pair_gaussians, first_pair };
+        r.run(&listing.emit, &view, emitted, groups)?;
+        let sorted = self.scratch.sort(sorting, &mut r, &pairs.sort, view.pairs, tile_bits(&view))?;
+        r.clear(ranges);
+        let sorted_tiles = &pairs.sort.keys[sorted];
+        r.run(&listing.tile_ranges, &view, TileRangesBuffers { sorted_tiles, ranges }, view.pairs.div_ceil(GROUP))?;
+        let keys = &tiles.sort.keys[0];
+        r.run(&listing.tile_load, &view, TileLoadBuffers { ranges, keys }, view.tile_count().div_ceil(GROUP))?;
+        let ordered = self.scratch.sort(sorting, &mut r, &tiles.sort, view.tile_count(), 8)?;
+        *on_cpu = r.submit();
+        Ok(Lists {
+            view,
+            order: order.clone(),
+            touched: touched.clone(),
+            first_pair: first_pair.clone(),
+            ranges: ranges.clone(),
+            tile_order: tiles.sort.values[ordered].clone(),
+            sorted_pairs: pairs.sort.values[sorted].clone(),
+            pair_gaussians: pair_gaussians.clone(),
+        })
+    }
+
+    /// The lists of a view whose geometry is frozen: made once, then kept with the view's target.
+    pub fn frozen(
+        &mut self,
+        gpu: &Gpu,
+        kernels: &Kernels,
+        g: &Gaussians,
+        view: View,
+        kind: Kind,
+        id: usize,
+        on_cpu: &mut usize,
+    ) -> Result<Lists> {
+        let known = self.frozen.get(&id).filter(|l| same_camera(&l.view, &view)).cloned();
+        if let Some(lists) = known {
+            let mut r = Recorder::new(gpu, *on_cpu);
+            project(kernels, &mut r, g, &view, kind)?;
+            *on_cpu = r.submit();
+            return Ok(lists);
+        }
+        let lists = self.lists(gpu, kernels, g, view, kind, on_cpu)?;
+        if self.frozen.values().map(Lists::bytes).sum::<u64>() < CACHE_LIMIT {
+            let (pairs, n, tiles) = (lists.view.pairs, lists.view.gaussians, lists.view.tile_count());
+            let mut r = Recorder::new(gpu, 0);
+            let mut keep = |from: &Buffer, words: u32| -> Result<Buffer> {
+                let to = gpu.storage("a view's lists", 4 * u64::from(words))?;
+                r.copy(from, &to);
+                Ok(to)
+            };
+            let kept = Lists {
+                view: lists.view,
+                order: keep(&lists.order, n)?,
+                touched: keep(&lists.touched, n)?,
+                first_pair: keep(&lists.first_pair, n)?,
+                ranges: keep(&lists.ranges, 2 * tiles)?,
+                tile_order: keep(&lists.tile_order, tiles)?,
+                sorted_pairs: keep(&lists.sorted_pairs, pairs)?,
+                pair_gaussians: keep(&lists.pair_gaussians, pairs)?,
+            };
+            r.submit();
+            self.frozen.insert(id, kept);
+        }
+        Ok(lists)
+    }
+
+    fn prepare_tiles(&mut self, gpu: &Gpu, view: &View) -> Result<()> {
+        if self.tiles.as_ref().is_none_or(|t| t.size != view.size) {
+            let tiles = view.tile_count();
+            let ranges = gpu.storage("tile ranges", 8 * u64::from(tiles))?;
+            self.tiles = Some(Tiles { size: view.size, ranges, sort: Sort::new(gpu, "tile order", tiles as usize)? });
+        }
+        Ok(())
+    }
+
+    /// Room for `pairs` pairs, with a quarter to spare so that growth is rare.
+    fn prepare_pairs(&mut self, gpu: &Gpu, pairs: usize) -> Result<()> {
+        if self.pairs.as_ref().is_none_or(|p| p.capacity < pairs) {
+            let most = (gpu.max_binding / 4) as usize;
+            let capacity = (pairs + pairs / 4 + 1024).min(most.max(pairs));
+            self.pairs = None;
+            let gaussians = gpu.storage("the tile list", 4 * capacity as u64)?;
+            let sort = Sort::new(gpu, "the tile list", capacity)?;
+            self.pairs = Some(Pairs { capacity, gaussians, sort });
+        }
+        Ok(())
+    }
+
+    /// Adds what it takes.
+    pub fn count(&self, memory: &mut Memory) {
+        memory.lists += self.pairs.as_ref().map_or(0, |p| p.gaussians.size() + p.sort.bytes());
+        memory.frame += self.tiles.as_ref().map_or(0, |t| t.ranges.size() + t.sort.bytes());
+        memory.views += self.frozen.values().map(Lists::bytes).sum::<u64>();
+    }
+}
+
+/// Projects all pages.
+fn project(kernels: &Kernels, r: &mut Recorder, g: &Gaussians, view: &View, kind: Kind) -> Result<()> {
+    let pass = &kernels.blending(kind).project;
+    for page in &g.pages {
+        let view = View { first: page.first as u32, page: page.n as u32, ..*view };
+        let Gaussians { splats, footprints, touched, .. } = g;
+        let buffers = ProjectBuffers { params: &page.params, splats, depths: &g.sort.keys[0], footprints, touched };
+        r.run(pass, &view, buffers, view.page.div_ceil(GROUP))?;
+    }
+    Ok(())
+}
+
+/// Whether lists made for `a` serve `b`.
+fn same_camera(a: &View, b: &View) -> bool {
+    let key = |v: &View| (v.world_to_camera, v.focal, v.centre, v.size, v.gaussians, v.antialias);
+    key(a) == key(b)
+}

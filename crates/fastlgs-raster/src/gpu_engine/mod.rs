@@ -1,0 +1,275 @@
+//! The passes on a wgpu device.
+
+mod backward;
+mod kernels;
+mod lists;
+mod pages;
+mod picture;
+mod sorting;
+
+use crate::channels::Channels;
+use crate::cpu::CHAINS;
+use crate::density::State;
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids};
+use crate::pass::{Recorder, Typed};
+use crate::profile::Profile;
+use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, Ceiling as CeilingKernel, CeilingBuffers, PerturbBuffers};
+use crate::view::{Ceiling, Perturb, Step, View};
+use crate::{Error, Gpu, Result};
+use backward::{Slots, adam};
+use fastlgs_core::Shares;
+use fastlgs_core::shares::KEPT;
+use kernels::{GROUP, Kernels, kind};
+use lists::{ListMaker, Lists};
+use pages::Gaussians;
+use picture::{Loss, Picture};
+use std::collections::{BTreeMap, HashMap};
+use std::time::Instant;
+use wgpu::Buffer;
+
+/// [`Engine`] on a wgpu adapter.
+pub struct GpuEngine {
+    gpu: Gpu,
+    kernels: Kernels,
+    lists: ListMaker,
+    gaussians: Option<Gaussians>,
+    picture: Option<Picture>,
+    /// Made on the first step.
+    loss: Option<Loss>,
+    slots: Slots,
+    targets: HashMap<usize, ([u32; 2], Buffer)>,
+    last: Option<(View, Channels)>,
+    /// This many first passes of every frame run as their CPU twins, to find a wrong one; `FASTLGS_PASSES_ON_CPU` sets it.
+    pub passes_on_cpu: usize,
+}
+
+impl GpuEngine {
+    /// Compiles the passes; those that differ with what is trained follow when they are needed.
+    pub fn new(gpu: Gpu) -> Self {
+        Self {
+            kernels: Kernels::new(&gpu),
+            lists: ListMaker::new(&gpu),
+            gpu,
+            gaussians: None,
+            picture: None,
+            loss: None,
+            slots: Slots::default(),
+            targets: HashMap::new(),
+            last: None,
+            passes_on_cpu: std::env::var("FASTLGS_PASSES_ON_CPU").ok().and_then(|k| k.parse().ok()).unwrap_or(0),
+        }
+    }
+
+    /// Prepares what a frame needs, and makes its lists; those of view `frozen` are kept.
+    fn prepare(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
+        let held = self.len();
+        let kind = kind(&view, channels);
+        let Some(g) = self.gaussians.as_ref().filter(|g| g.n == view.gaussians as usize && g.n > 0) else {
+            return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {held}", view.gaussians)));
+        };
+        self.kernels.prepare(&self.gpu, kind);
+        self.picture = Some(Picture::fitting(self.picture.take(), &self.gpu, &view)?);
+        match frozen {
+            Some(id) => self.lists.frozen(&self.gpu, &self.kernels, g, view, kind, id, on_cpu),
+            None => self.lists.lists(&self.gpu, &self.kernels, g, view, kind, on_cpu),
+        }
+    }
+
+    /// Everything up to blending into the frame buffer.
+    fn forward(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
+        let lists = self.prepare(view, channels, frozen, on_cpu)?;
+        let (splats, frame) = (&self.gaussians().splats, &self.picture().frame);
+        let mut r = Recorder::new(&self.gpu, *on_cpu);
+        let Lists { ranges, tile_order, sorted_pairs, pair_gaussians, .. } = &lists;
+        let buffers = BlendBuffers { ranges, tile_order, sorted_pairs, pair_gaussians, splats, frame };
+        let view = View { pairs: lists.view.pairs, ..view };
+        r.run(&self.kernels.blending(kind(&view, channels)).blend, &view, buffers, self.gpu.shape.groups(view.tile_count()))?;
+        *on_cpu = r.submit();
+        Ok(Lists { view, ..lists })
+    }
+
+    /// After [`Self::prepare`].
+    fn gaussians(&self) -> &Gaussians {
+        self.gaussians.as_ref().expect("checked when the frame was prepared")
+    }
+
+    /// After [`Self::prepare`].
+    fn picture(&self) -> &Picture {
+        self.picture.as_ref().expect("made when the frame was prepared")
+    }
+
+    fn read_pages(&self, what: impl Fn(&pages::Page) -> &Buffer) -> Result<Vec<f32>> {
+        self.gaussians.as_ref().map_or_else(|| Ok(Vec::new()), |g| g.read(&self.gpu, what))
+    }
+}
+
+impl Engine for GpuEngine {
+    fn name(&self) -> String {
+        self.gpu.name.clone()
+    }
+
+    fn len(&self) -> usize {
+        self.gaussians.as_ref().map_or(0, |g| g.n)
+    }
+
+    fn set_state(&mut self, state: &State) -> Result<()> {
+        let (n, sh_degree) = (state.len(), state.sh_degree);
+        self.lists.forget();
+        // Old buffers go before new ones are made.
+        let known = self.gaussians.take().filter(|g| (g.n, g.sh_degree) == (n, sh_degree));
+        let g = match known {
+            Some(g) => g,
+            None => Gaussians::new(&self.gpu, n, sh_degree)?,
+        };
+        g.write(&self.gpu, state);
+        let mut r = Recorder::new(&self.gpu, 0);
+        r.clear(&g.stats);
+        // Gradients of channels that are not trained stay what they are: zero.
+        g.pages.iter().for_each(|page| r.clear(&page.gradients));
+        r.submit();
+        self.gaussians = Some(g);
+        Ok(())
+    }
+
+    fn state(&self) -> Result<State> {
+        let sh_degree = self.gaussians.as_ref().map_or(0, |g| g.sh_degree);
+        let params = self.read_pages(|p| &p.params)?;
+        Ok(State { sh_degree, params, moment1: self.read_pages(|p| &p.moment1)?, moment2: self.read_pages(|p| &p.moment2)? })
+    }
+
+    fn stats(&self) -> Result<Vec<f32>> {
+        self.gaussians.as_ref().map_or(Ok(Vec::new()), |g| self.gpu.read(&g.stats, 2 * g.n))
+    }
+
+    fn set_stats(&mut self, stats: &[f32]) -> Result<()> {
+        if let Some(g) = &self.gaussians {
+            self.gpu.queue.write_buffer(&g.stats, 0, bytemuck::cast_slice(stats));
+        }
+        Ok(())
+    }
+
+    fn gradients(&self) -> Result<Vec<f32>> {
+        self.read_pages(|p| &p.gradients)
+    }
+
+    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
+        let camera_less =
+            View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
+        let buffer = self.gpu.storage_with("a target picture", &target.padded(&camera_less))?;
+        self.targets.insert(id, (target.size, buffer));
+        self.lists.forget_view(id);
+        Ok(())
+    }
+
+    fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
+        let mut on_cpu = self.passes_on_cpu;
+        let view = self.forward(view, channels, None, &mut on_cpu)?.view;
+        let plane = view.padded_pixels();
+        self.gpu.read_with(&self.picture().frame, 8 * plane, |planes: &[f32]| {
+            Frame::gathered(&view, channels, |channel, y| &planes[channel * plane + view.at(0, y)..])
+        })
+    }
+
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
+        check_ids(&view, ids, self.len())?;
+        let mut on_cpu = self.passes_on_cpu;
+        let lists = self.prepare(view, Channels::Feature, None, &mut on_cpu)?;
+        let words: Vec<u32> = ids.iter().map(|id| u32::from(*id)).collect();
+        let ids = &self.gpu.storage_with("object ids", &words)?;
+        // The frame has room for eight words a pixel, shares need four.
+        let (splats, shares) = (&self.gaussians().splats, &self.picture().frame);
+        let mut r = Recorder::new(&self.gpu, on_cpu);
+        let Lists { ranges, sorted_pairs, pair_gaussians, .. } = &lists;
+        let buffers = BlendIdsBuffers { ranges, sorted_pairs, pair_gaussians, splats, ids, shares };
+        r.run(&self.kernels.blend_ids, &lists.view, buffers, view.tile_count())?;
+        r.submit();
+        let [width, height] = view.size;
+        let plane = view.padded_pixels();
+        let gather = |slots: &[u32]| {
+            let pixel = |(x, y)| std::array::from_fn(|k| slots[k * plane + view.at(x, y)]);
+            (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(pixel).collect()
+        };
+        Ok(Shares { width, height, pixels: self.gpu.read_with(shares, KEPT * plane, gather)? })
+    }
+
+    fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {
+        let channels = options.channels;
+        let mut on_cpu = self.passes_on_cpu;
+        let frozen = (channels == Channels::Feature).then_some(id);
+        let lists = self.forward(view, channels, frozen, &mut on_cpu)?;
+        let view = lists.view;
+        self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view)?);
+        let target = self.targets.get(&id).filter(|t| t.0 == view.size).map(|t| &t.1);
+        let target = target.ok_or_else(|| Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])))?;
+        let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss) else { unreachable!("prepared above") };
+        let mut r = Recorder::new(&self.gpu, on_cpu);
+        loss.record(&self.kernels.training, &mut r, &view, options, &picture.frame, target)?;
+        let blending = self.kernels.blending(kind(&view, channels));
+        self.slots.record(&self.gpu, blending, &mut r, channels, &lists, g, &picture.frame, &loss.gradient)?;
+        adam(&self.kernels.training, &mut r, g, step)?;
+        r.submit();
+        self.last = Some((view, channels));
+        Ok(())
+    }
+
+    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()> {
+        let mut r = Recorder::new(&self.gpu, 0);
+        for page in self.gaussians.iter().flat_map(|g| &g.pages) {
+            let job = Perturb { n: page.n as u32, first: page.first as u32, seed, amount };
+            r.run(&self.kernels.training.perturb, &job, PerturbBuffers { params: &page.params }, job.n.div_ceil(GROUP))?;
+        }
+        r.submit();
+        Ok(())
+    }
+
+    fn losses(&self) -> Result<Losses> {
+        match (&self.last, &self.loss) {
+            (Some((view, channels)), Some(loss)) => loss.read(&self.gpu, view, *channels),
+            _ => Ok(Losses::default()),
+        }
+    }
+
+    fn ceiling(&self) -> Result<f64> {
+        let pass: Typed<CeilingKernel> = Typed::new(&self.gpu, Channels::Both, false);
+        let out = &self.gpu.storage("the ceiling", 4 * 65_536)?;
+        let mut best = 0.0f64;
+        let mut rounds = 100;
+        // The first run compiles the kernel; each later one is longer, until the launch no longer counts.
+        for attempt in 0..6 {
+            let job = Ceiling { invocations: 65_536, rounds, factor: 0.999, summand: 0.001 };
+            let started = Instant::now();
+            let mut r = Recorder::new(&self.gpu, 0);
+            r.run(&pass, &job, CeilingBuffers { out }, job.invocations / GROUP)?;
+            r.submit();
+            self.gpu.read::<f32>(out, 1)?;
+            let seconds = started.elapsed().as_secs_f64();
+            if attempt > 0 {
+                best = best.max(f64::from(rounds) * (65_536 * CHAINS * 4 * 2) as f64 / seconds);
+            }
+            if attempt > 0 && seconds < 0.05 {
+                rounds *= 4;
+            }
+        }
+        Ok(best)
+    }
+
+    fn memory(&self) -> Memory {
+        let mut memory = Memory::default();
+        self.gaussians.iter().for_each(|g| g.count(&mut memory));
+        self.picture.iter().for_each(|p| p.count(&mut memory));
+        self.loss.iter().for_each(|l| l.count(&mut memory));
+        self.lists.count(&mut memory);
+        memory.lists += self.slots.bytes();
+        memory.views += self.targets.values().map(|t| t.1.size()).sum::<u64>();
+        memory
+    }
+
+    fn set_profiling(&mut self, on: bool) -> bool {
+        self.gpu.profile = if on { Profile::new(&self.gpu) } else { None };
+        self.gpu.profile.is_some() == on
+    }
+
+    fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
+        self.gpu.profile.as_ref().map_or_else(|| Ok(BTreeMap::new()), |p| p.take(&self.gpu))
+    }
+}

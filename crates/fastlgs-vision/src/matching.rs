@@ -1,0 +1,148 @@
+//! Matching of key points: mutual nearest neighbours that pass Lowe's ratio test. Every descriptor of one photo is compared with every one of
+//! the other; squared distances are |a|^2 + |b|^2 - 2 a.b, whose products processors add up many at a time.
+
+use crate::keypoints::Keypoints;
+use fastlgs_core::vectorised;
+
+/// Ratio of the best to the second-best distance.
+const RATIO: f32 = 0.8;
+/// Descriptors of the first photo that are compared with one of the second while that is at hand.
+const BLOCK: usize = 4;
+
+/// A descriptor in numbers that processors multiply fastest.
+type Wide = [i16; 128];
+
+/// The nearest descriptor of the other photo.
+#[derive(Clone, Copy)]
+struct Nearest {
+    distance: i32,
+    second: i32,
+    index: u32,
+}
+
+impl Nearest {
+    const NONE: Self = Self { distance: i32::MAX, second: i32::MAX, index: u32::MAX };
+
+    /// Of equal distances the first counts.
+    #[inline(always)]
+    fn see(&mut self, distance: i32, index: usize) {
+        if distance < self.second {
+            if distance < self.distance {
+                *self = Self { distance, second: self.distance, index: index as u32 };
+            } else {
+                self.second = distance;
+            }
+        }
+    }
+
+    /// The match, if it stands out against the second best.
+    fn distinct(&self) -> Option<usize> {
+        // A lone descriptor has no second best.
+        let second = if self.second == i32::MAX { u32::MAX } else { self.second as u32 };
+        (self.index != u32::MAX && (self.distance as f32) < RATIO * RATIO * second as f32).then_some(self.index as usize)
+    }
+}
+
+/// Descriptors with the squares of their lengths.
+struct Descriptors {
+    rows: Vec<Wide>,
+    squares: Vec<i32>,
+}
+
+impl Descriptors {
+    fn of(points: &Keypoints) -> Self {
+        let rows: Vec<Wide> = points.descriptors.iter().map(|d| d.map(i16::from)).collect();
+        let squares = rows.iter().map(|row| dot(row, row)).collect();
+        Self { rows, squares }
+    }
+}
+
+#[inline(always)]
+fn dot(a: &Wide, b: &Wide) -> i32 {
+    a.iter().zip(b).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
+}
+
+vectorised! {
+    /// Compares all with all, and keeps the nearest on both sides.
+    fn compare(a: &Descriptors, b: &Descriptors, of_a: &mut [Nearest], of_b: &mut [Nearest]) = compare_body
+}
+
+#[inline(always)]
+fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [Nearest], of_b: &mut [Nearest]) {
+    let (blocks, rest) = a.rows.as_chunks::<BLOCK>();
+    for (k, block) in blocks.iter().enumerate() {
+        for (j, other) in b.rows.iter().enumerate() {
+            let products: [i32; BLOCK] = std::array::from_fn(|r| dot(&block[r], other));
+            for (r, product) in products.into_iter().enumerate() {
+                let i = BLOCK * k + r;
+                let distance = a.squares[i] + b.squares[j] - 2 * product;
+                of_a[i].see(distance, j);
+                of_b[j].see(distance, i);
+            }
+        }
+    }
+    for (r, row) in rest.iter().enumerate() {
+        let i = BLOCK * blocks.len() + r;
+        for (j, other) in b.rows.iter().enumerate() {
+            let distance = a.squares[i] + b.squares[j] - 2 * dot(row, other);
+            of_a[i].see(distance, j);
+            of_b[j].see(distance, i);
+        }
+    }
+}
+
+/// Mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
+pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
+    let (a, b) = (Descriptors::of(a), Descriptors::of(b));
+    let (mut of_a, mut of_b) = (vec![Nearest::NONE; a.rows.len()], vec![Nearest::NONE; b.rows.len()]);
+    compare(&a, &b, &mut of_a, &mut of_b);
+    let mutual = |(i, nearest): (usize, &Nearest)| {
+        let j = nearest.distinct()?;
+        (of_b[j].distinct() == Some(i)).then_some((i, j))
+    };
+    of_a.iter().enumerate().filter_map(mutual).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::rng::Rng;
+    use glam::Vec2;
+
+    fn points(descriptors: Vec<[u8; 128]>) -> Keypoints {
+        Keypoints { positions: vec![Vec2::ZERO; descriptors.len()], descriptors }
+    }
+
+    /// As the definition has it, pair by pair.
+    fn by_definition(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
+        let distance = |x: &[u8; 128], y: &[u8; 128]| x.iter().zip(y).map(|(x, y)| u32::from(x.abs_diff(*y)).pow(2)).sum::<u32>();
+        let nearest = |d: &[u8; 128], all: &[[u8; 128]]| {
+            let mut order: Vec<(u32, usize)> = all.iter().enumerate().map(|(k, o)| (distance(d, o), k)).collect();
+            order.sort_unstable();
+            let second = order.get(1).map_or(u32::MAX, |o| o.0);
+            order.first().filter(|o| (o.0 as f32) < RATIO * RATIO * second as f32).map(|o| o.1)
+        };
+        let back: Vec<Option<usize>> = b.descriptors.iter().map(|d| nearest(d, &a.descriptors)).collect();
+        let forth = a.descriptors.iter().enumerate().map(|(i, d)| (i, nearest(d, &b.descriptors)));
+        forth.filter_map(|(i, j)| j.filter(|j| back[*j] == Some(i)).map(|j| (i, j))).collect()
+    }
+
+    #[test]
+    fn blocks_find_what_the_definition_does() {
+        let mut rng = Rng::new(3, "descriptors");
+        for (n, m) in [(0, 5), (1, 1), (7, 9), (130, 121)] {
+            let a: Vec<[u8; 128]> = (0..n).map(|_| std::array::from_fn(|_| rng.below(256) as u8)).collect();
+            // Most of b are a with noise, in another order; some descriptors occur twice.
+            let noisy = |d: &[u8; 128], rng: &mut Rng| d.map(|v| v.saturating_add(rng.below(30) as u8));
+            let mut b: Vec<[u8; 128]> = a.iter().rev().take(m).map(|d| noisy(d, &mut rng)).collect();
+            b.resize_with(m, || std::array::from_fn(|_| rng.below(256) as u8));
+            if m > 8 {
+                b[3] = b[4];
+            }
+            let (a, b) = (points(a), points(b));
+            let found = matches(&a, &b);
+            assert_eq!(found, by_definition(&a, &b), "{n} and {m}");
+            assert!(n < 100 || found.len() > 50, "{} matches", found.len());
+        }
+    }
+}
