@@ -2,6 +2,7 @@
 
 use fastlgs::Run;
 use fastlgs::progress::Sink;
+use std::io::IsTerminal;
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
 
@@ -42,5 +43,11 @@ pub fn start_logging(common: &Common) {
     };
     let level = if common.verbose == 0 { format!("{level},wgpu_hal=error,ort=error") } else { level.to_owned() };
     let filter = EnvFilter::try_from_env("FASTLGS_LOG").unwrap_or_else(|_| EnvFilter::new(level));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).without_time().init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .without_time()
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
 }

@@ -1,21 +1,143 @@
-"""Structure from motion with pycolmap: PHOTOS/images -> the model of most photos, as COLMAP's binary files."""
+"""Poses of photos from their matched key points, with pycolmap: FOLDER/features.json and .bin -> FOLDER/sparse/K (COLMAP's binary files).
 
+features.json: images (name, path of the photo, width, height, key points), pairs (a, b, matches), seed, camera_model. features.bin holds, in that
+order, the key points of each image (x, y as 32-bit floats) and the matches of each pair (two 32-bit numbers each)."""
+
+import json
 import pathlib
 import sys
 
+import numpy
 import pycolmap
 
-images, work, camera_model = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), sys.argv[3]
-database = work / "database.db"
-print("features", flush=True)
-if hasattr(pycolmap, "ImageReaderOptions"):
-    how = {"reader_options": pycolmap.ImageReaderOptions(camera_model=camera_model)}
-else:
-    # Versions before 0.5 take the model itself.
-    how = {"camera_model": camera_model}
-pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.SINGLE, **how)
-print("matches", flush=True)
-pycolmap.match_exhaustive(database)
+# Up to so many photos are placed one by one, which is more exact and, for so few, faster; more are placed all at once.
+ONE_BY_ONE = 150
+# Below this share of placed photos the other way is tried as well, and the larger result counts.
+PLACED = 0.9
+# With so many photos of a lens, its principal point and all four distortion terms of OpenCV's model are found as well.
+WELL_SEEN = 20
+# Points with a larger error in pixels, or a smaller angle in degrees between their rays, are left out of that.
+MAX_ERROR, MIN_ANGLE = 2.0, 1.5
+# A principal point farther from the middle, as a share of the photo's size, is no lens that there is.
+MAX_OFFSET = 0.1
+
+work = pathlib.Path(sys.argv[1])
+plan = json.loads((work / "features.json").read_text())
+data = numpy.fromfile(work / "features.bin", dtype=numpy.uint32)
+place = 0
+
+
+def take(rows):
+    global place
+    place += 2 * rows
+    return data[place - 2 * rows : place].reshape(rows, 2)
+
+
+def camera_of(image):
+    """All photos of one size come from one lens; what the file tells of its focal length is where the search starts."""
+    size, focal, known = max(image["width"], image["height"]), 1.2, False
+    try:
+        told = pycolmap.infer_camera_from_image(image["path"])
+        focal, known = told.mean_focal_length() / max(told.width, told.height), told.has_prior_focal_length
+    except Exception as error:
+        print(f"no focal length in {image['name']}: {error}", flush=True)
+    model = getattr(pycolmap.CameraModelId, plan["camera_model"])
+    camera = pycolmap.Camera.create_from_model_id(1, model, focal * size, image["width"], image["height"])
+    camera.has_prior_focal_length = known
+    return camera
+
+
+database = pycolmap.Database.open(work / "database.db")
+cameras, ids = {}, []
+for image in plan["images"]:
+    size = (image["width"], image["height"])
+    if size not in cameras:
+        camera = camera_of(image)
+        camera.camera_id = database.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(camera.sensor_id)
+        cameras[size] = (camera, database.write_rig(rig))
+    camera, rig_id = cameras[size]
+    entry = pycolmap.Image(name=image["name"], camera_id=camera.camera_id)
+    image_id = database.write_image(entry)
+    entry.image_id = image_id
+    frame = pycolmap.Frame()
+    frame.rig_id = rig_id
+    frame.add_data_id(entry.data_id)
+    database.write_frame(frame)
+    database.write_keypoints(image_id, take(image["keypoints"]).view(numpy.float32))
+    ids.append(image_id)
+with open(work / "pairs.txt", "w") as listed:
+    for pair in plan["pairs"]:
+        database.write_matches(ids[pair["a"]], ids[pair["b"]], take(pair["matches"]))
+        listed.write(f"{plan['images'][pair['a']]['name']} {plan['images'][pair['b']]['name']}\n")
+database.close()
+
+print("verification", flush=True)
+verification = pycolmap.TwoViewGeometryOptions()
+verification.ransac.random_seed = plan["seed"]
+verification.ransac.max_error = 2.0
+verification.ransac.max_num_trials = 2000
+pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
+
+images = pathlib.Path(plan["images"][0]["path"]).parent
+
+
+def all_at_once():
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = plan["seed"]
+    options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = plan["seed"]
+    return list(pycolmap.global_mapping(work / "database.db", images, work, options).values())
+
+
+def one_by_one():
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = plan["seed"]
+    # More threads would sum in another order each time.
+    options.num_threads = 1
+    return list(pycolmap.incremental_mapping(work / "database.db", images, work, options).values())
+
+
+def most_placed(models):
+    return max((model.num_reg_images() for model in models), default=0)
+
+
 print("mapping", flush=True)
-(work / "sparse").mkdir(exist_ok=True)
-pycolmap.incremental_mapping(database, images, work / "sparse")
+models = one_by_one() if len(ids) <= ONE_BY_ONE else all_at_once()
+if most_placed(models) < PLACED * len(ids):
+    print(f"another way, because {most_placed(models)} of {len(ids)} photos were placed", flush=True)
+    models += all_at_once() if len(ids) <= ONE_BY_ONE else one_by_one()
+
+
+def calibrated(model):
+    """The model with the whole lens adjusted; as it was where that does not fit better."""
+    refined = pycolmap.Reconstruction(model)
+    for camera in refined.cameras.values():
+        focal, cx, cy, radial = camera.params
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = [focal, focal, cx, cy, radial, 0.0, 0.0, 0.0]
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_principal_point = True
+    options.ceres.solver_options.num_threads = 1
+    for _ in range(3):
+        pycolmap.bundle_adjustment(refined, options)
+        pycolmap.ObservationManager(refined).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    refined.update_point_3d_errors()
+    for camera in refined.cameras.values():
+        offset = numpy.abs(camera.params[2:4] / numpy.array([camera.width, camera.height]) - 0.5)
+        if not numpy.isfinite(camera.params).all() or offset.max() > MAX_OFFSET:
+            return model
+    model.update_point_3d_errors()
+    better = refined.compute_mean_reprojection_error() < model.compute_mean_reprojection_error()
+    return refined if better and refined.num_points3D() > model.num_points3D() / 2 else model
+
+
+most = most_placed(models)
+print("calibration", flush=True)
+for k, model in enumerate(models):
+    if model.num_reg_images() == most and most >= WELL_SEEN * len(cameras):
+        model = calibrated(model)
+    folder = work / "sparse" / str(k)
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    print(f"{model.num_reg_images()} of {len(ids)} photos placed, {model.num_points3D()} points", flush=True)

@@ -51,7 +51,7 @@ impl Conse {
     /// When they are not installed.
     pub fn load() -> Result<Self> {
         let folder = places::offline_dir();
-        let classifier = Model::load(&folder.join("classifier.onnx"))?;
+        let classifier = Model::load_for_each_core(&folder.join("classifier.onnx"))?;
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
         let projection = class_embeddings.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();

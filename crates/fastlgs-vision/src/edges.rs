@@ -16,7 +16,7 @@ impl Hed {
     /// # Errors
     /// When it is not installed.
     pub fn load() -> Result<Self> {
-        Ok(Self(Model::load(&places::offline_dir().join("edges.onnx"))?))
+        Ok(Self(Model::load_for_each_core(&places::offline_dir().join("edges.onnx"))?))
     }
 
     /// Edge probability of each pixel, row-major.

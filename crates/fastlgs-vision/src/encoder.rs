@@ -5,7 +5,7 @@ use fastlgs_core::LabelMap;
 use image::RgbImage;
 
 /// Embeds the masks of a photo.
-pub trait Encoder {
+pub trait Encoder: Sync {
     /// Name recorded in the scene; a query must use the text tower of the same encoder.
     fn name(&self) -> &'static str;
     /// One L2-normalised embedding for each label 1..=max of the map of a view, in order; zeros for labels that do not occur.

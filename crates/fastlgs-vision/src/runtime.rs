@@ -25,6 +25,10 @@ fn environment() -> Result<Environment> {
     Ok(slot.insert(environment).clone())
 }
 
+fn cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
 /// Values of a tensor with their shape, row-major. Whole numbers are held as floats, which is exact up to 2^24.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
@@ -59,15 +63,29 @@ pub struct Model {
     pub inputs: Vec<Slot>,
     /// Names of its outputs.
     pub outputs: Vec<String>,
-    session: Mutex<Session>,
+    /// One, or one a core; whoever comes takes one that is free.
+    sessions: Vec<Mutex<Session>>,
 }
 
 impl Model {
-    /// Loads an ONNX file; it uses as many threads as the machine has cores.
+    /// Loads an ONNX file; each run uses as many threads as the machine has cores.
     ///
     /// # Errors
     /// When the file or ONNX Runtime is missing, or it is no model.
     pub fn load(path: &Path) -> Result<Self> {
+        Self::with_sessions(path, 1, cores())
+    }
+
+    /// Loads a small ONNX file once a core, for runs that are done at the same time on one thread each: what surrounds them then fills the cores
+    /// as well.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_for_each_core(path: &Path) -> Result<Self> {
+        Self::with_sessions(path, cores(), 1)
+    }
+
+    fn with_sessions(path: &Path, count: usize, threads: usize) -> Result<Self> {
         let name = path.display().to_string();
         if !path.is_file() {
             let mend = "'fastlgs models install-offline' gets the offline models, 'fastlgs models pull NAME' the others";
@@ -75,9 +93,13 @@ impl Model {
         }
         let failed = |e: &dyn std::fmt::Display| Error::Inference { model: name.clone(), reason: e.to_string() };
         let environment = environment()?;
-        let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        let mut builder = Session::builder(&environment).map_err(|e| failed(&e))?.with_intra_threads(threads).map_err(|e| failed(&e))?;
-        let session = builder.commit_from_file(path).map_err(|e| failed(&e))?;
+        let open = || -> Result<Session> {
+            let mut builder =
+                Session::builder(&environment).map_err(|e| failed(&e))?.with_intra_threads(threads).map_err(|e| failed(&e))?;
+            builder.commit_from_file(path).map_err(|e| failed(&e))
+        };
+        let sessions = (0..count).map(|_| open()).collect::<Result<Vec<_>>>()?;
+        let session = &sessions[0];
         let slot = |outlet: &ort::value::Outlet| match outlet.dtype() {
             ValueType::Tensor { ty, shape, .. } => {
                 let shape = shape.iter().map(|d| usize::try_from(*d).ok().filter(|d| *d > 0)).collect();
@@ -87,7 +109,7 @@ impl Model {
         };
         let inputs = session.inputs().iter().map(slot).collect::<Result<Vec<_>>>()?;
         let outputs = session.outputs().iter().map(|o| o.name().to_owned()).collect();
-        Ok(Self { inputs, outputs, session: Mutex::new(session), name })
+        Ok(Self { inputs, outputs, sessions: sessions.into_iter().map(Mutex::new).collect(), name })
     }
 
     /// The input of one of these names.
@@ -116,7 +138,8 @@ impl Model {
             let slot = self.input(&[name]).ok_or_else(|| self.refuse(format!("it has no input '{name}'")))?;
             values.push((name.to_owned(), self.tensor(slot, array)?));
         }
-        let mut session = self.session.lock().expect("no panic while holding the lock");
+        let free = self.sessions.iter().find_map(|session| session.try_lock().ok());
+        let mut session = free.unwrap_or_else(|| self.sessions[0].lock().expect("no panic while holding the lock"));
         let found = session.run(values).map_err(failed)?;
         let array = |name: &&str| {
             let value = found.get(*name).ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;

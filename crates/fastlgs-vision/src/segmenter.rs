@@ -37,7 +37,7 @@ pub struct Segmentation {
 }
 
 /// Finds masks.
-pub trait Segmenter {
+pub trait Segmenter: Sync {
     /// Name recorded in the scene.
     fn name(&self) -> &'static str;
     /// Segments the photo of the view of that name; the label maps have its size.

@@ -1,43 +1,59 @@
-//! Poses for photos that come without: structure from motion by COLMAP (Schoenberger & Frahm 2016), as a program on the
-//! path or as pycolmap in Python.
+//! Poses for photos that come without: structure from motion by COLMAP (Schoenberger & Frahm 2016). pycolmap, which `models install-offline`
+//! installs, places key points that are found and matched here, all photos at once (GLOMAP, Pan et al. 2024); an installed `colmap` program does
+//! everything by itself.
 
-use crate::{Error, Result};
+use crate::keypoints::{self, Keypoints};
+use crate::matching::matches;
+use crate::{Error, Result, places};
 use fastlgs_core::dataset::{colmap, is_photo};
-use std::io::{BufRead, BufReader};
+use fastlgs_core::{fs, image_io};
+use rayon::prelude::*;
+use serde_json::json;
+use std::collections::BTreeSet;
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-/// One camera took all photos; its lens has one radial term, which the photos then lose.
+/// One camera took all photos of a size; its lens has one radial term, which the photos then lose.
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
-/// Up to so many photos each is matched with each, above with those that follow it.
-const EXHAUSTIVE: usize = 200;
+/// Up to so many photos each is matched with each.
+const EXHAUSTIVE: usize = 80;
+/// Above, each is matched with so many that follow it, in the order of their names, and with those at distances of powers of two.
+const FOLLOWING: usize = 12;
+/// And so many photos, spread over all, each with each: they close loops.
+const SPREAD: usize = 40;
+/// Longer side of the photos on which key points are found.
+const SIDE: u32 = 1000;
+/// Fewest matches of a pair that are worth verifying.
+const FEW: usize = 15;
 
 const RECONSTRUCT: &str = include_str!("../assets/reconstruct.py");
 
 /// What there is to run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Tool {
-    /// The program `colmap`.
-    Colmap(PathBuf),
     /// A Python that has pycolmap.
     Pycolmap(PathBuf),
+    /// The program `colmap`.
+    Colmap(PathBuf),
 }
 
 impl Tool {
-    /// `colmap` on the path, else a `python3` that can import pycolmap.
+    /// The pycolmap that was installed with the offline models, else a `python3` that can import it, else `colmap` on the path; with
+    /// `program`, `colmap` alone.
     ///
     /// # Errors
-    /// When there is neither; the message says how to get one.
-    pub fn find() -> Result<Self> {
+    /// When there is none; the message says how to get one.
+    pub fn find(program: bool) -> Result<Self> {
         let folders: Vec<PathBuf> = std::env::var_os("PATH").map(|p| std::env::split_paths(&p).collect()).unwrap_or_default();
         let on_path = |name: &str| folders.iter().map(|f| f.join(name)).find(|p| p.is_file());
-        if let Some(colmap) = on_path("colmap") {
-            return Ok(Self::Colmap(colmap));
-        }
         let imports = |python: &PathBuf| Command::new(python).args(["-c", "import pycolmap"]).output().is_ok_and(|o| o.status.success());
-        on_path("python3").filter(imports).map(Self::Pycolmap).ok_or_else(|| {
-            let mend = "install COLMAP ('apt-get install colmap', or 'pip install pycolmap'), or add poses";
-            Error::Missing(format!("the photos have no poses, and neither 'colmap' nor pycolmap is there to find them: {mend}"))
+        let pythons = std::iter::once(places::poses_python()).chain(on_path("python3")).filter(|p| p.is_file() && !program);
+        let pycolmap = pythons.into_iter().find(imports).map(Self::Pycolmap);
+        pycolmap.or_else(|| on_path("colmap").map(Self::Colmap)).ok_or_else(|| {
+            let mend =
+                "run 'fastlgs models install-offline', which installs pycolmap, or install COLMAP ('apt-get install colmap'), or add poses";
+            Error::Missing(format!("the photos have no poses, and nothing is there to find them: {mend}"))
         })
     }
 }
@@ -47,46 +63,25 @@ impl Tool {
 ///
 /// # Errors
 /// When the tool fails or no photo could be placed; what it said last is in the message.
-pub fn reconstruct(tool: &Tool, photos: &Path, mut say: impl FnMut(&str, &str)) -> Result<()> {
+pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &str) + Sync) -> Result<()> {
     let images = photos.join("images");
     let entries = images.read_dir().map_err(fastlgs_core::Error::io(&images))?;
-    let count = entries.flatten().filter(|e| is_photo(&e.path())).count();
-    if count < 3 {
-        return Err(Error::Invalid(format!("{}: {count} photos; poses need at least 3", images.display())));
+    let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
+    files.sort();
+    if files.len() < 3 {
+        return Err(Error::Invalid(format!("{}: {} photos; poses need at least 3", images.display(), files.len())));
     }
     let work = photos.join("sparse.partial");
     let _ = std::fs::remove_dir_all(&work);
     let models = work.join("sparse");
     std::fs::create_dir_all(&models).map_err(fastlgs_core::Error::io(&models))?;
-    let database = work.join("database.db");
     match tool {
-        Tool::Colmap(program) => {
-            let matcher = if count <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
-            let stages: [(&str, &str, &[&str]); 3] = [
-                (
-                    "features",
-                    "feature_extractor",
-                    &["--ImageReader.single_camera", "1", "--ImageReader.camera_model", CAMERA_MODEL, "--SiftExtraction.use_gpu", "0"],
-                ),
-                ("matches", matcher, &["--SiftMatching.use_gpu", "0"]),
-                ("mapping", "mapper", &[]),
-            ];
-            for (stage, name, options) in stages {
-                let mut command = Command::new(program);
-                command.arg(name).arg("--database_path").arg(&database);
-                if name != matcher {
-                    command.arg("--image_path").arg(&images);
-                }
-                if name == "mapper" {
-                    command.arg("--output_path").arg(&models);
-                }
-                run(command.args(options), stage, &mut say)?;
-            }
-        }
+        Tool::Colmap(program) => by_program(program, &images, &work, &models, files.len(), &say)?,
         Tool::Pycolmap(python) => {
+            plan(&files, &work, seed, &say)?;
             let script = work.join("reconstruct.py");
             std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
-            run(Command::new(python).arg(&script).arg(&images).arg(&work).arg(CAMERA_MODEL), "structure from motion", &mut say)?;
+            run(Command::new(python).arg(&script).arg(&work), "structure from motion", &say)?;
         }
     }
     let best = largest_model(&models).ok_or_else(|| {
@@ -100,6 +95,90 @@ pub fn reconstruct(tool: &Tool, photos: &Path, mut say: impl FnMut(&str, &str)) 
     Ok(())
 }
 
+/// Everything by COLMAP's own stages.
+fn by_program(program: &Path, images: &Path, work: &Path, models: &Path, count: usize, say: &impl Fn(&str, &str)) -> Result<()> {
+    let matcher = if count <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
+    let one_camera = ["--ImageReader.single_camera", "1", "--ImageReader.camera_model", CAMERA_MODEL];
+    let stages: [(&str, &str, &[&str]); 3] =
+        [("features", "feature_extractor", &one_camera), ("matches", matcher, &[]), ("mapping", "mapper", &[])];
+    for (stage, name, options) in stages {
+        let mut command = Command::new(program);
+        command.arg(name).arg("--database_path").arg(work.join("database.db"));
+        if name != matcher {
+            command.arg("--image_path").arg(images);
+        }
+        if name == "mapper" {
+            command.arg("--output_path").arg(models);
+        }
+        // Without a display COLMAP must not ask for a graphics card; how it is told depends on its version.
+        if let Some(option) = known_option(program, name, &USE_GPU) {
+            command.args([option, "0"]);
+        }
+        run(command.args(options), stage, say)?;
+    }
+    Ok(())
+}
+
+/// Options of COLMAP 3 and 4 that ask for a graphics card.
+const USE_GPU: [&str; 4] =
+    ["--SiftExtraction.use_gpu", "--FeatureExtraction.use_gpu", "--SiftMatching.use_gpu", "--FeatureMatching.use_gpu"];
+
+/// The first of these options that the program's help for a stage names.
+fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option<&'static str> {
+    let help = Command::new(program).args([stage, "--help"]).output().ok()?;
+    let text = [help.stdout, help.stderr].concat();
+    let text = String::from_utf8_lossy(&text);
+    options.iter().copied().find(|option| text.contains(option))
+}
+
+/// Finds and matches key points, and leaves them in the work folder as `reconstruct.py` reads them.
+fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + Sync)) -> Result<()> {
+    let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
+        say("features", &path.file_name().unwrap_or_default().to_string_lossy());
+        let photo = image_io::load_rgb(path)?;
+        let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
+        let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
+        let small = image_io::resize(&photo, size(photo.width()), size(photo.height()));
+        let points = keypoints::detect(&image::imageops::grayscale(&small))?;
+        Ok((small.width(), small.height(), points))
+    };
+    let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
+    say("matches", "");
+    let pairs: Vec<(usize, usize, Vec<(usize, usize)>)> =
+        pairs(files.len()).into_par_iter().map(|(a, b)| (a, b, matches(&photos[a].2, &photos[b].2))).filter(|p| p.2.len() >= FEW).collect();
+    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let image = |(path, (width, height, points)): (&PathBuf, &(u32, u32, Keypoints))| {
+        let path_text = std::path::absolute(path).unwrap_or_else(|_| path.clone());
+        json!({ "name": name(path), "path": path_text, "width": width, "height": height, "keypoints": points.positions.len() })
+    };
+    let plan = json!({
+        "images": files.iter().zip(&photos).map(image).collect::<Vec<_>>(),
+        "pairs": pairs.iter().map(|(a, b, found)| json!({ "a": a, "b": b, "matches": found.len() })).collect::<Vec<_>>(),
+        "seed": seed % (1 << 31),
+        "camera_model": CAMERA_MODEL,
+    });
+    fs::write_json(&work.join("features.json"), &plan)?;
+    let points = photos.iter().flat_map(|p| &p.2.positions).flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
+    let matched = pairs.iter().flat_map(|p| &p.2).flat_map(|(i, j)| [*i as u32, *j as u32]);
+    let bytes: Vec<u8> = points.chain(matched).flat_map(u32::to_le_bytes).collect();
+    Ok(fs::write_atomic(&work.join("features.bin"), |file| file.write_all(&bytes))?)
+}
+
+/// Which photos are matched, by their places in the order of names.
+fn pairs(count: usize) -> Vec<(usize, usize)> {
+    if count <= EXHAUSTIVE {
+        return (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))).collect();
+    }
+    let mut pairs = BTreeSet::new();
+    for a in 0..count {
+        let near = (1..=FOLLOWING).chain((0..).map(|k| 1usize << k).take_while(|d| *d < count));
+        pairs.extend(near.map(|d| (a, a + d)).filter(|p| p.1 < count));
+    }
+    let spread: Vec<usize> = (0..SPREAD).map(|k| k * count / SPREAD).collect();
+    pairs.extend(spread.iter().flat_map(|&a| spread.iter().filter(move |b| a < **b).map(move |&b| (a, b))));
+    pairs.into_iter().collect()
+}
+
 /// COLMAP may leave several models: the one whose list of photos is longest counts.
 fn largest_model(models: &Path) -> Option<PathBuf> {
     let folders = models.read_dir().ok()?.flatten().map(|e| e.path()).filter(|p| colmap::is_model(p));
@@ -107,7 +186,7 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
 }
 
 /// Runs one stage and passes on what it prints.
-fn run(command: &mut Command, stage: &str, say: &mut impl FnMut(&str, &str)) -> Result<()> {
+fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str)) -> Result<()> {
     let name = command.get_program().to_string_lossy().into_owned();
     let failed = |reason: String| Error::Missing(format!("{name} failed while finding poses ({stage}): {reason}"));
     say(stage, "");
@@ -129,6 +208,7 @@ fn run(command: &mut Command, stage: &str, say: &mut impl FnMut(&str, &str)) -> 
 mod tests {
     use super::*;
     use std::os::unix::fs::PermissionsExt;
+    use std::sync::Mutex;
 
     /// A stand-in for COLMAP: notes how it was called, and its mapper leaves two models.
     fn stand_in(dir: &Path, script: &str) -> Tool {
@@ -145,7 +225,8 @@ mod tests {
         photos
     }
 
-    const MAPPER: &str = "if [ \"$1\" = mapper ]; then
+    const MAPPER: &str = "if [ \"$2\" = --help ]; then echo '  --SiftExtraction.use_gpu arg (=1)'; exit 0; fi
+    if [ \"$1\" = mapper ]; then
         for k in 0 1; do
             mkdir -p \"$7/$k\"; printf x > \"$7/$k/cameras.bin\"; printf x > \"$7/$k/points3D.bin\"; head -c $((10 + k)) /dev/zero > \"$7/$k/images.bin\"
         done
@@ -155,24 +236,34 @@ mod tests {
     fn the_largest_model_becomes_sparse_0() {
         let dir = tempfile::tempdir().unwrap();
         let photos = photos(dir.path(), 4);
-        let mut stages = Vec::new();
-        reconstruct(&stand_in(dir.path(), MAPPER), &photos, |stage, _| stages.push(stage.to_owned())).unwrap();
-        assert_eq!(stages, ["features", "matches", "mapping"]);
+        let stages = Mutex::new(Vec::new());
+        reconstruct(&stand_in(dir.path(), MAPPER), &photos, 0, |stage, _| stages.lock().unwrap().push(stage.to_owned())).unwrap();
+        assert_eq!(*stages.lock().unwrap(), ["features", "matches", "mapping"]);
         assert_eq!(std::fs::metadata(photos.join("sparse/0/images.bin")).unwrap().len(), 11);
         assert!(!photos.join("sparse.partial").exists());
         let calls = std::fs::read_to_string(dir.path().join("calls")).unwrap();
         assert!(calls.contains("exhaustive_matcher") && calls.contains("single_camera 1"), "{calls}");
+        assert!(calls.contains("--SiftExtraction.use_gpu 0"), "{calls}");
     }
 
     #[test]
     fn failures_are_told_in_the_tools_words() {
         let dir = tempfile::tempdir().unwrap();
         let broken = stand_in(dir.path(), "echo 'cannot open display' >&2; exit 1");
-        let error = reconstruct(&broken, &photos(dir.path(), 4), |_, _| {}).unwrap_err().to_string();
+        let error = reconstruct(&broken, &photos(dir.path(), 4), 0, |_, _| {}).unwrap_err().to_string();
         assert!(error.contains("cannot open display") && error.contains("features"), "{error}");
         let nothing = stand_in(dir.path(), "exit 0");
-        assert!(reconstruct(&nothing, &photos(dir.path(), 4), |_, _| {}).unwrap_err().to_string().contains("place no photo"));
+        assert!(reconstruct(&nothing, &photos(dir.path(), 4), 0, |_, _| {}).unwrap_err().to_string().contains("place no photo"));
         let few = tempfile::tempdir().unwrap();
-        assert!(reconstruct(&nothing, &photos(few.path(), 2), |_, _| {}).unwrap_err().to_string().contains("at least 3"));
+        assert!(reconstruct(&nothing, &photos(few.path(), 2), 0, |_, _| {}).unwrap_err().to_string().contains("at least 3"));
+    }
+
+    #[test]
+    fn many_photos_are_matched_with_neighbours_and_across_loops() {
+        assert_eq!(pairs(4), [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]);
+        let many = pairs(300);
+        assert!(many.contains(&(10, 11)) && many.contains(&(10, 22)) && many.contains(&(10, 138)), "neighbours, and powers of two");
+        assert!(many.contains(&(0, 292)), "the first and the last of those that are spread");
+        assert!(many.len() < 20 * 300 + SPREAD * SPREAD / 2, "{} pairs of {}", many.len(), 300 * 299 / 2);
     }
 }

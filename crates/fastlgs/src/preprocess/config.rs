@@ -6,6 +6,18 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+/// What finds poses where there are none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Sfm {
+    /// pycolmap on key points that are found and matched here; without it, the program `colmap`.
+    #[default]
+    Auto,
+    /// The program `colmap` from photos to poses.
+    Colmap,
+}
+
 /// What is preprocessed, and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
@@ -25,6 +37,9 @@ pub struct Config {
     /// Keep out the photos that these labels name instead (of LERF-OVS, 3D-OVS or SPIn-NeRF).
     #[cfg_attr(feature = "clap", arg(long, value_name = "DIR", conflicts_with = "holdout"))]
     pub holdout_labels: Option<PathBuf>,
+    /// What finds poses where there are none.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub sfm: Sfm,
     /// Segmenter and encoder.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
@@ -45,6 +60,7 @@ impl Default for Config {
             max_side: 960,
             holdout: 8,
             holdout_labels: None,
+            sfm: Sfm::default(),
             eyes: Eyes::default(),
             neighbours: 10,
             memory: 4_000_000_000,
@@ -84,8 +100,6 @@ pub struct Report {
     pub masks: usize,
     /// Mean number of masks a photo, by level.
     pub masks_per_photo: BTreeMap<String, f64>,
-    /// Objects that Algorithm 1 found.
-    pub objects_by_algorithm_1: usize,
     /// Pairs of key points that matched.
     pub key_point_matches: usize,
     /// Points to start Gaussians from.

@@ -8,6 +8,7 @@ use crate::{Result, Run, masks};
 use fastlgs_core::{LabelMap, SceneFolder};
 use fastlgs_grid::mapping::Mask;
 use fastlgs_vision::{Encoder, Level, Segmenter};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Writes the masks of every training photo; returns the mean number of masks a photo by level.
@@ -20,9 +21,8 @@ pub(super) fn segment(
     run: &Run,
 ) -> Result<BTreeMap<String, f64>> {
     let work = run.work("masks", training.len() as u64);
-    let mut counts = BTreeMap::new();
     let identity = config.eyes.segmenter_identity()?;
-    for photo in training {
+    let of_photo = |photo: &Known| -> Result<[Option<usize>; 3]> {
         let name = &photo.camera.name;
         let make = || -> Result<[LabelMap; 3]> {
             Ok(segmenter.segment(name, &folder.photo(name)?).with_context(|| format!("segmenting {name}"))?.levels)
@@ -31,19 +31,22 @@ pub(super) fn segment(
             Some(identity) => cache.get("masks", &cache::key(&[&photo.key, identity.as_bytes()]), make)?,
             None => make()?,
         };
-        for (level, map) in Level::ALL.into_iter().zip(&levels) {
+        let mut counts = [None; 3];
+        for ((level, map), count) in Level::ALL.into_iter().zip(&levels).zip(&mut counts) {
             let path = folder.masks_path(level.name(), name);
             if config.eyes.keeps(level) {
-                let masks = map.areas().iter().skip(1).filter(|a| **a > 0).count();
-                *counts.entry(level.name().to_owned()).or_default() += masks as f64 / training.len() as f64;
+                *count = Some(map.areas().iter().skip(1).filter(|a| **a > 0).count());
                 map.save(&path)?;
             } else if path.is_file() {
                 std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
             }
         }
         work.advance()?;
-    }
-    Ok(counts)
+        Ok(counts)
+    };
+    let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
+    let mean = |k: usize| Some(counts.iter().map(|c| c[k]).sum::<Option<usize>>()? as f64 / training.len() as f64);
+    Ok(Level::ALL.into_iter().enumerate().filter_map(|(k, level)| Some((level.name().to_owned(), mean(k)?))).collect())
 }
 
 /// Embedding and colour distribution of every mask, sorted by view and label.
@@ -56,9 +59,8 @@ pub(super) fn describe(
     run: &Run,
 ) -> Result<Vec<Mask>> {
     let work = run.work("embeddings", training.len() as u64);
-    let mut found = Vec::new();
     let identity = config.eyes.encoder_identity()?;
-    for (view, photo) in training.iter().enumerate() {
+    let of_photo = |(view, photo): (usize, &Known)| -> Result<Vec<Mask>> {
         let name = &photo.camera.name;
         let labels = masks::whole(folder, &photo.camera)?;
         let make = || masks::described(name, &folder.photo(name)?, 0, &labels, encoder);
@@ -69,9 +71,10 @@ pub(super) fn describe(
             }
             None => make()?,
         };
-        // A photo keeps what is known of it when others come or go before it.
-        found.extend(of_view.into_iter().map(|mask| Mask { view, ..mask }));
         work.advance()?;
-    }
-    Ok(found)
+        // A photo keeps what is known of it when others come or go before it.
+        Ok(of_view.into_iter().map(|mask| Mask { view, ..mask }).collect())
+    };
+    let found = training.par_iter().enumerate().map(of_photo).collect::<Result<Vec<_>>>()?;
+    Ok(found.into_iter().flatten().collect())
 }

@@ -8,13 +8,12 @@ mod poses;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
-use crate::{Result, Run, objects};
+use crate::{Result, Run};
 use config::BRIGHTNESS_SPREAD;
-pub use config::{Config, Report, brightness_spread};
+pub use config::{Config, Report, Sfm, brightness_spread};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
-use fastlgs_grid::mapping::PaperConfig;
-use fastlgs_grid::{Grid, evidence};
+use fastlgs_grid::evidence;
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::{brightness, import, triangulate};
 use photos::Known;
@@ -39,7 +38,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         bail!("--max-side {} is too small: 64 pixels are the least", config.max_side);
     }
     if config.photos.join("images").is_dir() && !dataset::has_poses(&config.photos) {
-        poses::find(&config.photos, run)?;
+        poses::find(&config.photos, config.sfm, run)?;
         lap("poses");
     }
     let dataset = dataset::load(&config.photos)?;
@@ -92,30 +91,14 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
     let spread = brightness::spread(&colors, &matches);
 
-    // Points of moved cameras lie where those cameras were.
-    let points = if dataset.points.is_empty() || !checked.moved.is_empty() {
-        triangulate::triangulate(&poses, &keypoints, &colors, &matches)
-    } else {
-        dataset.points.clone()
-    };
+    // Points of moved cameras lie where those cameras were. Else the larger start counts: on fox 91,000 points that were triangulated here
+    // instead of the 7,500 of structure from motion give 1.3 dB more after 2,000 steps.
+    let own = triangulate::triangulate(&poses, &keypoints, &colors, &matches);
+    let points = if !checked.moved.is_empty() || own.len() > dataset.points.len() { own } else { dataset.points.clone() };
     folder.save_points(&points)?;
     let pairs = matches::correspondences(&masks, &folder, &poses, &keypoints, &matches)?;
     evidence::save(&folder, &masks, &pairs)?;
     lap("points");
-    // Without Gaussians only Algorithm 1 can map the masks; `train` maps again with what it learns, or with its options.
-    let mapped = match objects::by_algorithm_1(&folder, &poses, &PaperConfig::default(), run.seed) {
-        // The default mapping needs none of this.
-        Err(crate::Error::Grid(error @ fastlgs_grid::Error::TooManyObjects)) => {
-            let warning = format!("Algorithm 1: {error}");
-            run.warn(&warning);
-            warnings.push(warning);
-            Grid::default()
-        }
-        other => other?,
-    };
-    mapped.save(&folder)?;
-    lap("mapping");
-
     manifest.seconds = seconds.clone();
     manifest.notes.insert(BRIGHTNESS_SPREAD.to_owned(), spread.into());
     folder.save_manifest(&manifest)?;
@@ -128,7 +111,6 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         size: format!("{}x{}", cameras[0].width, cameras[0].height),
         masks: masks.len(),
         masks_per_photo: mask_counts,
-        objects_by_algorithm_1: mapped.objects.len(),
         key_point_matches: matches.iter().map(|m| m.pairs.len()).sum(),
         points: points.len(),
         sift: keypoints::backend().to_owned(),

@@ -1,5 +1,6 @@
 //! Poses: found where there are none, checked where they are given.
 
+use super::config::Sfm;
 use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::{Result, Run};
@@ -9,11 +10,11 @@ use fastlgs_vision::{pose_check, structure};
 use std::path::Path;
 
 /// Structure from motion for photos without poses.
-pub(super) fn find(photos: &Path, run: &Run) -> Result<()> {
-    let tool = structure::Tool::find()?;
+pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
+    let tool = structure::Tool::find(sfm == Sfm::Colmap)?;
     let work = run.work("poses", 0);
-    run.warn(&format!("{}: no poses; COLMAP looks for them, which takes minutes", photos.display()));
-    structure::reconstruct(&tool, photos, |stage, line| {
+    run.warn(&format!("{}: no poses; structure from motion looks for them, which takes minutes", photos.display()));
+    structure::reconstruct(&tool, photos, run.seed, |stage, line| {
         work.note(&format!("{stage}: {line}"));
         tracing::debug!(stage, line, "COLMAP");
     })?;
