@@ -1,17 +1,28 @@
 #!/usr/bin/env bash
-# Installs what is missing and runs all tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
+# Installs what is missing and runs the tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
+# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages. Before a release; about an hour on two cores.
 set -euo pipefail
 cd "$(dirname "$0")"
 ./setup.sh --tests
 export NODEVICE_SELECT=1          # Mesa's device chooser complains where there is no desktop session
 export FASTLGS_REQUIRE_GPU=1      # a missing device is a failure here, not a skip
 export FASTLGS_REQUIRE_MODELS=1   # and so are missing models, which setup.sh installs
+if [ "${1:-}" = --all ]; then
+    export FASTLGS_TEST_ALL=1 FASTLGS_FUZZ_SECONDS=${FASTLGS_FUZZ_SECONDS:-5}
+fi
+lap() { printf 'test: %s took %d s\n' "$1" $((SECONDS - began)); began=$SECONDS; }
+began=$SECONDS
 cargo fmt --all --check
 cargo clippy --release --locked --all-targets --features fastlgs-cli/opencv --quiet -- -D warnings
+# Also what a build without OpenCV has: key points in pure Rust.
+cargo clippy --release --locked -p fastlgs-cli --quiet -- -D warnings
+lap "formatting and clippy"
 RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps --features fastlgs-cli/opencv --quiet
+lap "documentation"
 tests/wasm.sh
-# Also builds without OpenCV, with the pure-Rust key points.
-tests/packages.sh
+if [ "${FASTLGS_TEST_ALL:-}" ]; then tests/packages.sh; fi
+lap "wasm and packages"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
-# Counts of kills, damaged inputs and benches are part of the log.
-cargo test --release --locked --features fastlgs-cli/opencv -- --show-output
+# Counts of kills, damaged inputs and benches are part of the log, and so is what takes longest.
+python3 tests/slowest.py cargo test --release --locked --features fastlgs-cli/opencv -- --show-output
+lap "tests"

@@ -1,4 +1,5 @@
-//! The quick suite of benches on generated scenes: that they run, that their figures add up, and the bounds that are promised.
+//! The quick suite of benches on generated scenes: that they run, that their figures add up, and the bounds that are promised. Of the
+//! rows that take longest only some, unless everything is tested.
 
 #[path = "support/run.rs"]
 mod run;
@@ -25,9 +26,12 @@ fn quick_suite() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let out = dir.path();
-    let bench = |what: &str| json(&["bench", what, "--quick", "--device", "cpu", "-o", text(out)]);
+    let bench = |what: &str, dose: &[&str]| {
+        let quick = ["bench", what, "--quick", "--device", "cpu", "-o", text(out)];
+        json(&[&quick[..], if run::all() { &[] } else { dose }].concat())
+    };
 
-    let chart = bench("chart");
+    let chart = bench("chart", &["--ways", "embeddings,+ colour (paper),global,code of 3 numbers,no grid,paper 300 steps"]);
     let rows = chart["rows"].as_array().expect("rows");
     let oracle = |way: &str| number(rows.iter().find(|r| r["way"] == way).expect("a way"), "oracle_miou");
     println!(
@@ -41,7 +45,7 @@ fn quick_suite() {
     assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| number(r, "seconds") > 0.0));
     written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
 
-    let size = bench("size");
+    let size = bench("size", &[]);
     let verdict = &size["auto"][0];
     println!("size: {verdict}");
     assert!(number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 1.0, "{verdict}");
@@ -50,7 +54,7 @@ fn quick_suite() {
     assert!(bytes("auto, compact") < bytes("auto") && bytes("degree 0") < bytes("full"));
     written(out, &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
 
-    let stability = bench("stability");
+    let stability = bench("stability", &["--cases", "photos shuffled,masks split,masks dropped"]);
     let rows = stability["rows"].as_array().expect("rows");
     let row = |disturbance: &str| rows.iter().find(|r| r["disturbance"] == disturbance).expect("a row");
     println!("stability: {} rows hold, {} fail", stability["holds"], stability["fails"]);

@@ -24,25 +24,15 @@ struct Fixture {
     scene: PathBuf,
 }
 
-/// One small generated scene, preprocessed with its exact masks and trained, shared by the tests.
+/// The generated room that all test programs share, and a folder of these tests' own.
 fn fixture() -> Option<&'static Fixture> {
     static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
-    FIXTURE
-        .get_or_init(|| {
-            if !run::ready() {
-                return None;
-            }
-            let dir = tempfile::tempdir().expect("a temporary folder");
-            let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
-            json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "320x240"]);
-            let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
-            assert_eq!((report["photos"].as_u64(), report["held_out"].as_u64()), (Some(32), Some(4)));
-            assert_eq!(report["moved_cameras"], 0, "all blocks look alike from four sides, and yet the poses are exact: {report}");
-            let report = json(&["train", text(&scene), "--iterations", "900", "--budget", "15000"]);
-            assert!(report["psnr_held_out"].as_f64().expect("a number") > 19.0, "{report}");
-            Some(Fixture { dir, photos, scene })
-        })
-        .as_ref()
+    let make = || {
+        let room = run::room()?;
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        Some(Fixture { dir, photos: room.photos.clone(), scene: room.scene.clone() })
+    };
+    FIXTURE.get_or_init(make).as_ref()
 }
 
 /// IoU of an answer's mask with the coffee's exact one in view 008.
@@ -259,7 +249,8 @@ fn transparent_and_masked_pixels_do_not_count() {
 fn speed_is_charted_for_several_devices() {
     let Some(f) = fixture() else { return };
     let out = f.dir.path().join("speed");
-    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", "auto,cpu", "-o", text(&out)];
+    let devices = format!("{},cpu", run::adapter());
+    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", &devices, "-o", text(&out)];
     let report = json(&[&["bench", "speed", text(&f.scene)], &settings[..]].concat());
     let devices = report["devices"].as_array().expect("a table");
     assert_eq!(devices.len(), 2);
@@ -334,7 +325,7 @@ fn preprocessing_does_again_only_what_changed() {
     let run = || json(&["preprocess", text(&photos), "-o", text(&scene), "--memory", "20M"]);
     let counts = |report: &Value, stage: &str| [0, 1].map(|k| report["cached"][stage][k].as_u64().expect("a number"));
     let first = run();
-    let results = || ["grid.json", "grid.safetensors", "embeddings.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
+    let results = || ["points.safetensors", "embeddings.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
     let before = results();
     assert_eq!([counts(&first, "masks"), counts(&first, "embeddings"), counts(&first, "poses")], [[0, 8], [0, 8], [0, 1]]);
     let second = run();

@@ -1,7 +1,7 @@
 //! Every parser gets damaged files: it may refuse them, in one sentence that names the file, but must neither panic nor hang.
 //!
 //! Inputs are mutations of valid files and of earlier finds: an input that makes a parser say something new joins the corpus in
-//! `target/fuzz/PARSER`, from which later runs go on. `FASTLGS_FUZZ_SECONDS` sets the time for each parser (default 2).
+//! `target/fuzz/PARSER`, from which later runs go on. `FASTLGS_FUZZ_SECONDS` sets the time for each parser (default 0.5; `./test.sh --all` gives each 5).
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::rng::Rng;
@@ -219,7 +219,7 @@ fn corpus_folder(name: &str) -> PathBuf {
 
 #[test]
 fn parsers_survive_damaged_files() {
-    let seconds = std::env::var("FASTLGS_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok()).unwrap_or(2.0);
+    let seconds = std::env::var("FASTLGS_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok()).unwrap_or(0.5);
     let (mut total, mut failures) = (0, Vec::new());
     for target in targets() {
         let dir = tempfile::tempdir().expect("a folder");

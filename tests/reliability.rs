@@ -45,13 +45,15 @@ fn results(scene: &Path) -> [Vec<u8>; 3] {
 }
 
 #[test]
-fn training_survives_twenty_kills() {
+fn training_survives_kills() {
     let Some(f) = fixture() else { return };
     let scene = f.dir.path().join("killed");
     copy_folder(&f.dir.path().join("untrained"), &scene);
     let mut rng = Rng::new(20, "kills");
     let (mut kills, mut resumed, mut finished) = (0, 0, 0);
-    while kills < 20 {
+    // Later kills find a checkpoint more often: a run that was killed late goes on from its middle.
+    let wanted = if run::all() { 20 } else { 5 };
+    while kills < wanted {
         resumed += usize::from(scene.join("checkpoints/train.json").is_file());
         let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
             .args([&["train", text(&scene), "--resume", "-q"], &TRAINING[..]].concat())
@@ -74,7 +76,7 @@ fn training_survives_twenty_kills() {
     }
     json(&[&["train", text(&scene), "--resume"], &TRAINING[..]].concat());
     println!("kills: {kills}, runs that found a checkpoint: {resumed}, runs that ended before their kill: {finished}");
-    assert!(resumed >= 3, "kills at random moments leave checkpoints");
+    assert!(resumed >= wanted / 7 + 1, "kills at random moments leave checkpoints: {resumed}");
     assert!(results(&scene) == results(&f.trained), "a run that was killed and resumed ends in the same bytes");
     let left = std::fs::read_dir(&scene).expect("the scene").flatten().filter(|e| e.file_name().to_string_lossy().contains(".partial"));
     println!("partial files left by kills: {}", left.count());

@@ -13,7 +13,7 @@ use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
 const PREPROCESS: &str = "--segmenter import";
-const TRAIN: &str = "--iterations 600 --budget 9000";
+const TRAIN: &str = "--iterations 500 --budget 8000";
 
 struct Library {
     dir: tempfile::TempDir,
@@ -31,7 +31,7 @@ fn library() -> Option<&'static Library> {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let (photos, scenes) = (dir.path().join("photos"), dir.path().join("scenes"));
         for kind in ["room", "table"] {
-            json(&["synth", kind, "-o", text(&photos.join(kind)), "--views", "24", "--size", "240x180"]);
+            json(&["synth", kind, "-o", text(&photos.join(kind)), "--views", "20", "--size", "200x150"]);
         }
         std::fs::create_dir(photos.join("empty")).expect("a folder");
         let folders = ["room", "empty", "table"].map(|name| photos.join(name));

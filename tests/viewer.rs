@@ -18,24 +18,16 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// The generated room with exact masks, trained; shared by the tests.
+/// The generated room that all test programs share.
 fn room() -> Option<&'static Path> {
-    static ROOM: OnceLock<Option<(tempfile::TempDir, PathBuf)>> = OnceLock::new();
-    let made = ROOM.get_or_init(|| {
-        if !run::ready() {
-            return None;
-        }
-        let dir = tempfile::tempdir().expect("a temporary folder");
-        let (photos, scene) = (dir.path().join("photos"), dir.path().join("room"));
-        json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "320x240"]);
-        json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
-        json(&["train", text(&scene), "--iterations", "1500", "--budget", "25000", "--device", "cpu"]);
-        Some((dir, scene))
-    });
-    made.as_ref().map(|(_, scene)| scene.as_path())
+    run::room().map(|room| room.scene.as_path())
+}
+
+/// The window: as the README shows it where everything is tested, else one that is drawn sooner.
+fn window() -> (u32, u32) {
+    if run::all() { (1180, 740) } else { (860, 560) }
 }
 
 /// A running `fastlgs serve` or `train --serve`; killed with this value.
@@ -341,7 +333,7 @@ const WEBGPU: [&str; 5] = [
 
 /// The page of a scene, drawn in one way: `word` lights up where the mask is, `absent` is not found, keys and mouse work.
 fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &str) -> Browser {
-    let browser = Browser::open(1180, 740, flags);
+    let browser = Browser::open(window().0, window().1, flags);
     browser.go(&format!("{}/?renderer={way}", served.url));
     browser.wait_for("document.body.dataset.ready");
     assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), way);
@@ -445,8 +437,31 @@ fn the_fox_lights_up_in_the_browser() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let scene = dir.path().join("fox");
+    let few = dir.path().join("few");
+    // Every third photo will do for a smaller dose.
+    let photos = if run::all() { photos } else { every_third(&photos, &few) };
     json(&["preprocess", text(&photos), "-o", text(&scene), "--max-side", "320"]);
     json(&["train", text(&scene), "--iterations", "700", "--budget", "30000", "--device", "cpu"]);
     let served = Served::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
     page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "fox", "bicycle");
+}
+
+/// A folder with every third photo and its pose.
+fn every_third(photos: &Path, to: &Path) -> PathBuf {
+    let text = std::fs::read(photos.join("transforms.json")).expect("poses");
+    let mut poses: Value = serde_json::from_slice(&text).expect("JSON");
+    let frames = poses["frames"].as_array_mut().expect("frames");
+    frames.retain(|f| photos.join(f["file_path"].as_str().expect("a path")).is_file());
+    let mut place = 0;
+    frames.retain(|_| {
+        place += 1;
+        place % 3 == 1
+    });
+    std::fs::create_dir_all(to.join("images")).expect("a folder");
+    for frame in frames.iter() {
+        let path = frame["file_path"].as_str().expect("a path");
+        std::fs::copy(photos.join(path), to.join(path)).expect("a photo");
+    }
+    std::fs::write(to.join("transforms.json"), poses.to_string()).expect("a file");
+    to.to_owned()
 }

@@ -1,12 +1,69 @@
-//! Runs the binary. Not every test needs all of this.
+//! Runs the binary, on the machine's adapter unless a test names another device. Not every test needs all of this.
 #![allow(dead_code)]
 
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::OnceLock;
+use std::time::UNIX_EPOCH;
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_fastlgs");
+
+/// The first adapter by name: what `--device auto` would pass over, if the processor is faster, is what must be tested.
+pub fn adapter() -> &'static str {
+    static ADAPTER: OnceLock<String> = OnceLock::new();
+    ADAPTER.get_or_init(|| {
+        let output = Command::new(PROGRAM).args(["info", "--json", "-"]).output().expect("the binary starts");
+        let info: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        info["adapters"][0].as_str().unwrap_or("auto").to_owned()
+    })
+}
 
 pub fn fastlgs(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(args).output().expect("the binary starts")
+    Command::new(PROGRAM).env("FASTLGS_DEVICE", adapter()).args(args).output().expect("the binary starts")
+}
+
+/// Whether everything is to be tested (`./test.sh --all`), or a smaller dose of what takes long.
+pub fn all() -> bool {
+    std::env::var_os("FASTLGS_TEST_ALL").is_some()
+}
+
+/// The generated room with exact masks, trained on the adapter: `photos` and `scene`. Made once for all test programs of a build, which
+/// leave it as it is.
+pub struct Room {
+    pub photos: PathBuf,
+    pub scene: PathBuf,
+}
+
+/// The room; nothing where models or device are missing.
+pub fn room() -> Option<&'static Room> {
+    static ROOM: OnceLock<Option<Room>> = OnceLock::new();
+    let make = || {
+        if !ready() {
+            return None;
+        }
+        let program = std::fs::metadata(PROGRAM).expect("the binary");
+        let built = program.modified().expect("a time").duration_since(UNIX_EPOCH).expect("after 1970").as_nanos();
+        let fixtures = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fixtures");
+        let folder = fixtures.join(format!("room-{}-{built}", program.len()));
+        if !folder.is_dir() {
+            // Those of earlier builds are of no use.
+            let _ = std::fs::remove_dir_all(&fixtures);
+            std::fs::create_dir_all(&fixtures).expect("a folder");
+            let partial = tempfile::tempdir_in(&fixtures).expect("a folder");
+            let (photos, scene) = (partial.path().join("photos"), partial.path().join("room"));
+            json(&["synth", "room", "-o", text(&photos), "--views", "32", "--size", "320x240"]);
+            let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+            assert_eq!((report["photos"].as_u64(), report["held_out"].as_u64()), (Some(32), Some(4)));
+            assert_eq!(report["moved_cameras"], 0, "all blocks look alike from four sides, and yet the poses are exact: {report}");
+            let report = json(&["train", text(&scene), "--iterations", "900", "--budget", "15000"]);
+            assert!(report["psnr_held_out"].as_f64().expect("a number") > 19.0, "{report}");
+            assert_eq!(report["device"]["device"], adapter());
+            std::fs::rename(partial.keep(), &folder).expect("the finished fixture takes its place");
+        }
+        Some(Room { photos: folder.join("photos"), scene: folder.join("room") })
+    };
+    ROOM.get_or_init(make).as_ref()
 }
 
 pub fn json(args: &[&str]) -> Value {

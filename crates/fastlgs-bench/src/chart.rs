@@ -4,7 +4,7 @@ use crate::command::call;
 use crate::plot::{self, Axes, Scatter, Spot};
 use crate::table::{self, number};
 use crate::trial::{self, Trial};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use fastlgs::Run;
 use fastlgs_core::SceneFolder;
 use serde_json::{Value, json};
@@ -21,6 +21,9 @@ pub struct Args {
     /// Also what takes long: the paper's number of steps, and the presets, which train geometry anew.
     #[arg(long, conflicts_with = "quick")]
     long: bool,
+    /// Ways that are tried, as the table calls them, separated by commas; all by default.
+    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
+    ways: Vec<String>,
     /// Folder for chart.md, .csv, .json, and two charts as SVG and PNG.
     #[arg(short, long)]
     output: PathBuf,
@@ -54,21 +57,21 @@ const WAYS: [Way; 21] = [
     Way { name: "code of 1 number", how: How::Baseline("code1"), cost: 0 },
     Way { name: "code of 2 numbers", how: How::Baseline("code2"), cost: 0 },
     Way { name: "code of 3 numbers", how: How::Baseline("code3"), cost: 0 },
-    Way { name: "code of 3, separated", how: How::Baseline("separated"), cost: 0 },
+    Way { name: "code of 3 separated", how: How::Baseline("separated"), cost: 0 },
     Way { name: "code of 4 numbers", how: How::Baseline("code4"), cost: 0 },
     Way { name: "no grid", how: How::Baseline("raw"), cost: 0 },
     Way { name: "like LangSplat", how: How::Baseline("langsplat"), cost: 1 },
     Way { name: "like LERF", how: How::Baseline("lerf"), cost: 1 },
-    Way { name: "paper, 300 steps", how: How::Descent("300"), cost: 0 },
-    Way { name: "paper, 1,000 steps", how: How::Descent("1000"), cost: 1 },
-    Way { name: "paper, 3,000 steps", how: How::Descent("3000"), cost: 1 },
-    Way { name: "paper, 7,000 steps", how: How::Descent("7000"), cost: 2 },
-    Way { name: "paper, 30,000 steps", how: How::Descent("30000"), cost: 2 },
+    Way { name: "paper 300 steps", how: How::Descent("300"), cost: 0 },
+    Way { name: "paper 1000 steps", how: How::Descent("1000"), cost: 1 },
+    Way { name: "paper 3000 steps", how: How::Descent("3000"), cost: 1 },
+    Way { name: "paper 7000 steps", how: How::Descent("7000"), cost: 2 },
+    Way { name: "paper 30000 steps", how: How::Descent("30000"), cost: 2 },
     Way { name: "preset quick", how: How::Train(&["--preset", "quick"]), cost: 2 },
     Way { name: "preset standard", how: How::Train(&["--preset", "standard"]), cost: 2 },
     Way { name: "preset paper", how: How::Train(&["--preset", "paper"]), cost: 2 },
     Way {
-        name: "preset paper, paper's way",
+        name: "preset paper in paper's way",
         how: How::Train(&["--preset", "paper", "--mapping", "paper", "--feature-mode", "train"]),
         cost: 2,
     },
@@ -92,7 +95,11 @@ impl How {
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let most = if args.long { 2 } else { u8::from(!args.quick) };
-    let ways: Vec<&Way> = WAYS.iter().filter(|w| w.cost <= most).collect();
+    if let Some(unknown) = args.ways.iter().find(|name| !WAYS.iter().any(|w| w.name == **name)) {
+        bail!("--ways: '{unknown}' is none of {}", WAYS.map(|w| w.name).join("; "));
+    }
+    let wanted = |way: &Way| args.ways.is_empty() || args.ways.iter().any(|name| name == way.name);
+    let ways: Vec<&Way> = WAYS.iter().filter(|w| w.cost <= most && wanted(w)).collect();
     let work = trial::workshop(&args.output)?;
     let mut scenes = args.scenes.clone();
     if scenes.is_empty() {

@@ -12,6 +12,7 @@ use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::synth::{KINDS, Kind};
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
@@ -22,6 +23,9 @@ pub struct Args {
     /// Kinds of generated scenes that are tried as they are, separated by commas; `none` for none.
     #[arg(long, value_delimiter = ',', default_value = "table,twins,nested,thin,mirror,glass,dark,sparse,long,big")]
     kinds: Vec<String>,
+    /// Disturbances that are tried, as the table calls them, separated by commas; all by default.
+    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
+    cases: Vec<String>,
     /// Runs of each random disturbance, and of the row "seed" at least five.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
@@ -164,7 +168,12 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let kinds: Vec<Kind> = if args.quick { vec![Kind::Twins] } else { kinds };
     let work = trial::workshop(&args.output)?;
     let bench = Bench { args, run, work: &work, iterations: args.iterations };
-    let cases: Vec<Case> = cases().into_iter().filter(|c| c.quick || !args.quick).collect();
+    if let Some(unknown) = args.cases.iter().find(|name| !cases().iter().any(|c| c.disturbance == **name)) {
+        let known: BTreeSet<&str> = cases().iter().map(|c| c.disturbance).collect();
+        bail!("--cases: '{unknown}' is none of {}", known.into_iter().collect::<Vec<_>>().join(", "));
+    }
+    let wanted = |case: &Case| args.cases.is_empty() || args.cases.iter().any(|name| name == case.disturbance);
+    let cases: Vec<Case> = cases().into_iter().filter(|c| (c.quick || !args.quick) && wanted(c)).collect();
     let count = cases.len() * args.scenes.len().max(1) + kinds.len();
     let progress = run.work("trials", count as u64);
     let mut rows = Vec::new();

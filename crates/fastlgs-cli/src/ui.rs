@@ -21,8 +21,9 @@ pub struct Common {
     /// Seed of all randomness.
     #[arg(long, default_value_t = 0, global = true)]
     pub seed: u64,
-    /// `auto`, `cpu`, or an adapter's name or index (`fastlgs info` lists them).
-    #[arg(long, default_value = "auto", global = true)]
+    /// `auto` (a graphics card, else the faster of software adapter and `cpu`), `cpu`, or an adapter's name or index (`fastlgs info` lists
+    /// them).
+    #[arg(long, default_value = "auto", global = true, env = "FASTLGS_DEVICE")]
     pub device: String,
 }
 

@@ -1,0 +1,29 @@
+"""Runs the tests, passes on what they print, and adds the ten that took longest. Usage: slowest.py COMMAND..."""
+
+import os
+import re
+import subprocess
+import sys
+
+# The test programs tell times only where they take unstable options, which they do with this variable; cargo must not see it, or it would build
+# everything anew.
+command = sys.argv[1:]
+built = subprocess.run([*command[: command.index("--")], "--no-run"])
+if built.returncode != 0:
+    sys.exit(built.returncode)
+wrapper = os.path.join(os.path.dirname(os.path.abspath(__file__)), "support", "timed.sh")
+host = subprocess.run(["rustc", "-vV"], capture_output=True, text=True).stdout
+host = re.search(r"host: (\S+)", host).group(1).replace("-", "_").upper()
+environment = dict(os.environ, **{f"CARGO_TARGET_{host}_RUNNER": wrapper})
+running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+times = []
+for line in running.stdout:
+    print(line, end="", flush=True)
+    found = re.match(r"test (.+?)(?: - .+)? \.\.\. \w+ <([\d.]+)s>", line)
+    if found:
+        times.append((float(found.group(2)), found.group(1)))
+running.wait()
+print("slowest tests:")
+for seconds, name in sorted(times, reverse=True)[:10]:
+    print(f"  {seconds:7.1f} s  {name}")
+sys.exit(running.returncode)
