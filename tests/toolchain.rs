@@ -251,7 +251,7 @@ fn examples_run() {
     let picture = l.photos.join("room/images/000.png");
     let (scene, rendered, labelled) = (room.join("scene.ply"), out.join("p.png"), out.join("l.ply"));
     for (name, args, word) in [
-        ("read_dataset", vec![text(&l.photos.join("room")).to_owned()], "24 photos"),
+        ("read_dataset", vec![text(&l.photos.join("room")).to_owned()], "20 photos"),
         ("render_ply", vec![text(&scene).to_owned(), text(&rendered).to_owned(), "cpu".to_owned()], "Gaussians"),
         ("lift_labels", vec![text(&room).to_owned(), text(&labelled).to_owned()], "have a label"),
         ("map_masks", vec![], "object 2"),

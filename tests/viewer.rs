@@ -368,10 +368,15 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     // Hiding, showing and isolating, by keys.
     browser.keys("x");
     browser.wait_for("fastlgs.state.hidden.size === 1 && fastlgs.state.selected.size === 0");
-    assert!(psnr(&snapshot(&browser), &plain) < 40.0, "{way}: hiding changes the picture");
+    let hidden = psnr(&snapshot(&browser), &plain);
     browser.keys("a");
-    assert!(psnr(&snapshot(&browser), &plain) > 45.0, "{way}: what was hidden comes back");
-    assert!(browser.run("return document.querySelectorAll('#list button').length;").as_u64() > Some(3));
+    let back = psnr(&snapshot(&browser), &plain);
+    assert!(back > 45.0, "{way}: what was hidden comes back");
+    // A small thing changes few pixels.
+    assert!(hidden < back - 5.0, "{way}: hiding changes the picture: {hidden:.1} dB, and {back:.1} dB when it is back");
+    let objects = served.json("/api/objects", None);
+    let outermost = objects.as_array().expect("objects").iter().filter(|o| o["parent"] == 0).count();
+    assert_eq!(browser.run("return document.querySelectorAll('#list button').length;").as_u64(), Some(outermost as u64), "{objects}");
 
     // Absent things are said to be absent.
     let said = type_text(&browser, absent);
@@ -438,16 +443,16 @@ fn the_fox_lights_up_in_the_browser() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let scene = dir.path().join("fox");
     let few = dir.path().join("few");
-    // Every third photo will do for a smaller dose.
-    let photos = if run::all() { photos } else { every_third(&photos, &few) };
+    // Every second photo will do for a smaller dose.
+    let photos = if run::all() { photos } else { every_second(&photos, &few) };
     json(&["preprocess", text(&photos), "-o", text(&scene), "--max-side", "320"]);
     json(&["train", text(&scene), "--iterations", "700", "--budget", "30000", "--device", "cpu"]);
     let served = Served::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
     page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "fox", "bicycle");
 }
 
-/// A folder with every third photo and its pose.
-fn every_third(photos: &Path, to: &Path) -> PathBuf {
+/// A folder with every second photo and its pose.
+fn every_second(photos: &Path, to: &Path) -> PathBuf {
     let text = std::fs::read(photos.join("transforms.json")).expect("poses");
     let mut poses: Value = serde_json::from_slice(&text).expect("JSON");
     let frames = poses["frames"].as_array_mut().expect("frames");
@@ -455,7 +460,7 @@ fn every_third(photos: &Path, to: &Path) -> PathBuf {
     let mut place = 0;
     frames.retain(|_| {
         place += 1;
-        place % 3 == 1
+        place % 2 == 1
     });
     std::fs::create_dir_all(to.join("images")).expect("a folder");
     for frame in frames.iter() {
