@@ -12,8 +12,8 @@ as_root() {
     else fail "root rights are needed for: $* (run this script as root, or install sudo)"; fi
 }
 
-# Vulkan on the CPU, OpenCV with its headers, libclang for its bindings, Python for the one-time weight conversion.
-packages="mesa-vulkan-drivers libvulkan1 libopencv-dev clang libclang-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
+# Vulkan on the CPU, OpenCV's SIFT with its headers, Python for the one-time weight conversion.
+packages="mesa-vulkan-drivers libvulkan1 libopencv-features2d-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
 if [ "${1:-}" = --tests ]; then
     packages="$packages chromium chromium-driver"
     # Where rustup cannot reach its server, Debian's compiler with its library's source builds for wasm32.
@@ -49,7 +49,7 @@ if ! command -v cargo >/dev/null; then
 fi
 
 say "building (the first build takes some minutes)"
-cargo build --release --locked --features fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
+cargo build --release --locked --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
 say "installing the offline encoders"
 ./target/release/fastlgs models install-offline --quiet || fail "the offline encoders could not be installed; the message is above"
 if [ "${1:-}" = --tests ] && [ ! -x target/snakemake/bin/snakemake ]; then

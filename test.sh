@@ -10,19 +10,28 @@ export FASTLGS_REQUIRE_MODELS=1   # and so are missing models, which setup.sh in
 if [ "${1:-}" = --all ]; then
     export FASTLGS_TEST_ALL=1 FASTLGS_FUZZ_SECONDS=${FASTLGS_FUZZ_SECONDS:-5}
 fi
+# The same as setup.sh, so that nothing is built twice.
+with="--no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv"
 lap() { printf 'test: %s took %d s\n' "$1" $((SECONDS - began)); began=$SECONDS; }
 began=$SECONDS
 cargo fmt --all --check
-cargo clippy --release --locked --all-targets --features fastlgs-cli/opencv --quiet -- -D warnings
+# shellcheck disable=SC2086
+cargo clippy --release --locked --all-targets $with --quiet -- -D warnings
 # Also what a build without OpenCV has: key points in pure Rust.
 cargo clippy --release --locked -p fastlgs-cli --quiet -- -D warnings
 lap "formatting and clippy"
-RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps --features fastlgs-cli/opencv --quiet
+# shellcheck disable=SC2086
+RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps $with --quiet
 lap "documentation"
 tests/wasm.sh
 if [ "${FASTLGS_TEST_ALL:-}" ]; then tests/packages.sh; fi
 lap "wasm and packages"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
 # Counts of kills, damaged inputs and benches are part of the log, and so is what takes longest.
-python3 tests/slowest.py cargo test --release --locked --features fastlgs-cli/opencv -- --show-output
+# shellcheck disable=SC2086
+python3 tests/slowest.py cargo test --release --locked $with -- --show-output
+if [ "${FASTLGS_TEST_ALL:-}" ]; then
+    # Both kinds of key points, against each other.
+    cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output
+fi
 lap "tests"

@@ -76,7 +76,7 @@ fn training_survives_kills() {
     }
     json(&[&["train", text(&scene), "--resume"], &TRAINING[..]].concat());
     println!("kills: {kills}, runs that found a checkpoint: {resumed}, runs that ended before their kill: {finished}");
-    assert!(resumed >= wanted / 7 + 1, "kills at random moments leave checkpoints: {resumed}");
+    assert!(resumed > wanted / 7, "kills at random moments leave checkpoints: {resumed}");
     assert!(results(&scene) == results(&f.trained), "a run that was killed and resumed ends in the same bytes");
     let left = std::fs::read_dir(&scene).expect("the scene").flatten().filter(|e| e.file_name().to_string_lossy().contains(".partial"));
     println!("partial files left by kills: {}", left.count());

@@ -20,7 +20,7 @@ struct View {
     slot_first: u32,
     slot_count: u32,
     sh_degree: u32,
-    // 1: opacity pays for the dilation of small Gaussians (2-D Mip filter).
+    // 1: opacity is lowered by what the dilation of small Gaussians adds (2-D Mip filter).
     antialias: u32,
     // 1: the first feature channel carries the depth (for depth images).
     depth_as_feature: u32,

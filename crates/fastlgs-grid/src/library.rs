@@ -242,7 +242,7 @@ impl Library {
             .map(|(row, object)| {
                 let score = query::object_score(&object, query);
                 let found = Found { scene: row.scene as usize, hit: Hit { id: row.id, score }, support: row.support };
-                (query::standing(score, row.support), found)
+                (query::rank_score(score, row.support), found)
             })
             .collect();
         objects.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.scene.cmp(&b.1.scene)).then(a.1.hit.id.cmp(&b.1.hit.id)));
@@ -360,7 +360,7 @@ mod tests {
             let mut exact: Vec<(f32, usize, Hit)> = Vec::new();
             for (k, (_, grid)) in scenes.iter().enumerate() {
                 let hit = query::rank(grid, &query)[0];
-                exact.push((query::standing(hit.score, grid.objects[usize::from(hit.id) - 1].support), k, hit));
+                exact.push((query::rank_score(hit.score, grid.objects[usize::from(hit.id) - 1].support), k, hit));
             }
             exact.sort_by(|a, b| b.0.total_cmp(&a.0));
             for (found, (_, scene, hit)) in library.search(&query, 5).unwrap().iter().zip(&exact) {

@@ -63,15 +63,15 @@ pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
 const SUPPORT_WEIGHT: f32 = 2.5;
 
 /// What objects are ranked by.
-pub fn standing(score: f32, support: f32) -> f32 {
+pub fn rank_score(score: f32, support: f32) -> f32 {
     odds(score) + SUPPORT_WEIGHT * support
 }
 
-/// All objects, best first: by their score, and the less the worse the masks bear them out. A union of two things is often
+/// All objects, best first: by their score and their support. A union of two things is often
 /// more relevant than the one that is meant.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     let hits = grid.objects.iter().map(|o| (object_score(o, query), o));
-    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (standing(score, o.support), Hit { id: o.id, score })).collect();
+    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (rank_score(score, o.support), Hit { id: o.id, score })).collect();
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
 }
@@ -85,17 +85,17 @@ fn odds(score: f32) -> f32 {
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
-pub const BORNE_OUT: f32 = 0.86;
+pub const SUPPORT_SHARE: f32 = 0.86;
 
-/// Of objects that lie in each other, from small to large: the largest that masks bear out about as well as any of them.
-pub fn borne_out(grid: &Grid, nested: &[u16]) -> Option<u16> {
+/// Of objects that lie in each other, from small to large: the largest whose support comes near the best.
+pub fn best_supported(grid: &Grid, nested: &[u16]) -> Option<u16> {
     let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
     let best = nested.iter().map(support).fold(0.0, f32::max);
-    nested.iter().rev().find(|id| support(id) >= BORNE_OUT * best).copied()
+    nested.iter().rev().find(|id| support(id) >= SUPPORT_SHARE * best).copied()
 }
 
 /// The target objects; empty means "not found". Of things that lie in each other one is taken: of the best and what around
-/// it is hardly less relevant, the largest that the masks bear out about as well as any of them.
+/// its relevancy is within the margin, the largest whose support comes near the best.
 pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     let Some(best) = ranked.iter().find(|h| h.score >= config.min_score) else { return Vec::new() };
     let floor = config.min_score.max(best.score - config.margin);
@@ -103,9 +103,9 @@ pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
     ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
     let mut chosen: Vec<Hit> = Vec::new();
     for hit in ranked.iter().filter(|h| h.score >= floor) {
-        let hardly_less = |s: f32| s >= config.min_score && odds(s) >= odds(hit.score) - PART_MARGIN;
-        let around: Vec<u16> = grid.chain(hit.id).filter(|id| hardly_less(score[usize::from(*id)])).collect();
-        let id = borne_out(grid, &around).unwrap_or(hit.id);
+        let within_margin = |s: f32| s >= config.min_score && odds(s) >= odds(hit.score) - PART_MARGIN;
+        let around: Vec<u16> = grid.chain(hit.id).filter(|id| within_margin(score[usize::from(*id)])).collect();
+        let id = best_supported(grid, &around).unwrap_or(hit.id);
         let nested = |other: &Hit| grid.chain(id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == id);
         if chosen.len() < config.top_k && !chosen.iter().any(nested) {
             chosen.push(Hit { id, score: score[usize::from(id)] });

@@ -1,4 +1,4 @@
-//! Global mapping, second step: regions grow into a containment tree, and the nodes that the photos' masks bear out become
+//! Global mapping, second step: regions grow into a containment tree, and the nodes that the photos' masks support become
 //! the objects.
 //!
 //! No single agreement is right for all things: at 0.5 a vase is one region and a bicycle five. So nothing is decided by a

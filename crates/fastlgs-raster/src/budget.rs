@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 pub(crate) const WATCH_EVERY: u32 = 500;
 /// Relative growth that has to show an effect.
 const GROWTH: f64 = 0.1;
-/// Gain on the watched views, in dB, that pays for twice as many Gaussians.
+/// Least gain on the watched views, in dB, for twice as many Gaussians.
 const GAIN: f64 = 0.5;
 /// Largest blending weight below which a Gaussian is removed.
 pub const MIN_WEIGHT: f32 = 0.1;

@@ -16,7 +16,7 @@ pub enum Strategy {
 /// How many Gaussians there may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Budget {
-    /// As many as pay for themselves, and no more than this; see `budget.rs`.
+    /// As many as held-out quality gains from, and no more than this; see `budget.rs`.
     Auto(usize),
     /// Growth up to this number; nothing is removed for being unimportant.
     Fixed(usize),
@@ -58,7 +58,7 @@ pub struct TrainConfig {
     pub refine_until: f32,
     /// Share of the iterations done at half the resolution.
     pub coarse_until: f32,
-    /// 2-D Mip filter: opacity pays for the dilation of small Gaussians.
+    /// 2-D Mip filter: opacity is lowered by what the dilation of small Gaussians adds.
     pub antialias: bool,
     /// Colour behind everything.
     pub background: [f32; 3],

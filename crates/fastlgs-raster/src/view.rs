@@ -41,7 +41,7 @@ pub struct View {
     pub slot_count: u32,
     /// Degree up to which colour depends on the view now.
     pub sh_degree: u32,
-    /// 1: opacity pays for dilation (2-D Mip filter).
+    /// 1: opacity is lowered by what dilation adds (2-D Mip filter).
     pub antialias: u32,
     /// 1: the first feature channel carries the depth.
     pub depth_as_feature: u32,

@@ -56,7 +56,7 @@ pub async fn scene(State(app): App) -> Answer {
                     "objects": desk.grid.objects.len(),
                     "gaussians": desk.gaussians(),
                     "min_score": desk.scene.min_score(),
-                    "borne_out": query::BORNE_OUT,
+                    "support_share": query::SUPPORT_SHARE,
                     "segmenter": desk.scene.manifest.segmenter,
                     "encoder": desk.scene.manifest.encoder,
                     "adapter": desk.scene.engine.name(),

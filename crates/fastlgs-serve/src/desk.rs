@@ -17,7 +17,7 @@ use tokio::sync::{mpsc, oneshot};
 /// Pieces of work that may wait; who comes later is told to come back.
 const WAITING: usize = 32;
 
-/// The opened scene with what is worth keeping between requests.
+/// The opened scene with what is kept between requests.
 pub struct Desk {
     /// The scene.
     pub scene: Session,

@@ -30,7 +30,7 @@ pub struct Progress {
 
 /// A run and who watches it.
 pub struct Live {
-    /// Whether opacity pays for dilation.
+    /// Whether the 2-D Mip filter is on.
     pub antialias: bool,
     /// Colour behind everything.
     pub background: [f32; 3],

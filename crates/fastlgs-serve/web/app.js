@@ -57,7 +57,7 @@ function update() {
   const own = [...selected].map((id) => objects.byId.get(id));
   const sum = own.reduce((n, o) => n + o.gaussians, 0).toLocaleString("en");
   $("facts").textContent = own.length === 1
-    ? `${sum} Gaussians, seen in ${own[0].views} photos, borne out by masks to ${own[0].support.toFixed(2)}`
+    ? `${sum} Gaussians, seen in ${own[0].views} photos, support by masks ${own[0].support.toFixed(2)}`
     : `${own.length} objects, ${sum} Gaussians`;
   const parts = own.length === 1 ? objects.parts(first).map((id) => ({ id })) : [];
   $("parts-title").hidden = parts.length === 0;
@@ -212,7 +212,7 @@ function listen() {
 
 async function ready() {
   scene = Object.assign(stage.scene, await getJson("/api/scene"));
-  objects = new Objects(await getJson("/api/objects"), scene.borne_out);
+  objects = new Objects(await getJson("/api/objects"), scene.support_share);
   $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
     + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, answered by ${scene.adapter}`;
   $("text").disabled = false;

@@ -3,9 +3,9 @@
 import { getBlob } from "/server.js";
 
 export class Objects {
-  constructor(list, borneOut) {
+  constructor(list, supportShare) {
     this.list = list;
-    this.borneOut = borneOut;
+    this.supportShare = supportShare;
     this.byId = new Map(list.map((o) => [o.id, o]));
     this.children = new Map();
     for (const o of list) this.children.set(o.parent, [...(this.children.get(o.parent) ?? []), o.id]);
@@ -26,12 +26,12 @@ export class Objects {
     return this.children.get(id) ?? [];
   }
 
-  // Of things that lie in each other, the largest that masks bear out about as well as any of them (fastlgs_grid::query::borne_out).
+  // Of things that lie in each other, the largest whose support comes near the best (fastlgs_grid::query::best_supported).
   meant(id) {
     const chain = this.chain(id);
     const support = (id) => this.byId.get(id).support;
     const best = Math.max(...chain.map(support));
-    return chain.findLast((id) => support(id) >= this.borneOut * best);
+    return chain.findLast((id) => support(id) >= this.supportShare * best);
   }
 
   // The next smaller thing around `id` below `selected`; where there is none, the largest again.

@@ -27,7 +27,7 @@ export async function openPictures(canvas) {
     setSplats() {},
     setObjects() {},
     setOrder() {},
-    // Only the newest frame is worth asking for while one is on its way.
+    // Only the newest frame is asked for while one is on its way.
     draw(frame) {
       next = { ...frame, camera: Object.assign(Object.create(Object.getPrototypeOf(frame.camera)), frame.camera) };
       if (busy) return drawn;

@@ -12,7 +12,7 @@
 
 struct Frame {
     world_to_camera: mat4x4<f32>,
-    // Position of the camera in the world; w: 1 where opacity pays for dilation (2-D Mip filter).
+    // Position of the camera in the world; w: 1 where opacity is lowered by what dilation adds (2-D Mip filter).
     camera: vec4<f32>,
     // Focal lengths and principal point in pixels.
     lens: vec4<f32>,

@@ -1,6 +1,6 @@
 //! SIFT key points (Lowe 2004), and the epipolar check of their matches.
 
-use crate::{Error, Result};
+use crate::Result;
 use fastlgs_core::Camera;
 use glam::{Mat3, Vec2, Vec3};
 use image::GrayImage;
@@ -37,41 +37,25 @@ pub const MAX_KEYPOINTS: usize = 2500;
 /// When the picture is refused.
 pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
     #[cfg(feature = "opencv")]
-    return detect_with_opencv(photo);
+    return crate::opencv_sift::detect(photo);
     #[cfg(not(feature = "opencv"))]
     detect_in_rust(photo)
 }
 
-#[cfg(feature = "opencv")]
-fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
-    use opencv::core::{KeyPoint, Mat, MatTraitConst, MatTraitConstManual, Vector, no_array};
-    use opencv::prelude::{Feature2DTrait, KeyPointTraitConst};
-    let failed = |e: opencv::Error| Error::Invalid(format!("SIFT failed: {e}"));
-    let rows = Mat::from_slice(photo.as_raw()).map_err(failed)?;
-    let picture = rows.reshape(1, photo.height() as i32).map_err(failed)?;
-    let mut sift = opencv::features2d::SIFT::create(MAX_KEYPOINTS as i32, 3, 0.02, 10.0, 1.6).map_err(failed)?;
-    let (mut points, mut descriptors) = (Vector::<KeyPoint>::new(), Mat::default());
-    sift.detect_and_compute(&picture, &no_array(), &mut points, &mut descriptors, false).map_err(failed)?;
-    let mut out = Keypoints::default();
-    for (i, point) in points.iter().enumerate() {
-        let row = descriptors.row(i as i32).map_err(failed)?;
-        let values = row.data_typed::<f32>().map_err(failed)?;
-        out.positions.push(Vec2::new(point.pt().x + 0.5, point.pt().y + 0.5));
-        out.descriptors.push(std::array::from_fn(|k| values[k] as u8));
-    }
-    Ok(out)
-}
-
-#[cfg(any(test, not(feature = "opencv")))]
+#[cfg(feature = "rust-sift")]
+#[cfg_attr(feature = "opencv", allow(dead_code, reason = "tests compare both"))]
 fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
     let found = sift_features::sift(photo, Some(MAX_KEYPOINTS));
     let descriptors = found.descriptors.rows().into_iter().map(|row| std::array::from_fn(|k| row[k])).collect::<Vec<[u8; 128]>>();
     if descriptors.len() != found.keypoints.len() {
-        return Err(Error::Invalid("SIFT gave unequal numbers of key points and descriptors".to_owned()));
+        return Err(crate::Error::Invalid("SIFT gave unequal numbers of key points and descriptors".to_owned()));
     }
     let positions = found.keypoints.iter().map(|p| Vec2::new(p.x + 0.5, p.y + 0.5)).collect();
     Ok(Keypoints { positions, descriptors })
 }
+
+#[cfg(not(any(feature = "rust-sift", feature = "opencv")))]
+compile_error!("key points need the feature 'rust-sift' or the feature 'opencv'");
 
 /// Which SIFT this build uses.
 pub fn backend() -> &'static str {
@@ -127,7 +111,7 @@ mod tests {
     }
 
     /// Both implementations tell the same of two neighbouring photos of fox.
-    #[cfg(feature = "opencv")]
+    #[cfg(all(feature = "opencv", feature = "rust-sift"))]
     #[test]
     fn opencv_and_rust_find_the_same_correspondences() {
         let images = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox/images");
@@ -144,7 +128,7 @@ mod tests {
             let (a, b) = (detect(&a).unwrap(), detect(&b).unwrap());
             matches(&a, &b).into_iter().map(|(i, j)| (a.positions[i], b.positions[j])).collect::<Vec<_>>()
         };
-        let (opencv, rust) = (flow(detect_with_opencv), flow(detect_in_rust));
+        let (opencv, rust) = (flow(crate::opencv_sift::detect), flow(detect_in_rust));
         let again = |(p, q): &&(Vec2, Vec2)| rust.iter().any(|(r, s)| r.distance(*p) < 2.0 && s.distance(*q) < 2.0);
         let shared = opencv.iter().filter(again).count();
         println!("correspondences of OpenCV {}, Rust {}; {shared} of OpenCV's found by both", opencv.len(), rust.len());

@@ -18,6 +18,8 @@ pub mod masks;
 pub mod matching;
 pub mod models;
 pub mod names;
+#[cfg(feature = "opencv")]
+mod opencv_sift;
 pub mod photo_quality;
 pub mod places;
 pub mod pose_check;

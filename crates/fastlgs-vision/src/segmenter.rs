@@ -124,7 +124,7 @@ impl Segmenter for OfflineSegmenter {
         let features = self.features(photo, &small)?;
         let tree = Hierarchy::build(&basins, count, w, &edges, &features, FEATURES, dissimilarity);
         let paint = |[low, high]: [f32; 2]| {
-            let cut = tree.best_cut(|i| standing(&tree, i, low, high));
+            let cut = tree.best_cut(|i| persistence(&tree, i, low, high));
             label_map(&tree, &cut, &basins, w, h).resized(photo.width(), photo.height())
         };
         Ok(Segmentation { levels: [WHOLE_HEIGHTS, PART_HEIGHTS, SUBPART_HEIGHTS].map(paint) })
@@ -150,7 +150,7 @@ fn dissimilarity(edge: f32, a: &Node, b: &Node) -> f32 {
 
 /// How much a region speaks for being an object: its area times the span of dissimilarity, between `low` and `high`,
 /// over which it stands (excess of mass).
-fn standing(tree: &Hierarchy, i: usize, low: f32, high: f32) -> f32 {
+fn persistence(tree: &Hierarchy, i: usize, low: f32, high: f32) -> f32 {
     let node = &tree.nodes[i];
     let end = node.parent.map_or(high, |p| tree.nodes[p].height);
     node.area * (end.clamp(low, high) - node.height.clamp(low, high))

@@ -4,6 +4,7 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
+use crate::triangulate::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{colmap, is_photo};
 use fastlgs_core::{fs, image_io};
@@ -24,7 +25,7 @@ const FOLLOWING: usize = 12;
 const SPREAD: usize = 40;
 /// Longer side of the photos on which key points are found.
 const SIDE: u32 = 1000;
-/// Fewest matches of a pair that are worth verifying.
+/// Fewest matches of a pair that is verified.
 const FEW: usize = 15;
 
 const RECONSTRUCT: &str = include_str!("../assets/reconstruct.py");
@@ -144,8 +145,8 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + 
     };
     let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
     say("matches", "");
-    let pairs: Vec<(usize, usize, Vec<(usize, usize)>)> =
-        pairs(files.len()).into_par_iter().map(|(a, b)| (a, b, matches(&photos[a].2, &photos[b].2))).filter(|p| p.2.len() >= FEW).collect();
+    let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&photos[a].2, &photos[b].2) };
+    let pairs: Vec<PairMatches> = pairs(files.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let image = |(path, (width, height, points)): (&PathBuf, &(u32, u32, Keypoints))| {
         let path_text = std::path::absolute(path).unwrap_or_else(|_| path.clone());
@@ -153,13 +154,13 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + 
     };
     let plan = json!({
         "images": files.iter().zip(&photos).map(image).collect::<Vec<_>>(),
-        "pairs": pairs.iter().map(|(a, b, found)| json!({ "a": a, "b": b, "matches": found.len() })).collect::<Vec<_>>(),
+        "pairs": pairs.iter().map(|m| json!({ "a": m.a, "b": m.b, "matches": m.pairs.len() })).collect::<Vec<_>>(),
         "seed": seed % (1 << 31),
         "camera_model": CAMERA_MODEL,
     });
     fs::write_json(&work.join("features.json"), &plan)?;
     let points = photos.iter().flat_map(|p| &p.2.positions).flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
-    let matched = pairs.iter().flat_map(|p| &p.2).flat_map(|(i, j)| [*i as u32, *j as u32]);
+    let matched = pairs.iter().flat_map(|m| &m.pairs).flat_map(|(i, j)| [*i as u32, *j as u32]);
     let bytes: Vec<u8> = points.chain(matched).flat_map(u32::to_le_bytes).collect();
     Ok(fs::write_atomic(&work.join("features.bin"), |file| file.write_all(&bytes))?)
 }

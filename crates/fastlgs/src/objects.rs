@@ -77,7 +77,7 @@ pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], gr
 }
 
 /// Global mapping: the views vote over the trained Gaussians which of them form regions and parts of regions, a tree grows
-/// over these, its nodes that masks bear out become the objects, and each is embedded as the views show it.
+/// over these, its nodes that masks support become the objects, and each is embedded as the views show it.
 pub fn by_consensus(
     scene: &mut Gaussians,
     folder: &SceneFolder,

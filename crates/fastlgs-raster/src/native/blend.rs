@@ -209,8 +209,8 @@ fn by_mask_body<const FMA: bool>(job: &Job<'_>, masks: &[Tile], transmittance: &
 pub struct Given {
     /// dL/d(colour, feature).
     pub gradient: [Tile; 6],
-    /// R.g: what the light behind is worth; shaders/blend_backward.wgsl.
-    pub behind: Tile,
+    /// R.g of the light behind; docs/gradients.md, section 1.
+    pub r_dot_g: Tile,
     /// 1 for pixels of the picture, 0 for others.
     pub transmittance: Tile,
     /// Pairs that the forward pass walked.
@@ -250,17 +250,17 @@ fn backward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool, const 
                 }
             }
             if COLOR {
-                let mut worth = [0.0; LANES];
+                let mut c_dot_g = [0.0; LANES];
                 for c in 0..if MOVES { 6 } else { 3 } {
                     for i in 0..LANES {
-                        worth[i] = madd::<FMA>(values[c], given.gradient[c][j][i], worth[i]);
+                        c_dot_g[i] = madd::<FMA>(values[c], given.gradient[c][j][i], c_dot_g[i]);
                     }
                 }
                 for i in 0..LANES {
-                    let gain = w[i] * worth[i];
-                    let behind = given.behind[j][i] - gain;
-                    given.behind[j][i] = behind;
-                    let p = gain - behind * (alpha[i] / (1.0 - alpha[i]));
+                    let w_c_dot_g = w[i] * c_dot_g[i];
+                    let r_dot_g = given.r_dot_g[j][i] - w_c_dot_g;
+                    given.r_dot_g[j][i] = r_dot_g;
+                    let p = w_c_dot_g - r_dot_g * (alpha[i] / (1.0 - alpha[i]));
                     p_sum[i] += p;
                     py_sum[i] = madd::<FMA>(p, dy[i], py_sum[i]);
                     pyy_sum[i] = madd::<FMA>(p * dy[i], dy[i], pyy_sum[i]);

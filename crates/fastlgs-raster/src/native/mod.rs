@@ -187,14 +187,14 @@ impl CpuEngine {
                 let job = Job::new(view, tile, &lists.gaussians[start..end], &lists.splats);
                 let trained = |c: usize| if c < 3 { COLOR } else { FEATURE };
                 let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { Tile::default() });
-                let mut behind = Tile::default();
+                let mut r_dot_g = Tile::default();
                 for c in 0..if MOVES { 6 } else { 3 } {
                     let light = frame.tile(c, &job);
-                    for (b, (l, g)) in behind.iter_mut().flatten().zip(light.iter().flatten().zip(g[c].iter().flatten())) {
+                    for (b, (l, g)) in r_dot_g.iter_mut().flatten().zip(light.iter().flatten().zip(g[c].iter().flatten())) {
                         *b += l * g;
                     }
                 }
-                let mut given = Given { gradient: g, behind, transmittance: blend::shown(view, &job), walked: walked[tile] };
+                let mut given = Given { gradient: g, r_dot_g, transmittance: blend::shown(view, &job), walked: walked[tile] };
                 blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, &mut band[start - first..end - first]);
             }
         });

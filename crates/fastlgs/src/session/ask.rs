@@ -96,7 +96,7 @@ impl Meaning {
                 }
                 let nested: Vec<u16> = grid.chain(field.owners(grid).at(*x, *y)).collect();
                 let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
-                let targets = query::borne_out(grid, &nested).map(hit).into_iter().collect();
+                let targets = query::best_supported(grid, &nested).map(hit).into_iter().collect();
                 Ok(Found { ranked: nested.into_iter().map(hit).collect(), targets })
             }
         }

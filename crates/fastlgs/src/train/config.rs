@@ -149,7 +149,7 @@ pub struct Config {
     /// Iterations, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub iterations: Option<u32>,
-    /// Gaussians: `auto` (as many as pay for themselves; at most 200,000 with the preset quick, 300,000 with standard, a
+    /// Gaussians: `auto` (as many as held-out quality gains from; at most 200,000 with the preset quick, 300,000 with standard, a
     /// million with paper), or exactly how many there may be.
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
     pub budget: BudgetChoice,

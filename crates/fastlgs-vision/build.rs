@@ -1,0 +1,27 @@
+//! With the feature `opencv`: compiles the function that calls OpenCV's SIFT, and links the system's OpenCV.
+
+fn main() {
+    println!("cargo::rerun-if-changed=src/opencv_sift.cpp");
+    if std::env::var_os("CARGO_FEATURE_OPENCV").is_none() {
+        return;
+    }
+    let mut build = cc::Build::new();
+    build.cpp(true).std("c++14").warnings(false).file("src/opencv_sift.cpp");
+    // Where pkg-config does not know it (Debian's single modules), the usual place will do.
+    match pkg_config::Config::new().cargo_metadata(false).probe("opencv4") {
+        Ok(library) => {
+            build.includes(&library.include_paths);
+            library.link_paths.iter().for_each(|path| println!("cargo::rustc-link-search=native={}", path.display()));
+        }
+        Err(_) => drop(build.include("/usr/include/opencv4")),
+    }
+    if let Err(error) = build.try_compile("fastlgs_opencv_sift") {
+        let mend =
+            "install OpenCV 4.4 or newer with its headers (on Debian: libopencv-features2d-dev), or build without the feature 'opencv'";
+        println!("cargo::error={error}; {mend}");
+        return;
+    }
+    for module in ["features2d", "core"] {
+        println!("cargo::rustc-link-lib=opencv_{module}");
+    }
+}

@@ -1,0 +1,60 @@
+//! SIFT by the system's OpenCV (`opencv_sift.cpp`).
+
+use crate::keypoints::{Keypoints, MAX_KEYPOINTS};
+use crate::{Error, Result};
+use glam::Vec2;
+use image::GrayImage;
+use std::ffi::{CStr, c_char, c_int};
+
+unsafe extern "C" {
+    fn fastlgs_opencv_sift(
+        pixels: *const u8,
+        width: c_int,
+        height: c_int,
+        most: c_int,
+        capacity: c_int,
+        positions: *mut f32,
+        descriptors: *mut u8,
+        reason: *mut c_char,
+        reason_size: usize,
+    ) -> c_int;
+}
+
+/// Key points that are as strong as the last one come on top of the most that are asked for.
+const CAPACITY: usize = 2 * MAX_KEYPOINTS;
+
+/// Detects and describes key points.
+///
+/// # Errors
+/// When OpenCV refuses the picture.
+pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
+    let mut positions = vec![[0.0f32; 2]; CAPACITY];
+    let mut descriptors = vec![[0u8; 128]; CAPACITY];
+    let mut reason = [0 as c_char; 256];
+    let size = |n: u32| c_int::try_from(n).map_err(|_| Error::Invalid(format!("SIFT: a side of {n} pixels is too long")));
+    let (width, height) = (size(photo.width())?, size(photo.height())?);
+    // SAFETY: the picture holds width x height bytes, which are only read; positions, descriptors and reason have the room that is named, and the
+    // function writes no more than that, the reason with its final zero.
+    let count = unsafe {
+        fastlgs_opencv_sift(
+            photo.as_raw().as_ptr(),
+            width,
+            height,
+            MAX_KEYPOINTS as c_int,
+            CAPACITY as c_int,
+            positions.as_mut_ptr().cast(),
+            descriptors.as_mut_ptr().cast(),
+            reason.as_mut_ptr(),
+            reason.len(),
+        )
+    };
+    let Ok(count) = usize::try_from(count) else {
+        // SAFETY: the function ended the text with a zero; the buffer began as zeros.
+        let words = unsafe { CStr::from_ptr(reason.as_ptr()) };
+        return Err(Error::Invalid(format!("SIFT failed: {}", words.to_string_lossy())));
+    };
+    descriptors.truncate(count);
+    // OpenCV counts from the middle of the first pixel.
+    let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.5, y + 0.5)).collect();
+    Ok(Keypoints { positions, descriptors })
+}
