@@ -1,0 +1,48 @@
+//! The whole way in one program: posed photos to a scene, and a text to the pixels that it names.
+//!
+//! `cargo run --release -p fastlgs --example photos_to_answers -- PHOTOS SCENE TEXT`
+
+use fastlgs::progress::{Message, Sink};
+use fastlgs::session::answer::Question;
+use fastlgs::session::ask::Ask;
+use fastlgs::{Run, Session, preprocess, train};
+use fastlgs_grid::query::QueryConfig;
+
+/// Says which stage begins, and what is wrong.
+struct Stages;
+
+impl Sink for Stages {
+    fn tell(&self, message: Message<'_>) {
+        match message {
+            Message::Started { stage, total } => println!("{stage}: {total}"),
+            Message::Warning(text) => println!("warning: {text}"),
+            _ => {}
+        }
+    }
+}
+
+fn main() -> fastlgs::Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [photos, scene, text] = arguments.as_slice() else {
+        println!("usage: photos_to_answers PHOTOS SCENE TEXT");
+        return Ok(());
+    };
+    let run = Run { progress: &Stages, ..Run::silent("auto", 0) };
+    let found = fastlgs::preprocess(
+        &preprocess::Config { photos: photos.into(), output: scene.into(), max_side: 320, ..Default::default() },
+        &run,
+    )?;
+    println!("{} photos, {} masks, {} points", found.photos, found.masks, found.points);
+    let made = fastlgs::train(&train::Config { scene: scene.into(), iterations: Some(600), ..Default::default() }, &run)?;
+    println!("{} Gaussians, {} objects, {:.1} dB on held-out views", made.gaussians, made.objects, made.psnr_held_out.unwrap_or(f64::NAN));
+
+    let mut session = Session::open(scene.as_ref(), "auto")?;
+    let (camera, grid) = (session.cameras[0].clone(), session.grid()?);
+    let field = session.field(&camera, None)?;
+    let config = QueryConfig { min_score: session.min_score(), ..QueryConfig::default() };
+    let question = Question { ask: &Ask::Text(text.clone()), negatives: &[], config, dilate: None, candidates: 3 };
+    let (answer, report) = question.put(&session, &grid, &field, &camera, 0.0)?;
+    let pixels = answer.mask.iter().filter(|m| **m).count();
+    println!("{text}: {}, score {:.2}, {pixels} pixels of {}", if report.found { "found" } else { "not found" }, report.score, report.view);
+    Ok(())
+}
