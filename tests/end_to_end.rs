@@ -342,6 +342,40 @@ fn preprocessing_does_again_only_what_changed() {
     assert!(before != results());
 }
 
+/// The exact poses are taken away; what structure from motion finds must agree with them but for a similarity.
+#[test]
+fn photos_without_poses_are_placed() {
+    if fixture().is_none() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, exact, scene) = (dir.path().join("photos"), dir.path().join("exact"), dir.path().join("scene"));
+    json(&["synth", "table", "-o", text(&photos), "--views", "24", "--size", "400x300"]);
+    json(&["preprocess", text(&photos), "-o", text(&exact), "--segmenter", "import"]);
+    std::fs::remove_file(photos.join("transforms.json")).expect("the poses");
+    let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+    assert!(report["photos"].as_u64() >= Some(22), "{report}");
+    assert!(photos.join("sparse/0/images.bin").is_file() && !photos.join("sparse.partial").exists());
+    let cameras = |scene: &Path| -> Vec<fastlgs_core::Camera> {
+        fastlgs_core::SceneFolder::open(scene).and_then(|folder| folder.cameras()).expect("cameras")
+    };
+    let (exact, found) = (cameras(&exact), cameras(&scene));
+    // Distances between centres, as shares of their mean, know no similarity.
+    let pairs = |all: &[fastlgs_core::Camera]| -> Vec<f32> {
+        let centre = |name: &str| all.iter().find(|c| c.name == name).expect("a camera").centre();
+        let names: Vec<&str> = found.iter().map(|c| c.name.as_str()).collect();
+        let far = names.iter().zip(names.iter().skip(5)).map(|(a, b)| centre(a).distance(centre(b))).collect::<Vec<_>>();
+        let mean = far.iter().sum::<f32>() / far.len() as f32;
+        far.iter().map(|d| d / mean).collect()
+    };
+    let mut off: Vec<f32> = pairs(&exact).iter().zip(pairs(&found)).map(|(a, b)| (a - b).abs()).collect();
+    off.sort_by(f32::total_cmp);
+    let (median, worst) = (off[off.len() / 2], off[off.len() - 1]);
+    println!("{} of 24 photos placed; distances between centres differ by {median:.4} of their mean, at most {worst:.4}", found.len());
+    // Some three dozen points a photo are all that the table's plain surfaces give: single photos may be off.
+    assert!(median < 0.02 && worst < 0.3, "{off:?}");
+}
+
 #[test]
 fn texts_are_answered_line_by_line() {
     let Some(f) = fixture() else { return };

@@ -37,9 +37,15 @@ pub const MAX_KEYPOINTS: usize = 2500;
 /// When the picture is refused.
 pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
     #[cfg(feature = "opencv")]
-    return crate::opencv_sift::detect(photo);
+    return detect_with_opencv(photo);
     #[cfg(not(feature = "opencv"))]
     detect_in_rust(photo)
+}
+
+#[cfg(feature = "opencv")]
+fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
+    let (positions, descriptors) = crate::opencv_sift::detect(photo, MAX_KEYPOINTS)?;
+    Ok(Keypoints { positions, descriptors })
 }
 
 #[cfg(feature = "rust-sift")]
@@ -128,7 +134,7 @@ mod tests {
             let (a, b) = (detect(&a).unwrap(), detect(&b).unwrap());
             matches(&a, &b).into_iter().map(|(i, j)| (a.positions[i], b.positions[j])).collect::<Vec<_>>()
         };
-        let (opencv, rust) = (flow(crate::opencv_sift::detect), flow(detect_in_rust));
+        let (opencv, rust) = (flow(detect_with_opencv), flow(detect_in_rust));
         let again = |(p, q): &&(Vec2, Vec2)| rust.iter().any(|(r, s)| r.distance(*p) < 2.0 && s.distance(*q) < 2.0);
         let shared = opencv.iter().filter(again).count();
         println!("correspondences of OpenCV {}, Rust {}; {shared} of OpenCV's found by both", opencv.len(), rust.len());

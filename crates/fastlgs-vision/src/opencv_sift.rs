@@ -1,6 +1,5 @@
 //! SIFT by the system's OpenCV (`opencv_sift.cpp`).
 
-use crate::keypoints::{Keypoints, MAX_KEYPOINTS};
 use crate::{Error, Result};
 use glam::Vec2;
 use image::GrayImage;
@@ -20,16 +19,17 @@ unsafe extern "C" {
     ) -> c_int;
 }
 
-/// Key points that are as strong as the last one come on top of the most that are asked for.
-const CAPACITY: usize = 2 * MAX_KEYPOINTS;
+/// Positions in pixels, and 128-byte descriptors.
+pub type Found = (Vec<Vec2>, Vec<[u8; 128]>);
 
-/// Detects and describes key points.
+/// Detects and describes the `most` strongest key points; those that are as strong as the last one come on top.
 ///
 /// # Errors
 /// When OpenCV refuses the picture.
-pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
-    let mut positions = vec![[0.0f32; 2]; CAPACITY];
-    let mut descriptors = vec![[0u8; 128]; CAPACITY];
+pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
+    let capacity = 2 * most;
+    let mut positions = vec![[0.0f32; 2]; capacity];
+    let mut descriptors = vec![[0u8; 128]; capacity];
     let mut reason = [0 as c_char; 256];
     let size = |n: u32| c_int::try_from(n).map_err(|_| Error::Invalid(format!("SIFT: a side of {n} pixels is too long")));
     let (width, height) = (size(photo.width())?, size(photo.height())?);
@@ -40,8 +40,8 @@ pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
             photo.as_raw().as_ptr(),
             width,
             height,
-            MAX_KEYPOINTS as c_int,
-            CAPACITY as c_int,
+            most as c_int,
+            capacity as c_int,
             positions.as_mut_ptr().cast(),
             descriptors.as_mut_ptr().cast(),
             reason.as_mut_ptr(),
@@ -56,5 +56,5 @@ pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
     descriptors.truncate(count);
     // OpenCV counts from the middle of the first pixel.
     let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.5, y + 0.5)).collect();
-    Ok(Keypoints { positions, descriptors })
+    Ok((positions, descriptors))
 }
