@@ -351,10 +351,21 @@ fn photos_without_poses_are_placed() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (photos, exact, scene) = (dir.path().join("photos"), dir.path().join("exact"), dir.path().join("scene"));
     json(&["synth", "table", "-o", text(&photos), "--views", "24", "--size", "400x300"]);
+    // Names of photos may have spaces.
+    for [from, to] in ["images/*", "masks/*.png", "masks/part/*.png", "masks/subpart/*.png"]
+        .map(|f| ["003.png", "photo 3.png"].map(|n| photos.join(f.replace('*', n))))
+    {
+        if from.is_file() {
+            std::fs::rename(from, to).expect("another name");
+        }
+    }
+    let poses = std::fs::read_to_string(photos.join("transforms.json")).expect("poses");
+    std::fs::write(photos.join("transforms.json"), poses.replace("images/003.png", "images/photo 3.png")).expect("poses");
     json(&["preprocess", text(&photos), "-o", text(&exact), "--segmenter", "import"]);
     std::fs::remove_file(photos.join("transforms.json")).expect("the poses");
     let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
     assert!(report["photos"].as_u64() >= Some(22), "{report}");
+    assert!(std::fs::read(scene.join("cameras/cameras.json")).is_ok_and(|c| String::from_utf8_lossy(&c).contains("photo 3.png")));
     assert!(photos.join("sparse/0/images.bin").is_file() && !photos.join("sparse.partial").exists());
     let cameras = |scene: &Path| -> Vec<fastlgs_core::Camera> {
         fastlgs_core::SceneFolder::open(scene).and_then(|folder| folder.cameras()).expect("cameras")

@@ -48,6 +48,16 @@ def camera_of(image):
     return camera
 
 
+def alias(k):
+    """The list of pairs is split at spaces, which names of photos may have."""
+    return f"{k:06}" + pathlib.Path(plan["images"][k]["path"]).suffix
+
+
+images = work / "images"
+images.mkdir()
+for k, image in enumerate(plan["images"]):
+    (images / alias(k)).symlink_to(image["path"])
+
 database = pycolmap.Database.open(work / "database.db")
 cameras, ids = {}, []
 for image in plan["images"]:
@@ -59,7 +69,7 @@ for image in plan["images"]:
         rig.add_ref_sensor(camera.sensor_id)
         cameras[size] = (camera, database.write_rig(rig))
     camera, rig_id = cameras[size]
-    entry = pycolmap.Image(name=image["name"], camera_id=camera.camera_id)
+    entry = pycolmap.Image(name=alias(len(ids)), camera_id=camera.camera_id)
     image_id = database.write_image(entry)
     entry.image_id = image_id
     frame = pycolmap.Frame()
@@ -71,7 +81,7 @@ for image in plan["images"]:
 with open(work / "pairs.txt", "w") as listed:
     for pair in plan["pairs"]:
         database.write_matches(ids[pair["a"]], ids[pair["b"]], take(pair["matches"]))
-        listed.write(f"{plan['images'][pair['a']]['name']} {plan['images'][pair['b']]['name']}\n")
+        listed.write(f"{alias(pair['a'])} {alias(pair['b'])}\n")
 database.close()
 
 print("verification", flush=True)
@@ -81,7 +91,6 @@ verification.ransac.max_error = 2.0
 verification.ransac.max_num_trials = 2000
 pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
 
-images = pathlib.Path(plan["images"][0]["path"]).parent
 
 
 def all_at_once():
@@ -139,6 +148,8 @@ for k, model in enumerate(models):
     points = model.compute_num_observations() / max(model.num_reg_images(), 1)
     if model.num_reg_images() == most and most >= WELL_SEEN * len(cameras) and points >= POINTS:
         model = calibrated(model)
+    for image in model.images.values():
+        image.name = plan["images"][ids.index(image.image_id)]["name"]
     folder = work / "sparse" / str(k)
     folder.mkdir(parents=True, exist_ok=True)
     model.write(folder)

@@ -30,6 +30,10 @@ impl Sink for Both<'_> {
         self.0.tell(message);
         self.1.tell(message);
     }
+
+    fn cancelled(&self) -> bool {
+        self.0.cancelled() || self.1.cancelled()
+    }
 }
 
 pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcome> {
