@@ -49,6 +49,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let m2 = 0.999 * moment2[k] + 0.001 * g * g;
         moment1[k] = m1;
         moment2[k] = m2;
-        params[k] = value - rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
+        let next = value - rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
+        // Codes lie in (0, 1)^3 (paper): a Gaussian that hardly shows must not leave it to make up for others.
+        let is_feature = channel >= FEATURE && channel < SH_REST;
+        params[k] = select(next, clamp(next, vec4(0.0), vec4(1.0)), is_feature);
     }
 }

@@ -72,7 +72,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
     let report = json(&args);
     assert!(report["objects"].as_u64().is_some_and(|k| k >= 4), "{report}");
     let answer =
-        json(&["query", text(&scene), "coffee", "--view", "008", "--min-score", "0.5", "-o", text(&f.dir.path().join("paper-out"))]);
+        json(&["query", text(&scene), "coffee", "--view", "008", "--false-alarms", "0.5", "-o", text(&f.dir.path().join("paper-out"))]);
     assert!(answer["pixels"].as_u64().is_some_and(|n| n > 100), "tau_ac leaves pixels: {answer}");
     let mask = LabelMap::load(Path::new(answer["mask"].as_str().expect("a path"))).expect("the mask is a grey PNG");
     let truth = LabelMap::load(&f.photos.join("masks/008.png.png")).expect("exact masks");
@@ -172,9 +172,10 @@ fn onnx_exports_of_sam_and_clip() {
     let report = json(&args);
     let masks = &report["masks_per_photo"];
     assert!(masks["whole"].as_f64().is_some_and(|n| n > 1.0) && masks["subpart"].is_null(), "{report}");
-    json(&["train", text(&scene), "--init-ply", text(&f.scene.join("scene.ply")), "--iterations", "0"]);
+    // Eight prompts a side leave things without a mask in many views, which speaks against them.
+    json(&["train", text(&scene), "--init-ply", text(&f.scene.join("scene.ply")), "--iterations", "0", "--support", "0.3"]);
     let ask = |color: &str| {
-        let options = ["--view", "008", "--min-score", "0.5", "--top-k", "1"];
+        let options = ["--view", "008", "--false-alarms", "0.5", "--top-k", "1"];
         json(&[&["query", text(&scene), color, "-o", text(&file("out"))], &options[..]].concat())
     };
     let (red, blue) = (ask("red"), ask("blue"));
@@ -299,8 +300,10 @@ fn every_way_to_ask_ends_in_the_same_object() {
     let photo = fastlgs_core::image_io::load_rgb(&f.photos.join("images/008.png")).expect("the photo");
     let crop = image::imageops::crop_imm(&photo, middle[0], middle[1], middle[2] - middle[0], middle[3] - middle[1]).to_image();
     fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");
-    let picture = ask(&["--image", text(&file("crop.png")), "--min-score", "0.2"]);
-    assert_eq!(picture["objects"][0]["id"], id, "{picture}");
+    let picture = ask(&["--image", text(&file("crop.png")), "--false-alarms", "0.8"]);
+    // The picture may be as like a part of it.
+    let found = &picture["objects"][0];
+    assert!(found["id"] == id || found["parent"] == id, "{picture}");
 
     // Wider masks, and a text that is ruled out by another one.
     let wide = ask(&["cat", "--dilate", "3x3", "--dilate-times", "2"]);

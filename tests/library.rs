@@ -4,6 +4,9 @@
 
 use fastlgs::progress::{Message, Sink};
 use fastlgs::{Error, Run, Session, preprocess, synth, train};
+use fastlgs_core::rng::Rng;
+use fastlgs_core::{Camera, SceneFolder};
+use glam::{Mat4, Quat, Vec3};
 use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -37,11 +40,19 @@ impl Sink for Watcher {
     }
 }
 
+/// Whether the offline models are installed; says so where they are not.
+fn models_are_there() -> bool {
+    let installed = fastlgs_vision::models::offline_installed();
+    assert!(installed || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "the offline models are missing");
+    if !installed {
+        eprintln!("SKIPPED: needs the offline models");
+    }
+    installed
+}
+
 #[test]
 fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
-    if !fastlgs_vision::models::offline_installed() {
-        assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "the offline models are missing");
-        eprintln!("SKIPPED: needs the offline models");
+    if !models_are_there() {
         return;
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -81,6 +92,91 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         let place = |what: &str| heard.iter().position(|line| *line == format!("{stage} {what}"));
         assert!(place("begins").is_some() && place("begins") < place("ends"), "{stage}: {heard:?}");
     }
+}
+
+/// Angles between each camera and the next, which no choice of coordinates changes.
+fn turns(cameras: &[Camera]) -> Vec<Quat> {
+    let turn = |c: &Camera| Quat::from_mat4(&c.world_to_camera);
+    cameras.windows(2).map(|pair| turn(&pair[1]) * turn(&pair[0]).inverse()).collect()
+}
+
+/// Mean difference of these angles between two sets of cameras, in pixels of the picture.
+fn turned_by(a: &[Camera], b: &[Camera]) -> f32 {
+    let angles = turns(a).into_iter().zip(turns(b)).map(|(a, b)| a.angle_between(b));
+    a[0].fx * angles.sum::<f32>() / (a.len() - 1) as f32
+}
+
+/// Every photo's camera is turned a little: what `preprocess` makes of the poses must come back to the true ones, unless it shall keep them.
+#[test]
+fn noise_on_poses_is_removed() {
+    if !models_are_there() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let photos = dir.path().join("photos");
+    let run = Run::silent("cpu", 3);
+    let made = synth::Config { kind: "table".into(), output: photos.clone(), views: Some(30), size: (320, 240), ..Default::default() };
+    fastlgs::synth(&made, &run).expect("a generated scene");
+    let preprocessed = |name: &str, poses: preprocess::Poses| {
+        let scene = dir.path().join(name);
+        let mut config = preprocess::Config { photos: photos.clone(), output: scene.clone(), poses, ..Default::default() };
+        config.eyes.segmenter = fastlgs::eyes::SegmenterKind::Import;
+        let report = fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
+        (SceneFolder::new(scene).cameras().expect("cameras"), report)
+    };
+    let (truth, report) = preprocessed("exact", preprocess::Poses::Check);
+    assert!(report.adjusted.is_some_and(|a| !a.used), "exact poses stay: {:?}", report.adjusted);
+
+    let file = photos.join("transforms.json");
+    let mut transforms: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).expect("poses")).expect("JSON");
+    let mut rng = Rng::new(1, "noise");
+    for frame in transforms["frames"].as_array_mut().expect("frames") {
+        let rows: [[f32; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).expect("a matrix");
+        let deviation = 3.0 / truth[0].fx;
+        let turn = Quat::from_scaled_axis(deviation * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+        let moved = (Mat4::from_cols_array_2d(&rows).transpose() * Mat4::from_quat(turn)).transpose();
+        frame["transform_matrix"] = serde_json::json!(moved.to_cols_array_2d());
+    }
+    std::fs::write(&file, transforms.to_string()).expect("poses");
+    let (kept, report) = preprocessed("kept", preprocess::Poses::Keep);
+    assert_eq!(report.adjusted, None);
+    let (adjusted, report) = preprocessed("checked", preprocess::Poses::Check);
+    let how = report.adjusted.expect("adjusted poses");
+    assert!(how.used && how.error_after < 0.9 * how.error_before && how.moved_median > 1.0, "{how:?}");
+    let [before, after] = [turned_by(&kept, &truth), turned_by(&adjusted, &truth)];
+    assert!(before > 5.0 && after < 0.1 * before, "{before} px before, {after} after");
+}
+
+/// Cameras that training moved belong to its Gaussians: what goes on from these keeps them, what starts anew does not.
+#[test]
+fn moved_cameras_stay_with_their_gaussians() {
+    if !models_are_there() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+    let run = Run::silent("cpu", 5);
+    let made = synth::Config { kind: "table".into(), output: photos.clone(), views: Some(10), size: (96, 72), ..Default::default() };
+    fastlgs::synth(&made, &run).expect("a generated scene");
+    let mut config = preprocess::Config { photos, output: scene.clone(), ..Default::default() };
+    config.eyes.segmenter = fastlgs::eyes::SegmenterKind::Import;
+    fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
+    let cameras = || SceneFolder::new(&scene).cameras().expect("cameras");
+    let given = cameras();
+
+    let moving =
+        train::Config { scene: scene.clone(), iterations: Some(100), budget: Some(1500), align: train::Align::On, ..Default::default() };
+    assert!(fastlgs::train(&moving, &run).expect("a trained scene").aligned);
+    let moved = cameras();
+    assert_ne!(moved, given);
+    let lifting =
+        train::Config { iterations: Some(0), init_ply: Some(scene.join("scene.ply")), align: train::Align::Auto, ..moving.clone() };
+    assert!(fastlgs::train(&lifting, &run).expect("a lifted scene").aligned);
+    assert_eq!(cameras(), moved, "objects are lifted with the cameras that the Gaussians were trained with");
+    let anew = train::Config { align: train::Align::Auto, ..moving };
+    let report = fastlgs::train(&anew, &run).expect("a trained scene");
+    assert!(!report.aligned && report.alignment_gain.is_none(), "no photo was kept aside: {report:?}");
+    assert_eq!(cameras(), given);
 }
 
 #[test]

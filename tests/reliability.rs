@@ -109,7 +109,7 @@ fn a_full_disk_leaves_earlier_results_whole() {
     }
     assert!(results(&scene) == before, "the earlier scene is whole");
     assert_eq!(std::fs::read(&ply).expect("the earlier file"), b"earlier");
-    json(&["query", text(&scene), "table", "--min-score", "0.01", "--device", "cpu"]);
+    json(&["query", text(&scene), "table", "--false-alarms", "1", "--device", "cpu"]);
     println!("full disk: {tried} commands refused, earlier results whole");
 }
 
@@ -124,7 +124,7 @@ fn places_that_cannot_be_written_are_named() {
         vec!["synth", "twins", "-o", nowhere, "--views", "4", "--size", "16x12"],
         vec!["preprocess", text(&f.dir.path().join("photos")), "-o", nowhere, "--segmenter", "import"],
         vec!["render", scene, "-o", nowhere, "--device", "cpu"],
-        vec!["query", scene, "table", "--min-score", "0.01", "-o", nowhere, "--device", "cpu"],
+        vec!["query", scene, "table", "--false-alarms", "1", "-o", nowhere, "--device", "cpu"],
         vec!["export", scene, "/proc/fastlgs/out.ply", "--device", "cpu"],
         vec!["eval", scene, "--json", "/proc/fastlgs/report.json", "--device", "cpu"],
         vec!["bench", "size", scene, "-o", nowhere, "--device", "cpu"],
@@ -143,7 +143,7 @@ fn many_queries_at_once_agree() {
     let out = |user: usize| f.dir.path().join(format!("user-{user}"));
     let ask = |user: usize| {
         Command::new(env!("CARGO_BIN_EXE_fastlgs"))
-            .args(["query", text(&f.trained), "table", "--min-score", "0.01", "--device", "cpu", "--json", "-", "-o", text(&out(user))])
+            .args(["query", text(&f.trained), "table", "--false-alarms", "1", "--device", "cpu", "--json", "-", "-o", text(&out(user))])
             .stdout(Stdio::piped())
             .spawn()
             .expect("the binary starts")

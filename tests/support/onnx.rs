@@ -12,6 +12,8 @@ pub enum Kind {
     Float = 1,
     /// 64-bit integers.
     Int = 7,
+    /// 16-bit floats.
+    Half = 10,
 }
 
 /// An attribute of a node.
@@ -81,8 +83,13 @@ impl Graph {
 
     /// Declares that a value is an output, under another name.
     pub fn output(&mut self, value: &str, name: &str, shape: &[i64]) {
+        self.output_as(value, name, Kind::Float, shape);
+    }
+
+    /// Makes a value of another type than 32-bit floats an output.
+    pub fn output_as(&mut self, value: &str, name: &str, kind: Kind, shape: &[i64]) {
         self.node("Identity", &[value], &[], name);
-        bytes(&mut self.outputs, 12, &value_info(name, Kind::Float, shape));
+        bytes(&mut self.outputs, 12, &value_info(name, kind, shape));
     }
 
     fn fresh(&mut self) -> String {

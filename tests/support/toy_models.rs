@@ -12,6 +12,21 @@ pub enum SamExport {
     Efficient,
     /// `input_points`.
     Transformers,
+    /// Only the official decoder's points, and other names for what it gives (EdgeSAM).
+    Edge,
+    /// A stretched picture, and embeddings of three resolutions (SAM 2).
+    Second,
+    /// The official decoder, with one mask a prompt.
+    Single,
+    /// The official export in 16-bit floats.
+    Half,
+}
+
+impl SamExport {
+    /// Whether points come as `point_coords`.
+    fn official(self) -> bool {
+        !matches!(self, Self::Efficient | Self::Transformers)
+    }
 }
 
 /// Side of the stand-in's picture and masks.
@@ -25,14 +40,29 @@ pub const REACH: [f32; 3] = [0.02, 0.4, 1.6];
 pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     let mut g = Graph::default();
     let (input, shape) = match export {
-        SamExport::Official { .. } => ("image", [1, 3, 1024, 1024]),
+        SamExport::Official { .. } | SamExport::Edge | SamExport::Second | SamExport::Single | SamExport::Half => {
+            ("image", [1, 3, 1024, 1024])
+        }
         SamExport::Efficient => ("batched_images", [-1, 3, -1, -1]),
         SamExport::Transformers => ("pixel_values", [-1, 3, 1024, 1024]),
     };
-    let photo = g.input(input, Kind::Float, &shape);
+    let kind = if export == SamExport::Half { Kind::Half } else { Kind::Float };
+    let cast = |g: &mut Graph, value: &str, to: Kind| {
+        if export == SamExport::Half { g.op("Cast", &[value], &[Attribute::Int("to", to as i64)]) } else { value.to_owned() }
+    };
+    let photo = g.input(input, kind, &shape);
+    let photo = cast(&mut g, &photo, Kind::Float);
     let sizes = g.ints(&[1, 3, SIDE, SIDE]);
     let small = g.op("Resize", &[&photo, "", "", &sizes], &[Attribute::Text("mode", "nearest")]);
-    g.output(&small, "image_embeddings", &[1, 3, SIDE, SIDE]);
+    let small = cast(&mut g, &small, Kind::Half);
+    let main = if export == SamExport::Second { "image_embed" } else { "image_embeddings" };
+    g.output_as(&small, main, kind, &[1, 3, SIDE, SIDE]);
+    if export == SamExport::Second {
+        for name in ["high_res_feats_0", "high_res_feats_1"] {
+            let same = g.op("Identity", &[&small], &[]);
+            g.output(&same, name, &[1, 3, SIDE, SIDE]);
+        }
+    }
     if export == SamExport::Transformers {
         let nothing = g.op("Sub", &[&small, &small], &[]);
         g.output(&nothing, "image_positional_embeddings", &[1, 3, SIDE, SIDE]);
@@ -40,16 +70,22 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     g.save(encoder);
 
     let mut g = Graph::default();
-    let embedding = g.input("image_embeddings", Kind::Float, &[1, 3, SIDE, SIDE]);
+    let embedding = g.input(main, kind, &[1, 3, SIDE, SIDE]);
+    let embedding = cast(&mut g, &embedding, Kind::Float);
     // Points as cells of the embedding.
     let points = match export {
-        SamExport::Official { batched } => {
-            let n = if batched { -1 } else { 1 };
+        SamExport::Official { .. } | SamExport::Edge | SamExport::Second | SamExport::Single | SamExport::Half => {
+            let n = if export == (SamExport::Official { batched: false }) { 1 } else { -1 };
             let points = g.input("point_coords", Kind::Float, &[n, -1, 2]);
             g.input("point_labels", Kind::Float, &[n, -1]);
-            g.input("mask_input", Kind::Float, &[1, 1, SIDE, SIDE]);
-            g.input("has_mask_input", Kind::Float, &[1]);
-            g.input("orig_im_size", Kind::Float, &[2]);
+            if export != SamExport::Edge {
+                g.input("mask_input", Kind::Float, &[1, 1, SIDE, SIDE]);
+                g.input("has_mask_input", Kind::Float, &[1]);
+                g.input("orig_im_size", Kind::Float, &[2]);
+            }
+            if export == SamExport::Second {
+                ["high_res_feats_0", "high_res_feats_1"].iter().for_each(|name| drop(g.input(name, Kind::Float, &[1, 3, SIDE, SIDE])));
+            }
             let first = g.ints(&[0]);
             let point = g.op("Gather", &[&points, &first], &[Attribute::Int("axis", 1)]);
             let ratio = g.floats(&[1], &[SIDE as f32 / 1024.0]);
@@ -96,8 +132,11 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     // EfficientSAM takes colours from 0 to 1, the others in standard deviations of about 58 of 255.
     let unit = if export == SamExport::Efficient { 0.052 } else { 1.0 };
     let mut reach = REACH.map(|r| unit * r).to_vec();
-    if matches!(export, SamExport::Official { .. }) {
+    if matches!(export, SamExport::Official { .. } | SamExport::Edge | SamExport::Half) {
         reach.insert(0, 1e6);
+    }
+    if export == SamExport::Single {
+        reach = vec![REACH[2]];
     }
     let m = reach.len() as i64;
     let reach = g.floats(&[1, m, 1, 1], &reach);
@@ -114,11 +153,12 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     let least = g.floats(&[1], &[0.9]);
     let scores = g.op("Add", &[&bonus, &least], &[]);
     match export {
-        SamExport::Official { .. } => {
-            g.output(&logits, "low_res_masks", &[-1, m, SIDE, SIDE]);
-            g.output(&scores, "iou_predictions", &[-1, m]);
+        export if export.official() => {
+            let (masks, ious) = if export == SamExport::Edge { ("masks", "scores") } else { ("low_res_masks", "iou_predictions") };
+            g.output(&logits, masks, &[-1, m, SIDE, SIDE]);
+            g.output(&scores, ious, &[-1, m]);
         }
-        SamExport::Efficient | SamExport::Transformers => {
+        _ => {
             let (masks, ious) =
                 if export == SamExport::Efficient { ("output_masks", "iou_predictions") } else { ("pred_masks", "iou_scores") };
             let shape = g.ints(&[1, -1, m, SIDE, SIDE]);

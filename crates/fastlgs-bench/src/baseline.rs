@@ -9,13 +9,13 @@ use fastlgs::{Run, Session, eval, eyes};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::shares::{Shares, pack, unpack};
-use fastlgs_core::{Camera, LabelMap, metrics};
+use fastlgs_core::{Camera, LabelMap, Level, metrics};
 use fastlgs_grid::query::{self, Field, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_grid::{Grid, codes};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, View, lift};
-use fastlgs_vision::{Encoder, Level};
+use fastlgs_vision::Encoder;
 use glam::Vec3;
 use ndarray::{Array2, Axis};
 use serde_json::{Value, json};
@@ -38,6 +38,9 @@ pub struct Args {
 
 /// What vectors of all Gaussians may take.
 const MOST_BYTES: usize = 4 << 30;
+
+/// Relevancy from which a pixel is nearer to the text than to anything.
+const NEARER: f32 = 0.5;
 
 /// Sides of LERF's tiles, as shares of the photo's shorter side.
 const TILES: [f32; 3] = [0.5, 0.25, 0.125];
@@ -114,7 +117,7 @@ impl PerPixel {
     fn raw(scene: &Session) -> Result<Self> {
         let (masks, _) = fastlgs_grid::evidence::load(&scene.folder)?;
         let lifted = lifted(scene, |view, camera| {
-            let map = LabelMap::load(&scene.folder.masks_path(Level::Whole.name(), &camera.name))?;
+            let map = scene.folder.masks(camera)?.painted(Level::Whole);
             let own = masks.iter().filter(|m| m.view == view);
             Ok((map, own.map(|m| (m.label, m.embedding.clone())).collect()))
         })?;
@@ -146,10 +149,10 @@ impl PerPixel {
         let mut levels: [Vec<Labelled>; 2] = Default::default();
         for (level, found) in [Level::Whole, Level::Part].into_iter().zip(&mut levels) {
             for camera in &training {
-                let path = scene.folder.masks_path(level.name(), &camera.name);
+                let masks = scene.folder.masks(camera)?;
                 // Scenes of one level have no parts.
-                let path = if path.is_file() { path } else { scene.folder.masks_path(Level::Whole.name(), &camera.name) };
-                found.push(embedded(scene, encoder.as_ref(), camera, LabelMap::load(&path)?)?);
+                let level = if masks.count(level) > 0 { level } else { Level::Whole };
+                found.push(embedded(scene, encoder.as_ref(), camera, masks.painted(level))?);
                 progress.advance()?;
             }
         }
@@ -188,7 +191,6 @@ impl PerPixel {
     /// Oracle IoU, IoU of the text's mask, and whether the peak is right, of each label.
     fn score(&self, scene: &Session, grid: &Grid, view: &LabelledView, camera: &Camera, pictures: Vec<Vectors>) -> Result<Vec<[f64; 3]>> {
         let (w, h) = (camera.width, camera.height);
-        let config = QueryConfig { min_score: scene.min_score(), ..QueryConfig::default() };
         let localised =
             |relevancy: &[f32], label: &labels::Label| f64::from(u8::from(metrics::localised(relevancy, w, h, &view.boxes(label, w, h))));
         if let Meaning::Object(codes) = &self.meaning {
@@ -196,8 +198,9 @@ impl PerPixel {
             let field = Field::Shares(Shares { width: w, height: h, pixels });
             let score = |label: &labels::Label| -> Result<[f64; 3]> {
                 let truth = view.mask(label, w, h);
-                let ranked = query::rank(grid, &scene.text_query(&label.category)?);
-                let mask = field.mask(grid, &query::select(grid, &ranked, &config));
+                let text = scene.text_query(&label.category)?;
+                let ranked = query::rank(grid, &text);
+                let mask = field.mask(grid, &query::select(grid, &ranked, &text, &QueryConfig::default()));
                 Ok([
                     eval::best_object(grid, &field, &truth).0,
                     metrics::iou(&mask, &truth),
@@ -216,7 +219,7 @@ impl PerPixel {
             let text = scene.text_query(&label.category)?;
             let relevancy = relevancy(&embeddings, &text);
             let above = |threshold: f32| metrics::iou(&relevancy.iter().map(|r| *r >= threshold).collect::<Vec<_>>(), &truth);
-            Ok([thresholds(&relevancy).into_iter().map(above).fold(0.0, f64::max), above(config.min_score), localised(&relevancy, label)])
+            Ok([thresholds(&relevancy).into_iter().map(above).fold(0.0, f64::max), above(NEARER), localised(&relevancy, label)])
         };
         view.labels.iter().map(score).collect()
     }
@@ -280,7 +283,7 @@ fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -
                 *place = Some(k);
             }
         }
-        for vote in lift::votes(&scene.gaussians, camera, &map) {
+        for vote in lift::votes(&scene.gaussians, &scene.view(camera), &map) {
             if let Some(k) = place[usize::from(vote.label)] {
                 let mut row = sums.row_mut(vote.gaussian as usize);
                 row.iter_mut().zip(&vectors[k].1).for_each(|(sum, v)| *sum += vote.weight * v);
@@ -346,6 +349,7 @@ fn nearest(rendered: &[f32], codes: &Vectors) -> u16 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_grid::relevancy::Calibration;
 
     #[test]
     fn the_nearest_code_decides() {
@@ -357,7 +361,13 @@ mod tests {
     fn the_most_relevant_layer_counts() {
         let layer = |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
         let layers = [layer([1.0, 0.0, 0.0, 2.0]), layer([0.0, 1.0, 3.0, 0.0])];
-        let text = TextQuery { text: vec![1.0, 0.0], canonical: Vec::new(), anything: 0.5 };
+        let text = TextQuery {
+            text: vec![1.0, 0.0],
+            canonical: Vec::new(),
+            negatives: Vec::new(),
+            anything: 0.5,
+            calibration: Calibration::OFFLINE,
+        };
         let found = relevancy(&layers, &text);
         assert!(found[0] > 0.9 && found[1] > 0.9);
         assert_eq!(thresholds(&found).len(), 64);

@@ -4,9 +4,8 @@ use anyhow::{Context, Result};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::view_of;
-use fastlgs_core::{Camera, LabelMap, SceneFolder, fs, image_io};
+use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder, fs, image_io};
 use fastlgs_grid::Grid;
-use fastlgs_vision::Level;
 use glam::{Mat4, Quat, Vec2, Vec3, Vec4};
 use image::codecs::jpeg::JpegEncoder;
 use image::{GrayImage, Luma, RgbImage, imageops};
@@ -58,7 +57,7 @@ struct Shot {
     /// Black where nothing counts.
     ignore: Option<GrayImage>,
     /// Masks by level, where they are not made by a segmenter.
-    masks: Vec<(Level, LabelMap)>,
+    masks: Option<MaskList>,
     labelled: bool,
 }
 
@@ -91,13 +90,8 @@ impl Album {
             let darker = |a: GrayImage, b: GrayImage| {
                 GrayImage::from_fn(a.width(), a.height(), |x, y| Luma([a.get_pixel(x, y)[0].min(b.get_pixel(x, y)[0])]))
             };
-            let mut masks = Vec::new();
-            for level in Level::ALL.into_iter().filter(|_| manifest.segmenter == "import") {
-                let path = scene.masks_path(level.name(), name);
-                if path.is_file() {
-                    masks.push((level, LabelMap::load(&path)?));
-                }
-            }
+            let own = manifest.segmenter == "import" && scene.masks_path(name).is_file();
+            let masks = own.then(|| scene.masks(&camera)).transpose()?;
             let (pixels, labelled) = (scene.photo(name)?, labelled.contains(name));
             shots.push(Shot { ignore: ignored.into_iter().reduce(darker), pixels, masks, labelled, camera });
         }
@@ -123,9 +117,8 @@ impl Album {
             if let Some(ignore) = &shot.ignore {
                 image_io::save_png(&to.join("ignore").join(format!("{name}.png")), ignore.clone())?;
             }
-            for (level, map) in &shot.masks {
-                let folder = if *level == Level::Whole { to.join("masks") } else { to.join("masks").join(level.name()) };
-                map.save(&folder.join(format!("{name}.png")))?;
+            if let Some(masks) = &shot.masks {
+                masks.save(&to.join("masks").join(format!("{name}.json")))?;
             }
             let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
             let camera_to_world = (camera.world_to_camera.inverse() * flip).transpose().to_cols_array_2d();
@@ -204,12 +197,9 @@ fn scale_channels(pixels: &mut RgbImage, gains: [f32; 3]) {
 pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed masks");
     for camera in scene.manifest()?.training(&scene.cameras()?) {
-        for level in Level::ALL {
-            let path = scene.masks_path(level.name(), &camera.name);
-            if path.is_file() {
-                changed_masks(&LabelMap::load(&path)?, change, &mut rng).save(&path)?;
-            }
-        }
+        let masks = scene.masks(&camera)?;
+        let levels = Level::ALL.map(|level| changed_masks(&masks.painted(level), change, &mut rng));
+        MaskList::of_levels(&levels).save(&scene.masks_path(&camera.name))?;
     }
     Ok(())
 }

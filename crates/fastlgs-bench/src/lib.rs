@@ -5,6 +5,7 @@ mod baseline;
 mod chart;
 mod command;
 mod disturb;
+mod growth;
 mod plot;
 mod report;
 mod size;
@@ -38,6 +39,8 @@ enum What {
     Size(size::Args),
     /// What remains of accuracy when the input is disturbed, and on scenes that methods fail at.
     Stability(stability::Args),
+    /// Seconds and memory of global mapping as photos, masks and Gaussians grow.
+    Growth(growth::Args),
     /// The other benches' results and sample pictures in one HTML file.
     Report(report::Args),
     /// Masks and embeddings alone, on labelled photos.
@@ -55,6 +58,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         What::Chart(args) => chart::run(args, run),
         What::Size(args) => size::run(args, run),
         What::Stability(args) => stability::run(args, run),
+        What::Growth(args) => growth::run(args, run),
         What::Report(args) => report::run(args, run),
         What::Vision(args) => vision::run(args, run),
     }

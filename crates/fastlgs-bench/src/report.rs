@@ -158,10 +158,9 @@ fn pictures(scene: &Path, run: &Run) -> Result<String> {
     let objects = RgbImage::from_fn(ids.width, ids.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
     let photo = folder.photo(name)?;
     let mut shown = vec![("photo".to_owned(), photo), ("rendered".to_owned(), color.clone()), ("objects".to_owned(), objects)];
-    let config = QueryConfig { min_score: session.min_score(), ..QueryConfig::default() };
     for label in view.labels.iter().take(ASKED) {
         let ask = Ask::Text(label.category.clone());
-        let question = Question { ask: &ask, negatives: &[], config, dilate: None, candidates: 0 };
+        let question = Question { ask: &ask, negatives: &[], config: QueryConfig::default(), dilate: None, candidates: 0 };
         let (answer, report) = question.put(&session, &grid, &field, &camera, 0.0)?;
         // Nothing found is an answer as well, but no picture.
         if report.found {

@@ -7,7 +7,7 @@ use crate::trial::{self, Trial, text};
 use anyhow::Result;
 use fastlgs::Run;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
-use fastlgs_raster::lift::largest_weights;
+use fastlgs_raster::{View, budget};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -115,10 +115,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 
 /// Gaussians by their largest blending weight over all training views, greatest first.
 fn by_largest_weight(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
-    let mut largest = vec![0.0f32; scene.len()];
-    for camera in folder.manifest()?.training(&folder.cameras()?) {
-        largest.iter_mut().zip(largest_weights(scene, &camera)).for_each(|(l, w)| *l = l.max(w));
-    }
+    let manifest = folder.manifest()?;
+    let trained = fastlgs::train::Report::of(&manifest).unwrap_or_default();
+    let views: Vec<View> = manifest.training(&folder.cameras()?).iter().map(|camera| trained.view(camera, scene)).collect();
+    let largest = budget::largest_weights(scene, &views);
     let mut order: Vec<usize> = (0..scene.len()).collect();
     order.sort_by(|a, b| largest[*b].total_cmp(&largest[*a]).then(a.cmp(b)));
     Ok(order)

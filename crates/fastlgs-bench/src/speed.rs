@@ -146,7 +146,7 @@ fn growth(settings: &[Setting]) -> Value {
 }
 
 /// The most memory this process ever held, where the system tells.
-fn peak_process_bytes() -> Option<u64> {
+pub fn peak_process_bytes() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
     line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok().map(|kib| 1024 * kib)

@@ -29,9 +29,9 @@ pub struct Args {
     /// Runs of each random disturbance, and of the row "seed" at least five.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
-    /// Iterations of each training.
-    #[arg(long, default_value_t = 1000)]
-    iterations: u32,
+    /// Iterations of each training: 3,000 by default, 1,000 with --quick.
+    #[arg(long)]
+    iterations: Option<u32>,
     /// One strength of each disturbance on a small table and twins: minutes instead of an hour.
     #[arg(long)]
     quick: bool,
@@ -70,8 +70,8 @@ struct Case {
     quick: bool,
 }
 
-/// All disturbances, three strengths each. Bounds: 5 points for what happens to careful users, 15 for what is plainly bad input; those of
-/// order, 2 px of pose noise, a fifth of the masks, half of the views and seeds are the project's goals.
+/// All disturbances, three strengths each. Bounds: those of poses, views, exposure, blur, focal length and seeds are the project's goals;
+/// else 5 points for what happens to careful users, 15 for what is plainly bad input.
 fn cases() -> Vec<Case> {
     let case = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "oracle_miou", bound, quick };
     let text = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "miou", bound, quick };
@@ -80,27 +80,27 @@ fn cases() -> Vec<Case> {
     let map = |disturbance, strength, args, quick| case(disturbance, strength, Change::Map(args), 10.0, quick);
     vec![
         photos("photos shuffled", "", Photos::Shuffled, 3.0, true),
-        photos("pose noise", "1 px", Photos::Pose(1.0), 3.0, false),
+        photos("pose noise", "1 px", Photos::Pose(1.0), 1.0, false),
         photos("pose noise", "2 px", Photos::Pose(2.0), 3.0, true),
-        photos("pose noise", "4 px", Photos::Pose(4.0), 15.0, false),
-        photos("views missing", "25 %", Photos::Missing(0.25), 5.0, false),
-        photos("views missing", "50 %", Photos::Missing(0.5), 5.0, true),
-        photos("views missing", "75 %", Photos::Missing(0.75), 15.0, false),
+        photos("pose noise", "4 px", Photos::Pose(4.0), 8.0, false),
+        photos("views missing", "25 %", Photos::Missing(0.25), 1.0, false),
+        photos("views missing", "50 %", Photos::Missing(0.5), 2.0, true),
+        photos("views missing", "75 %", Photos::Missing(0.75), 10.0, false),
         photos("exposure", "0.25 stops", Photos::Exposure(0.25), 5.0, false),
-        photos("exposure", "0.5 stops", Photos::Exposure(0.5), 5.0, true),
-        photos("exposure", "1 stop", Photos::Exposure(1.0), 15.0, false),
+        photos("exposure", "0.5 stops", Photos::Exposure(0.5), 2.0, true),
+        photos("exposure", "1 stop", Photos::Exposure(1.0), 8.0, false),
         photos("white balance", "5 %", Photos::WhiteBalance(0.05), 5.0, false),
         photos("white balance", "10 %", Photos::WhiteBalance(0.1), 5.0, true),
         photos("white balance", "20 %", Photos::WhiteBalance(0.2), 15.0, false),
         photos("blur", "0.5 px", Photos::Blur(0.5), 5.0, false),
         photos("blur", "1 px", Photos::Blur(1.0), 5.0, true),
-        photos("blur", "2 px", Photos::Blur(2.0), 15.0, false),
+        photos("blur", "2 px", Photos::Blur(2.0), 3.0, false),
         photos("JPEG", "quality 70", Photos::Jpeg(70), 5.0, false),
         photos("JPEG", "quality 40", Photos::Jpeg(40), 5.0, true),
         photos("JPEG", "quality 15", Photos::Jpeg(15), 15.0, false),
         photos("focal length", "1 %", Photos::Focal(0.01), 5.0, false),
-        photos("focal length", "3 %", Photos::Focal(0.03), 5.0, true),
-        photos("focal length", "10 %", Photos::Focal(0.1), 15.0, false),
+        photos("focal length", "3 %", Photos::Focal(0.03), 3.0, true),
+        photos("focal length", "10 %", Photos::Focal(0.1), 10.0, false),
         case("seed", "spread", Change::Seed, 1.0, true),
         masks("masks eroded", "1 px", Masks::Eroded(1), 5.0, false),
         masks("masks eroded", "2 px", Masks::Eroded(2), 5.0, true),
@@ -117,8 +117,6 @@ fn cases() -> Vec<Case> {
         text("embedding noise", "25 %", Change::Embeddings(0.25), 5.0, false),
         text("embedding noise", "50 %", Change::Embeddings(0.5), 5.0, true),
         text("embedding noise", "100 %", Change::Embeddings(1.0), 15.0, false),
-        map("agreement", "0.15", &["--agreement", "0.15"], false),
-        map("agreement", "0.9", &["--agreement", "0.9"], false),
         map("support", "0.1", &["--support", "0.1"], false),
         map("support", "0.7", &["--support", "0.7"], false),
         map("paper: tau", "1", &["--mapping", "paper", "--tau", "1"], false),
@@ -137,8 +135,16 @@ fn cases() -> Vec<Case> {
     ]
 }
 
-/// Least oracle mIoU of each generated scene, and least share of pixels of the right one of two twins.
-const KIND_BOUND: f64 = 0.8;
+/// Least oracle mIoU of a generated scene: the project's goals, else what a user would call good.
+fn kind_bound(kind: Kind) -> f64 {
+    match kind {
+        Kind::Dark => 0.9,
+        Kind::Thin | Kind::Glass | Kind::Long => 0.85,
+        _ => 0.8,
+    }
+}
+
+/// Least share of pixels of the right one of two twins.
 const TWINS_APART: f64 = 0.95;
 
 const COLUMNS: [&str; 14] = [
@@ -167,7 +173,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         .collect::<Result<_>>()?;
     let kinds: Vec<Kind> = if args.quick { vec![Kind::Twins] } else { kinds };
     let work = trial::workshop(&args.output)?;
-    let bench = Bench { args, run, work: &work, iterations: args.iterations };
+    let bench = Bench { args, run, work: &work, iterations: args.iterations.unwrap_or(if args.quick { 1000 } else { 3000 }) };
     if let Some(unknown) = args.cases.iter().find(|name| !cases().iter().any(|c| c.disturbance == **name)) {
         let known: BTreeSet<&str> = cases().iter().map(|c| c.disturbance).collect();
         bail!("--cases: '{unknown}' is none of {}", known.into_iter().collect::<Vec<_>>().join(", "));
@@ -228,7 +234,7 @@ impl Bench<'_> {
         let scene = self.generated(kind, name)?;
         let trial = Trial::new(&scene, self.work, self.run)?;
         let [trained, scored] = trial.train_and_eval(&["--iterations", &self.iterations.to_string()])?;
-        let (measure, bound) = if kind == Kind::Twins { ("apart", TWINS_APART) } else { ("oracle_miou", KIND_BOUND) };
+        let (measure, bound) = if kind == Kind::Twins { ("apart", TWINS_APART) } else { ("oracle_miou", kind_bound(kind)) };
         let reached = number(&scored, measure);
         Ok(json!({
             "scene": name, "disturbance": "none", "strength": "", "runs": 1, "measure": measure, "change": reached, "worst": reached, "bound": bound,

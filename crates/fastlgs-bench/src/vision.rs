@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use fastlgs::Run;
 use fastlgs::eyes::Eyes;
 use fastlgs::preprocess::load_photo;
-use fastlgs_core::{LabelMap, dataset, labels, metrics};
-use fastlgs_vision::{Level, import};
+use fastlgs_core::{LabelMap, Level, MaskList, dataset, labels, metrics};
+use fastlgs_vision::import;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -62,13 +62,13 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             let started = Instant::now();
             let found = segmenter.segment(&view.name, &photo.pixels)?;
             segment_seconds += started.elapsed().as_secs_f64();
-            for (level, map) in Level::ALL.iter().zip(&found.levels) {
-                *counts.entry(level.name()).or_default() += map.areas().iter().skip(1).filter(|a| **a > 0).count() as f64;
+            for level in Level::ALL {
+                *counts.entry(level.name()).or_default() += found.count(level) as f64;
             }
             let started = Instant::now();
             for label in &view.labels {
                 let truth = view.mask(label, w, h);
-                let (single, union) = oracle(&found.levels, &truth);
+                let (single, union) = oracle(&found, &truth);
                 let map = LabelMap { width: w, height: h, labels: truth.iter().map(|t| u16::from(*t)).collect() };
                 let embedding = encoder.embed_masks(&view.name, &photo.pixels, &map)?.pop();
                 let embedding = embedding.with_context(|| format!("the label '{}' of '{}' covers no pixel", label.category, view.name))?;
@@ -124,15 +124,14 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 }
 
 /// IoU of the best mask of any level, and of the best union of up to three.
-fn oracle(levels: &[LabelMap; 3], truth: &[bool]) -> (f64, f64) {
+fn oracle(list: &MaskList, truth: &[bool]) -> (f64, f64) {
     let mut masks: Vec<(usize, Vec<bool>)> = Vec::new();
-    for map in levels {
-        for (label, _) in map.areas().into_iter().enumerate().skip(1).filter(|a| a.1 > 0) {
-            let mask = map.mask(label as u16);
-            let shared = mask.iter().zip(truth).filter(|(m, t)| **m && **t).count();
-            if shared > 0 {
-                masks.push((shared, mask));
-            }
+    for one in &list.masks {
+        let mut mask = vec![false; truth.len()];
+        list.places(one).for_each(|p| mask[p] = true);
+        let shared = mask.iter().zip(truth).filter(|(m, t)| **m && **t).count();
+        if shared > 0 {
+            masks.push((shared, mask));
         }
     }
     masks.sort_by_key(|m| std::cmp::Reverse(m.0));
@@ -161,8 +160,8 @@ mod tests {
     fn unions_of_three_over_all_levels() {
         let map = |labels: &[u16]| LabelMap { width: 4, height: 1, labels: labels.to_vec() };
         let levels = [map(&[1, 2, 2, 3]), map(&[1, 1, 0, 0]), map(&[0, 0, 0, 0])];
-        assert_eq!(oracle(&levels, &[true, true, false, false]), (1.0, 1.0));
-        assert_eq!(oracle(&levels, &[true, false, false, true]), (0.5, 1.0));
-        assert_eq!(oracle(&levels, &[true, true, true, false]), (2.0 / 3.0, 1.0));
+        assert_eq!(oracle(&MaskList::of_levels(&levels), &[true, true, false, false]), (1.0, 1.0));
+        assert_eq!(oracle(&MaskList::of_levels(&levels), &[true, false, false, true]), (0.5, 1.0));
+        assert_eq!(oracle(&MaskList::of_levels(&levels), &[true, true, true, false]), (2.0 / 3.0, 1.0));
     }
 }

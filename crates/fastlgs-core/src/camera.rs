@@ -33,6 +33,12 @@ impl Camera {
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..self.clone() }
     }
 
+    /// The same view on pixels of twice the size; where sides are odd, the last of these stick out by half.
+    pub fn halved(&self) -> Self {
+        let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
+        Self { width, height, fx: self.fx / 2.0, fy: self.fy / 2.0, cx: self.cx / 2.0, cy: self.cy / 2.0, ..self.clone() }
+    }
+
     /// The same view with its longer side at most `max_side` pixels; never enlarged.
     pub fn shrunk_to(&self, max_side: u32) -> Self {
         let scale = max_side as f32 / self.width.max(self.height) as f32;

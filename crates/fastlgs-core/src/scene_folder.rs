@@ -1,7 +1,7 @@
 //! The scene folder: one place for everything a stage leaves for the next.
 
 use crate::dataset::SfmPoint;
-use crate::{Camera, Error, Gaussians, LabelMap, Result, compact, fs, image_io, ply};
+use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, compact, fs, image_io, ply};
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -151,20 +151,47 @@ impl SceneFolder {
         ply::read(&path)
     }
 
-    /// Writes the cameras, sorted by name.
+    /// Writes the cameras that training starts from, sorted by name; what an earlier training made of them goes.
     ///
     /// # Errors
     /// The system's refusal.
     pub fn save_cameras(&self, cameras: &[Camera]) -> Result<()> {
-        fs::write_json(&self.root.join("cameras/cameras.json"), &cameras)
+        fs::write_json(&self.root.join("cameras/cameras.json"), &cameras)?;
+        self.save_trained_cameras(None)
     }
 
-    /// All cameras, sorted by name.
+    /// All cameras as training starts from them, sorted by name.
+    ///
+    /// # Errors
+    /// Missing or damaged file.
+    pub fn given_cameras(&self) -> Result<Vec<Camera>> {
+        fs::read_json(&self.root.join("cameras/cameras.json"))
+    }
+
+    fn trained_cameras_path(&self) -> PathBuf {
+        self.root.join("cameras/trained.json")
+    }
+
+    /// Writes the cameras as training moved them; `None` where it left them as they were given.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn save_trained_cameras(&self, cameras: Option<&[Camera]>) -> Result<()> {
+        let path = self.trained_cameras_path();
+        match cameras {
+            Some(cameras) => fs::write_json(&path, &cameras),
+            None if path.is_file() => std::fs::remove_file(&path).map_err(Error::io(&path)),
+            None => Ok(()),
+        }
+    }
+
+    /// All cameras, sorted by name: as training moved them, where it did.
     ///
     /// # Errors
     /// Missing or damaged file.
     pub fn cameras(&self) -> Result<Vec<Camera>> {
-        fs::read_json(&self.root.join("cameras/cameras.json"))
+        let trained = self.trained_cameras_path();
+        if trained.is_file() { fs::read_json(&trained) } else { self.given_cameras() }
     }
 
     /// Index of a view by exact file name, or by name without ending where that is unique.
@@ -202,9 +229,27 @@ impl SceneFolder {
         image_io::load_rgb(&self.photo_path(view))
     }
 
-    /// Label map of a view and level, of raw segmenter masks.
-    pub fn masks_path(&self, level: &str, view: &str) -> PathBuf {
-        self.root.join("masks").join(level).join(format!("{view}.png"))
+    /// The segmenter's masks of a view.
+    pub fn masks_path(&self, view: &str) -> PathBuf {
+        self.root.join("masks").join(format!("{view}.json"))
+    }
+
+    /// Reads the segmenter's masks of a view.
+    ///
+    /// # Errors
+    /// A missing or damaged file, or masks that do not fit the view's camera.
+    pub fn masks(&self, camera: &Camera) -> Result<MaskList> {
+        let path = self.masks_path(&camera.name);
+        let (width, height) = (camera.width, camera.height);
+        if !path.is_file() {
+            return Err(Error::Invalid(format!("{} is missing; run 'fastlgs preprocess' again", path.display())));
+        }
+        let list = MaskList::load(&path)?;
+        match (list.width, list.height) {
+            _ if list.masks.is_empty() => Ok(MaskList::new(width, height)),
+            size if size == (width, height) => Ok(list),
+            _ => Err(Error::format(&path, "it does not fit the view's camera; run 'fastlgs preprocess' again")),
+        }
     }
 
     /// Label map of a view after mapping: values are object ids.

@@ -6,7 +6,7 @@
 use fastlgs_core::SceneFolder;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{QueryConfig, rank, select};
-use fastlgs_grid::relevancy::{OFFLINE_ANYTHING, TextQuery};
+use fastlgs_grid::relevancy::{Calibration, TextQuery};
 use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -17,12 +17,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let asked = grid.objects.get(object.wrapping_sub(1)).ok_or_else(|| format!("{scene} has objects 1 to {}", grid.objects.len()))?;
     let embedding = asked.embeddings.first().ok_or("this object was seen from too far to be embedded")?;
 
-    let query = TextQuery { text: embedding.clone(), canonical: Vec::new(), anything: OFFLINE_ANYTHING };
+    let calibration = Calibration::OFFLINE;
+    let query =
+        TextQuery { text: embedding.clone(), canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration };
     let ranked = rank(&grid, &query);
     for hit in ranked.iter().take(5) {
-        println!("object {:4}  relevancy {:.3}", hit.id, hit.score);
+        println!("object {:4}  score {:.3}", hit.id, hit.score);
     }
-    let answer: Vec<u16> = select(&grid, &ranked, &QueryConfig::default()).iter().map(|hit| hit.id).collect();
+    let answer: Vec<u16> = select(&grid, &ranked, &query, &QueryConfig::default()).iter().map(|hit| hit.id).collect();
     println!("the answer: {answer:?}");
     Ok(())
 }

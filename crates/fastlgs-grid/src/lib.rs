@@ -1,14 +1,16 @@
-//! The semantic feature grid of FastLGS: masks become objects ([`mapping`]), objects get low-dimensional codes
+//! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`tree`], [`support`] and [`objects`]), objects get low-dimensional codes
 //! ([`codes`]) and keep all their embeddings ([`grid`]), and a text finds its object ([`relevancy`], [`query`]).
 
 pub mod codes;
-pub mod consensus;
 pub mod evidence;
 pub mod grid;
 pub mod library;
 pub mod mapping;
+pub mod objects;
 pub mod query;
 pub mod relevancy;
+pub mod seen;
+pub mod support;
 pub mod tree;
 
 pub use grid::{Grid, Object};

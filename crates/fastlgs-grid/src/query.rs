@@ -6,30 +6,27 @@ use crate::relevancy::TextQuery;
 use fastlgs_core::{LabelMap, Shares};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
+use std::cmp::Reverse;
 
 /// How objects are chosen.
 #[derive(Clone, Copy, Debug)]
 pub struct QueryConfig {
-    /// Score from which an object counts as found.
-    pub min_score: f32,
+    /// Share of the names of absent things that may be answered all the same.
+    pub false_alarms: f32,
     /// At most this many objects.
     pub top_k: usize,
-    /// Further objects must score within this of the best.
-    pub margin: f32,
 }
-
-/// Calibrated on the offline encoder: see `docs/evaluation.md`.
-pub const MIN_SCORE: f32 = 0.6;
-
-/// The same for CLIP, whose cosines lie closer together: nearer to the text than to anything. Not calibrated.
-pub const CLIP_MIN_SCORE: f32 = 0.55;
-
-/// Share of an object's area, over its views, that decides its score.
-pub const BEST_SHARE: f32 = 0.5;
 
 impl Default for QueryConfig {
     fn default() -> Self {
-        Self { min_score: MIN_SCORE, top_k: 8, margin: 0.02 }
+        Self { false_alarms: 0.07, top_k: 8 }
+    }
+}
+
+impl QueryConfig {
+    /// Score from which an object counts as found.
+    pub fn min_score(&self) -> f32 {
+        1.0 - self.false_alarms
     }
 }
 
@@ -42,46 +39,63 @@ pub struct Hit {
     pub score: f32,
 }
 
-/// Score of an object: area-weighted mean relevancy of its best views, which together show [`BEST_SHARE`] of all the area
-/// it has in its views. An object is seldom recognised from everywhere; a single view that fools the encoder counts little.
-pub fn object_score(object: &Object, query: &TextQuery) -> f32 {
-    let mut scores: Vec<(f32, f32)> = object.embeddings.iter().map(|e| query.relevancy(e)).zip(object.areas.iter().copied()).collect();
-    scores.sort_by(|a, b| b.0.total_cmp(&a.0));
+/// What a text says for an object.
+#[derive(Clone, Copy, Debug)]
+pub struct Evidence {
+    /// What objects are ranked by: log-odds that this one is meant, up to a constant.
+    pub rank: f32,
+    /// Share of absent names that no object of a scene is as like as this one is like the text.
+    pub score: f32,
+    /// Standard error of the rank, from view to view.
+    pub error: f32,
+}
+
+/// Least size of an object, as a share of a photo.
+const LEAST_AREA: f32 = 1e-4;
+
+/// Share of an object's area, over its views, in which it must be like the text to be there.
+const BEST_SHARE: f32 = 0.5;
+
+/// What a text says for an object.
+///
+/// Which object is meant: the mean cosine over its views, weighted by area, times what a unit of cosine is worth with the encoder, and the logarithm of
+/// its size. A thing is as likely to be meant as a pixel is to show it: there are ever more parts the smaller they are, of which some look like
+/// anything. Whether the text names anything at all: how much more its best views, with half of its area, are like the text than like
+/// anything, since an object is seldom recognised from everywhere; a single view that fools the encoder counts little.
+pub fn evidence(object: &Object, query: &TextQuery) -> Evidence {
     let total: f32 = object.areas.iter().sum();
-    let (mut sum, mut weight) = (0.0, 0.0);
-    for (score, area) in scores {
-        sum += score * area;
-        weight += area;
-        if weight >= BEST_SHARE * total {
+    let views = || object.embeddings.iter().zip(object.areas.iter().map(|area| area / total));
+    let cosine: f32 = views().map(|(e, weight)| weight * query.cosine(e)).sum();
+    let negative: f32 = views().map(|(e, weight)| weight * query.negative(e)).sum();
+    if object.embeddings.is_empty() || total <= 0.0 || negative >= cosine {
+        return Evidence { rank: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
+    }
+    let temperature = query.calibration.temperature;
+    let variance: f32 = views().map(|(e, weight)| (weight * (query.cosine(e) - cosine)).powi(2)).sum();
+    let size = object.areas.iter().fold(LEAST_AREA, |most, area| area.max(most)).ln();
+    let mut margins: Vec<(f32, f32)> = views().map(|(e, weight)| (query.cosine(e) - query.canonical(e), weight)).collect();
+    margins.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let (mut margin, mut share) = (0.0, 0.0);
+    for (own, weight) in margins {
+        margin += own * weight;
+        share += weight;
+        if share >= BEST_SHARE {
             break;
         }
     }
-    if weight > 0.0 { sum / weight } else { 0.0 }
+    let score = query.calibration.confidence(temperature * margin / share);
+    Evidence { rank: temperature * cosine + size, score, error: temperature * variance.sqrt() }
 }
 
-/// What full support by the masks adds to the log-odds of the score when objects are ranked.
-const SUPPORT_WEIGHT: f32 = 2.5;
-
-/// What objects are ranked by.
-pub fn rank_score(score: f32, support: f32) -> f32 {
-    odds(score) + SUPPORT_WEIGHT * support
-}
-
-/// All objects, best first: by their score and their support. A union of two things is often
-/// more relevant than the one that is meant.
+/// All objects, the likeliest first.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
-    let hits = grid.objects.iter().map(|o| (object_score(o, query), o));
-    let mut hits: Vec<(f32, Hit)> = hits.map(|(score, o)| (rank_score(score, o.support), Hit { id: o.id, score })).collect();
+    let mut hits: Vec<(f32, Hit)> = Vec::with_capacity(grid.objects.len());
+    for object in &grid.objects {
+        let Evidence { rank, score, .. } = evidence(object, query);
+        hits.push((rank, Hit { id: object.id, score }));
+    }
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
-}
-
-/// By how much, in log-odds, a part must be more relevant than what it is a part of to be meant: a face is more like "cat" than a
-/// cat is.
-const PART_MARGIN: f32 = 1.2;
-
-fn odds(score: f32) -> f32 {
-    (score.max(1e-6) / (1.0 - score).max(1e-6)).ln()
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
@@ -94,21 +108,26 @@ pub fn best_supported(grid: &Grid, nested: &[u16]) -> Option<u16> {
     nested.iter().rev().find(|id| support(id) >= SUPPORT_SHARE * best).copied()
 }
 
-/// The target objects; empty means "not found". Of things that lie in each other one is taken: of the best and what around
-/// its relevancy is within the margin, the largest whose support comes near the best.
-pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
-    let Some(best) = ranked.iter().find(|h| h.score >= config.min_score) else { return Vec::new() };
-    let floor = config.min_score.max(best.score - config.margin);
-    let mut score = vec![0.0; grid.objects.len() + 1];
-    ranked.iter().for_each(|h| score[usize::from(h.id)] = h.score);
-    let mut chosen: Vec<Hit> = Vec::new();
-    for hit in ranked.iter().filter(|h| h.score >= floor) {
-        let within_margin = |s: f32| s >= config.min_score && odds(s) >= odds(hit.score) - PART_MARGIN;
-        let around: Vec<u16> = grid.chain(hit.id).filter(|id| within_margin(score[usize::from(*id)])).collect();
-        let id = best_supported(grid, &around).unwrap_or(hit.id);
-        let nested = |other: &Hit| grid.chain(id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == id);
-        if chosen.len() < config.top_k && !chosen.iter().any(nested) {
-            chosen.push(Hit { id, score: score[usize::from(id)] });
+/// Score of the object that is most like the text, which need not be the likeliest one to be meant: what decides whether it is found.
+pub fn best_score(ranked: &[Hit]) -> f32 {
+    ranked.iter().map(|hit| hit.score).fold(0.0, f32::max)
+}
+
+/// The target objects; empty means "not found". The likeliest one, and those elsewhere that are found and cannot be told from it: by no more than
+/// the errors of both.
+pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
+    let of = |hit: &Hit| evidence(&grid.objects[usize::from(hit.id) - 1], query);
+    let Some(best) = ranked.first().filter(|_| best_score(ranked) >= config.min_score()) else { return Vec::new() };
+    let first = of(best);
+    let mut chosen = vec![*best];
+    for hit in &ranked[1..] {
+        let own = of(hit);
+        if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
+            break;
+        }
+        let nested = |other: &Hit| grid.chain(hit.id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == hit.id);
+        if hit.score >= config.min_score() && !chosen.iter().any(nested) {
+            chosen.push(*hit);
         }
     }
     chosen
@@ -118,7 +137,7 @@ pub fn select(grid: &Grid, ranked: &[Hit], config: &QueryConfig) -> Vec<Hit> {
 pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Found {
     let inside = |id: u16| grid.chain(id).skip(1).any(|above| targets.iter().any(|t| t.id == above));
     let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside(h.id)).collect();
-    let parts = select(grid, &below, config);
+    let parts = select(grid, &below, query, config);
     if parts.is_empty() { Found { ranked: targets.to_vec(), targets: targets.to_vec() } } else { Found { ranked: below, targets: parts } }
 }
 
@@ -129,6 +148,15 @@ pub struct Found {
     pub ranked: Vec<Hit>,
     /// The answer; empty means "not found".
     pub targets: Vec<Hit>,
+}
+
+/// At each pixel the smallest object that has most of its weight; 0 for none. What contains an object, its `parent`, has a lower number.
+pub fn smallest_objects(shares: &Shares, parent: impl Fn(u16) -> u16) -> LabelMap {
+    let object = |id: u16| Some(Reverse(id)).filter(|_| id > 0);
+    // A damaged file might go in circles.
+    let above = |id: Reverse<u16>| object(parent(id.0)).filter(|above| *above > id);
+    let labels = shares.smallest(object, above).map(|id| id.map_or(0, |id| id.0)).collect();
+    LabelMap { width: shares.width, height: shares.height, labels }
 }
 
 /// What a rendered view tells about objects.
@@ -143,18 +171,19 @@ pub enum Field {
         height: u32,
         /// `[3][h][w]`.
         values: Vec<f32>,
-        /// Largest distance of a feature to its object's code, on the 0..255 scale.
-        tau_ac: f32,
+        /// Largest distance of a feature to its object's code, on the 0..255 scale (paper). Without it the nearest code decides, where a feature
+        /// of zero is no object's: with few objects codes lie a hundred apart, and what blends with its surroundings is lost within 5.
+        tau_ac: Option<f32>,
     },
 }
 
 impl Field {
-    /// The smallest object that each pixel shows; 0 for none.
+    /// The smallest object that has most of each pixel; 0 for none.
     pub fn owners(&self, grid: &Grid) -> LabelMap {
         match self {
-            Self::Shares(shares) => shares.winners(),
+            Self::Shares(shares) => smallest_objects(shares, |id| grid.chain(id).nth(1).unwrap_or(0)),
             Self::Features { width, height, values, tau_ac } => {
-                let nearest = |feature: Vec3| grid.nearest(feature).filter(|(_, d)| d < tau_ac).map_or(0, |(id, _)| id);
+                let nearest = |feature: Vec3| decided(grid, feature, *tau_ac);
                 LabelMap { width: *width, height: *height, labels: features(values).map(nearest).collect() }
             }
         }
@@ -166,7 +195,8 @@ impl Field {
         let members = grid.members(&ids);
         match self {
             Self::Shares(shares) => shares.mask(&members),
-            Self::Features { values, tau_ac, .. } => {
+            Self::Features { values, tau_ac: None, .. } => features(values).map(|f| members[usize::from(decided(grid, f, None))]).collect(),
+            Self::Features { values, tau_ac: Some(tau_ac), .. } => {
                 let codes: Vec<Vec3> = grid.objects.iter().filter(|o| members[usize::from(o.id)]).map(|o| o.code).collect();
                 features(values).map(|f| codes.iter().any(|c| codes::distance(f, *c) < *tau_ac)).collect()
             }
@@ -183,6 +213,12 @@ impl Field {
     }
 }
 
+/// The object that a feature shows; 0 for none.
+fn decided(grid: &Grid, feature: Vec3, tau_ac: Option<f32>) -> u16 {
+    let least = tau_ac.unwrap_or_else(|| codes::distance(feature, Vec3::ZERO));
+    grid.nearest(feature).filter(|(_, d)| *d < least).map_or(0, |(id, _)| id)
+}
+
 /// Pixels of a planar feature picture.
 fn features(values: &[f32]) -> impl Iterator<Item = Vec3> {
     let n = values.len() / 3;
@@ -192,6 +228,7 @@ fn features(values: &[f32]) -> impl Iterator<Item = Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::relevancy::Calibration;
     use fastlgs_core::shares::pack;
 
     /// Object 2 lies in object 1; 3 is elsewhere.
@@ -212,56 +249,77 @@ mod tests {
         hits.iter().map(|h| h.id).collect()
     }
 
+    fn query(text: [f32; 2]) -> TextQuery {
+        TextQuery { text: text.to_vec(), canonical: Vec::new(), negatives: Vec::new(), anything: 0.6, calibration: Calibration::OFFLINE }
+    }
+
+    fn find(grid: &Grid, text: [f32; 2], config: &QueryConfig) -> Vec<u16> {
+        let query = query(text);
+        ids(&select(grid, &rank(grid, &query), &query, config))
+    }
+
     #[test]
     fn the_right_object_is_found_and_absence_is_said() {
-        let find = |text: [f32; 2], config: &QueryConfig| {
-            let query = TextQuery { text: text.to_vec(), canonical: vec![vec![0.1, 0.1]], anything: -1.0 };
-            ids(&select(&grid(), &rank(&grid(), &query), config))
-        };
         let config = QueryConfig::default();
-        assert_eq!(find([1.0, 0.0], &config), [1]);
-        assert_eq!(find([-0.5, 1.0], &config), [3]);
-        assert!(find([-1.0, 0.0], &config).is_empty());
-        // The part is a little more relevant than the whole: it takes more than that to be meant.
-        let one = QueryConfig { top_k: 1, ..config };
-        assert_eq!((find([0.85, 0.5], &one), find([0.8, 0.6], &one)), (vec![1], vec![2]));
+        assert_eq!(find(&grid(), [1.0, 0.0], &config), [1]);
+        assert_eq!(find(&grid(), [0.0, 1.0], &config), [3]);
+        assert!(find(&grid(), [-1.0, 0.0], &config).is_empty());
+        assert_eq!(find(&grid(), [0.8, 0.6], &config), [2], "a part that the text fits better");
+        let lenient = QueryConfig { false_alarms: 1.0, ..config };
+        assert_eq!(find(&grid(), [-1.0, 0.0], &lenient).len(), 1);
+    }
+
+    #[test]
+    fn of_things_that_are_as_like_the_text_the_larger_is_meant() {
+        let mut grid = grid();
+        grid.objects[2].embeddings = vec![vec![0.999, 0.045]];
+        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [1]);
+        grid.objects[2].areas = vec![0.3];
+        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [3]);
+    }
+
+    #[test]
+    fn what_is_nearer_to_a_negative_is_not_meant() {
+        let mut query = query([0.95, 0.31]);
+        let find = |query: &TextQuery| ids(&select(&grid(), &rank(&grid(), query), query, &QueryConfig::default()))[0];
+        grid().objects.iter().for_each(|o| assert!(evidence(o, &query).rank.is_finite()));
+        query.negatives.push(vec![1.0, 0.0]);
+        assert_eq!(find(&query), 2, "object 1 is nearer to the negative");
     }
 
     #[test]
     fn one_view_that_fools_the_encoder_counts_little() {
-        let query = TextQuery { text: vec![1.0, 0.0], canonical: Vec::new(), anything: 0.6 };
         let seen = |recognised: usize| {
             let view = |k: usize| if k < recognised { vec![1.0, 0.0] } else { vec![0.0, 1.0] };
-            object_score(&Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() }, &query)
+            let object = Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() };
+            evidence(&object, &query([1.0, 0.0])).score
         };
-        assert!(seen(1) < 0.5, "{}", seen(1));
-        assert!(seen(3) > 0.95, "recognised from most sides: {}", seen(3));
+        assert!(seen(1) < 0.05, "{}", seen(1));
+        assert!(seen(4) > 0.9, "recognised from most sides: {}", seen(4));
+        let unseen = Object { embeddings: Vec::new(), areas: Vec::new(), ..grid().objects[0].clone() };
+        assert_eq!(evidence(&unseen, &query([1.0, 0.0])).score, 0.0);
     }
 
     #[test]
     fn parts_are_looked_for_inside_their_object() {
-        let query = |text: [f32; 2]| TextQuery { text: text.to_vec(), canonical: Vec::new(), anything: 0.0 };
         let targets = [Hit { id: 1, score: 0.9 }];
         let ask = |text| ids(&part(&grid(), &targets, &query(text), &QueryConfig::default()).targets);
-        assert_eq!(ask([0.0, 1.0]), [2], "3 is nearer but lies elsewhere");
+        assert_eq!(ask([0.3, 0.954]), [2], "3 is nearer but lies elsewhere");
         assert_eq!(ask([0.0, -1.0]), [1], "no such part");
     }
 
     #[test]
-    fn a_whole_that_no_mask_shows_is_not_taken_for_its_part() {
-        let mut grid = grid();
-        let ranked = [Hit { id: 2, score: 0.9 }, Hit { id: 1, score: 0.89 }];
-        assert_eq!(ids(&select(&grid, &ranked, &QueryConfig::default())), [1]);
-        grid.objects[0].support = 0.5;
-        assert_eq!(ids(&select(&grid, &ranked, &QueryConfig::default())), [2]);
-    }
-
-    #[test]
     fn several_of_a_kind_are_found_together() {
-        let hit = |id, score| Hit { id, score };
-        let ranked = [hit(2, 0.97), hit(3, 0.96), hit(1, 0.2)];
-        assert_eq!(ids(&select(&grid(), &ranked, &QueryConfig::default())), [2, 3]);
-        assert_eq!(ids(&select(&grid(), &ranked, &QueryConfig { top_k: 1, ..QueryConfig::default() })), [2]);
+        let mut grid = grid();
+        // Two things that look alike, within what each varies from view to view.
+        let alike = |k: usize| -> Vec<Vec<f32>> {
+            [0.98f32, 0.999].map(|c| vec![c, (1.0 - c * c).sqrt()]).into_iter().cycle().skip(k).take(2).collect()
+        };
+        (grid.objects[1].parent, grid.objects[1].embeddings, grid.objects[1].areas) = (0, alike(0), vec![0.11, 0.1]);
+        (grid.objects[2].embeddings, grid.objects[2].areas) = (alike(1), vec![0.1, 0.1]);
+        grid.objects[0].embeddings = vec![vec![0.0, 1.0]];
+        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [2, 3]);
+        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig { top_k: 1, ..QueryConfig::default() }), [2]);
     }
 
     #[test]
@@ -269,9 +327,14 @@ mod tests {
         // Features: on code 1, within 5/255 of it, midway between codes 1 and 2, on code 3.
         let x = [0.25, 0.26, 0.375, 0.75];
         let values: Vec<f32> = x.iter().chain(&x).chain(&x).copied().collect();
-        let field = Field::Features { width: 4, height: 1, values, tau_ac: codes::TAU_AC };
+        let field = Field::Features { width: 4, height: 1, values: values.clone(), tau_ac: Some(codes::TAU_AC) };
         assert_eq!(field.mask(&grid(), &[Hit { id: 1, score: 1.0 }]), [true, true, false, false]);
         assert_eq!(field.owners(&grid()).labels, [1, 1, 0, 3]);
+        let nearest = Field::Features { width: 4, height: 1, values, tau_ac: None };
+        assert_eq!(nearest.owners(&grid()).labels, [1, 1, 1, 3]);
+        assert_eq!(nearest.mask(&grid(), &[Hit { id: 1, score: 1.0 }]), [true, true, true, false]);
+        let nothing = Field::Features { width: 1, height: 1, values: vec![0.1; 3], tau_ac: None };
+        assert_eq!(nothing.owners(&grid()).labels, [0]);
     }
 
     #[test]

@@ -1,317 +1,275 @@
-//! Global mapping, second step: regions grow into a containment tree, and the nodes that the photos' masks support become
-//! the objects.
+//! Global mapping, first step: the views' masks grow a tree over the Gaussians.
 //!
-//! No single agreement is right for all things: at 0.5 a vase is one region and a bicycle five. So nothing is decided by a
-//! threshold; touching regions are joined, most agreed first, and every union stays as a node above its members, as the
-//! parts that finer masks show stay below. What is an object is then asked of the masks again: a node is kept where views
-//! show masks of its shape.
+//! Neighbouring sets of Gaussians are joined, those first that most masks hold together, as all views see it ([`Seen::agreement`]): parts come
+//! to be before the things that they are parts of, and these before what they stand on. The order of the photos plays no part, a wrong mask in
+//! one view is outvoted by the others, and what one view cuts apart or glues together the majority mends. Nothing is decided here by a
+//! threshold: which of the nodes are objects is asked of the masks again ([`crate::support`], [`crate::objects`]).
 
-use crate::consensus::{Regions, Seen, agreement, merged};
-use fastlgs_core::LabelMap;
+use crate::seen::{Seen, Vote};
+use fastlgs_core::mask_list::Table;
 use rayon::prelude::*;
-use std::collections::{BTreeMap, BTreeSet};
+use std::borrow::Cow;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
 
-/// Pairs of neighbouring Gaussians that make two regions touch, as a share of the smaller one's.
-const TOUCH: f32 = 0.02;
-/// Agreement below which nothing is joined any more.
-const LEAST_AGREEMENT: f32 = 0.1;
+/// A node of a [`Tree`], by its number from 0; no node has a higher number than the one above it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Node(pub u32);
 
-/// Nodes 1.. over the Gaussians: first the regions, then their parts, then unions of regions.
+impl Node {
+    /// Its place in lists of all nodes.
+    pub fn place(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Nested sets of Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Tree {
-    /// Node above node k + 1; 0 for none.
-    pub parents: Vec<u16>,
-    /// Deepest node of each Gaussian; 0 for none.
-    pub of: Vec<u16>,
-    regions: usize,
-    parts: usize,
+    /// By node: the one above it.
+    pub parents: Vec<Option<Node>>,
+    /// By Gaussian: the smallest node that it belongs to.
+    pub of: Vec<Option<Node>>,
+}
+
+/// What makes a set of Gaussians large enough to be a node.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Config {
+    /// So many views must show it.
+    pub min_views: usize,
+    /// And so many pixels of it each.
+    pub min_pixels: f32,
+}
+
+/// Agreement below which nothing is joined: no masks but those of a few views hold both.
+const LEAST_AGREEMENT: f32 = 0.02;
+/// Growth from which a set is looked at anew: what it gained before changes little.
+const GROWN: f32 = 1.05;
+/// What agrees at least this share of what a node's own do is more of the same; what agrees less makes a new node above it.
+const SAME_LEVEL: f32 = 0.85;
+
+/// A set of Gaussians that is still growing.
+struct Set {
+    /// What it sees; a single Gaussian's is worked out where it is needed, since all together would not fit.
+    seen: Option<Seen>,
+    near: BTreeSet<u32>,
+    /// Those of its Gaussians that belong to no node yet.
+    loose: Vec<u32>,
+    node: Option<Node>,
+    /// The agreement at which that node came to be.
+    level: f32,
+    /// Changes when it has grown, with its weight then; the last version of all is that of a set that is gone.
+    version: u32,
+    weight: f32,
+}
+
+const GONE: u32 = u32::MAX;
+
+/// Sets that grow, and the nodes that they have become.
+struct Growing<'a> {
+    votes: &'a [Vec<Vote>],
+    tables: &'a [Table],
+    sets: Vec<Set>,
+    tree: Tree,
+    /// By node: the one that it has become one with.
+    dissolved: Vec<Option<Node>>,
+}
+
+/// Agreement as bits, so that it has an order; then the pair, and the versions in which they agreed.
+type Offer = (u32, Reverse<(u32, u32)>, u32, u32);
+
+impl Growing<'_> {
+    fn seen(&self, set: u32) -> Cow<'_, Seen> {
+        let single = || Cow::Owned(Seen::of(&self.votes[set as usize], self.tables));
+        self.sets[set as usize].seen.as_ref().map_or_else(single, Cow::Borrowed)
+    }
+
+    /// What joining two sets is worth; none where nothing speaks for it.
+    fn offer(&self, a: u32, b: u32) -> Option<Offer> {
+        let (a, b) = (a.min(b), a.max(b));
+        let agreed = self.seen(a).agreement(&self.seen(b));
+        let versions = [a, b].map(|s| self.sets[s as usize].version);
+        (agreed >= LEAST_AGREEMENT).then_some((agreed.to_bits(), Reverse((a, b)), versions[0], versions[1]))
+    }
+
+    /// A new node above some others.
+    fn new_node(&mut self, below: &[Node]) -> Node {
+        self.tree.parents.push(None);
+        self.dissolved.push(None);
+        let node = Node(self.tree.parents.len() as u32 - 1);
+        below.iter().for_each(|below| self.tree.parents[below.place()] = Some(node));
+        node
+    }
+
+    fn settle(&mut self, loose: Vec<u32>, node: Node) {
+        loose.into_iter().for_each(|g| self.tree.of[g as usize] = Some(node));
+    }
+
+    /// Joins two sets; returns the one that is left, whose neighbours are those of both, and which of them are new to it.
+    fn join(&mut self, a: u32, b: u32, agreed: f32, config: &Config) -> (u32, Vec<u32>) {
+        // The one with more neighbours swallows the other.
+        let (keep, gone) = if self.sets[a as usize].near.len() >= self.sets[b as usize].near.len() { (a, b) } else { (b, a) };
+        let whole = self.seen(keep).merged(&self.seen(gone));
+        let empty = Set { seen: None, near: BTreeSet::new(), loose: Vec::new(), node: None, level: 0.0, version: GONE, weight: 0.0 };
+        let other = std::mem::replace(&mut self.sets[gone as usize], empty);
+        let mut loose = std::mem::take(&mut self.sets[keep as usize].loose);
+        loose.extend(other.loose);
+        let set = &self.sets[keep as usize];
+        let (node, level) = match (set.node.map(|n| (n, set.level)), other.node.map(|n| (n, other.level))) {
+            (None, None) if whole.reached_by(config.min_views, self.tables.len()) < config.min_pixels => (None, 0.0),
+            (None, None) => (Some(self.new_node(&[])), agreed),
+            (Some(x), Some(y)) if agreed < SAME_LEVEL * x.1.max(y.1) => (Some(self.new_node(&[x.0, y.0])), agreed),
+            (Some(x), Some(y)) => {
+                // The later one, so that what lies in it has lower numbers.
+                let (gone, stays) = (x.0.min(y.0), x.0.max(y.0));
+                self.dissolved[gone.place()] = Some(stays);
+                (Some(stays), x.1.max(y.1))
+            }
+            (Some((node, level)), None) | (None, Some((node, level))) if agreed < SAME_LEVEL * level => {
+                (Some(self.new_node(&[node])), agreed)
+            }
+            (Some((node, level)), None) | (None, Some((node, level))) => (Some(node), level),
+        };
+        if let Some(node) = node {
+            self.settle(std::mem::take(&mut loose), node);
+        }
+        let set = &mut self.sets[keep as usize];
+        let weight = whole.weight();
+        if weight > GROWN * set.weight {
+            (set.version, set.weight) = (set.version + 1, weight);
+        }
+        (set.seen, set.loose, set.node, set.level) = (Some(whole), loose, node, level);
+        set.near.remove(&gone);
+        let mut new = Vec::new();
+        for &c in other.near.iter().filter(|c| **c != keep) {
+            self.sets[c as usize].near.remove(&gone);
+            if self.sets[c as usize].near.insert(keep) {
+                new.push(c);
+            }
+            self.sets[keep as usize].near.insert(c);
+        }
+        (keep, new)
+    }
+
+    /// The tree of the nodes that are left.
+    fn finished(self) -> Tree {
+        let left = |node: Node| std::iter::successors(Some(node), |n| self.dissolved[n.place()]).last().unwrap_or(node);
+        let mut number = vec![Node(0); self.dissolved.len()];
+        let stays = (0..self.dissolved.len()).filter(|n| self.dissolved[*n].is_none());
+        stays.clone().enumerate().for_each(|(place, node)| number[node] = Node(place as u32));
+        let renamed = |node: Option<Node>| node.map(|n| number[left(n).place()]);
+        Tree {
+            parents: stays.map(|node| renamed(self.tree.parents[node])).collect(),
+            of: self.tree.of.iter().map(|node| renamed(*node)).collect(),
+        }
+    }
 }
 
 impl Tree {
-    /// Grows the tree over `regions`; each of `parts` lies inside one of them.
-    pub fn grow(regions: &Regions, parts: &Regions) -> Self {
-        let (count, below) = (regions.seen.len(), parts.seen.len());
-        let mut parents = vec![0; count + below];
-        let mut of = regions.of.clone();
-        for (deepest, part) in of.iter_mut().zip(&parts.of).filter(|(region, part)| **region > 0 && **part > 0) {
-            let node = count as u16 + part;
-            parents[usize::from(node) - 1] = *deepest;
-            *deepest = node;
+    /// Grows the tree. `votes` holds each Gaussian's, rising by view; `tables` are those of all views; `near` are pairs of neighbours.
+    pub fn grow(mut votes: Vec<Vec<Vote>>, tables: &[Table], near: &[(u32, u32)], config: &Config) -> Self {
+        // A Gaussian that mostly shows where no mask is belongs to no object.
+        votes.par_iter_mut().filter(|v| !Seen::of(v, tables).is_covered()).for_each(|v| *v = Vec::new());
+        let set = |g: usize| {
+            let weight = votes[g].iter().map(|v| v.weight()).sum();
+            Set { seen: None, near: BTreeSet::new(), loose: vec![g as u32], node: None, level: 0.0, version: 0, weight }
+        };
+        let sets = (0..votes.len()).map(set).collect();
+        let tree = Self { parents: Vec::new(), of: vec![None; votes.len()] };
+        let mut growing = Growing { votes: &votes, tables, sets, tree, dissolved: Vec::new() };
+        for &(a, b) in near.iter().filter(|(a, b)| !votes[*a as usize].is_empty() && !votes[*b as usize].is_empty()) {
+            growing.sets[a as usize].near.insert(b);
+            growing.sets[b as usize].near.insert(a);
         }
-        let mut sizes = vec![0u32; count];
-        regions.of.iter().filter(|r| **r > 0).for_each(|r| sizes[usize::from(*r) - 1] += 1);
-        join(regions, sizes, &mut parents);
-        Self { parents, of, regions: count, parts: below }
-    }
-
-    /// Nodes, each after all that lie below it: parts, regions, unions.
-    fn bottom_up(&self) -> impl Iterator<Item = usize> {
-        let first_union = self.regions + self.parts;
-        (self.regions..first_union).chain(0..self.regions).chain(first_union..self.parents.len())
-    }
-}
-
-/// Joins touching regions, most agreed first; every union becomes a node of `parents`.
-fn join(regions: &Regions, mut sizes: Vec<u32>, parents: &mut Vec<u16>) {
-    let mut seen: Vec<Seen> = regions.seen.clone();
-    // Groups are numbered as they come; `node[g]` is the tree's node of group g.
-    let mut node: Vec<usize> = (0..sizes.len()).collect();
-    let mut contacts: BTreeMap<(usize, usize), u32> =
-        regions.contacts.iter().map(|(&(a, b), n)| ((usize::from(a) - 1, usize::from(b) - 1), *n)).collect();
-    let score = |seen: &[Seen], sizes: &[u32], (a, b): (usize, usize), n: u32| {
-        let touch = n as f32 >= TOUCH * sizes[a].min(sizes[b]) as f32;
-        if touch { agreement(&seen[a], &seen[b]) } else { 0.0 }
-    };
-    let mut scores: BTreeMap<(usize, usize), f32> = contacts.iter().map(|(pair, n)| (*pair, score(&seen, &sizes, *pair, *n))).collect();
-    while let Some((&(a, b), _)) = scores.iter().filter(|s| *s.1 >= LEAST_AGREEMENT).max_by(|x, y| x.1.total_cmp(y.1).then(y.0.cmp(x.0)))
-        && parents.len() < usize::from(u16::MAX)
-    {
-        let union = sizes.len();
-        parents.push(0);
-        let above = parents.len();
-        node.push(above - 1);
-        [a, b].into_iter().for_each(|g| parents[node[g]] = above as u16);
-        let (below_a, below_b) = (std::mem::take(&mut seen[a]), std::mem::take(&mut seen[b]));
-        seen.push(merged(&below_a, &below_b));
-        sizes.push(sizes[a] + sizes[b]);
-        scores.remove(&(a, b));
-        contacts.remove(&(a, b));
-        let touched: Vec<(usize, usize)> = contacts.keys().copied().filter(|c| [c.0, c.1].iter().any(|g| *g == a || *g == b)).collect();
-        for pair in touched {
-            scores.remove(&pair);
-            let n = contacts.remove(&pair).unwrap_or(0);
-            let other = if pair.0 == a || pair.0 == b { pair.1 } else { pair.0 };
-            *contacts.entry((other, union)).or_default() += n;
-        }
-        for (pair, n) in contacts.iter().filter(|c| c.0.1 == union) {
-            scores.insert(*pair, score(&seen, &sizes, *pair, *n));
-        }
-    }
-}
-
-/// What the views show of a node.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Support {
-    /// Mean IoU of the node with the best mask of each view, weighted by the node's pixels there.
-    pub iou: f32,
-    /// (pixels, view) of the views that show it.
-    pub areas: Vec<(u32, usize)>,
-}
-
-impl Support {
-    fn pixels(&self) -> f32 {
-        self.areas.iter().map(|a| a.0 as f32).sum()
-    }
-}
-
-/// Fewest pixels with which a view shows a node.
-const MIN_PIXELS: u32 = 60;
-
-/// Compares every node with the masks of every view. `views(v)` gives the view's map of deepest nodes and its mask maps.
-///
-/// # Errors
-/// The first one that `views` returns.
-pub fn support<E: Send>(
-    tree: &Tree,
-    views: usize,
-    load: impl Fn(usize) -> Result<(LabelMap, Vec<LabelMap>), E> + Sync,
-) -> Result<Vec<Support>, E> {
-    let of_view = |view: usize| -> Result<Vec<(u32, f32)>, E> {
-        let (nodes, levels) = load(view)?;
-        let mut best = vec![0.0f32; tree.parents.len()];
-        let mut areas = Vec::new();
-        for masks in &levels {
-            let (masks, _) = masks.dense();
-            let width = usize::from(masks.max()) + 1;
-            let mut common = vec![0u32; (tree.parents.len() + 1) * width];
-            nodes.labels.iter().zip(&masks.labels).for_each(|(n, m)| common[usize::from(*n) * width + usize::from(*m)] += 1);
-            for node in tree.bottom_up() {
-                let (own, above) = (node + 1, usize::from(tree.parents[node]));
-                if above > 0 {
-                    (0..width).for_each(|m| common[above * width + m] += common[own * width + m]);
-                }
+        let mut queue: BinaryHeap<Offer> = near.par_iter().filter_map(|&(a, b)| growing.offer(a, b)).collect::<Vec<_>>().into();
+        while let Some((agreed, Reverse((a, b)), va, vb)) = queue.pop() {
+            let now = [a, b].map(|s| growing.sets[s as usize].version);
+            if now.contains(&GONE) {
+                continue;
             }
-            let sizes = masks.areas();
-            areas = common.chunks_exact(width).skip(1).map(|row| row.iter().sum::<u32>()).collect();
-            for (node, row) in common.chunks_exact(width).skip(1).enumerate() {
-                for mask in (1..width).filter(|m| row[*m] > 0) {
-                    let union = areas[node] + sizes[mask] as u32 - row[mask];
-                    best[node] = best[node].max(row[mask] as f32 / union as f32);
-                }
+            if now != [va, vb] {
+                // One of them has grown since: ask the views again.
+                queue.extend(growing.offer(a, b));
+                continue;
             }
+            let (keep, new) = growing.join(a, b, f32::from_bits(agreed), config);
+            queue.extend(new.into_iter().filter_map(|c| growing.offer(keep, c)));
         }
-        Ok(areas.into_iter().zip(best).collect())
-    };
-    let all = (0..views).into_par_iter().map(of_view).collect::<Result<Vec<_>, E>>()?;
-    let gather = |node: usize| {
-        let shown: Vec<(u32, usize, f32)> =
-            all.iter().enumerate().map(|(v, nodes)| (nodes[node].0, v, nodes[node].1)).filter(|s| s.0 >= MIN_PIXELS).collect();
-        let (sum, weight) = shown.iter().fold((0.0, 0.0), |(s, w), (area, _, iou)| (s + *area as f32 * iou, w + *area as f32));
-        Support { iou: if weight > 0.0 { sum / weight } else { 0.0 }, areas: shown.into_iter().map(|(area, v, _)| (area, v)).collect() }
-    };
-    Ok((0..tree.parents.len()).map(gather).collect())
-}
-
-/// When a node is an object.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Config {
-    /// Fewest views that must show it.
-    pub min_views: usize,
-    /// Smallest mean share of the pixels of the views that show it.
-    pub min_share: f32,
-    /// Least support by masks.
-    pub min_support: f32,
-    /// Of a node and one below it that has more than this share of its pixels, only the better supported one is kept.
-    pub same: f32,
-}
-
-impl Default for Config {
-    fn default() -> Self {
-        Self { min_views: 3, min_share: 0.002, min_support: 0.4, same: 0.85 }
-    }
-}
-
-/// The nodes that are objects.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Chosen {
-    /// Object of node k + 1: its own, else the next one above it; 0 for none.
-    pub object_of: Vec<u16>,
-    /// Object that contains object k + 1; 0 for none.
-    pub parents: Vec<u16>,
-    /// Node, less one, of each object.
-    pub nodes: Vec<usize>,
-    /// Nodes that are no objects: too few views, too small, no masks of their shape, the same as another.
-    pub dropped: [usize; 4],
-}
-
-impl Chosen {
-    /// Object of a node of [`Tree`]; 0 for node 0.
-    pub fn object(&self, node: u16) -> u16 {
-        if node > 0 { self.object_of[usize::from(node) - 1] } else { 0 }
+        growing.finished()
     }
 
-    /// An object and all that contain it, from small to large.
-    fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
-        std::iter::successors(Some(id), |id| Some(self.parents[usize::from(*id) - 1]).filter(|p| *p > 0))
+    /// The nodes that Gaussians belong to at first hand, and for each Gaussian the place of its own among them, from 1 on; 0 for none.
+    /// Where 16 bits cannot number them all, the Gaussians of the smallest are left to the next node above.
+    pub fn labels(&self) -> (Vec<Node>, Vec<u16>) {
+        let mut sizes: BTreeMap<Node, usize> = BTreeMap::new();
+        self.of.iter().flatten().for_each(|node| *sizes.entry(*node).or_default() += 1);
+        let mut nodes: Vec<(usize, Node)> = sizes.into_iter().map(|(node, size)| (size, node)).collect();
+        nodes.sort_by_key(|&(size, node)| (Reverse(size), node));
+        nodes.truncate(usize::from(u16::MAX));
+        let nodes: Vec<Node> = nodes.into_iter().map(|n| n.1).collect();
+        let label: BTreeMap<Node, u16> = nodes.iter().copied().zip(1..=u16::MAX).collect();
+        let of = |own: &Option<Node>| own.and_then(|node| self.upwards(node).find_map(|n| label.get(&n).copied())).unwrap_or(0);
+        let labels = self.of.iter().map(of).collect();
+        (nodes, labels)
     }
 
-    /// Objects none of which lies in another one of the same layer: by the number of objects around them.
-    pub fn layers(&self) -> Vec<BTreeSet<u16>> {
-        let mut layers: Vec<BTreeSet<u16>> = Vec::new();
-        for id in 1..=self.parents.len() as u16 {
-            let depth = self.chain(id).skip(1).count();
-            layers.resize(layers.len().max(depth + 1), BTreeSet::new());
-            layers[depth].insert(id);
-        }
-        layers
+    /// A node and all above it.
+    pub fn upwards(&self, node: Node) -> impl Iterator<Item = Node> {
+        std::iter::successors(Some(node), |node| self.parents[node.place()])
     }
-
-    /// For each id 0..=K the object of `layer` that it is or lies in, where `wanted`; 0 for none.
-    pub fn ancestors_on(&self, layer: &BTreeSet<u16>, wanted: impl Fn(u16) -> bool) -> Vec<u16> {
-        let on_layer = |id: u16| self.chain(id).find(|a| layer.contains(a)).filter(|a| wanted(*a));
-        std::iter::once(0).chain((1..=self.parents.len() as u16).map(|id| on_layer(id).unwrap_or(0))).collect()
-    }
-}
-
-/// Chooses the objects among the nodes and numbers them, 1..=K, by falling size, so that none precedes what contains it.
-pub fn choose(tree: &Tree, support: &[Support], pixels: usize, config: &Config) -> Chosen {
-    let mut chosen = Chosen::default();
-    let mut kept: BTreeSet<usize> = BTreeSet::new();
-    for (node, s) in support.iter().enumerate() {
-        let share = s.pixels() / (s.areas.len().max(1) * pixels) as f32;
-        match [s.areas.len() < config.min_views, share < config.min_share, s.iou < config.min_support].iter().position(|bad| *bad) {
-            Some(reason) => chosen.dropped[reason] += 1,
-            None => {
-                kept.insert(node);
-            }
-        }
-    }
-    let above = |kept: &BTreeSet<usize>, node: usize| {
-        let up = |n: &usize| usize::from(tree.parents[*n]).checked_sub(1);
-        std::iter::successors(up(&node), up).find(|n| kept.contains(n))
-    };
-    // Small ones first, so that a chain of ever larger unions of one thing is thinned link by link.
-    let mut order: Vec<usize> = kept.iter().copied().collect();
-    order.sort_by(|a, b| support[*a].pixels().total_cmp(&support[*b].pixels()).then(a.cmp(b)));
-    for &node in &order {
-        if let Some(whole) = above(&kept, node).filter(|w| support[node].pixels() > config.same * support[*w].pixels()) {
-            kept.remove(if support[node].iou > support[whole].iou { &whole } else { &node });
-            chosen.dropped[3] += 1;
-        }
-    }
-    // A node removed after its turn leaves the pair above it unchecked; that costs a duplicate, never an object.
-    let mut nodes: Vec<usize> = kept.iter().copied().collect();
-    nodes.sort_by(|a, b| support[*b].pixels().total_cmp(&support[*a].pixels()).then(b.cmp(a)));
-    let ids: BTreeMap<usize, u16> = nodes.iter().enumerate().map(|(k, n)| (*n, k as u16 + 1)).collect();
-    let id = |node: Option<usize>| node.map_or(0, |n| ids[&n]);
-    chosen.object_of = (0..support.len()).map(|n| ids.get(&n).copied().unwrap_or_else(|| id(above(&kept, n)))).collect();
-    chosen.parents = nodes.iter().map(|n| id(above(&kept, *n))).collect();
-    chosen.nodes = nodes;
-    chosen
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::convert::Infallible;
+    use fastlgs_core::mask_list::{Mask, RunLengths};
+    use fastlgs_core::{Level, MaskList};
 
-    /// Regions 1 2 3 4 of two Gaussians each, in a row; all views show 1 and 2 in one mask, half of them 2 and 3, none 4.
-    fn regions() -> Regions {
-        let seen = |labels: [u16; 4]| -> Seen { labels.iter().enumerate().map(|(view, l)| ((view as u16, *l), 10.0)).collect() };
-        Regions {
-            of: vec![1, 1, 2, 2, 3, 3, 4, 4],
-            seen: vec![seen([1, 1, 1, 1]), seen([1, 1, 1, 1]), seen([1, 1, 2, 2]), seen([3, 3, 3, 3])],
-            contacts: BTreeMap::from([((1, 2), 2), ((2, 3), 2), ((3, 4), 2)]),
+    const WIDTH: u32 = 16;
+
+    /// A row of 12 Gaussians that cover a pixel each; every view has its masks, given by their first pixel and the one after their last.
+    /// `order`: the views' numbers.
+    fn grown(views: &[&[[u32; 2]]], order: &[usize]) -> Tree {
+        let list = |masks: &[[u32; 2]]| {
+            let mask = |[from, to]: &[u32; 2]| Mask::new(Level::Whole, RunLengths::of(WIDTH, 1, |x, _| (*from..*to).contains(&x)));
+            MaskList { masks: masks.iter().map(mask).collect(), ..MaskList::new(WIDTH, 1) }.atoms()
+        };
+        let atoms: Vec<_> = order.iter().map(|v| list(views[*v])).collect();
+        let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
+        let votes = |g: u32| atoms.iter().enumerate().map(|(v, a)| Vote::new(v as u16, a.map.at(g, 0), 50.0)).collect();
+        let near: Vec<(u32, u32)> = (0..11).map(|g| (g, g + 1)).collect();
+        Tree::grow((0..12).map(votes).collect(), &tables, &near, &Config { min_views: 3, min_pixels: 100.0 })
+    }
+
+    /// The Gaussians of every node, sorted.
+    fn sets(tree: &Tree) -> BTreeSet<Vec<usize>> {
+        let mut sets = vec![Vec::new(); tree.parents.len()];
+        for (g, node) in tree.of.iter().enumerate() {
+            node.iter().flat_map(|n| tree.upwards(*n)).for_each(|n| sets[n.place()].push(g));
         }
-    }
-
-    fn parts() -> Regions {
-        Regions { of: vec![1, 0, 0, 0, 0, 0, 2, 3], seen: vec![Seen::new(); 3], contacts: BTreeMap::new() }
+        sets.into_iter().collect()
     }
 
     #[test]
-    fn agreement_orders_the_unions_and_parts_hang_below() {
-        let tree = Tree::grow(&regions(), &parts());
-        // Nodes 1-4 regions, 5-7 parts, 8 = {1, 2}, 9 = {8, 3}; 4 agrees with nobody.
-        assert_eq!(tree.parents, [8, 8, 9, 0, 1, 4, 4, 9, 0]);
-        assert_eq!(tree.of, [5, 1, 2, 2, 3, 3, 6, 7]);
+    fn parts_come_before_wholes_and_the_majority_of_views_decides() {
+        // A handle of 2 on a cup of 6 on a saucer of 10; one view glues all, another cuts the cup, and two pixels have no mask.
+        let good: &[[u32; 2]] = &[[0, 10], [0, 6], [0, 2]];
+        let views = [good, good, good, &[[0, 10]], &[[0, 10], [0, 3], [3, 6]]];
+        let tree = grown(&views, &[0, 1, 2, 3, 4]);
+        let found = sets(&tree);
+        for wanted in [0..2, 0..6, 0..10] {
+            assert!(found.contains(&wanted.clone().collect::<Vec<_>>()), "{wanted:?} in {found:?}");
+        }
+        assert_eq!(tree.of[10..], [None, None]);
+        assert_eq!(found, sets(&grown(&views, &[4, 2, 0, 3, 1])), "the order of the views plays no part");
     }
 
     #[test]
-    fn nodes_with_masks_of_their_shape_are_objects() {
-        let tree = Tree::grow(&regions(), &parts());
-        // One row of 800 pixels: 100 for each Gaussian. Masks show {1, 2}, 3 and 4 whole, and the part 5 on its own.
-        let nodes = LabelMap { width: 800, height: 1, labels: tree.of.iter().flat_map(|n| [*n; 100]).collect() };
-        let masks = |labels: [u16; 8]| LabelMap { width: 800, height: 1, labels: labels.iter().flat_map(|l| [*l; 100]).collect() };
-        let load = |_| Ok::<_, Infallible>((nodes.clone(), vec![masks([1, 1, 1, 1, 2, 2, 3, 3]), masks([4, 0, 0, 0, 0, 0, 0, 0])]));
-        let support = support(&tree, 4, load).unwrap();
-        let iou: Vec<f32> = support.iter().map(|s| s.iou).collect();
-        assert_eq!(iou, [0.5, 0.5, 1.0, 1.0, 1.0, 0.5, 0.5, 1.0, 4.0 / 6.0]);
-        let config = Config { min_support: 0.6, ..Config::default() };
-        let chosen = choose(&tree, &support, 800, &config);
-        // By size: 9 (600 pixels), 8 (400), then 4, 3 (200 each) and part 5 (100).
-        assert_eq!(chosen.nodes, [8, 7, 3, 2, 4]);
-        assert_eq!(chosen.parents, [0, 1, 0, 1, 2]);
-        assert_eq!(chosen.object_of, [2, 2, 4, 3, 5, 3, 3, 2, 1]);
-        assert_eq!(chosen.dropped, [0, 0, 4, 0]);
-        assert_eq!(choose(&tree, &support, 800, &Config { min_views: 5, ..config }).dropped, [9, 0, 0, 0]);
-    }
-
-    #[test]
-    fn layers_hold_no_object_inside_another() {
-        // 2 and 3 lie in 1, 4 in 2.
-        let chosen = Chosen { parents: vec![0, 1, 1, 2, 0], ..Chosen::default() };
-        let layers = chosen.layers();
-        assert_eq!(layers, [BTreeSet::from([1, 5]), BTreeSet::from([2, 3]), BTreeSet::from([4])]);
-        assert_eq!(chosen.ancestors_on(&layers[0], |_| true), [0, 1, 1, 1, 1, 5]);
-        assert_eq!(chosen.ancestors_on(&layers[1], |id| id != 3), [0, 0, 2, 0, 2, 0]);
-    }
-
-    #[test]
-    fn of_two_that_are_nearly_the_same_the_better_one_stays() {
-        let tree = Tree { parents: vec![2, 3, 0], of: vec![1, 2, 3], regions: 3, parts: 0 };
-        let node = |area: u32, iou: f32| Support { iou, areas: (0..4).map(|v| (area, v)).collect() };
-        let chosen = choose(&tree, &[node(400, 0.4), node(950, 0.9), node(1000, 0.8)], 10_000, &Config::default());
-        assert_eq!((chosen.nodes, chosen.parents, chosen.object_of), (vec![1, 0], vec![0, 1], vec![2, 1, 0]));
+    fn labels_name_the_nodes_that_own_gaussians() {
+        // Node 2 holds 0 and 1, and a Gaussian of its own.
+        let [a, b, c] = [0, 1, 2].map(Node);
+        let tree = Tree { parents: vec![Some(c), Some(c), None], of: vec![Some(a), Some(a), Some(b), Some(b), Some(b), Some(c), None] };
+        assert_eq!(tree.labels(), (vec![b, a, c], vec![2, 2, 1, 1, 1, 3, 0]));
+        assert_eq!(tree.upwards(a).collect::<Vec<_>>(), [a, c]);
     }
 }

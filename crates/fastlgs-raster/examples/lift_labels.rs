@@ -5,7 +5,7 @@
 //! The labels are the object maps of its views; any label maps whose numbers mean the same in all views will do.
 
 use fastlgs_core::{SceneFolder, ply};
-use fastlgs_raster::lift;
+use fastlgs_raster::{View, lift};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![BTreeMap::new(); gaussians.len()];
     for camera in &cameras {
         // One pass over a view tells how much each Gaussian contributes to each label.
-        for vote in lift::votes(&gaussians, camera, &folder.objects(&camera.name)?) {
+        for vote in lift::votes(&gaussians, &View::new(camera, gaussians.len(), 0), &folder.objects(&camera.name)?) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }
     }

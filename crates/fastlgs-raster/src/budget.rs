@@ -1,18 +1,18 @@
 //! No more Gaussians than the scene needs (`--budget auto`).
 //!
-//! *Growth* stops when it no longer pays: some training views are kept aside and watched; every `WATCH_EVERY` steps, if
+//! *Growth* stops when it no longer pays: some training views are kept aside and watched; now and then, if
 //! the scene has grown by at least `GROWTH` since the last look and the watched views gained less than `GAIN` dB a
 //! doubling, it may grow no further, and the watched views join the training.
 //!
-//! *Pruning* then removes Gaussians that nobody sees: those whose largest blending weight over all training views stays
-//! under [`MIN_WEIGHT`] (as in RadSplat, Niemeyer et al. 2024). What is left is refined by the rest of the run.
+//! *Pruning* then removes Gaussians that nobody sees: those whose largest blending weight over all training views stays under [`MIN_WEIGHT`]
+//! (as in RadSplat, Niemeyer et al. 2024). What is left is refined by the rest of the run. What that costs at once (fox: 9 dB of views that
+//! are trained on) says little about what it costs in the end: asking for an affordable price there left 99,546 Gaussians instead of 41,154, for 0.03 dB.
 
-use crate::lift::largest_weights;
-use fastlgs_core::{Camera, Gaussians};
+use crate::lift;
+use crate::view::View;
+use fastlgs_core::Gaussians;
 use serde::{Deserialize, Serialize};
 
-/// Steps between two looks at the watched views.
-pub(crate) const WATCH_EVERY: u32 = 500;
 /// Relative growth that has to show an effect.
 const GROWTH: f64 = 0.1;
 /// Least gain on the watched views, in dB, for twice as many Gaussians.
@@ -22,11 +22,13 @@ pub const MIN_WEIGHT: f32 = 0.1;
 /// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
 pub const DEGREE_LOSS: f64 = 0.02;
 /// Every so many training views one is watched.
-const WATCHED: usize = 10;
+pub(crate) const WATCHED: usize = 10;
+/// Where fewer would be left to train on, none is: of 28 views, the three that wait cost the held-out ones 1.7 dB.
+const FEW: usize = 40;
 
 /// Whether training view `index` of `count` is watched and not trained on while the scene grows.
 pub(crate) fn is_watched(index: usize, count: usize) -> bool {
-    count >= 2 * WATCHED && index % WATCHED == WATCHED / 2
+    count >= FEW + count / WATCHED && index % WATCHED == WATCHED / 2
 }
 
 /// The rule that ends growth.
@@ -67,18 +69,24 @@ pub struct Removal {
     pub psnr_after: Option<f64>,
 }
 
-/// Places of the Gaussians that some view sees with at least `threshold`.
-pub fn seen(scene: &Gaussians, cameras: &[Camera], threshold: f32) -> Vec<usize> {
+/// Largest blending weight of each Gaussian over all pixels of all views.
+pub fn largest_weights(scene: &Gaussians, views: &[View]) -> Vec<f32> {
     let mut largest = vec![0.0f32; scene.len()];
-    for camera in cameras {
-        largest.iter_mut().zip(largest_weights(scene, camera)).for_each(|(l, w)| *l = l.max(w));
+    for view in views {
+        largest.iter_mut().zip(lift::largest_weights(scene, view)).for_each(|(l, w)| *l = l.max(w));
     }
-    (0..scene.len()).filter(|&i| largest[i] >= threshold).collect()
+    largest
+}
+
+/// Places of those that reach a threshold.
+pub(crate) fn reaching(largest: &[f32], threshold: f32) -> Vec<usize> {
+    (0..largest.len()).filter(|&i| largest[i] >= threshold).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::Camera;
     use glam::Vec3;
 
     #[test]
@@ -95,13 +103,14 @@ mod tests {
     #[test]
     fn what_is_hidden_everywhere_is_not_seen() {
         let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let other = Camera::look_at("b", Vec3::new(0.0, 0.0, 4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
         let mut scene = Gaussians::default();
         for depth in [0.0, 0.1, 0.2] {
             scene.push_sphere(Vec3::Z * depth, 0.2, 0.99, [0.5; 3]);
         }
         scene.push_sphere(Vec3::Z * 0.3, 0.05, 0.99, [0.5; 3]);
-        assert_eq!(seen(&scene, std::slice::from_ref(&camera), MIN_WEIGHT), [0, 1, 2]);
-        let other = Camera::look_at("b", Vec3::new(0.0, 0.0, 4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
-        assert_eq!(seen(&scene, &[camera, other], MIN_WEIGHT), [0, 1, 2, 3]);
+        let [camera, other] = [camera, other].map(|c| View::new(&c, scene.len(), 0));
+        assert_eq!(reaching(&largest_weights(&scene, &[camera]), MIN_WEIGHT), [0, 1, 2]);
+        assert_eq!(reaching(&largest_weights(&scene, &[camera, other]), MIN_WEIGHT), [0, 1, 2, 3]);
     }
 }

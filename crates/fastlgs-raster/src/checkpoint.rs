@@ -9,6 +9,7 @@ use fastlgs_core::fs;
 use fastlgs_core::gaussians::channels;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use glam::Mat4;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -24,6 +25,10 @@ pub(crate) struct Course {
     pub removals: Vec<Removal>,
     pub exposures: Vec<LearnedExposure>,
     pub background: Learned<6>,
+    /// Poses of the training views, world to camera.
+    pub poses: Vec<Mat4>,
+    /// What the watched views gained by alignment, in dB, once that was looked at.
+    pub alignment_gain: Option<f64>,
 }
 
 fn tensors_path(path: &Path, iteration: u32) -> PathBuf {

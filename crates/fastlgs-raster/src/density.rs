@@ -28,13 +28,15 @@ pub struct Config {
     pub split_scale: f32,
     /// Opacity below which a Gaussian is removed.
     pub min_opacity: f32,
+    /// Largest scale, as a share of the scene extent, beyond which a Gaussian is removed.
+    pub largest: f32,
     /// No more Gaussians than this.
     pub budget: usize,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { gradient: 2e-4, split_scale: 0.01, min_opacity: 0.005, budget: 60_000 }
+        Self { gradient: 2e-4, split_scale: 0.01, min_opacity: 0.005, largest: f32::INFINITY, budget: 60_000 }
     }
 }
 
@@ -99,6 +101,20 @@ impl State {
         *self = self.gathered(&sources);
     }
 
+    fn is_finite(&self, i: usize) -> bool {
+        (0..channels(self.sh_degree)).all(|c| self.params[c * self.len() + i].is_finite())
+    }
+
+    /// Removes Gaussians with a value that is no finite number; returns how many.
+    pub fn keep_finite(&mut self) -> usize {
+        let n = self.len();
+        let places: Vec<usize> = (0..n).filter(|&i| self.is_finite(i)).collect();
+        if places.len() < n {
+            self.keep(&places);
+        }
+        n - places.len()
+    }
+
     /// Moves Gaussian `i` to a sample of its own distribution and shrinks it by 1.6.
     fn resample(&mut self, i: usize, rng: &mut Rng) {
         let n = self.len();
@@ -126,7 +142,9 @@ fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
 /// One round: prune the faint, clone small and split large coarse Gaussians within the budget.
 pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rng: &mut Rng) -> Counts {
     let n = state.len();
-    let keep: Vec<bool> = (0..n).map(|i| state.opacity(i) >= config.min_opacity).collect();
+    let keeps =
+        |i: usize| state.is_finite(i) && state.opacity(i) >= config.min_opacity && state.largest_scale(i) <= config.largest * extent;
+    let keep: Vec<bool> = (0..n).map(keeps).collect();
     let kept = keep.iter().filter(|k| **k).count();
     let mut counts = Counts { pruned: n - kept, ..Counts::default() };
     let mut coarse = vec![false; n];
@@ -169,7 +187,7 @@ const DEAD: f32 = 0.005;
 /// Moves dead Gaussians onto live ones, chosen with the probability of their opacity; the place looks as before.
 /// Returns how many moved.
 pub fn relocate(state: &mut State, rng: &mut Rng) -> usize {
-    let dead: Vec<usize> = (0..state.len()).filter(|&i| state.opacity(i) <= DEAD).collect();
+    let dead: Vec<usize> = (0..state.len()).filter(|&i| !state.is_finite(i) || state.opacity(i) <= DEAD).collect();
     if dead.len() == state.len() {
         return 0;
     }
@@ -181,11 +199,12 @@ pub fn relocate(state: &mut State, rng: &mut Rng) -> usize {
     dead.len()
 }
 
-/// Adds copies of Gaussians chosen with the probability of their opacity, a twentieth more at most, within the budget.
-/// Returns how many were added.
-pub fn grow(state: &mut State, budget: usize, rng: &mut Rng) -> usize {
+/// Adds copies of Gaussians chosen with the probability of their opacity, so many that equal rates reach the budget in `rounds`, this one
+/// among them. Returns how many were added.
+pub fn grow(state: &mut State, budget: usize, rounds: u32, rng: &mut Rng) -> usize {
     let n = state.len();
-    let added = (n / 20).min(budget.saturating_sub(n));
+    let rate = (budget as f64 / n as f64).powf(1.0 / f64::from(rounds.max(1)));
+    let added = ((n as f64 * rate).round() as usize).min(budget).saturating_sub(n);
     let sources: Vec<usize> = (0..n).chain(sampled(state, added, rng)).collect();
     share(state, &sources);
     added
@@ -280,6 +299,19 @@ mod tests {
     }
 
     #[test]
+    fn what_is_no_number_goes() {
+        let mut scene = Gaussians::default();
+        (0..4).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
+        scene.means[1].x = f32::NAN;
+        scene.log_scales[2].y = f32::INFINITY;
+        let mut s = state(&scene);
+        assert_eq!(s.keep_finite(), 2);
+        let mut s = state(&scene);
+        assert_eq!(refine(&mut s, &[0.0; 8], 1.0, &Config::default(), &mut Rng::new(1, "test")).pruned, 2);
+        assert_eq!(s.len(), 2);
+    }
+
+    #[test]
     fn relocation_revives_the_dead_where_it_is_dense() {
         let mut scene = Gaussians::default();
         scene.push_sphere(Vec3::ZERO, 0.5, 0.9, [0.5; 3]);
@@ -298,8 +330,9 @@ mod tests {
         let mut scene = Gaussians::default();
         (0..100).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
         let mut s = state(&scene);
-        assert_eq!(grow(&mut s, 103, &mut Rng::new(1, "test")), 3);
-        assert_eq!(s.len(), 103);
-        assert_eq!(grow(&mut s, 103, &mut Rng::new(1, "test")), 0);
+        assert_eq!(grow(&mut s, 121, 2, &mut Rng::new(1, "test")), 10);
+        assert_eq!(grow(&mut s, 121, 1, &mut Rng::new(1, "test")), 11);
+        assert_eq!(s.len(), 121);
+        assert_eq!(grow(&mut s, 121, 3, &mut Rng::new(1, "test")), 0);
     }
 }

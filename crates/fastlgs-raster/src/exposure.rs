@@ -47,26 +47,48 @@ impl<const N: usize> Learned<N> {
     }
 }
 
-/// Learning rate of exposures and background.
-pub(crate) const RATE: f32 = 1e-3;
+/// Learning rate of the background.
+pub(crate) const BACKGROUND_RATE: f32 = 1e-3;
+/// Learning rates of exposures at the run's begin and end.
+const RATES: [f32; 2] = [1e-2, 1e-3];
+/// Gain from which a photo's nearly white pixels are taken for cut off.
+const BRIGHT: f32 = 1.05;
+/// Values that may have been cut off at white.
+const CLIPPED: u8 = 250;
 
-/// Exposure of one view: three gains, three offsets.
+/// Exposure of one view: logarithms of three gains, and three offsets.
 pub(crate) type LearnedExposure = Learned<6>;
 
-impl Default for LearnedExposure {
-    fn default() -> Self {
-        Self::new([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+impl LearnedExposure {
+    /// What is known of a photo before training.
+    pub fn from_gain(gain: [f32; 3]) -> Self {
+        let [a, b, c] = gain.map(f32::ln);
+        Self::new([a, b, c, 0.0, 0.0, 0.0])
+    }
+
+    pub fn exposure(&self) -> Exposure {
+        let [a, b, c, d, e, f] = self.values;
+        Exposure { gain: [a, b, c].map(f32::exp), offset: [d, e, f] }
+    }
+
+    /// A step at some share of the run.
+    pub fn learn(&mut self, losses: &Losses, progress: f32) {
+        let gain = self.exposure().gain;
+        let [a, b, c]: [f64; 3] = std::array::from_fn(|k| losses.by_gain[k] * f64::from(gain[k]));
+        let [d, e, f] = losses.by_offset;
+        self.step([a, b, c, d, e, f], RATES[0] * (RATES[1] / RATES[0]).powf(progress));
     }
 }
 
-impl LearnedExposure {
-    pub fn exposure(&self) -> Exposure {
-        let [a, b, c, d, e, f] = self.values;
-        Exposure { gain: [a, b, c], offset: [d, e, f] }
+/// Shifts all exposures so that their mean does nothing: else the scene's brightness and theirs could drift against each other.
+pub(crate) fn pin_mean(exposures: &mut [LearnedExposure]) {
+    for k in 0..6 {
+        let mean = exposures.iter().map(|e| e.values[k]).sum::<f32>() / exposures.len().max(1) as f32;
+        exposures.iter_mut().for_each(|e| e.values[k] -= mean);
     }
+}
 
-    pub fn learn(&mut self, losses: &Losses) {
-        let ([a, b, c], [d, e, f]) = (losses.by_gain, losses.by_offset);
-        self.step([a, b, c, d, e, f], RATE);
-    }
+/// Whether a pixel of a photo that is so many times brighter than the mean was cut off at white: it tells no brightness.
+pub(crate) fn is_clipped(pixel: u32, gain: [f32; 3]) -> bool {
+    pixel.to_le_bytes().iter().zip(gain).any(|(value, gain)| gain > BRIGHT && *value >= CLIPPED)
 }

@@ -1,13 +1,17 @@
 //! First Gaussians: from points, or at worst at random in what the cameras see together.
 
+use crate::target::Target;
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
 use glam::Vec3;
 use kiddo::{KdTree, SquaredEuclidean};
+use std::collections::BTreeSet;
 
-/// One isotropic Gaussian a point, as wide as the mean distance to its three nearest neighbours (3DGS).
+/// One isotropic Gaussian a point, as wide as the mean distance to its three nearest neighbours (3DGS); of points in one place the first.
 pub fn from_points(points: &[SfmPoint]) -> Gaussians {
+    let mut known = BTreeSet::new();
+    let points: Vec<&SfmPoint> = points.iter().filter(|p| known.insert(p.position.to_array().map(f32::to_bits))).collect();
     let mut tree: KdTree<f64, 3> = KdTree::new();
     for (i, p) in points.iter().enumerate() {
         tree.add(&p.position.as_dvec3().to_array(), i as u64);
@@ -23,16 +27,20 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     scene
 }
 
-/// `count` grey points in front of random cameras, at depths around their distance to the cameras' common focus.
-pub fn random_points(cameras: &[Camera], count: usize, rng: &mut Rng) -> Vec<SfmPoint> {
-    let focus = common_focus(cameras);
+/// `count` points in front of random views, coloured as their photos are there, at depths around their distance to the cameras' common
+/// focus: the last resort where nothing else is known.
+pub fn random_points(views: &[Target], count: usize, rng: &mut Rng) -> Vec<SfmPoint> {
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
+    let focus = common_focus(&cameras);
     (0..count)
         .map(|_| {
-            let camera = &cameras[rng.below(cameras.len())];
-            let pixel = glam::Vec2::new(rng.uniform() * camera.width as f32, rng.uniform() * camera.height as f32);
+            let Target { camera, image, .. } = &views[rng.below(views.len())];
+            let pixel = [camera.width, camera.height].map(|side| rng.below(side as usize));
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
-            let position = camera.world_to_camera.inverse().transform_point3(camera.ray(pixel) * depth);
-            SfmPoint { position, color: [128; 3] }
+            let ray = camera.ray(glam::Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
+            let position = camera.world_to_camera.inverse().transform_point3(ray * depth);
+            let [r, g, b, _] = image.color[pixel[1] * camera.width as usize + pixel[0]].to_le_bytes();
+            SfmPoint { position, color: [r, g, b] }
         })
         .collect()
 }
@@ -54,6 +62,17 @@ pub fn common_focus(cameras: &[Camera]) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn points_in_one_place_are_one() {
+        let point = |x: f32| SfmPoint { position: Vec3::X * x, color: [9; 3] };
+        let mut points = vec![point(0.0); 100];
+        points.extend([point(1.0), point(2.0)]);
+        let scene = from_points(&points);
+        assert_eq!(scene.len(), 3);
+        assert!((scene.log_scales[1].x.exp() - 1.0).abs() < 1e-5, "the distance to both neighbours");
+        assert_eq!(from_points(&points[..1]).len(), 1);
+    }
 
     #[test]
     fn focus_is_where_the_cameras_look() {

@@ -7,6 +7,7 @@
 //!
 //! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as vectorised Rust ([`CpuEngine`]).
 
+pub mod align;
 pub mod budget;
 mod channels;
 mod checkpoint;
@@ -25,6 +26,7 @@ mod profile;
 mod schedule;
 mod shader;
 mod shape;
+mod target;
 mod trainer;
 pub mod tuning;
 mod view;
@@ -39,9 +41,10 @@ pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
 pub use open::{Choice, choice, open_engine};
 
-pub use schedule::{Budget, Strategy, TrainConfig};
+pub use schedule::{Alignment, Budget, Strategy, TrainConfig};
 pub use shape::Shape;
-pub use trainer::{Progress, Target, TrainReport, Trainer};
+pub use target::Target;
+pub use trainer::{Progress, TrainReport, Trainer};
 pub use view::{Rates, Step, View};
 
 /// Errors of the rasteriser.

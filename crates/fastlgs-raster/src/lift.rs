@@ -4,7 +4,7 @@ use crate::cpu;
 use crate::native::Lists;
 use crate::native::blend::{self, Job, Tile};
 use crate::view::{TILE, View};
-use fastlgs_core::{Camera, Gaussians, LabelMap};
+use fastlgs_core::{Gaussians, LabelMap};
 use kiddo::{KdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
@@ -26,11 +26,11 @@ const MIN_WEIGHT: f32 = 0.02;
 /// Votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
 ///
 /// # Panics
-/// If map and camera differ in size.
-pub fn votes(scene: &Gaussians, camera: &Camera, labels: &LabelMap) -> Vec<Vote> {
-    assert_eq!((camera.width, camera.height), (labels.width, labels.height), "the label map has the view's size");
-    let lists = lists_of(scene, camera);
-    let view = View::new(camera, scene.len(), 0);
+/// If map and view differ in size.
+pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
+    assert_eq!(view.size, [labels.width, labels.height], "the label map has the view's size");
+    let view = View { sh_degree: 0, ..*view };
+    let lists = lists_of(scene, &view);
     let of_tile = |sums: &mut Vec<f32>, tile: usize| {
         let [start, end] = lists.ranges[tile].map(|p| p as usize);
         let job = Job::new(&view, tile, &lists.gaussians[start..end], &lists.splats);
@@ -73,16 +73,16 @@ fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
 }
 
 /// Tile lists of a view; what depends on the viewing direction is left out.
-fn lists_of(scene: &Gaussians, camera: &Camera) -> Lists {
+fn lists_of(scene: &Gaussians, view: &View) -> Lists {
     let params = scene.to_channels();
     let n = scene.len();
-    Lists::new(&View::new(camera, n, 0), |i, c| params[c * n + i])
+    Lists::new(view, |i, c| params[c * n + i])
 }
 
 /// Largest blending weight alpha * transmittance of each Gaussian over all pixels of a view.
-pub fn largest_weights(scene: &Gaussians, camera: &Camera) -> Vec<f32> {
-    let view = View::new(camera, scene.len(), 0);
-    let lists = lists_of(scene, camera);
+pub fn largest_weights(scene: &Gaussians, view: &View) -> Vec<f32> {
+    let view = View { sh_degree: 0, ..*view };
+    let lists = lists_of(scene, &view);
     let of_tile = |tile: u32| {
         let [start, end] = lists.ranges[tile as usize].map(|p| p as usize);
         let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, cpu::shown(x, y, &view))).collect();
@@ -133,6 +133,7 @@ pub fn neighbours(scene: &Gaussians, k: usize) -> Vec<(u32, u32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::Camera;
     use glam::Vec3;
 
     #[test]
@@ -143,7 +144,7 @@ mod tests {
         scene.push_sphere(Vec3::new(0.0, 0.0, 2.0), 0.2, 0.95, [0.5; 3]); // mostly hidden behind the first
         let mut labels = LabelMap::new(64, 48);
         labels.labels.iter_mut().enumerate().for_each(|(p, l)| *l = if p % 64 < 32 { 1 } else { 2 });
-        let votes = votes(&scene, &camera, &labels);
+        let votes = votes(&scene, &View::new(&camera, 2, 0), &labels);
         let of = |g: u32, l: u16| votes.iter().find(|v| (v.gaussian, v.label) == (g, l)).map_or(0.0, |v| v.weight);
         assert!((of(0, 1) - of(0, 2)).abs() < 0.01 * of(0, 1), "the border cuts it in halves");
         assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden one has little to say");

@@ -31,6 +31,17 @@ impl Budget {
     }
 }
 
+/// Whether cameras are moved to where the scene says that they were.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Alignment {
+    /// No.
+    Off,
+    /// Where views that are not trained on show that it pays.
+    Auto,
+    /// Yes.
+    On,
+}
+
 /// What a training run needs to know; part of every checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainConfig {
@@ -52,8 +63,6 @@ pub struct TrainConfig {
     pub lambda: f32,
     /// Weight of the feature loss.
     pub feature_weight: f32,
-    /// Steps between rounds of density control.
-    pub refine_every: u32,
     /// Share of the iterations after which the scene no longer grows.
     pub refine_until: f32,
     /// Share of the iterations done at half the resolution.
@@ -66,6 +75,8 @@ pub struct TrainConfig {
     pub learn_background: bool,
     /// Learn an affine exposure for each training view.
     pub exposure: bool,
+    /// Move the cameras of the training views.
+    pub alignment: Alignment,
 }
 
 impl Default for TrainConfig {
@@ -80,29 +91,43 @@ impl Default for TrainConfig {
             first_degree: 0,
             lambda: 0.2,
             feature_weight: 1.0,
-            refine_every: 100,
             refine_until: 0.5,
             coarse_until: 0.2,
             antialias: false,
             background: [0.0; 3],
             learn_background: false,
             exposure: false,
+            alignment: Alignment::Off,
         }
     }
 }
 
-/// First step of density control.
-const FIRST_REFINEMENT: u32 = 300;
+/// Share of the iterations after which density control begins.
+const REFINE_FROM: f32 = 0.05;
+/// Rounds of density control that a run has room for, as far as the steps between two of them allow.
+const ROUNDS: u32 = 16;
+/// Fewest and most steps between two rounds: fewer tell little about gradients, more waste a long run.
+const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
+/// How often a run looks at its watched views, if it grew to its end.
+const LOOKS: u32 = 16;
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
 /// Shares of the iterations after which unimportant Gaussians are removed under an automatic budget.
 const PRUNE_AT: [f32; 2] = [0.55, 0.75];
+/// Share of the iterations for which MCMC moves Gaussians, as its authors do: 25,000 of 30,000.
+const MCMC_UNTIL: f32 = 0.83;
+/// Shares of the iterations after which cameras are aligned: once shapes stand, and so that what is left can follow.
+const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
+/// Weights of the means of opacity and scale in the loss. MCMC's authors have both. In the classic strategy the first stands for opacity
+/// resets, from which runs of a few thousand steps would not recover, and ends with the first removal: what no photo asks for fades, and goes.
+const OPACITY_WEIGHT: f32 = 0.01;
+const SCALE_WEIGHT: f32 = 0.01 / 3.0;
 /// Noise scale of MCMC against the means' learning rate.
 const NOISE: f32 = 5e5;
 
 impl TrainConfig {
     /// Share of the run that is done at a step.
-    fn progress(&self, iteration: u32) -> f32 {
+    pub(crate) fn progress(&self, iteration: u32) -> f32 {
         iteration as f32 / self.iterations.max(1) as f32
     }
 
@@ -110,15 +135,17 @@ impl TrainConfig {
         (self.iterations as f32 * share) as u32
     }
 
-    /// Learning rates of 3DGS; those of means decay exponentially to a hundredth. `extent`: size of the scene.
+    /// Learning rates of 3DGS; those of means decay exponentially to a hundredth, and so do those of features: at a constant 1e-2, two steps
+    /// lead out of what the paper's tau_ac accepts, and where views disagree a feature never comes to rest. `extent`: size of the scene.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
-        rates[0..3].fill(1.6e-4 * extent * 0.01f32.powf(self.progress(iteration)));
+        let decay = 0.01f32.powf(self.progress(iteration));
+        rates[0..3].fill(1.6e-4 * extent * decay);
         rates[3..6].fill(5e-3);
         rates[6..10].fill(1e-3);
         rates[10] = 5e-2;
         rates[11..14].fill(5e-3);
-        rates[14..17].fill(1e-2);
+        rates[14..17].fill(1e-2 * decay);
         rates[17] = 5e-3 / 20.0;
         rates
     }
@@ -134,11 +161,35 @@ impl TrainConfig {
         iteration < self.step_at(self.coarse_until)
     }
 
+    /// Steps between two rounds of density control.
+    fn between_rounds(&self) -> u32 {
+        let growing = self.step_at(self.density_until()).saturating_sub(self.step_at(REFINE_FROM));
+        (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
+    }
+
+    /// Rounds of density control from the one at `iteration` on.
+    pub(crate) fn rounds_left(&self, iteration: u32) -> u32 {
+        1 + self.step_at(self.density_until()).saturating_sub(iteration) / self.between_rounds()
+    }
+
+    /// Share of the iterations after which density control ends: with MCMC, which moves Gaussians as well, later than growth.
+    fn density_until(&self) -> f32 {
+        match self.strategy {
+            Strategy::Classic => self.refine_until,
+            Strategy::Mcmc => self.refine_until.max(MCMC_UNTIL),
+        }
+    }
+
     /// Whether a round of density control follows the step that made it `iteration` steps.
     pub(crate) fn refines(&self, iteration: u32) -> bool {
-        let until = self.step_at(self.refine_until);
-        let geometry = self.channels.color();
-        geometry && iteration.is_multiple_of(self.refine_every) && iteration >= FIRST_REFINEMENT.min(until) && iteration <= until
+        let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.density_until()));
+        let due = iteration.checked_sub(from).is_some_and(|since| since.is_multiple_of(self.between_rounds()));
+        self.channels.color() && due && iteration > 0 && iteration <= until
+    }
+
+    /// Whether the watched views are looked at then.
+    pub(crate) fn looks(&self, iteration: u32) -> bool {
+        matches!(self.budget, Budget::Auto(_)) && iteration.is_multiple_of((self.iterations / LOOKS).max(1))
     }
 
     /// Whether opacities are reset then: not in the last round, after which they could not recover.
@@ -152,6 +203,23 @@ impl TrainConfig {
     pub(crate) fn prunes(&self, iteration: u32) -> bool {
         let automatic = matches!(self.budget, Budget::Auto(_)) && self.channels.color();
         automatic && PRUNE_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
+    }
+
+    /// Whether the cameras of the training views are aligned to the scene then.
+    pub(crate) fn aligns(&self, iteration: u32) -> bool {
+        let asked = self.alignment != Alignment::Off && self.channels.color();
+        asked && ALIGN_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
+    }
+
+    /// Weights of each of so many Gaussians' opacity and scale in the loss of a step.
+    pub(crate) fn regularisers(&self, iteration: u32, gaussians: usize) -> [f32; 2] {
+        let each = 1.0 / gaussians as f32;
+        match self.strategy {
+            _ if !self.channels.color() => [0.0; 2],
+            Strategy::Mcmc => [OPACITY_WEIGHT * each, SCALE_WEIGHT * each],
+            Strategy::Classic if iteration < self.step_at(PRUNE_AT[0]) => [OPACITY_WEIGHT * each, 0.0],
+            Strategy::Classic => [0.0; 2],
+        }
     }
 
     /// Amount of the MCMC noise, where there is any.
@@ -169,16 +237,23 @@ mod tests {
         let config = TrainConfig { iterations: 8000, sh_degree: 3, budget: Budget::Auto(1000), ..TrainConfig::default() };
         assert_eq!([0, 999, 1000, 2500, 7999].map(|i| config.degree(i)), [0, 0, 1, 2, 3]);
         assert!(config.coarse(1599) && !config.coarse(1600));
-        assert!(config.refines(300) && !config.refines(200) && config.refines(4000) && !config.refines(4100));
+        assert!(config.refines(400) && !config.refines(300) && config.refines(4000) && !config.refines(4100));
+        let rounds = |iterations: u32| {
+            let config = TrainConfig { iterations, ..config.clone() };
+            (0..=iterations).filter(|i| config.refines(*i)).count()
+        };
+        assert_eq!([1000, 2000, 7000, 30_000].map(rounds), [17, 17, 32, 136]);
+        assert!(config.looks(500) && !config.looks(400));
         assert!(!config.resets_opacity(3000), "too late to recover");
         let long = TrainConfig { iterations: 30_000, ..config.clone() };
         assert!(long.resets_opacity(3000) && long.resets_opacity(12_000) && !long.resets_opacity(15_000));
         assert!(config.prunes(4400) && config.prunes(6000) && !config.prunes(6001));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
+        assert_eq!([4399, 4400].map(|i| config.regularisers(i, 1)), [[OPACITY_WEIGHT, 0.0], [0.0; 2]]);
         let continued = TrainConfig { first_degree: 2, ..config.clone() };
         assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
-        assert!(!frozen.refines(300) && !frozen.prunes(4400));
+        assert!(!frozen.refines(400) && !frozen.prunes(4400));
     }
 }

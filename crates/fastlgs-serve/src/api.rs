@@ -55,7 +55,7 @@ pub async fn scene(State(app): App) -> Answer {
                     "background": desk.scene.trained.background,
                     "objects": desk.grid.objects.len(),
                     "gaussians": desk.gaussians(),
-                    "min_score": desk.scene.min_score(),
+                    "min_score": QueryConfig::default().min_score(),
                     "support_share": query::SUPPORT_SHARE,
                     "segmenter": desk.scene.manifest.segmenter,
                     "encoder": desk.scene.manifest.encoder,
@@ -173,8 +173,7 @@ pub struct Asked {
     camera: Option<Camera>,
     size: Option<String>,
     top_k: Option<usize>,
-    min_score: Option<f32>,
-    margin: Option<f32>,
+    false_alarms: Option<f32>,
     /// Objects that are listed with their scores.
     candidates: Option<usize>,
     /// Whether mask and heat map come with the answer, as data URLs.
@@ -206,9 +205,8 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
     let work = move |desk: &mut Desk| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
-            min_score: asked.min_score.unwrap_or(desk.scene.min_score()),
+            false_alarms: asked.false_alarms.unwrap_or(defaults.false_alarms),
             top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
-            margin: asked.margin.unwrap_or(defaults.margin),
         };
         let candidates = asked.candidates.unwrap_or(CANDIDATES);
         let render_ms = desk.look(&camera)?;

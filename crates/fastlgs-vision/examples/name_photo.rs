@@ -2,8 +2,8 @@
 //!
 //! `cargo run --release -p fastlgs-vision --example name_photo -- photo.jpg cat coffee bicycle`
 
-use fastlgs_core::image_io;
-use fastlgs_vision::{Conse, Encoder, Level, OfflineSegmenter, OfflineText, Segmenter, TextEncoder};
+use fastlgs_core::{Level, image_io};
+use fastlgs_vision::{Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder};
 use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -15,7 +15,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let texts: Vec<&str> = words.iter().map(String::as_str).collect();
     let texts = OfflineText::load()?.embed(&texts)?;
 
-    let masks = OfflineSegmenter::load()?.segment(photo, &pixels)?.levels[Level::Whole as usize].clone();
+    let masks = OfflineSegmenter::load()?.segment(photo, &pixels)?.painted(Level::Whole);
     let embeddings = Conse::load()?.embed_masks(photo, &pixels, &masks)?;
     for (label, (embedding, area)) in embeddings.iter().zip(masks.areas().into_iter().skip(1)).enumerate() {
         let cosine = |text: &Vec<f32>| text.iter().zip(embedding).map(|(a, b)| a * b).sum::<f32>();

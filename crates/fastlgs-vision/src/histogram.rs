@@ -8,14 +8,19 @@ const SIDE: usize = 8;
 /// Length of a histogram.
 pub const BINS: usize = SIDE * SIDE * SIDE;
 
-/// Normalised joint RGB histogram of each label 1..=max.
+/// Normalised joint RGB histogram of each label 1..=max. A pixel counts in the two bins around it along each channel, as it lies between their
+/// middles: with hard bins, two photos of a thing of which one is a little brighter share few bins, and Algorithm 1 would ask for a cosine above 1.
 pub fn histograms(photo: &RgbImage, masks: &LabelMap) -> Vec<Vec<f32>> {
     let photo = image::imageops::resize(photo, masks.width, masks.height, FilterType::Triangle);
     let mut out = vec![vec![0.0f32; BINS]; usize::from(masks.max())];
     for (pixel, &label) in photo.pixels().zip(&masks.labels) {
         if label > 0 {
-            let bin = pixel.0.iter().fold(0, |b, &v| b * SIDE + usize::from(v) * SIDE / 256);
-            out[usize::from(label) - 1][bin] += 1.0;
+            let along = pixel.0.map(around);
+            for corner in 0..8usize {
+                let of = |c: usize| along[c][corner >> c & 1];
+                let bin = (0..3).fold(0, |b, c| b * SIDE + of(c).0);
+                out[usize::from(label) - 1][bin] += (0..3).map(|c| of(c).1).product::<f32>();
+            }
         }
     }
     for histogram in &mut out {
@@ -23,4 +28,29 @@ pub fn histograms(photo: &RgbImage, masks: &LabelMap) -> Vec<Vec<f32>> {
         histogram.iter_mut().for_each(|v| *v /= sum.max(1.0));
     }
     out
+}
+
+/// The two bins around a value, with its shares in them.
+fn around(value: u8) -> [(usize, f32); 2] {
+    let at = ((f32::from(value) + 0.5) * SIDE as f32 / 256.0 - 0.5).clamp(0.0, (SIDE - 1) as f32);
+    let below = (at as usize).min(SIDE - 2);
+    [(below, 1.0 - (at - below as f32)), (below + 1, at - below as f32)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::Rgb;
+
+    #[test]
+    fn a_little_more_light_changes_little() {
+        let masks = LabelMap { width: 2, height: 1, labels: vec![1, 1] };
+        let of = |v: u8| histograms(&RgbImage::from_pixel(2, 1, Rgb([v, v, v])), &masks).remove(0);
+        let alike = |a: u8, b: u8| of(a).iter().zip(of(b)).map(|(x, y)| (x * y).sqrt()).sum::<f32>();
+        for v in [0, 31, 32, 100, 255] {
+            assert!((of(v).iter().sum::<f32>() - 1.0).abs() < 1e-5 && (alike(v, v) - 1.0).abs() < 1e-5);
+        }
+        assert!(alike(30, 33) > 0.97, "over the border of two bins: {}", alike(30, 33));
+        assert!(alike(20, 120) < 0.01);
+    }
 }

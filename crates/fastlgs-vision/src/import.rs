@@ -1,14 +1,14 @@
 //! Masks and embeddings that other programs made, in the layouts that they leave beside the photos.
 
-use crate::masks::{Mask, paint};
 use crate::runtime::Array;
-use crate::segmenter::{Level, Segmentation, Segmenter};
+use crate::segmenter::Segmenter;
 use crate::{Encoder, Error, Result, encoder};
 use fastlgs_core::dataset::Dataset;
+use fastlgs_core::mask_list::{Mask, RunLengths};
 use fastlgs_core::npy::{self, Npy};
 use fastlgs_core::scene_folder::load_tensors;
 use fastlgs_core::undistort::Distortion;
-use fastlgs_core::{Camera, LabelMap, image_io};
+use fastlgs_core::{Camera, LabelMap, Level, MaskList, image_io};
 use image::RgbImage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,6 +18,9 @@ use std::path::{Path, PathBuf};
 pub enum Layout {
     /// `masks/NAME.png`: 16-bit labels, 0 for none; finer levels in `masks/part/` and `masks/subpart/`.
     Labels,
+    /// `masks/NAME.json` or `masks/STEM.json`: COCO's annotations with run lengths, as Segment Anything's own script writes them; masks may
+    /// overlap, and `track_id` is the same in all photos.
+    Annotations,
     /// `masks/STEM/*.png`: one black-and-white picture a mask, which may overlap.
     MaskFolders,
     /// LangSplat's `language_features/STEM_s.npy` (levels default, small, medium, large) and `STEM_f.npy`.
@@ -52,8 +55,30 @@ fn stem(view: &str) -> &str {
     Path::new(view).file_stem().and_then(|s| s.to_str()).unwrap_or(view)
 }
 
-/// Label maps as they are on disk, coarse to fine; those that a layout lacks are `None`.
-type Maps = [Option<LabelMap>; 3];
+/// Masks as they are on disk, and the row of each one's embedding among those of its photo: those of finer levels have none.
+struct Found {
+    list: MaskList,
+    rows: Vec<Option<usize>>,
+}
+
+impl Found {
+    /// From label maps, coarse to fine: embeddings are in the order of the coarsest map's labels, from 1 on.
+    fn of_maps(maps: &[LabelMap]) -> Self {
+        let mut found = Self { list: MaskList::new(maps[0].width, maps[0].height), rows: Vec::new() };
+        for (level, map) in Level::ALL.into_iter().zip(maps) {
+            let row = |label: u16| (level == Level::Whole).then(|| usize::from(label) - 1);
+            // Finer levels may be drawn at another size.
+            let map = map.resized(found.list.width, found.list.height);
+            found.rows.extend(found.list.add(level, &map).into_iter().map(row));
+        }
+        found
+    }
+
+    /// From masks in the order of their embeddings.
+    fn in_order(list: MaskList) -> Self {
+        Self { rows: (0..list.masks.len()).map(Some).collect(), list }
+    }
+}
 
 impl Import {
     /// Finds out which layout PHOTOS has.
@@ -65,7 +90,9 @@ impl Import {
         let some = |folder: &Path, want: &dyn Fn(&Path) -> bool| folder.read_dir().is_ok_and(|d| d.flatten().any(|e| want(&e.path())));
         let png = |p: &Path| p.extension().is_some_and(|e| e == "png");
         let level = |p: &Path| Level::ALL.iter().any(|l| p.ends_with(l.name()));
-        let layout = if some(&masks, &png) || some(&masks.join("whole"), &png) {
+        let layout = if some(&masks, &|p| p.extension().is_some_and(|e| e == "json")) {
+            Layout::Annotations
+        } else if some(&masks, &png) || some(&masks.join("whole"), &png) {
             Layout::Labels
         } else if some(&masks, &|p| p.is_dir() && !level(p)) {
             Layout::MaskFolders
@@ -77,7 +104,7 @@ impl Import {
             Layout::SpinNerf
         } else {
             return Err(Error::Missing(format!(
-                "{}: no masks to import; expected masks/NAME.png (16-bit labels), masks/STEM/*.png, language_features/ (LangSplat), \
+                "{}: no masks to import; expected masks/NAME.json (COCO's run lengths), masks/NAME.png (16-bit labels), masks/STEM/*.png, language_features/ (LangSplat), \
                  object_mask/ (Gaussian Grouping) or label/ (SPIn-NeRF) beside images/",
                 photos.display()
             )));
@@ -98,24 +125,23 @@ impl Import {
         })
     }
 
-    fn maps(&self, view: &str) -> Result<Maps> {
+    /// The masks of a view as they are on disk.
+    fn found(&self, view: &str) -> Result<Found> {
         let stem = stem(view);
-        let named = |folder: PathBuf| [folder.join(format!("{view}.png")), folder.join(format!("{stem}.png"))];
+        let named = |folder: PathBuf, ending: &str| [view, stem].map(|n| folder.join(format!("{n}.{ending}")));
+        let masks = self.photos.join("masks");
         match self.layout {
+            Layout::Annotations => Ok(Found::in_order(MaskList::load(&self.find(view, &named(masks, "json"))?)?)),
             Layout::Labels => {
-                let masks = self.photos.join("masks");
-                let whole = self.find(view, &[named(masks.clone()), named(masks.join("whole"))].concat())?;
-                let finer = |level: Level| {
-                    let path = named(masks.join(level.name())).into_iter().find(|p| p.is_file());
-                    path.map(|p| LabelMap::load(&p)).transpose()
-                };
-                Ok([Some(LabelMap::load(&whole)?), finer(Level::Part)?, finer(Level::Subpart)?])
+                let whole = self.find(view, &[named(masks.clone(), "png"), named(masks.join("whole"), "png")].concat())?;
+                let finer =
+                    [Level::Part, Level::Subpart].map(|level| named(masks.join(level.name()), "png").into_iter().find(|p| p.is_file()));
+                let whole = LabelMap::load(&whole)?;
+                let empty = || Ok(LabelMap::new(whole.width, whole.height));
+                let [part, subpart] = finer.map(|path| path.map_or_else(empty, |path| LabelMap::load(&path)));
+                Ok(Found::of_maps(&[whole.clone(), part?, subpart?]))
             }
-            Layout::MaskFolders => {
-                let masks = self.photos.join("masks");
-                let folder = self.find(view, &[masks.join(stem), masks.join(view)])?;
-                Ok([Some(overlaid(&folder)?), None, None])
-            }
+            Layout::MaskFolders => Ok(Found::in_order(pictures(&self.find(view, &[masks.join(stem), masks.join(view)])?)?)),
             Layout::LangSplat => {
                 let path = self.find(view, &[self.photos.join(format!("language_features/{stem}_s.npy"))])?;
                 let Npy { shape, values } = npy::read(&path)?;
@@ -129,35 +155,57 @@ impl Import {
                     let own = &values[k * rows * columns..][..rows * columns];
                     LabelMap { width: columns as u32, height: rows as u32, labels: own.iter().map(|v| (v + 1.0).max(0.0) as u16).collect() }
                 };
-                Ok(if levels == 1 { [Some(level(0)), None, None] } else { [3, 2, 1].map(|k| Some(level(k))) })
+                Ok(if levels == 1 { Found::of_maps(&[level(0)]) } else { Found::of_maps(&[3, 2, 1].map(level)) })
             }
             Layout::GaussianGrouping => {
-                let path = self.find(view, &named(self.photos.join("object_mask")))?;
-                Ok([Some(LabelMap::load(&path)?), None, None])
+                let map = LabelMap::load(&self.find(view, &named(self.photos.join("object_mask"), "png"))?)?;
+                let mut found = Found::of_maps(&[map]);
+                // Rows follow the labels, and these are the things' numbers in all photos.
+                found.list.masks.iter_mut().zip(&found.rows).for_each(|(mask, row)| mask.track = row.map(|r| r as u32 + 1));
+                Ok(found)
             }
             Layout::SpinNerf => {
                 let folder = spin_nerf_folder(&self.photos).expect("found when it was opened");
-                let mut map = LabelMap::load(&self.find(view, &named(folder))?)?;
+                let mut map = LabelMap::load(&self.find(view, &named(folder, "png"))?)?;
                 map.labels.iter_mut().for_each(|l| *l = u16::from(*l > 0));
-                Ok([Some(map), None, None])
+                Ok(Found::of_maps(&[map]))
             }
         }
     }
 
-    /// A map at the size of the working photo, without the lens's distortion.
-    fn fitted(&self, view: &str, map: LabelMap, width: u32, height: u32) -> Result<LabelMap> {
+    /// The masks of a view at the size of the working photo, without the lens's distortion; those of which nothing is left are gone.
+    fn fitted(&self, view: &str, width: u32, height: u32) -> Result<Found> {
+        let Found { list, rows } = self.found(view)?;
+        if list.masks.is_empty() {
+            tracing::warn!("the photo '{view}' has no masks");
+            return Ok(Found::in_order(MaskList::new(width, height)));
+        }
         let proportions = |w: u32, h: u32| f64::from(w) / f64::from(h);
-        if (proportions(map.width, map.height) / proportions(width, height) - 1.0).abs() > PROPORTIONS {
-            let (w, h) = (map.width, map.height);
+        if (proportions(list.width, list.height) / proportions(width, height) - 1.0).abs() > PROPORTIONS {
+            let (w, h) = (list.width, list.height);
             return Err(Error::Invalid(format!(
                 "the masks of '{view}' are {w}x{h}, which does not fit a photo of {width}x{height}; were they cropped or rotated?"
             )));
         }
-        let map = map.resized(width, height);
-        Ok(match self.lenses.get(view) {
-            Some((camera, distortion)) if !distortion.is_none() => map.undistorted(&camera.resized(width, height), distortion),
-            _ => map,
-        })
+        let lens = self.lenses.get(view).filter(|(_, distortion)| !distortion.is_none());
+        if (list.width, list.height) == (width, height) && lens.is_none() {
+            return Ok(Found { list, rows });
+        }
+        let mut fitted = Found::in_order(MaskList::new(width, height));
+        for (mask, row) in list.masks.iter().zip(rows) {
+            let mut map = LabelMap::new(list.width, list.height);
+            list.places(mask).for_each(|p| map.labels[p] = 1);
+            let mut map = map.resized(width, height);
+            if let Some((camera, distortion)) = lens {
+                map = map.undistorted(&camera.resized(width, height), distortion);
+            }
+            let runs = RunLengths::of(width, height, |x, y| map.at(x, y) > 0);
+            if runs.area() > 0 {
+                fitted.list.masks.push(Mask { runs, ..mask.clone() });
+                fitted.rows.push(row);
+            }
+        }
+        Ok(fitted)
     }
 
     /// Embeddings of a view's *whole* masks, label 1 first; none where the layout has none.
@@ -196,26 +244,22 @@ fn spin_nerf_folder(photos: &Path) -> Option<PathBuf> {
     folders.iter().map(|f| photos.join(f)).find(|f| f.is_dir())
 }
 
-/// All black-and-white pictures of a folder, in the order of their names, as one map; the smaller lie on top.
-fn overlaid(folder: &Path) -> Result<LabelMap> {
+/// All black-and-white pictures of a folder as masks, in the order of their names.
+fn pictures(folder: &Path) -> Result<MaskList> {
     let entries = folder.read_dir().map_err(fastlgs_core::Error::io(folder))?;
     let mut paths: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
     paths.sort();
-    let mut size = None;
-    let mut masks = Vec::new();
+    let mut list: Option<MaskList> = None;
     for path in paths {
         let picture = image_io::load_gray(&path)?;
-        let own = picture.dimensions();
-        if *size.get_or_insert(own) != own {
+        let (width, height) = picture.dimensions();
+        let list = list.get_or_insert_with(|| MaskList::new(width, height));
+        if (list.width, list.height) != (width, height) {
             return Err(Error::Invalid(format!("{}: it differs in size from the other masks of its folder", path.display())));
         }
-        match Mask::of([0, 0, own.0, own.1], |x, y| picture.get_pixel(x, y)[0] > 127) {
-            Some(mask) => masks.push(mask),
-            None => tracing::warn!("{}: the mask is empty", path.display()),
-        }
+        list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| picture.get_pixel(x, y)[0] > 127)));
     }
-    let (width, height) = size.ok_or_else(|| Error::Missing(format!("{}: no masks (*.png) in it", folder.display())))?;
-    Ok(paint(&masks, width, height))
+    list.ok_or_else(|| Error::Missing(format!("{}: no masks (*.png) in it", folder.display())))
 }
 
 impl Segmenter for Import {
@@ -223,15 +267,8 @@ impl Segmenter for Import {
         "import"
     }
 
-    fn segment(&self, view: &str, photo: &RgbImage) -> Result<Segmentation> {
-        let empty = || LabelMap::new(photo.width(), photo.height());
-        let [whole, part, subpart] =
-            self.maps(view)?.map(|map| map.map_or_else(|| Ok(empty()), |map| self.fitted(view, map, photo.width(), photo.height())));
-        let levels = [whole?, part?, subpart?];
-        if levels[0].max() == 0 {
-            tracing::warn!("the label map of '{view}' is empty");
-        }
-        Ok(Segmentation { levels })
+    fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList> {
+        Ok(self.fitted(view, photo.width(), photo.height())?.list)
     }
 }
 
@@ -246,39 +283,44 @@ impl Encoder for Import {
             let folder = self.photos.display();
             Error::Missing(format!("{folder}/embeddings: no embeddings of '{view}' (.npy or .safetensors, one row a mask)"))
         };
-        let rows = self.rows(view)?.ok_or_else(missing)?;
-        let dimension = rows.shape[1];
-        let [whole, ..] = self.segment(view, photo)?.levels;
-        if usize::from(whole.max()) > rows.shape[0] {
-            return Err(Error::Invalid(format!("'{view}' has masks up to label {} but {} embeddings", whole.max(), rows.shape[0])));
+        let embeddings = self.rows(view)?.ok_or_else(missing)?;
+        let dimension = embeddings.shape[1];
+        let Found { list, rows } = self.fitted(view, photo.width(), photo.height())?;
+        let needed = rows.iter().flatten().max().map_or(0, |r| r + 1);
+        if needed > embeddings.shape[0] {
+            return Err(Error::Invalid(format!("'{view}' has {needed} masks or labels but {} embeddings", embeddings.shape[0])));
         }
-        let embedding = |label: Option<u16>| match label {
-            Some(label) => {
-                let mut row = rows.values[(usize::from(label) - 1) * dimension..][..dimension].to_vec();
+        let with_row = MaskList { masks: list.masks.iter().zip(&rows).filter(|m| m.1.is_some()).map(|m| m.0.clone()).collect(), ..list };
+        let rows: Vec<usize> = rows.into_iter().flatten().collect();
+        let embedding = |place: Option<usize>| match place {
+            Some(place) => {
+                let mut row = embeddings.values[rows[place] * dimension..][..dimension].to_vec();
                 encoder::normalise(&mut row);
                 row
             }
             None => vec![0.0; dimension],
         };
-        Ok(fitting(masks, &whole).into_iter().map(embedding).collect())
+        Ok(fitting(masks, &with_row).into_iter().map(embedding).collect())
     }
 }
 
-/// For each label 1..=max of `masks` the label of `others`, which may be of another size, whose mask fits best, if it fits.
-pub fn fitting(masks: &LabelMap, others: &LabelMap) -> Vec<Option<u16>> {
-    let others = others.resized(masks.width, masks.height);
-    let mut common: BTreeMap<(u16, u16), usize> = BTreeMap::new();
-    masks.labels.iter().zip(&others.labels).for_each(|pair| *common.entry((*pair.0, *pair.1)).or_default() += 1);
-    let (areas, other_areas) = (masks.areas(), others.areas());
-    let best = |label: u16| {
-        let overlaps = common.range((label, 1)..=(label, u16::MAX)).map(|(&(_, other), &n)| {
-            let either = areas[usize::from(label)] + other_areas[usize::from(other)] - n;
-            (n as f32 / either as f32, other)
-        });
-        let best = overlaps.filter(|(iou, _)| *iou >= SAME).max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
-        best.map(|(_, other)| other)
-    };
-    (1..=masks.max()).map(best).collect()
+/// For each label 1..=max of `masks` the place of the mask in `others`, which has the same size, that fits best, if it fits.
+pub fn fitting(masks: &LabelMap, others: &MaskList) -> Vec<Option<usize>> {
+    let areas = masks.areas();
+    let mut best: Vec<(f32, Option<usize>)> = vec![(SAME, None); areas.len()];
+    for (place, other) in others.masks.iter().enumerate() {
+        let mut common: BTreeMap<u16, usize> = BTreeMap::new();
+        others.places(other).for_each(|p| *common.entry(masks.labels[p]).or_default() += 1);
+        let area = other.runs.area();
+        for (label, n) in common {
+            let iou = n as f32 / (areas[usize::from(label)] + area - n) as f32;
+            let (before, chosen) = &mut best[usize::from(label)];
+            if iou > *before || (iou == *before && chosen.is_none()) {
+                (*before, *chosen) = (iou, Some(place));
+            }
+        }
+    }
+    best.into_iter().skip(1).map(|b| b.1).collect()
 }
 
 #[cfg(test)]
@@ -311,6 +353,11 @@ mod tests {
         Import::open(dir, BTreeMap::new()).unwrap()
     }
 
+    fn levels(import: &Import) -> [LabelMap; 3] {
+        let found = import.segment("a.jpg", &photo()).unwrap();
+        Level::ALL.map(|level| found.painted(level))
+    }
+
     fn gray(path: &Path, value: impl Fn(u32, u32) -> u8) {
         image_io::save_png(path, GrayImage::from_fn(PHOTO.0, PHOTO.1, |x, y| Luma([value(x, y)]))).unwrap();
     }
@@ -322,7 +369,7 @@ mod tests {
         halves(8, 4).save(&dir.path().join("masks/part/a.png")).unwrap();
         let import = open(dir.path());
         assert_eq!(import.layout(), Layout::Labels);
-        let [whole, part, subpart] = import.segment("a.jpg", &photo()).unwrap().levels;
+        let [whole, part, subpart] = levels(&import);
         assert_eq!((&whole, &part), (&halves(8, 4), &halves(8, 4)), "scaled to the photo");
         assert_eq!(subpart.max(), 0);
         assert!(import.segment("b.jpg", &photo()).err().unwrap().to_string().contains("b.jpg"));
@@ -345,6 +392,14 @@ mod tests {
         assert_eq!(import.embed_masks("a.jpg", &photo(), &other).unwrap(), [vec![0.0, 1.0], vec![1.0, 0.0], vec![0.0, 0.0]]);
         npy(&dir.path().join("embeddings/a.npy"), &[1, 2], &[3.0f32, 0.0]);
         assert!(import.embed_masks("a.jpg", &photo(), &other).unwrap_err().to_string().contains("1 embeddings"));
+        // Of two that overlap, each answers for itself.
+        let both = |x: u32| if x < 2 { 1 } else { 2 };
+        let map = LabelMap { width: 8, height: 4, labels: (0..32).map(|p| both(p % 8)).collect() };
+        let list = |ends: [u32; 2]| MaskList {
+            masks: ends.map(|end| Mask::new(Level::Whole, RunLengths::of(8, 4, |x, _| x < end))).to_vec(),
+            ..MaskList::new(8, 4)
+        };
+        assert_eq!(fitting(&map, &list([8, 2])), [Some(1), Some(0)]);
     }
 
     #[test]
@@ -355,11 +410,11 @@ mod tests {
         npy(&features.join("a_s.npy"), &[4, 4, 8], &level(0).chain(level(1)).chain(level(2)).chain(level(3)).collect::<Vec<_>>());
         npy(&features.join("a_f.npy"), &[4, 2], &[1.0f32, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, -2.0]);
         let import = open(dir.path());
-        let levels = import.segment("a.jpg", &photo()).unwrap().levels;
-        assert_eq!(levels.each_ref().map(|m| m.at(0, 0)), [4, 3, 2], "large, medium, small");
+        let levels = levels(&import);
+        assert_eq!(levels.each_ref().map(|m| m.at(0, 0)), [1; 3], "large, medium, small");
         assert_eq!(levels[0].at(7, 0), 0);
         let embeddings = import.embed_masks("a.jpg", &photo(), &levels[0]).unwrap();
-        assert_eq!(embeddings[3], [0.0, -1.0]);
+        assert_eq!(embeddings, [[0.0, -1.0]], "the large one's");
     }
 
     #[test]
@@ -368,17 +423,25 @@ mod tests {
         gray(&dir.path().join("images_4/label/a.png"), |x, _| if x < 2 { 255 } else { 0 });
         let import = open(dir.path());
         assert_eq!(import.layout(), Layout::SpinNerf);
-        let whole = |import: &Import| import.segment("a.jpg", &photo()).unwrap().levels[0].clone();
+        let whole = |import: &Import| levels(import)[0].clone();
         assert_eq!((whole(&import).at(1, 0), whole(&import).at(2, 0)), (1, 0));
 
         gray(&dir.path().join("object_mask/a.png"), |x, _| if x < 2 { 7 } else { 9 });
-        assert_eq!((open(dir.path()).layout(), whole(&open(dir.path())).at(7, 3)), (Layout::GaussianGrouping, 9));
+        assert_eq!(open(dir.path()).layout(), Layout::GaussianGrouping);
+        let tracks: Vec<_> = open(dir.path()).segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.track).collect();
+        assert_eq!(tracks, [Some(7), Some(9)]);
 
         gray(&dir.path().join("masks/a/0.png"), |_, _| 255);
         gray(&dir.path().join("masks/a/1.png"), |x, _| if x < 2 { 255 } else { 0 });
         let import = open(dir.path());
         assert_eq!(import.layout(), Layout::MaskFolders);
         assert_eq!((whole(&import).at(0, 0), whole(&import).at(5, 0)), (2, 1));
+        let areas: Vec<usize> = import.segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.runs.area()).collect();
+        assert_eq!(areas, [32, 8], "what lies below is whole");
+
+        import.segment("a.jpg", &photo()).unwrap().save(&dir.path().join("masks/a.json")).unwrap();
+        assert_eq!(open(dir.path()).layout(), Layout::Annotations);
+        assert_eq!(open(dir.path()).segment("a.jpg", &photo()).unwrap(), import.segment("a.jpg", &photo()).unwrap());
     }
 
     #[test]
@@ -394,7 +457,7 @@ mod tests {
         };
         let lens = (camera, Distortion { k1: 1.0, ..Distortion::default() });
         let import = Import::open(dir.path(), BTreeMap::from([("a.jpg".to_owned(), lens)])).unwrap();
-        let whole = import.segment("a.jpg", &photo()).unwrap().levels[0].clone();
+        let [whole, ..] = levels(&import);
         // The corner's ray lies outside what the distorted photo shows.
         assert_eq!((whole.at(0, 0), whole.at(3, 2), whole.at(4, 2)), (0, 1, 2));
     }

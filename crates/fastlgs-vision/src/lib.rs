@@ -4,6 +4,7 @@
 
 pub mod attributes;
 pub mod brightness;
+pub mod bundle;
 pub mod clip;
 pub mod clip_tokens;
 pub mod conse;
@@ -25,11 +26,17 @@ pub mod places;
 pub mod pose_check;
 pub mod pull;
 pub mod regions;
+pub mod resection;
+#[cfg(test)]
+mod ring;
 pub mod runtime;
 pub mod sam;
 pub mod segmenter;
+pub mod similarity;
 pub mod structure;
+pub mod sweep;
 pub mod text;
+pub mod tracks;
 pub mod triangulate;
 
 #[cfg(test)]
@@ -44,7 +51,7 @@ pub use conse::Conse;
 pub use encoder::{Encoder, TextEncoder};
 pub use import::Import;
 pub use sam::Sam;
-pub use segmenter::{Level, OfflineSegmenter, Segmentation, Segmenter};
+pub use segmenter::{OfflineSegmenter, Segmenter};
 pub use text::{MiniLm, OfflineText};
 
 /// Errors of the vision crate.

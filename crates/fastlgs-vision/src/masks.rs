@@ -1,17 +1,17 @@
-//! Masks of single things, which may overlap; label maps cannot hold those.
+//! Masks while they are made: a bit a pixel, over their bounding boxes only.
 
-use fastlgs_core::LabelMap;
+use fastlgs_core::mask_list::RunLengths;
 
 /// A mask, held over its bounding box only.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Mask {
+pub struct BitMask {
     /// Left, top, right, bottom in pixels; right and bottom are exclusive.
     pub bounds: [u32; 4],
     /// Whether a pixel of the box belongs to the mask, row-major.
     pub bits: Vec<bool>,
 }
 
-impl Mask {
+impl BitMask {
     /// The mask of the pixels of `bounds` for which `member` (x, y) holds, cut to their own bounding box; none if there are none.
     pub fn of(bounds: [u32; 4], member: impl Fn(u32, u32) -> bool) -> Option<Self> {
         let [x0, y0, x1, y1] = bounds;
@@ -52,10 +52,20 @@ impl Mask {
         (x0..x1).contains(&x) && (y0..y1).contains(&y) && self.bits[(y - y0) as usize * self.width() + (x - x0) as usize]
     }
 
+    /// Its runs in a picture of that size.
+    pub fn runs(&self, width: u32, height: u32) -> RunLengths {
+        RunLengths::of(width, height, |x, y| self.at(x, y))
+    }
+
+    /// Pixels that both have.
+    pub fn common(&self, other: &Self) -> usize {
+        let [x0, y0, x1, y1] = meet(self.bounds, other.bounds);
+        (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).filter(|&(x, y)| self.at(x, y) && other.at(x, y)).count()
+    }
+
     /// Intersection over union.
     pub fn iou(&self, other: &Self) -> f32 {
-        let [x0, y0, x1, y1] = meet(self.bounds, other.bounds);
-        let common = (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).filter(|&(x, y)| self.at(x, y) && other.at(x, y)).count();
+        let common = self.common(other);
         common as f32 / (self.area() + other.area() - common).max(1) as f32
     }
 
@@ -117,29 +127,13 @@ fn components(bits: &[bool], width: usize, value: bool) -> Vec<Vec<usize>> {
     out
 }
 
-/// A label map of masks: large ones first, so that smaller ones lie on top. Labels 1, 2, ... follow falling area.
-pub fn paint(masks: &[Mask], width: u32, height: u32) -> LabelMap {
-    let mut order: Vec<(usize, usize)> = masks.iter().map(Mask::area).zip(0..).collect();
-    order.sort_by_key(|&(area, k)| (std::cmp::Reverse(area), k));
-    let mut map = LabelMap::new(width, height);
-    for (label, &(_, k)) in order.iter().enumerate().take(usize::from(u16::MAX)) {
-        let mask = &masks[k];
-        let [x0, y0, ..] = mask.bounds;
-        for (i, _) in mask.bits.iter().enumerate().filter(|b| *b.1) {
-            let (x, y) = (x0 as usize + i % mask.width(), y0 as usize + i / mask.width());
-            map.labels[y * width as usize + x] = label as u16 + 1;
-        }
-    }
-    map
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn mask(rows: &[&str]) -> Mask {
+    fn mask(rows: &[&str]) -> BitMask {
         let (w, h) = (rows[0].len() as u32, rows.len() as u32);
-        Mask::of([0, 0, w, h], |x, y| rows[y as usize].as_bytes()[x as usize] == b'#').unwrap()
+        BitMask::of([0, 0, w, h], |x, y| rows[y as usize].as_bytes()[x as usize] == b'#').unwrap()
     }
 
     #[test]
@@ -150,7 +144,7 @@ mod tests {
         assert!((a.iou(&b) - 2.0 / 6.0).abs() < 1e-6);
         assert!((box_iou(a.bounds, b.bounds) - 2.0 / 6.0).abs() < 1e-6);
         assert_eq!(box_iou([0, 0, 1, 1], [5, 5, 6, 6]), 0.0);
-        assert!(Mask::of([0, 0, 3, 3], |_, _| false).is_none());
+        assert!(BitMask::of([0, 0, 3, 3], |_, _| false).is_none());
     }
 
     #[test]
@@ -159,11 +153,5 @@ mod tests {
         let without = with.clone().without_specks(2).unwrap();
         assert_eq!(without, mask(&["#####...", "#####...", "####....", "#####..."]));
         assert!(with.without_specks(50).is_none());
-    }
-
-    #[test]
-    fn smaller_masks_lie_on_top() {
-        let map = paint(&[mask(&["#."]), mask(&["##"])], 2, 1);
-        assert_eq!(map.labels, [2, 1]);
     }
 }

@@ -1,6 +1,7 @@
 //! ONNX Runtime, loaded at run time from a shared library, or linked in (`--features download-ort`).
 
 use crate::{Error, Result, places};
+use half::f16;
 use ort::environment::Environment;
 use ort::session::Session;
 use ort::value::{DynValue, Tensor, TensorElementType, ValueType};
@@ -143,8 +144,12 @@ impl Model {
         let found = session.run(values).map_err(failed)?;
         let array = |name: &&str| {
             let value = found.get(*name).ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;
+            let lengths = |shape: &[i64]| shape.iter().map(|d| *d as usize).collect::<Vec<_>>();
+            if let Ok((shape, data)) = value.try_extract_tensor::<f16>() {
+                return Ok(Array::new(lengths(shape), data.iter().map(|v| v.to_f32()).collect()));
+            }
             let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
-            Ok(Array::new(shape.iter().map(|d| *d as usize).collect::<Vec<_>>(), data.to_vec()))
+            Ok(Array::new(lengths(shape), data.to_vec()))
         };
         outputs.iter().map(array).collect()
     }
@@ -152,6 +157,9 @@ impl Model {
     fn tensor(&self, slot: &Slot, Array { shape, values }: Array) -> Result<DynValue> {
         let value = match slot.kind {
             TensorElementType::Float32 => Tensor::from_array((shape, values)).map(Tensor::into_dyn),
+            TensorElementType::Float16 => {
+                Tensor::from_array((shape, values.iter().map(|v| f16::from_f32(*v)).collect::<Vec<_>>())).map(Tensor::into_dyn)
+            }
             TensorElementType::Int64 => {
                 Tensor::from_array((shape, values.iter().map(|v| *v as i64).collect::<Vec<_>>())).map(Tensor::into_dyn)
             }

@@ -6,45 +6,18 @@ use crate::edges::Hed;
 use crate::exposure;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::color::lab;
-use fastlgs_core::{LabelMap, image_io};
+use fastlgs_core::{LabelMap, MaskList, image_io};
 use image::RgbImage;
-
-/// How large a thing a mask stands for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Level {
-    /// Objects (the paper's *whole* level).
-    Whole,
-    /// Their parts.
-    Part,
-    /// Parts of parts.
-    Subpart,
-}
-
-impl Level {
-    /// Coarse to fine.
-    pub const ALL: [Self; 3] = [Self::Whole, Self::Part, Self::Subpart];
-
-    /// Name of its folder and in options.
-    pub fn name(self) -> &'static str {
-        ["whole", "part", "subpart"][self as usize]
-    }
-}
-
-/// Masks of one photo.
-pub struct Segmentation {
-    /// One map a level, coarse to fine.
-    pub levels: [LabelMap; 3],
-}
 
 /// Finds masks.
 pub trait Segmenter: Sync {
     /// Name recorded in the scene.
     fn name(&self) -> &'static str;
-    /// Segments the photo of the view of that name; the label maps have its size.
+    /// The masks of the photo of the view of that name; the list has its size.
     ///
     /// # Errors
     /// When inference fails, or masks that were made elsewhere are missing.
-    fn segment(&self, view: &str, photo: &RgbImage) -> Result<Segmentation>;
+    fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList>;
 }
 
 /// Learned edges (HED), colour and the classifier's dense opinion, turned into a region hierarchy whose most lasting
@@ -115,7 +88,7 @@ impl Segmenter for OfflineSegmenter {
         "offline"
     }
 
-    fn segment(&self, _view: &str, photo: &RgbImage) -> Result<Segmentation> {
+    fn segment(&self, _view: &str, photo: &RgbImage) -> Result<MaskList> {
         let photo = &exposure::lifted(photo);
         let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));
         let (w, h) = (small.width() as usize, small.height() as usize);
@@ -127,7 +100,7 @@ impl Segmenter for OfflineSegmenter {
             let cut = tree.best_cut(|i| persistence(&tree, i, low, high));
             label_map(&tree, &cut, &basins, w, h).resized(photo.width(), photo.height())
         };
-        Ok(Segmentation { levels: [WHOLE_HEIGHTS, PART_HEIGHTS, SUBPART_HEIGHTS].map(paint) })
+        Ok(MaskList::of_levels(&[WHOLE_HEIGHTS, PART_HEIGHTS, SUBPART_HEIGHTS].map(paint)))
     }
 }
 

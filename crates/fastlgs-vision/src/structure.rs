@@ -4,7 +4,7 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
-use crate::triangulate::PairMatches;
+use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{colmap, is_photo};
 use fastlgs_core::{fs, image_io};

@@ -1,48 +1,34 @@
-//! Points from matched key points and known poses, and which photos see the same.
+//! Points of the scene from pixels of several photos with known poses.
 
-use crate::keypoints::{Keypoints, epipolar_error, fundamental};
 use fastlgs_core::Camera;
-use fastlgs_core::dataset::SfmPoint;
-use glam::{Vec2, Vec3};
+use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 
-/// A matched pair of photos: indices, and key-point pairs that obey the known poses.
-#[derive(Clone, Debug)]
-pub struct PairMatches {
-    /// Index of the earlier photo.
-    pub a: usize,
-    /// Index of the later photo.
-    pub b: usize,
-    /// (key point in a, key point in b).
-    pub pairs: Vec<(usize, usize)>,
-}
-
-/// Largest epipolar error of a match in pixels.
-const MAX_EPIPOLAR: f32 = 2.0;
 /// Smallest angle between the rays of a triangulated point, in radians.
 const MIN_ANGLE: f32 = 0.02;
+/// Observations of a point whose pairs are tried as starts.
+const TRIED: usize = 6;
+/// Gauss-Newton steps; two are enough near the solution.
+const STEPS: usize = 4;
 
-/// For each photo the `count` others that look at the same from nearby: pairs (a, b), a < b, sorted.
-pub fn overlapping_pairs(cameras: &[Camera], count: usize) -> Vec<(usize, usize)> {
-    let span = fastlgs_core::camera::scene_extent(cameras);
-    let mut pairs = std::collections::BTreeSet::new();
-    for (i, a) in cameras.iter().enumerate() {
-        let cost = |b: &Camera| a.centre().distance(b.centre()) / span + 2.0 * (1.0 - a.forward().dot(b.forward()));
-        let mut others: Vec<usize> = (0..cameras.len()).filter(|&j| j != i && a.forward().dot(cameras[j].forward()) > 0.3).collect();
-        others.sort_by(|&x, &y| cost(&cameras[x]).total_cmp(&cost(&cameras[y])).then(x.cmp(&y)));
-        pairs.extend(others.into_iter().take(count).map(|j| (i.min(j), i.max(j))));
-    }
-    pairs.into_iter().collect()
+/// A point and who sees it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Located {
+    /// In the world.
+    pub position: Vec3,
+    /// Root mean square of its reprojection errors in pixels.
+    pub error: f32,
+    /// Places of the observations that agree.
+    pub agreeing: Vec<usize>,
 }
 
-/// Keeps the matches that agree with the poses.
-pub fn epipolar_filter(a: (&Camera, &Keypoints), b: (&Camera, &Keypoints), pairs: &[(usize, usize)]) -> Vec<(usize, usize)> {
-    let f = fundamental(a.0, b.0);
-    let good = |&&(i, j): &&(usize, usize)| epipolar_error(&f, a.1.positions[i], b.1.positions[j]) < MAX_EPIPOLAR;
-    pairs.iter().filter(good).copied().collect()
+/// Distance in pixels between where a camera sees a point and where it should; none behind the camera.
+pub fn reprojection_error(camera: &Camera, point: Vec3, pixel: Vec2) -> Option<f32> {
+    let q = camera.world_to_camera.transform_point3(point);
+    (q.z > 0.0).then(|| camera.to_pixel(q).distance(pixel))
 }
 
-/// The point nearest to both rays, if it lies before both cameras and reprojects well.
-pub(crate) fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2) -> Option<Vec3> {
+/// The point nearest to both rays, if these meet at an angle that tells the depth, before both cameras and within `tolerance` pixels.
+pub(crate) fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2, tolerance: f32) -> Option<Vec3> {
     let ray = |c: &Camera, p: Vec2| (c.world_to_camera.inverse().transform_vector3(c.ray(p))).normalize();
     let (oa, ob, da, db) = (a.centre(), b.centre(), ray(a, pa), ray(b, pb));
     let cosine = da.dot(db);
@@ -50,45 +36,109 @@ pub(crate) fn intersect(a: &Camera, pa: Vec2, b: &Camera, pb: Vec2) -> Option<Ve
         return None;
     }
     let between = ob - oa;
-    let (pa_, pb_) = (between.dot(da), between.dot(db));
+    let (along_a, along_b) = (between.dot(da), between.dot(db));
     let sine2 = 1.0 - cosine * cosine;
-    let (s, t) = ((pa_ - cosine * pb_) / sine2, (cosine * pa_ - pb_) / sine2);
+    let (s, t) = ((along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2);
     let point = 0.5 * (oa + s * da + ob + t * db);
-    let seen = |c: &Camera, p: Vec2| {
-        let q = c.world_to_camera.transform_point3(point);
-        q.z > 0.0 && c.to_pixel(q).distance(p) < MAX_EPIPOLAR
-    };
+    let seen = |c: &Camera, p: Vec2| reprojection_error(c, point, p).is_some_and(|error| error < tolerance);
     (s > 0.0 && t > 0.0 && seen(a, pa) && seen(b, pb)).then_some(point)
 }
 
-/// Triangulates every match; `colors` are those of each photo's key points, of which the first photo's is taken.
-pub fn triangulate(cameras: &[Camera], keypoints: &[Keypoints], colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Vec<SfmPoint> {
-    let mut points = Vec::new();
-    for m in matches {
-        let (a, b) = (&cameras[m.a], &cameras[m.b]);
-        for &(i, j) in &m.pairs {
-            let pa = keypoints[m.a].positions[i];
-            if let Some(position) = intersect(a, pa, b, keypoints[m.b].positions[j]) {
-                points.push(SfmPoint { position, color: colors[m.a][i] });
+/// The point that most of the observations agree on within `tolerance` pixels, two at least: the best of the intersections of pairs, then
+/// least squares over those that agree.
+pub fn locate(seen: &[(&Camera, Vec2)], tolerance: f32) -> Option<Located> {
+    let agreeing = |point: Vec3| -> (Vec<usize>, f32) {
+        let errors = seen.iter().enumerate().filter_map(|(k, (c, p))| Some((k, reprojection_error(c, point, *p)?)));
+        let near: Vec<(usize, f32)> = errors.filter(|(_, error)| *error < tolerance).collect();
+        let square = near.iter().map(|(_, e)| e * e).sum::<f32>();
+        (near.iter().map(|n| n.0).collect(), square)
+    };
+    let tried: Vec<usize> = (0..seen.len().min(TRIED)).map(|k| k * seen.len() / seen.len().min(TRIED)).collect();
+    let mut best: Option<(Vec3, Vec<usize>, f32)> = None;
+    for (n, &i) in tried.iter().enumerate() {
+        for &j in &tried[n + 1..] {
+            let Some(point) = intersect(seen[i].0, seen[i].1, seen[j].0, seen[j].1, tolerance) else { continue };
+            let (who, square) = agreeing(point);
+            let better = |b: &(Vec3, Vec<usize>, f32)| who.len() > b.1.len() || who.len() == b.1.len() && square < b.2;
+            if best.as_ref().is_none_or(better) {
+                best = Some((point, who, square));
             }
         }
     }
-    points
+    let (start, who, _) = best.filter(|b| b.1.len() >= 2)?;
+    let position = least_squares(start, who.iter().map(|&k| seen[k]));
+    let (agreeing, square) = agreeing(position);
+    (agreeing.len() >= 2).then(|| Located { position, error: (square / agreeing.len() as f32).sqrt(), agreeing })
+}
+
+/// The point with the least sum of squared reprojection errors, from one near it (Gauss-Newton).
+fn least_squares<'a>(start: Vec3, seen: impl Iterator<Item = (&'a Camera, Vec2)> + Clone) -> Vec3 {
+    let mut point = start.as_dvec3();
+    for _ in 0..STEPS {
+        let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+        for (camera, pixel) in seen.clone() {
+            let pose = camera.world_to_camera.as_dmat4();
+            let q = pose.transform_point3(point);
+            let (fx, fy) = (f64::from(camera.fx), f64::from(camera.fy));
+            let shown = DVec2::new(fx * q.x / q.z + f64::from(camera.cx), fy * q.y / q.z + f64::from(camera.cy));
+            let residual = shown - pixel.as_dvec2();
+            let turned = DMat3::from_mat4(pose).transpose();
+            for (row, r) in [
+                (turned * DVec3::new(fx / q.z, 0.0, -fx * q.x / (q.z * q.z)), residual.x),
+                (turned * DVec3::new(0.0, fy / q.z, -fy * q.y / (q.z * q.z)), residual.y),
+            ] {
+                normal += DMat3::from_cols(row * row.x, row * row.y, row * row.z);
+                right -= row * r;
+            }
+        }
+        let step = normal.inverse() * right;
+        if !step.is_finite() {
+            break;
+        }
+        point += step;
+    }
+    point.as_vec3()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::rng::Rng;
+
+    fn ring(count: usize) -> Vec<Camera> {
+        let eye = |k: usize| 4.0 * Vec3::new((0.3 * k as f32).cos(), 0.2, (0.3 * k as f32).sin());
+        (0..count).map(|k| Camera::look_at(&k.to_string(), eye(k), Vec3::ZERO, Vec3::Y, 320, 240, 0.8)).collect()
+    }
+
+    fn see(camera: &Camera, point: Vec3) -> Vec2 {
+        camera.to_pixel(camera.world_to_camera.transform_point3(point))
+    }
 
     #[test]
     fn two_rays_meet_where_the_point_is() {
-        let a = Camera::look_at("a", Vec3::new(3.0, 0.0, 0.0), Vec3::ZERO, Vec3::Y, 320, 240, 0.8);
-        let b = Camera::look_at("b", Vec3::new(1.0, 0.5, 3.0), Vec3::ZERO, Vec3::Y, 300, 200, 0.7);
+        let cameras = ring(3);
         let point = Vec3::new(0.2, -0.3, 0.1);
-        let see = |c: &Camera| c.to_pixel(c.world_to_camera.transform_point3(point));
-        assert!((intersect(&a, see(&a), &b, see(&b)).unwrap() - point).length() < 1e-3);
-        assert!(intersect(&a, see(&a), &a, see(&a)).is_none(), "no parallax, no point");
-        let pairs = overlapping_pairs(&[a.clone(), b, a], 1);
-        assert!(pairs.contains(&(0, 2)), "the twin camera is the nearest: {pairs:?}");
+        let [a, b] = [&cameras[0], &cameras[2]];
+        assert!((intersect(a, see(a, point), b, see(b, point), 1.0).unwrap() - point).length() < 1e-3);
+        assert!(intersect(a, see(a, point), a, see(a, point), 1.0).is_none(), "no parallax, no point");
+    }
+
+    #[test]
+    fn a_point_of_many_views_is_better_than_one_of_two_and_survives_a_liar() {
+        let cameras = ring(8);
+        let mut rng = Rng::new(2, "noise");
+        let (mut of_all, mut of_two) = (0.0, 0.0);
+        for _ in 0..50 {
+            let point = Vec3::new(rng.range(-0.5, 0.5), rng.range(-0.5, 0.5), rng.range(-0.5, 0.5));
+            let mut seen: Vec<(&Camera, Vec2)> =
+                cameras.iter().map(|c| (c, see(c, point) + 0.5 * Vec2::new(rng.normal(), rng.normal()))).collect();
+            of_two += locate(&seen[..2], 4.0).map_or(0.0, |l| l.position.distance(point));
+            seen[5].1 += Vec2::new(40.0, -30.0);
+            let located = locate(&seen, 4.0).unwrap();
+            assert_eq!(located.agreeing, [0, 1, 2, 3, 4, 6, 7]);
+            assert!(located.error < 1.5);
+            of_all += located.position.distance(point);
+        }
+        assert!(of_all < 0.5 * of_two, "{of_all} against {of_two}");
     }
 }

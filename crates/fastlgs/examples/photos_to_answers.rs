@@ -39,8 +39,7 @@ fn main() -> fastlgs::Result<()> {
     let mut session = Session::open(scene.as_ref(), "auto")?;
     let (camera, grid) = (session.cameras[0].clone(), session.grid()?);
     let field = session.field(&camera, None)?;
-    let config = QueryConfig { min_score: session.min_score(), ..QueryConfig::default() };
-    let question = Question { ask: &Ask::Text(text.clone()), negatives: &[], config, dilate: None, candidates: 3 };
+    let question = Question { ask: &Ask::Text(text.clone()), negatives: &[], config: QueryConfig::default(), dilate: None, candidates: 3 };
     let (answer, report) = question.put(&session, &grid, &field, &camera, 0.0)?;
     let pixels = answer.mask.iter().filter(|m| **m).count();
     println!("{text}: {}, score {:.2}, {pixels} pixels of {}", if report.found { "found" } else { "not found" }, report.score, report.view);

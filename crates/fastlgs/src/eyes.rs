@@ -3,15 +3,13 @@
 use crate::Result;
 use crate::error::{Context, bail};
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
-use fastlgs_core::{LabelMap, SceneFolder};
+use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
-use fastlgs_vision::{
-    ClipImage, ClipText, Conse, Encoder, Level, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, models, places,
-};
+use fastlgs_vision::{ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, models, places};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -40,6 +38,20 @@ impl SegmenterKind {
             Self::Import => "import",
         }
     }
+}
+
+/// How SAM is asked for all masks of a photo.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum SamPreset {
+    /// As its authors' generator does: predicted IoU 0.88, stability 0.95, no crops.
+    #[default]
+    Meta,
+    /// As LangSplat does, whose masks the paper takes: 0.7, 0.85, one layer of crops, and masks of one level that do not repeat or hold each
+    /// other.
+    #[cfg_attr(feature = "clap", value(name = "langsplat"))]
+    LangSplat,
 }
 
 /// What embeds masks.
@@ -90,15 +102,18 @@ pub struct Eyes {
     /// SAM's prompt decoder, instead of --sam.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_encoder"))]
     pub sam_decoder: Option<PathBuf>,
-    /// Point prompts along each side of a photo.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_points, value_parser = clap::value_parser!(u32).range(1..=128)))]
-    pub sam_points: u32,
-    /// Least IoU that SAM predicts for its own mask.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_iou))]
-    pub sam_iou: f32,
-    /// Least stability of SAM's masks.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Eyes::default().sam_stability))]
-    pub sam_stability: f32,
+    /// How SAM is asked for all masks of a photo.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub sam_preset: SamPreset,
+    /// Point prompts along each side of a photo, instead of the preset's 32.
+    #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(1..=128)))]
+    pub sam_points: Option<u32>,
+    /// Least IoU that SAM predicts for its own mask, instead of the preset's.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub sam_iou: Option<f32>,
+    /// Least stability of SAM's masks, instead of the preset's.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub sam_stability: Option<f32>,
     /// CLIP by the name that `models pull` knows it by.
     #[cfg_attr(feature = "clap", arg(long, default_value = "clip-vit-b16", value_name = "NAME"))]
     pub clip: String,
@@ -112,7 +127,6 @@ pub struct Eyes {
 
 impl Default for Eyes {
     fn default() -> Self {
-        let sam = sam::Config::default();
         Self {
             segmenter: SegmenterKind::default(),
             encoder: EncoderKind::default(),
@@ -120,9 +134,10 @@ impl Default for Eyes {
             sam: "slimsam".to_owned(),
             sam_encoder: None,
             sam_decoder: None,
-            sam_points: sam.points_per_side,
-            sam_iou: sam.predicted_iou,
-            sam_stability: sam.stability,
+            sam_preset: SamPreset::default(),
+            sam_points: None,
+            sam_iou: None,
+            sam_stability: None,
             clip: "clip-vit-b16".to_owned(),
             clip_image: None,
             clip_text: None,
@@ -145,14 +160,25 @@ impl Eyes {
         })
     }
 
+    fn sam_config(&self) -> sam::Config {
+        let preset = match self.sam_preset {
+            SamPreset::Meta => sam::Config::default(),
+            SamPreset::LangSplat => sam::Config::langsplat(),
+        };
+        sam::Config {
+            points_per_side: self.sam_points.unwrap_or(preset.points_per_side),
+            predicted_iou: self.sam_iou.unwrap_or(preset.predicted_iou),
+            stability: self.sam_stability.unwrap_or(preset.stability),
+            ..preset
+        }
+    }
+
     /// The segmenter.
     pub fn segmenter(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Segmenter>> {
         Ok(match self.segmenter {
             SegmenterKind::Sam => {
                 let [encoder, decoder] = self.sam_files()?;
-                let (predicted_iou, stability) = (self.sam_iou, self.sam_stability);
-                let config = sam::Config { points_per_side: self.sam_points, predicted_iou, stability, ..sam::Config::default() };
-                Box::new(Sam::load(&encoder, &decoder, config)?)
+                Box::new(Sam::load(&encoder, &decoder, self.sam_config())?)
             }
             SegmenterKind::Import => Box::new(Import::open(photos, lenses.clone())?),
             SegmenterKind::Offline => Box::new(OfflineSegmenter::load()?),
@@ -215,9 +241,10 @@ impl Eyes {
         Ok(match self.segmenter {
             SegmenterKind::Import => None,
             SegmenterKind::Sam => {
+                // SAM's own files alone: another encoder leaves the masks as they are.
                 let files = self.files()?;
-                let sums: Vec<&str> = files.values().map(|f| f.sha256.as_str()).collect();
-                Some(format!("sam {} {} {} {}", self.sam_points, self.sam_iou, self.sam_stability, sums.join(" ")))
+                let sums: Vec<&str> = files.iter().filter(|(role, _)| role.starts_with("sam")).map(|(_, f)| f.sha256.as_str()).collect();
+                Some(format!("sam {:?} {}", self.sam_config(), sums.join(" ")))
             }
             SegmenterKind::Offline => Some(format!("offline {}", models::offline_stamp())),
         })
@@ -227,7 +254,10 @@ impl Eyes {
     pub fn encoder_identity(&self) -> Result<Option<String>> {
         Ok(match self.encoder {
             EncoderKind::Import => None,
-            EncoderKind::Clip => Some(self.files()?.values().map(|f| f.sha256.clone()).collect::<Vec<_>>().join(" ")),
+            EncoderKind::Clip => {
+                let files = self.files()?.into_iter().filter(|(role, _)| role.starts_with("clip"));
+                Some(files.map(|(_, f)| f.sha256).collect::<Vec<_>>().join(" "))
+            }
             EncoderKind::Offline => Some(format!("offline {}", models::offline_stamp())),
         })
     }
@@ -274,13 +304,13 @@ pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<
 /// Imported embeddings as `preprocess` left them in the scene folder: those of the masks that fit.
 struct Recorded {
     folder: SceneFolder,
-    views: Vec<String>,
+    views: Vec<Camera>,
     masks: Vec<Mask>,
 }
 
 impl Recorded {
     fn load(folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
-        let views = manifest.training(&folder.cameras()?).into_iter().map(|c| c.name).collect();
+        let views = manifest.training(&folder.cameras()?);
         Ok(Self { folder: folder.clone(), views, masks: evidence::load(folder)?.0 })
     }
 }
@@ -291,11 +321,15 @@ impl Encoder for Recorded {
     }
 
     fn embed_masks(&self, view: &str, _photo: &RgbImage, masks: &LabelMap) -> fastlgs_vision::Result<Vec<Vec<f32>>> {
-        let whole = LabelMap::load(&self.folder.masks_path(Level::Whole.name(), view))?;
-        let index = self.views.iter().position(|v| v == view);
+        let index = self.views.iter().position(|camera| camera.name == view);
+        let Some(camera) = index.map(|i| &self.views[i]) else {
+            return Err(fastlgs_vision::Error::Missing(format!("the view '{view}' is none of the training")));
+        };
+        let mut whole = MaskList::new(camera.width, camera.height);
+        let labels = whole.add(Level::Whole, &self.folder.masks(camera)?.painted(Level::Whole));
         let row = |label: u16| self.masks.iter().find(|m| Some(m.view) == index && m.label == label).map(|m| m.embedding.clone());
         let dimension = self.masks.first().map_or(0, |m| m.embedding.len());
         let fitting = import::fitting(masks, &whole).into_iter();
-        Ok(fitting.map(|label| label.and_then(row).unwrap_or_else(|| vec![0.0; dimension])).collect())
+        Ok(fitting.map(|place| place.and_then(|p| row(labels[p])).unwrap_or_else(|| vec![0.0; dimension])).collect())
     }
 }

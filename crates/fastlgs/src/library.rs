@@ -17,12 +17,12 @@ const INDEX: &str = "library.index";
 const DEPTH: usize = 3;
 
 /// What is asked of a library, beside the text.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Config {
     /// Most scenes that are named.
     pub scenes: usize,
-    /// Relevancy from which an object counts as found; by default what suits the encoder.
-    pub min_score: Option<f32>,
+    /// Share of the names of absent things that a scene may answer all the same.
+    pub false_alarms: f32,
     /// Texts that the object must not be nearer to.
     pub negatives: Vec<String>,
     /// A CLIP text tower in place of the one that the scenes remember.
@@ -134,7 +134,7 @@ impl Search {
         let started = Instant::now();
         let best = self.index.search(&query, self.config.scenes)?;
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
-        let least = self.config.min_score.unwrap_or(self.texts.min_score());
+        let least = 1.0 - self.config.false_alarms;
         let row = |f: &Found| Row {
             scene: self.index.scenes[f.scene].path.clone(),
             object: f.hit.id,

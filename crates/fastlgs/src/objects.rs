@@ -2,27 +2,30 @@
 
 use crate::error::{Context, bail};
 use crate::{Result, Run, eyes, masks};
+use fastlgs_core::mask_list::Table;
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
-use fastlgs_grid::consensus::{self, Seen};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
-use fastlgs_grid::tree::{self, Chosen, Tree};
+use fastlgs_grid::objects::{self as nodes, Chosen};
+use fastlgs_grid::query::smallest_objects;
+use fastlgs_grid::seen::Vote;
+use fastlgs_grid::support::{Shown, Support, support};
+use fastlgs_grid::tree::{self, Tree};
 use fastlgs_grid::{Grid, codes, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
-use fastlgs_vision::Level;
 use fastlgs_vision::photo_quality::{self, Impression};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Constants of global mapping.
 pub struct Config {
-    /// When Gaussians form a region.
-    pub consensus: consensus::Config,
     /// When a node of the tree is an object.
-    pub objects: tree::Config,
+    pub objects: nodes::Config,
+    /// Whether the scene was trained with the 2-D Mip filter, which changes what Gaussians weigh.
+    pub antialias: bool,
 }
 
-/// Neighbours of each Gaussian in the consensus graph.
+/// Neighbours of each Gaussian in the graph that the tree grows over.
 const NEIGHBOURS: usize = 10;
 /// Views in which an object is embedded: those that show most of it.
 const EMBEDDED_VIEWS: usize = 5;
@@ -62,11 +65,16 @@ pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     Ok(grid)
 }
 
+/// The frame of a camera without what depends on the viewing direction.
+fn frame(scene: &Gaussians, camera: &Camera, antialias: bool) -> View {
+    View { antialias: u32::from(antialias), ..View::new(camera, scene.len(), 0) }
+}
+
 /// Gives every Gaussian the object of the views' object maps that most of its blending weight falls on, and that object's code.
-pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], grid: &Grid) -> Result<()> {
+pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], grid: &Grid, antialias: bool) -> Result<()> {
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
     for camera in training {
-        for vote in lift::votes(scene, camera, &folder.objects(&camera.name)?) {
+        for vote in lift::votes(scene, &frame(scene, camera, antialias), &folder.objects(&camera.name)?) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }
     }
@@ -76,8 +84,60 @@ pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], gr
     Ok(())
 }
 
-/// Global mapping: the views vote over the trained Gaussians which of them form regions and parts of regions, a tree grows
-/// over these, its nodes that masks support become the objects, and each is embedded as the views show it.
+/// Nodes of the tree may be this much smaller than the smallest object, which is made of them.
+const NODE_OF_OBJECT: f32 = 0.5;
+
+/// What global mapping makes of masks, before its objects are embedded.
+pub struct Mapped {
+    /// The objects, as nodes of a tree.
+    pub chosen: Chosen,
+    /// What the views show of every node.
+    pub support: Vec<Support>,
+    /// What was found, and what was not.
+    pub summary: Summary,
+}
+
+/// Global mapping up to the objects: the views' masks grow a tree over the Gaussians, and its nodes that masks support become the objects, whose
+/// numbers the Gaussians get. The folder needs masks and cameras.
+pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
+    let pixels = (training[0].width * training[0].height) as usize;
+    let clock = std::time::Instant::now();
+    let told = |what: &str, count: usize| tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}");
+    let (votes, tables) = votes(scene, folder, training, config.antialias, run)?;
+    let masks = tables.iter().map(|t| t.areas.len()).sum();
+    let left_out: usize = tables.iter().map(|t| t.left_out).sum();
+    if left_out > 0 {
+        run.warn(&format!("{left_out} masks cut others into more pieces than can be numbered; they were left out"));
+    }
+    told("votes", votes.iter().map(Vec::len).sum());
+    let near = lift::neighbours(scene, NEIGHBOURS);
+    let least = NODE_OF_OBJECT * config.objects.min_share * pixels as f32;
+    let tree = Tree::grow(votes, &tables, &near, &tree::Config { min_views: config.objects.min_views, min_pixels: least });
+    told("nodes", tree.parents.len());
+    let (owners, labels) = tree.labels();
+    told("labels", owners.len());
+
+    let mut engine = fastlgs_raster::open_engine(run.device)?;
+    engine.set_state(&State::of(scene))?;
+    let mut shown = Vec::new();
+    let work = run.work("objects", training.len() as u64);
+    for camera in training {
+        let shares = engine.render_ids(frame(scene, camera, config.antialias), &labels)?;
+        let own = |label: u16| usize::from(label).checked_sub(1).map(|k| owners[k]);
+        shown.push(Shown::of(shares.smallest(own, |node| tree.parents[node.place()]), &folder.masks(camera)?.atoms().map));
+        work.advance()?;
+    }
+    let support = support(&tree, &shown, &tables);
+    let chosen = nodes::choose(&tree, &support, pixels, &config.objects);
+    told("objects", chosen.nodes.len());
+    let object_of_label: Vec<u16> = std::iter::once(0).chain(owners.iter().map(|node| chosen.object(*node))).collect();
+    scene.object_ids = labels.iter().map(|label| object_of_label[usize::from(*label)]).collect();
+    let [few_views, small, unsupported, same] = chosen.dropped;
+    let summary = Summary { masks, nodes: tree.parents.len(), few_views, small, unsupported, same };
+    Ok(Mapped { chosen, support, summary })
+}
+
+/// Global mapping: the objects of [`map`], each embedded as the views show it.
 pub fn by_consensus(
     scene: &mut Gaussians,
     folder: &SceneFolder,
@@ -85,59 +145,38 @@ pub fn by_consensus(
     config: &Config,
     run: &Run,
 ) -> Result<(Grid, Summary)> {
-    let pixels = (training[0].width * training[0].height) as usize;
-    let clock = std::time::Instant::now();
-    let told = |what: &str, count: usize| tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}");
-    let [whole, part] = votes(scene, folder, training, run)?;
-    told("votes", training.len());
-    let near = lift::neighbours(scene, NEIGHBOURS);
-    let regions = consensus::regions(whole, &near, pixels, &config.consensus);
-    told("regions", regions.seen.len());
-    let inside: Vec<(u32, u32)> = near.into_iter().filter(|&(a, b)| regions.of[a as usize] == regions.of[b as usize]).collect();
-    let parts = consensus::regions(part, &inside, pixels, &config.consensus);
-    told("parts", parts.seen.len());
-    let tree = Tree::grow(&regions, &parts);
-
-    let mut engine = fastlgs_raster::open_engine(run.device)?;
-    engine.set_state(&State::of(scene))?;
-    let work = run.work("objects", training.len() as u64);
-    for camera in training {
-        let shares = engine.render_ids(View::new(camera, scene.len(), 0), &tree.of)?;
-        shares.winners().save(&folder.objects_path(&camera.name))?;
-        work.advance()?;
-    }
-    let load = |view: usize| -> Result<(LabelMap, Vec<LabelMap>)> {
-        let camera = &training[view];
-        let levels = Level::ALL.iter().filter_map(|level| masks::of_level(folder, camera, *level).transpose()).collect::<Result<_>>()?;
-        Ok((folder.objects(&camera.name)?, levels))
-    };
-    let support = tree::support(&tree, training.len(), load)?;
-    let chosen = tree::choose(&tree, &support, pixels, &config.objects);
-    told("objects", chosen.nodes.len());
-    scene.object_ids = tree.of.iter().map(|node| chosen.object(*node)).collect();
-
-    let areas: Vec<&[(u32, usize)]> = chosen.nodes.iter().map(|n| support[*n].areas.as_slice()).collect();
-    let (found, object_of) = embed(folder, training, &chosen, &best_views(&areas), run)?;
-    told("embeddings", found.len());
-    let mut grid = Grid::build(&found, &object_of, codes::lattice(chosen.nodes.len(), run.seed));
+    let Mapped { chosen, support, summary } = map(scene, folder, training, config, run)?;
+    write_maps(scene, folder, training, &chosen, config.antialias, run)?;
+    let areas: Vec<&[(u32, u32)]> = chosen.nodes.iter().map(|n| support[n.place()].areas.as_slice()).collect();
+    let (found, of_found) = embed(folder, training, &chosen, &best_views(&areas), run)?;
+    let mut grid = Grid::build(&found, &of_found, codes::lattice(chosen.nodes.len(), run.seed));
     for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
-        (object.parent, object.support, object.views) = (*parent, support[*node].iou, support[*node].areas.len());
+        let support = &support[node.place()];
+        (object.parent, object.support, object.views) = (*parent, support.iou, support.areas.len());
     }
     grid.set_codes(scene);
-    let [few_views, small, unsupported, same] = chosen.dropped;
-    Ok((grid, Summary { regions: regions.seen.len(), parts: parts.seen.len(), few_views, small, unsupported, same }))
+    Ok((grid, summary))
 }
 
-/// Embeds every object as its best views show it; also writes the object maps of all views.
+/// Writes the object maps of all views: at each pixel the smallest object that shows there.
+fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], chosen: &Chosen, antialias: bool, run: &Run) -> Result<()> {
+    let mut engine = fastlgs_raster::open_engine(run.device)?;
+    engine.set_state(&State::of(scene))?;
+    for camera in training {
+        let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
+        smallest_objects(&shares, |id| chosen.parents[usize::from(id) - 1]).save(&folder.objects_path(&camera.name))?;
+    }
+    Ok(())
+}
+
+/// Embeds every object as its best views show it.
 fn embed(folder: &SceneFolder, training: &[Camera], chosen: &Chosen, shown: &[Vec<usize>], run: &Run) -> Result<(Vec<Mask>, Vec<u16>)> {
     let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
     let layers = chosen.layers();
     let work = run.work("embeddings", training.len() as u64);
     let (mut found, mut object_of, mut impressions) = (Vec::new(), Vec::new(), Vec::new());
     for (view, camera) in training.iter().enumerate() {
-        let mut map = folder.objects(&camera.name)?;
-        map.labels.iter_mut().for_each(|l| *l = chosen.object(*l));
-        map.save(&folder.objects_path(&camera.name))?;
+        let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
         for layer in &layers {
             let on_layer = chosen.ancestors_on(layer, |id| shown[usize::from(id) - 1].contains(&view));
@@ -156,11 +195,12 @@ fn embed(folder: &SceneFolder, training: &[Camera], chosen: &Chosen, shown: &[Ve
 
 /// What global mapping found, and why nodes of the tree are no objects.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct Summary {
-    /// Regions of Gaussians that the views agree on.
-    pub regions: usize,
-    /// Parts of these.
-    pub parts: usize,
+    /// Masks of all views.
+    pub masks: usize,
+    /// Sets of Gaussians that the masks speak of.
+    pub nodes: usize,
     /// Nodes that too few views show.
     pub few_views: usize,
     /// Nodes that are too small.
@@ -171,36 +211,27 @@ pub struct Summary {
     pub same: usize,
 }
 
-/// What each Gaussian sees of the whole masks and of the parts, in one pass over the views.
-fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<[Vec<Seen>; 2]> {
-    let mut seen = [vec![Seen::new(); scene.len()], vec![Seen::new(); scene.len()]];
+/// How much of each Gaussian falls on the atoms of each view's masks, and which masks these lie in.
+fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], antialias: bool, run: &Run) -> Result<(Vec<Vec<Vote>>, Vec<Table>)> {
+    let (mut votes, mut tables) = (vec![Vec::new(); scene.len()], Vec::new());
     let work = run.work("votes", training.len() as u64);
     for (view, camera) in training.iter().enumerate() {
-        let whole = masks::whole(folder, camera)?;
-        let part = masks::of_level(folder, camera, Level::Part)?.unwrap_or_else(|| whole.clone());
-        let (joint, pairs) = whole.joint(&part);
-        for vote in lift::votes(scene, camera, &joint) {
-            let (whole, part) = pairs[usize::from(vote.label)];
-            for (seen, label) in seen.iter_mut().zip([whole, part]) {
-                let own = &mut seen[vote.gaussian as usize];
-                let key = (view as u16, label);
-                match own.binary_search_by_key(&key, |s| s.0) {
-                    Ok(place) => own[place].1 += vote.weight,
-                    Err(place) => own.insert(place, (key, vote.weight)),
-                }
-            }
+        let atoms = folder.masks(camera)?.atoms();
+        for vote in lift::votes(scene, &frame(scene, camera, antialias), &atoms.map) {
+            votes[vote.gaussian as usize].push(Vote::new(view as u16, vote.label, vote.weight));
         }
+        tables.push(atoms.table);
         work.advance()?;
     }
-    Ok(seen)
+    Ok((votes, tables))
 }
 
 /// The views that show most of each object.
-fn best_views(areas: &[&[(u32, usize)]]) -> Vec<Vec<usize>> {
-    let best = |areas: &&[(u32, usize)]| {
+fn best_views(areas: &[&[(u32, u32)]]) -> Vec<Vec<usize>> {
+    let best = |areas: &&[(u32, u32)]| {
         let mut areas = areas.to_vec();
         areas.sort_by_key(|&(area, view)| (std::cmp::Reverse(area), view));
-        areas.into_iter().take(EMBEDDED_VIEWS).map(|a| a.1).collect()
+        areas.into_iter().take(EMBEDDED_VIEWS).map(|a| a.1 as usize).collect()
     };
     areas.iter().map(best).collect()
 }

@@ -4,7 +4,7 @@ use crate::error::{Context, bail};
 #[cfg(feature = "clap")]
 use crate::session::parse_size;
 use crate::{Result, Run};
-use fastlgs_core::synth::{self, KINDS, Kind};
+use fastlgs_core::synth::{self, KINDS, Kind, Masks};
 use fastlgs_vision::models;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ pub struct Config {
     /// Kind of scene.
     #[cfg_attr(feature = "clap", arg(value_parser = kinds()))]
     pub kind: String,
-    /// Folder to write: images/, transforms.json, masks/ of three levels, depth/, labels/.
+    /// Folder to write: images/, transforms.json, masks/, depth/, labels/.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
     /// Number of photos; by default 40 for most kinds.
@@ -29,6 +29,9 @@ pub struct Config {
     /// Folder of the room's pictures, instead of the installed ones.
     #[cfg_attr(feature = "clap", arg(long))]
     pub pictures: Option<PathBuf>,
+    /// Write masks as lists in COCO's layout, of whole things and their parts, which overlap, instead of label maps of three levels.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub mask_lists: bool,
     /// Every N-th view is labelled, to be held out.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
     pub holdout: usize,
@@ -36,7 +39,15 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { kind: KINDS[0].0.to_owned(), output: PathBuf::new(), views: None, size: (320, 240), pictures: None, holdout: 8 }
+        Self {
+            kind: KINDS[0].0.to_owned(),
+            output: PathBuf::new(),
+            views: None,
+            size: (320, 240),
+            pictures: None,
+            mask_lists: false,
+            holdout: 8,
+        }
     }
 }
 
@@ -73,7 +84,8 @@ pub fn synth(config: &Config, run: &Run) -> Result<Report> {
     let pictures = config.pictures.clone().unwrap_or_else(models::pictures_dir);
     let world = kind.world(&pictures, views, config.size, run.seed)?;
     let work = run.work("synth", views as u64);
-    synth::write(&config.output, &world, config.holdout, || drop(work.advance()))?;
+    let masks = if config.mask_lists { Masks::Lists } else { Masks::Levels };
+    synth::write(&config.output, &world, config.holdout, masks, || drop(work.advance()))?;
     work.check()?;
     Ok(Report {
         kind: config.kind.clone(),

@@ -52,15 +52,12 @@ pub struct Args {
     /// Most objects that together form the answer.
     #[arg(long, default_value_t = QueryConfig::default().top_k, value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..))]
     top_k: usize,
-    /// Relevancy from which an object counts as found; by default what suits the scene's encoder (0.6 offline, 0.55 CLIP).
-    #[arg(long)]
-    min_score: Option<f32>,
+    /// Share of the names of absent things that may be answered all the same, 0 to 1; more finds more that is there, too.
+    #[arg(long, value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms, value_parser = parse_share)]
+    false_alarms: f32,
     /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
     #[arg(long, value_name = "FILE")]
     clip_text: Option<PathBuf>,
-    /// Further objects must score within this of the best.
-    #[arg(long, default_value_t = QueryConfig::default().margin)]
-    margin: f32,
     /// Decide as in the paper: the largest distance (5 there) of a rendered feature to its code, on the 0..255 scale.
     /// Without it, lifted scenes take the objects that have most of a pixel's weight.
     #[arg(long)]
@@ -80,6 +77,10 @@ pub struct Args {
     /// Write the scene without the selected Gaussians, in the same formats.
     #[arg(long, value_name = "FILE", alias = "remove-ply")]
     export_rest: Option<PathBuf>,
+}
+
+fn parse_share(text: &str) -> Result<f32, String> {
+    text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "a share from 0 to 1 is needed".into())
 }
 
 /// Parses `120,45`.
@@ -118,7 +119,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             bail!("--library answers texts with scenes; ask one of these scenes for pictures, points and selections");
         }
         let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
-        let config = fastlgs::library::Config { scenes: args.scenes, min_score: args.min_score, negatives, clip_text };
+        let config = fastlgs::library::Config { scenes: args.scenes, false_alarms: args.false_alarms, negatives, clip_text };
         return library::run(root, config, &texts, common, run);
     }
     let lines = args.text.iter().any(|t| t == "-");
@@ -130,7 +131,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let grid = scene.grid()?;
     let cameras = args.views.cameras(&scene.folder, &scene.cameras)?;
     scene.clip_text.clone_from(&args.clip_text);
-    let config = QueryConfig { min_score: args.min_score.unwrap_or(scene.min_score()), top_k: args.top_k, margin: args.margin };
+    let config = QueryConfig { false_alarms: args.false_alarms, top_k: args.top_k };
     if !args.text.is_empty() || !args.negative.is_empty() {
         // The text encoder is loaded once, before the first query is timed.
         scene.text_query("warm up")?;

@@ -4,6 +4,7 @@ use super::hierarchy::Hierarchy;
 use super::props::{self, Look, Make, Piece};
 use super::solid::{Shape, Solid};
 use super::surface::Surface;
+use super::walks::{CORE, CORRIDOR, Ring, path, walk};
 use super::{Backdrop, Thing, World};
 use crate::rng::Rng;
 use crate::{Camera, Error, Result, image_io};
@@ -26,6 +27,7 @@ pub enum Kind {
     Table,
     Twins,
     Nested,
+    Containers,
     Thin,
     Mirror,
     Glass,
@@ -36,11 +38,12 @@ pub enum Kind {
 }
 
 /// Every kind with its name and what it shows.
-pub const KINDS: [(&str, Kind, &str); 11] = [
+pub const KINDS: [(&str, Kind, &str); 12] = [
     ("room", Kind::Room, "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room"),
     ("table", Kind::Table, "a dozen different things on a table"),
     ("twins", Kind::Twins, "three pairs of the same thing, side by side"),
     ("nested", Kind::Nested, "things with parts with parts"),
+    ("containers", Kind::Containers, "cups on saucers, chests with drawers and bottles with labels"),
     ("thin", Kind::Thin, "wires, spokes and leaves"),
     ("mirror", Kind::Mirror, "things before a mirror and a mirrored ball"),
     ("glass", Kind::Glass, "things behind a pane and a ball of glass"),
@@ -103,6 +106,7 @@ impl Kind {
             }
             Self::Twins => build.twins(),
             Self::Nested => build.nested(),
+            Self::Containers => build.containers(),
             Self::Thin => build.thin(),
             Self::Mirror => build.mirrors(),
             Self::Glass => build.glass(),
@@ -126,59 +130,6 @@ impl Kind {
         };
         Ok(build.finish(cameras, exposures, backdrop))
     }
-}
-
-/// Cameras on a wavy ring that look at one point.
-struct Ring {
-    radius: f32,
-    height: f32,
-    wave: f32,
-    target: Vec3,
-    fov: f32,
-}
-
-impl Ring {
-    fn cameras(&self, count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
-        let at = |k: usize| {
-            let angle = TAU * k as f32 / count as f32;
-            let eye = Vec3::new(self.radius * angle.cos(), self.height + self.wave * (3.0 * angle).sin(), self.radius * angle.sin());
-            Camera::look_at(&format!("{k:03}.png"), eye, self.target, Vec3::Y, width, height, self.fov)
-        };
-        (0..count).map(at).collect()
-    }
-}
-
-/// Half extents of the corridor's outside, and of the block that it goes around.
-const CORRIDOR: Vec3 = Vec3::new(6.5, 1.5, 6.5);
-const CORE: Vec3 = Vec3::new(3.5, 1.5, 3.5);
-
-/// A point of the square path in the middle of the corridor; `along` in 0..1.
-fn path(along: f32) -> Vec3 {
-    let side = 4.0 * along.rem_euclid(1.0);
-    let r = 0.5 * (CORRIDOR.x + CORE.x);
-    let t = 2.0 * side.fract() - 1.0;
-    // Corners are cut, as feet do.
-    let cut = |v: f32| v.clamp(-0.8, 0.8);
-    let p = match side as u32 {
-        0 => Vec3::new(1.0, 0.0, cut(t)),
-        1 => Vec3::new(cut(-t), 0.0, 1.0),
-        2 => Vec3::new(-1.0, 0.0, cut(-t)),
-        _ => Vec3::new(cut(t), 0.0, -1.0),
-    };
-    p * r
-}
-
-/// A walk along the corridor, looking ahead and to both sides.
-fn walk(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
-    let at = |k: usize| {
-        let along = k as f32 / count as f32;
-        // The mean of a stretch of path, so that corners are rounded.
-        let smooth = |from: f32| (0..9).map(|s| path(from + (s as f32 - 4.0) * 0.008)).sum::<Vec3>() / 9.0;
-        let (eye, ahead) = (smooth(along) + Vec3::Y * 1.25, smooth(along + 0.05) + Vec3::Y * 0.75);
-        let sway = Mat3::from_rotation_y(0.55 * (TAU * k as f32 / 17.0).sin());
-        Camera::look_at(&format!("{k:03}.png"), eye, eye + sway * (ahead - eye), Vec3::Y, width, height, 0.95)
-    };
-    (0..count).map(at).collect()
 }
 
 /// Light that goes from full to a third and back twice, and from warm to cold once.
@@ -304,7 +255,6 @@ impl Builder {
     }
 
     fn nested(&mut self) {
-        self.table();
         let things: [(&str, Make, usize); 6] = [
             ("cart", props::cart, 0),
             ("cabinet", props::cabinet, 8),
@@ -313,12 +263,30 @@ impl Builder {
             ("cabinet", props::cabinet, 2),
             ("mug", props::mug, 5),
         ];
-        for (k, (name, make, color)) in things.into_iter().enumerate() {
+        self.with_parts(&things);
+    }
+
+    /// Six things on a ring on the table, whose parts have names.
+    fn with_parts(&mut self, things: &[(&str, Make, usize); 6]) {
+        self.table();
+        for (k, &(name, make, color)) in things.iter().enumerate() {
             let turn = k as f32 / 6.0;
             // Drawers look outwards.
             let place = Place { yaw: FRAC_PI_2 - TAU * turn, ..self.on_table(0.88, turn, 0.55) };
             self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, true);
         }
+    }
+
+    fn containers(&mut self) {
+        let things: [(&str, Make, usize); 6] = [
+            ("coffee set", props::cup_and_saucer, 0),
+            ("chest", props::chest, 8),
+            ("bottle", props::labelled_bottle, 2),
+            ("tea set", props::cup_and_saucer, 1),
+            ("trunk", props::chest, 4),
+            ("flask", props::labelled_bottle, 5),
+        ];
+        self.with_parts(&things);
     }
 
     fn thin(&mut self) {

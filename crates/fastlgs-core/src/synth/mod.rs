@@ -7,10 +7,11 @@ mod kinds;
 mod props;
 mod solid;
 mod surface;
+mod walks;
 mod write;
 
 pub use kinds::{KINDS, Kind, PICTURES, TEXTURES};
-pub use write::write;
+pub use write::{Masks, write};
 
 use crate::{Camera, LabelMap};
 use glam::{Mat3, Vec2, Vec3};

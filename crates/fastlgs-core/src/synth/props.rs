@@ -176,6 +176,29 @@ pub fn cabinet() -> Vec<Piece> {
     pieces
 }
 
+/// A cup on a saucer: neither is all of it.
+pub fn cup_and_saucer() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.05, 0.0], [0.62, 0.05, 0.62], CREAM).of(&["saucer"]),
+        piece(Cylinder, [0.0, 0.42, 0.0], [0.34, 0.32, 0.34], OWN).of(&["cup"]),
+        piece(Block, [0.44, 0.42, 0.0], [0.12, 0.2, 0.06], OWN).of(&["cup"]),
+    ]
+}
+
+/// A chest with a drawer in its front, and nothing else with a name.
+pub fn chest() -> Vec<Piece> {
+    vec![piece(Block, [0.0, 0.45, 0.0], [0.6, 0.45, 0.4], OWN), piece(Block, [0.0, 0.5, 0.42], [0.45, 0.25, 0.04], CREAM).of(&["drawer"])]
+}
+
+/// A bottle with a label around it.
+pub fn labelled_bottle() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.5, 0.0], [0.32, 0.5, 0.32], OWN),
+        piece(Cylinder, [0.0, 1.12, 0.0], [0.13, 0.2, 0.13], OWN),
+        piece(Cylinder, [0.0, 0.5, 0.0], [0.33, 0.24, 0.33], CREAM).of(&["label"]),
+    ]
+}
+
 /// A wire frame: twelve thin rods.
 pub fn wire_frame() -> Vec<Piece> {
     let (r, thin) = (0.5, 0.014);

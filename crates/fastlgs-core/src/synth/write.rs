@@ -1,24 +1,38 @@
 //! A generated scene as a folder of photos.
 
 use super::{Thing, World};
-use crate::{Camera, LabelMap, Result, exr_image, fs, image_io};
+use crate::mask_list::{Mask, RunLengths};
+use crate::{Camera, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
 use serde_json::json;
 use std::path::Path;
 
-/// Writes PHOTOS: `images/`, `transforms.json`, exact masks of three levels in `masks/`, `masks/part/` and `masks/subpart/` (16-bit),
-/// `depth/` (EXR) and `labels/` of every `holdout`-th view.
+/// How exact masks are written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Masks {
+    /// Three levels of label maps: `masks/`, `masks/part/` and `masks/subpart/` (16-bit).
+    Levels,
+    /// Lists of whole masks, which overlap, and of which nothing tells the level: `masks/NAME.json`.
+    Lists,
+}
+
+/// Writes PHOTOS: `images/`, `transforms.json`, exact masks, `depth/` (EXR) and `labels/` of every `holdout`-th view.
 ///
 /// # Errors
 /// The system's refusal.
-pub fn write(out: &Path, world: &World, holdout: usize, mut done: impl FnMut()) -> Result<()> {
+pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: impl FnMut()) -> Result<()> {
     let mut frames = Vec::new();
     for (index, camera) in world.cameras.iter().enumerate() {
         let view = world.render(index, 2);
         let name = &camera.name;
         image_io::save_png(&out.join("images").join(name), view.photo.clone())?;
-        for (level, folder) in ["masks", "masks/part", "masks/subpart"].into_iter().enumerate() {
-            let labels = view.instances.labels.iter().map(|id| at_level(&world.things, *id, level)).collect();
-            LabelMap { labels, ..view.instances }.save(&out.join(folder).join(format!("{name}.png")))?;
+        match masks {
+            Masks::Levels => {
+                for (level, folder) in ["masks", "masks/part", "masks/subpart"].into_iter().enumerate() {
+                    let labels = view.instances.labels.iter().map(|id| at_level(&world.things, *id, level)).collect();
+                    LabelMap { labels, ..view.instances }.save(&out.join(folder).join(format!("{name}.png")))?;
+                }
+            }
+            Masks::Lists => overlapping(&world.things, &view.instances).save(&out.join("masks").join(format!("{name}.json")))?,
         }
         let depth = out.join("depth").join(format!("{name}.exr"));
         exr_image::write(&depth, camera.width as usize, camera.height as usize, &[("Z", &view.depth)])?;
@@ -50,6 +64,19 @@ fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
 fn at_level(things: &[Thing], id: u16, level: usize) -> u16 {
     let chain: Vec<u16> = chain(things, id).collect();
     chain.iter().rev().nth(level).or(chain.first()).copied().unwrap_or(0)
+}
+
+/// The mask of every thing that can be seen, its parts included.
+fn overlapping(things: &[Thing], instances: &LabelMap) -> MaskList {
+    let mut list = MaskList::new(instances.width, instances.height);
+    for own in 1..=things.len() as u16 {
+        let inside: Vec<bool> = (0..=things.len() as u16).map(|id| chain(things, id).any(|c| c == own)).collect();
+        let runs = RunLengths::of(instances.width, instances.height, |x, y| inside[usize::from(instances.at(x, y))]);
+        if runs.area() > 0 {
+            list.masks.push(Mask::new(Level::Whole, runs));
+        }
+    }
+    list
 }
 
 /// Exact labels of things and parts in the LERF-OVS layout: one rectangle for each run of pixels in a row.
@@ -88,5 +115,9 @@ mod tests {
         assert_eq!([0, 1, 2].map(|level| at_level(&things, 3, level)), [1, 2, 3]);
         assert_eq!([0, 1, 2].map(|level| at_level(&things, 4, level)), [4, 4, 4]);
         assert_eq!(at_level(&things, 0, 1), 0);
+        // A pixel each of nothing, the cart, its wheel, the hub, and the ball.
+        let list = overlapping(&things, &LabelMap { width: 5, height: 1, labels: vec![0, 1, 2, 3, 4] });
+        let areas: Vec<usize> = list.masks.iter().map(|m| m.runs.area()).collect();
+        assert_eq!(areas, [3, 2, 1, 1]);
     }
 }

@@ -25,5 +25,6 @@ pub(crate) fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f
     let m1 = 0.9 * *moment1 + 0.1 * g;
     let m2 = 0.999 * *moment2 + 0.001 * g * g;
     (*moment1, *moment2) = (m1, m2);
-    *param -= step.rates[channel.min(BASE_CHANNELS)] * (m1 / step.correction1) / ((m2 / step.correction2).sqrt() + step.epsilon);
+    let next = *param - step.rates[channel.min(BASE_CHANNELS)] * (m1 / step.correction1) / ((m2 / step.correction2).sqrt() + step.epsilon);
+    *param = if (14..BASE_CHANNELS).contains(&channel) { next.clamp(0.0, 1.0) } else { next };
 }

@@ -112,9 +112,10 @@ pub(crate) fn backward_one(
     let [jw_x, jw_y] = covariance::affine(t, view);
     let (a_x, a_y) = (r.transpose() * jw_x * s, r.transpose() * jw_y * s);
     let cov = covariance::dilated(a_x, a_y);
-    // Section 2. Opacity is clamped at ALPHA_MAX from above.
+    // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = sigmoid(param(10));
-    let unclamped_opacity = if opacity * covariance::compensation(cov, view) < ALPHA_MAX { 1.0 } else { 0.0 };
+    let clamped = opacity * covariance::compensation(cov, view) >= ALPHA_MAX;
+    let unclamped_opacity = if clamped && slot[5] < 0.0 { 0.0 } else { 1.0 };
     put(10, slot[5] * (1.0 - opacity) * unclamped_opacity);
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
     if view.antialias == 1 && covariance::determinant_share(cov) > 1e-6 {

@@ -1,5 +1,6 @@
 //! Every pass against its CPU twin on a real adapter, both engines against each other, and gradients against differences.
 
+mod alignment;
 mod engines;
 mod gradients;
 mod passes;

@@ -10,7 +10,7 @@ fn views(count: usize) -> Vec<Target> {
         let angle = k as f32 * 0.3;
         Camera::look_at(&format!("v{k}"), 4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
     };
-    (0..count).map(|k| Target { camera: around(k), image: target(64, 48) }).collect()
+    (0..count).map(|k| Target { camera: around(k), image: target(64, 48), gain: [1.0; 3] }).collect()
 }
 
 fn trainer(engine: Box<dyn Engine>, config: TrainConfig) -> Trainer {

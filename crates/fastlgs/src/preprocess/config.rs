@@ -18,6 +18,20 @@ pub enum Sfm {
     Colmap,
 }
 
+/// What is done about given poses.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Poses {
+    /// Nothing.
+    Keep,
+    /// Groups of cameras that contradict the photos are moved; all are adjusted to the key points where that mends them.
+    #[default]
+    Check,
+    /// The same, and all are adjusted in any case.
+    Refine,
+}
+
 /// What is preprocessed, and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
@@ -40,6 +54,9 @@ pub struct Config {
     /// What finds poses where there are none.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub sfm: Sfm,
+    /// What is done about the poses.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub poses: Poses,
     /// Segmenter and encoder.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
@@ -61,6 +78,7 @@ impl Default for Config {
             holdout: 8,
             holdout_labels: None,
             sfm: Sfm::default(),
+            poses: Poses::default(),
             eyes: Eyes::default(),
             neighbours: 10,
             memory: 4_000_000_000,
@@ -108,6 +126,8 @@ pub struct Report {
     pub sift: String,
     /// Cameras whose poses contradicted the photos and were moved.
     pub moved_cameras: usize,
+    /// How all cameras were adjusted to the key points, if they were.
+    pub adjusted: Option<Adjusted>,
     /// What was survivable but wrong.
     pub warnings: Vec<String>,
     /// How much the photos' brightness varies, in stops.
@@ -120,10 +140,52 @@ pub struct Report {
     pub seconds_total: f64,
 }
 
-/// The manifest's note of how much the photos' brightness varies, in stops.
-pub(super) const BRIGHTNESS_SPREAD: &str = "brightness_spread_stops";
+/// How far bundle adjustment moved the cameras.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Adjusted {
+    /// Root mean square reprojection error of the key points before, in pixels of the working photos.
+    pub error_before: f32,
+    /// And after.
+    pub error_after: f32,
+    /// By how much more key points the poses explain: a factor.
+    pub explained: f32,
+    /// Median over the cameras of how far their pictures moved, in pixels.
+    pub moved_median: f32,
+    /// The largest of these.
+    pub moved_most: f32,
+    /// Mean factor on the focal lengths.
+    pub focal: f32,
+    /// Largest radial term that was left in the pictures.
+    pub k1: f32,
+    /// Whether the adjusted poses are used.
+    pub used: bool,
+}
 
-/// How much the brightness of a scene's photos varies, in stops, where that is known.
-pub fn brightness_spread(manifest: &Manifest) -> Option<f64> {
-    manifest.notes.get(BRIGHTNESS_SPREAD)?.as_f64()
+/// The manifest's note of how bright photos are.
+const BRIGHTNESS: &str = "brightness";
+
+/// How bright a scene's training photos are against each other.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Brightness {
+    /// The typical difference of two photos in stops.
+    pub spread_stops: f32,
+    /// By the photo's name, how many times brighter than the mean it shows things, by channel.
+    pub gains: BTreeMap<String, [f32; 3]>,
+}
+
+impl Brightness {
+    /// What preprocessing noted; as if all were alike where it noted nothing.
+    pub fn of(manifest: &Manifest) -> Self {
+        manifest.notes.get(BRIGHTNESS).and_then(|note| serde_json::from_value(note.clone()).ok()).unwrap_or_default()
+    }
+
+    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {
+        manifest.notes.insert(BRIGHTNESS.to_owned(), serde_json::to_value(self)?);
+        Ok(())
+    }
+
+    /// Of a photo.
+    pub fn gain(&self, name: &str) -> [f32; 3] {
+        self.gains.get(name).copied().unwrap_or([1.0; 3])
+    }
 }

@@ -5,9 +5,9 @@ use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::error::Context;
 use crate::{Result, Run, masks};
-use fastlgs_core::{LabelMap, SceneFolder};
+use fastlgs_core::{Level, SceneFolder};
 use fastlgs_grid::mapping::Mask;
-use fastlgs_vision::{Encoder, Level, Segmenter};
+use fastlgs_vision::{Encoder, Segmenter};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -22,31 +22,22 @@ pub(super) fn segment(
 ) -> Result<BTreeMap<String, f64>> {
     let work = run.work("masks", training.len() as u64);
     let identity = config.eyes.segmenter_identity()?;
-    let of_photo = |photo: &Known| -> Result<[Option<usize>; 3]> {
+    let of_photo = |photo: &Known| -> Result<[usize; 3]> {
         let name = &photo.camera.name;
-        let make = || -> Result<[LabelMap; 3]> {
-            Ok(segmenter.segment(name, &folder.photo(name)?).with_context(|| format!("segmenting {name}"))?.levels)
-        };
-        let levels = match &identity {
-            Some(identity) => cache.get("masks", &cache::key(&[&photo.key, identity.as_bytes()]), make)?,
+        let make = || segmenter.segment(name, &folder.photo(name)?).with_context(|| format!("segmenting {name}"));
+        let mut list = match &identity {
+            Some(identity) => cache.get("masks", &cache::key(&[b"list", &photo.key, identity.as_bytes()]), make)?,
             None => make()?,
         };
-        let mut counts = [None; 3];
-        for ((level, map), count) in Level::ALL.into_iter().zip(&levels).zip(&mut counts) {
-            let path = folder.masks_path(level.name(), name);
-            if config.eyes.keeps(level) {
-                *count = Some(map.areas().iter().skip(1).filter(|a| **a > 0).count());
-                map.save(&path)?;
-            } else if path.is_file() {
-                std::fs::remove_file(&path).with_context(|| path.display().to_string())?;
-            }
-        }
+        list.masks.retain(|mask| config.eyes.keeps(mask.level));
+        list.save(&folder.masks_path(name))?;
         work.advance()?;
-        Ok(counts)
+        Ok(Level::ALL.map(|level| list.count(level)))
     };
     let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
-    let mean = |k: usize| Some(counts.iter().map(|c| c[k]).sum::<Option<usize>>()? as f64 / training.len() as f64);
-    Ok(Level::ALL.into_iter().enumerate().filter_map(|(k, level)| Some((level.name().to_owned(), mean(k)?))).collect())
+    let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
+    let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));
+    Ok(kept.map(|level| (level.name().to_owned(), mean(level as usize))).collect())
 }
 
 /// Embedding and colour distribution of every mask, sorted by view and label.

@@ -7,33 +7,63 @@ use fastlgs_core::{Camera, SceneFolder};
 use fastlgs_grid::mapping::{Correspondences, Mask};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::matching;
-use fastlgs_vision::triangulate::{self, PairMatches};
+use fastlgs_vision::tracks::{self, PairMatches};
 use glam::Vec2;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
-/// Matches each photo with its neighbours.
-pub(super) fn match_photos(
-    training: &[Known],
-    cameras: &[Camera],
-    neighbours: usize,
-    cache: &Cache,
-    run: &Run,
-) -> Result<Vec<PairMatches>> {
-    let described = cameras.iter().map(serde_json::to_vec).collect::<Result<Vec<_>, _>>()?;
-    let chosen = triangulate::overlapping_pairs(cameras, neighbours);
+/// Matches each photo with its neighbours by the poses as given, and photos whose poses are wrong with all others, whether or not the matches
+/// obey the poses.
+pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, cache: &Cache, run: &Run) -> Result<Vec<PairMatches>> {
+    let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
+    let mut chosen: BTreeSet<(usize, usize)> = tracks::overlapping_pairs(&cameras, neighbours).into_iter().collect();
+    for &photo in lost {
+        chosen.extend((0..photos.len()).filter(|other| *other != photo).map(|other| (photo.min(other), photo.max(other))));
+    }
     let work = run.work("matches", chosen.len() as u64);
     let match_pair = |(a, b): (usize, usize)| {
-        let inputs = [&training[a].key, &training[b].key, described[a].as_slice(), &described[b], keypoints::backend().as_bytes()];
-        let pairs = cache.get("matches", &cache::key(&inputs), || {
-            let [pa, pb] = [a, b].map(|k| &training[k].points);
-            let pairs = matching::matches(pa, pb);
-            Ok(triangulate::epipolar_filter((&cameras[a], pa), (&cameras[b], pb), &pairs))
-        })?;
+        let inputs = [&photos[a].key, &photos[b].key, keypoints::backend().as_bytes()];
+        let pairs = cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))?;
         work.advance()?;
         Ok::<_, Error>(PairMatches { a, b, pairs })
     };
+    let chosen: Vec<(usize, usize)> = chosen.into_iter().collect();
     chosen.into_par_iter().map(match_pair).collect()
+}
+
+/// The matches between photos that are kept, by their new places, as far as they obey the poses.
+pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
+    let place: BTreeMap<usize, usize> = kept.iter().enumerate().map(|(new, old)| (*old, new)).collect();
+    let renumbered = |m: &PairMatches| Some(PairMatches { a: *place.get(&m.a)?, b: *place.get(&m.b)?, pairs: m.pairs.clone() });
+    let obeying = |m: PairMatches| m.obeying(cameras, points, tracks::TOLERANCE);
+    matches.iter().filter_map(renumbered).map(obeying).collect()
+}
+
+/// Fewest matches by which a photo is held to share something with another.
+const FEW: usize = 15;
+
+/// Says so where photos share too little with any other, and names the one that is turned farthest from its nearest.
+pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Option<String> {
+    let mut most = vec![0; cameras.len()];
+    for m in matches {
+        [m.a, m.b].into_iter().for_each(|photo| most[photo] = most[photo].max(m.pairs.len()));
+    }
+    let alone: Vec<usize> = (0..cameras.len()).filter(|&photo| most[photo] < FEW).collect();
+    let turned = |a: usize, b: usize| cameras[a].forward().angle_between(cameras[b].forward()).to_degrees();
+    let gap = |&photo: &usize| {
+        let others = (0..cameras.len()).filter(|other| *other != photo);
+        let nearest = others.min_by(|a, b| turned(photo, *a).total_cmp(&turned(photo, *b)))?;
+        Some((photo, nearest, turned(photo, nearest)))
+    };
+    let (photo, nearest, degrees) = alone.iter().filter_map(gap).max_by(|a, b| a.2.total_cmp(&b.2))?;
+    Some(format!(
+        "{} of {} photos share too little with any other to tell shapes from; the largest gap is {degrees:.0} degrees, from {} to {}: \
+         take photos between them",
+        alone.len(),
+        cameras.len(),
+        cameras[photo].name,
+        cameras[nearest].name
+    ))
 }
 
 /// Counts the key-point pairs between the masks of matched photos.
@@ -60,4 +90,21 @@ pub(super) fn correspondences(
         }
     }
     Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    #[test]
+    fn the_largest_gap_is_named() {
+        let eye = |degrees: f32| 4.0 * Vec3::new(degrees.to_radians().sin(), 0.0, -degrees.to_radians().cos());
+        let camera = |degrees: f32| Camera::look_at(&format!("{degrees}.png"), eye(degrees), Vec3::ZERO, Vec3::Y, 64, 48, 0.9);
+        let cameras = [camera(0.0), camera(10.0), camera(60.0)];
+        let shared = |a, b, count| PairMatches { a, b, pairs: vec![(0, 0); count] };
+        let warning = warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 4)]).unwrap();
+        assert!(warning.starts_with("1 of 3 photos") && warning.contains("50 degrees, from 60.png to 10.png"), "{warning}");
+        assert_eq!(warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 40)]), None);
+    }
 }

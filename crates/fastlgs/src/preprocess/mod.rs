@@ -9,13 +9,12 @@ mod poses;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::{Result, Run};
-use config::BRIGHTNESS_SPREAD;
-pub use config::{Config, Report, Sfm, brightness_spread};
+pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
 use fastlgs_grid::evidence;
 use fastlgs_vision::keypoints::{self, Keypoints};
-use fastlgs_vision::{brightness, import, triangulate};
+use fastlgs_vision::{brightness, import, sweep, tracks};
 use photos::Known;
 pub use photos::{Photo, load_photo};
 use std::collections::BTreeMap;
@@ -53,7 +52,20 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     lap("photos");
     let mut warnings = dataset.warnings.clone();
     photos::warn_of_bad_photos(&known, run, &mut warnings);
-    let checked = poses::check(&mut known, &folder, &cache, run, &mut warnings)?;
+    let mut checked = match config.poses {
+        Poses::Keep => Default::default(),
+        Poses::Check | Poses::Refine => poses::check(&mut known, &folder, &cache, run)?,
+    };
+    lap("pose_check");
+    let matches = matches::match_photos(&known, &checked.contradictory, config.neighbours, &cache, run)?;
+    lap("matches");
+    poses::place(&mut known, &mut checked, &matches);
+    poses::warn(&known, &checked, run, &mut warnings);
+    let adjusted = match config.poses {
+        Poses::Keep => None,
+        asked => poses::adjust(&mut known, &matches, asked, run, &mut warnings),
+    };
+    lap("adjusting");
     let cameras: Vec<Camera> = known.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
@@ -73,11 +85,11 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         notes: BTreeMap::new(),
     };
     let usable = |i: usize| !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i);
+    let kept: Vec<usize> = (0..known.len()).filter(|&i| usable(i)).collect();
     let training: Vec<Known> = known.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
     if training.len() < 2 {
         bail!("{}: only {} photos are left for training; at least 2 are needed", config.photos.display(), training.len());
     }
-    lap("pose_check");
 
     let mask_counts = masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
     drop(segmenter);
@@ -86,21 +98,35 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     drop(encoder);
     lap("embeddings");
     let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
-    let matches = matches::match_photos(&training, &poses, config.neighbours, &cache, run)?;
-    lap("matches");
     let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
-    let spread = brightness::spread(&colors, &matches);
+    let matches = matches::between(&kept, &matches, &poses, &keypoints);
+    if let Some(warning) = matches::warn_of_gaps(&poses, &matches) {
+        run.warn(&warning);
+        warnings.push(warning);
+        manifest.warnings.clone_from(&warnings);
+    }
+    let compared = brightness::compare(&colors, &matches);
+    let gains = poses.iter().map(|c| c.name.clone()).zip(compared.gains).collect();
+    let light = Brightness { spread_stops: compared.spread_stops, gains };
 
-    // Points of moved cameras lie where those cameras were. Else the larger start counts: on fox 62,681 points that were triangulated here
-    // instead of the 7,500 of structure from motion give 1.2 dB more after 2,000 steps.
-    let own = triangulate::triangulate(&poses, &keypoints, &colors, &matches);
-    let points = if !checked.moved.is_empty() || own.len() > dataset.points.len() { own } else { dataset.points.clone() };
+    let tracks = tracks::tracks(&poses, &keypoints, &matches, tracks::TOLERANCE);
+    let mut points = tracks::points(&tracks, &colors);
+    lap("tracks");
+    let work = run.work("depths", poses.len() as u64);
+    points.extend(sweep::points(&poses, &tracks, |camera| Ok(folder.photo(&camera.name)?), || work.advance())?);
+    drop(work);
+    lap("depths");
+    // Those that came with the poses lie where these were.
+    let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
+    if poses_are_given && dataset.points.len() > points.len() {
+        points.clone_from(&dataset.points);
+    }
     folder.save_points(&points)?;
     let pairs = matches::correspondences(&masks, &folder, &poses, &keypoints, &matches)?;
     evidence::save(&folder, &masks, &pairs)?;
     lap("points");
     manifest.seconds = seconds.clone();
-    manifest.notes.insert(BRIGHTNESS_SPREAD.to_owned(), spread.into());
+    light.note(&mut manifest)?;
     folder.save_manifest(&manifest)?;
     cache.tidy();
     Ok(Report {
@@ -115,8 +141,9 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         points: points.len(),
         sift: keypoints::backend().to_owned(),
         moved_cameras: checked.moved.len(),
+        adjusted,
         warnings,
-        brightness_spread_stops: spread,
+        brightness_spread_stops: light.spread_stops,
         cached: cache.counts().into_iter().map(|(stage, counts)| (stage.to_owned(), counts)).collect(),
         seconds,
         seconds_total: started.elapsed().as_secs_f64(),

@@ -6,7 +6,7 @@ use super::{Session, selection};
 use crate::Result;
 use fastlgs_core::{Camera, image_io, metrics};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::{Field, Found, Hit, QueryConfig};
+use fastlgs_grid::query::{Field, Found, Hit, QueryConfig, best_score};
 use fastlgs_raster::Frame;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -53,7 +53,7 @@ impl Question<'_> {
         if let Some(radius) = self.dilate {
             mask = metrics::dilate(&mask, camera.width, camera.height, radius);
         }
-        let answer = Answer { grid, field, found, mask };
+        let answer = Answer { grid, field, found, mask, calibrated: meaning.is_calibrated() };
         let total = encode_ms + render_ms + select_ms + restore_ms;
         let ms = Milliseconds { encode: encode_ms, render: render_ms, select: select_ms, restore: restore_ms, total };
         let report = answer.report(session, self.ask.name(), camera, self.candidates, ms);
@@ -72,8 +72,10 @@ pub struct Report {
     pub size: String,
     /// Whether anything in the scene matches.
     pub found: bool,
-    /// Score of the best object, found or not.
+    /// Score of the object that is most like what is asked, found or not: the share of absent names that score lower.
     pub score: f32,
+    /// Whether that was measured with the scene's encoder; otherwise it follows from what is published about its kind.
+    pub calibrated: bool,
     /// The objects that form the answer.
     pub objects: Vec<ObjectReport>,
     /// The best objects, chosen or not.
@@ -138,6 +140,8 @@ pub struct Answer<'a> {
     pub found: Found,
     /// Pixels of the answer.
     pub mask: Vec<bool>,
+    /// See [`Report::calibrated`].
+    pub calibrated: bool,
 }
 
 impl Answer<'_> {
@@ -148,7 +152,8 @@ impl Answer<'_> {
             view: camera.name.clone(),
             size: format!("{}x{}", camera.width, camera.height),
             found: !targets.is_empty(),
-            score: targets.first().or(ranked.first()).map_or(0.0, |h| h.score),
+            score: best_score(ranked),
+            calibrated: self.calibrated,
             objects: targets.iter().map(|t| self.object(session, camera.width, t)).collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),

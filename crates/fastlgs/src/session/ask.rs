@@ -4,9 +4,9 @@ use super::Session;
 use crate::Result;
 use crate::error::{Context, bail};
 use fastlgs_core::{Camera, LabelMap};
+use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
-use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_grid::{Grid, relevancy};
+use fastlgs_grid::relevancy::{Calibration, TextQuery};
 use image::RgbImage;
 
 /// One question.
@@ -41,7 +41,7 @@ impl Ask {
     pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
         let with_negatives = |mut query: TextQuery| -> Result<TextQuery> {
             for text in negatives {
-                query.canonical.push(session.text_query(text)?.text);
+                query.negatives.push(session.text_query(text)?.text);
             }
             Ok(query)
         };
@@ -75,19 +75,29 @@ fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result<TextQuery>
     let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let embedding =
         embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    Ok(TextQuery { text: embedding, canonical: Vec::new(), anything: relevancy::IMAGE_ANYTHING })
+    // Pictures are about as far from each other with any encoder.
+    let calibration = Calibration { measured: false, ..Calibration::OFFLINE };
+    Ok(TextQuery { text: embedding, canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration })
 }
 
 impl Meaning {
+    /// Whether what scores mean was measured with the encoder.
+    pub fn is_calibrated(&self) -> bool {
+        match self {
+            Self::Embedded(query, _) => query.calibration.measured,
+            Self::Point(..) => true,
+        }
+    }
+
     /// The objects that are meant.
     pub fn find(&self, grid: &Grid, field: &Field, camera: &Camera, config: &QueryConfig) -> Result<Found> {
         match self {
             Self::Embedded(query, None) => {
                 let ranked = query::rank(grid, query);
-                Ok(Found { targets: query::select(grid, &ranked, config), ranked })
+                Ok(Found { targets: query::select(grid, &ranked, query, config), ranked })
             }
             Self::Embedded(object, Some(part)) => {
-                let targets = query::select(grid, &query::rank(grid, object), config);
+                let targets = query::select(grid, &query::rank(grid, object), object, config);
                 Ok(query::part(grid, &targets, part, config))
             }
             Self::Point(x, y) => {

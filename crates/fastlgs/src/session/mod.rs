@@ -11,9 +11,9 @@ use crate::error::{Context, bail};
 use crate::{Result, eyes, train};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_grid::Grid;
 use fastlgs_grid::query::Field;
-use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_grid::{Grid, codes};
+use fastlgs_grid::relevancy::{Calibration, TextQuery};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::Encoder;
@@ -86,11 +86,8 @@ impl Session {
     }
 
     /// The frame of a camera, rendered in the way the scene was trained.
-    fn view(&self, camera: &Camera) -> View {
-        let mut view = View::new(camera, self.gaussians.len(), self.gaussians.sh_degree);
-        view.antialias = u32::from(self.trained.antialias);
-        view.background_color[..3].copy_from_slice(&self.trained.background);
-        view
+    pub fn view(&self, camera: &Camera) -> View {
+        self.trained.view(camera, &self.gaussians)
     }
 
     /// Renders the expected depth (sum of w z / sum of w), infinite where nothing is.
@@ -110,7 +107,7 @@ impl Session {
         let (width, height) = (frame.width, frame.height);
         // Codes that were trained make up for what passes through; those that were lifted do not.
         let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
-        Ok(Field::Features { width, height, values, tau_ac: tau_ac.unwrap_or(codes::TAU_AC) })
+        Ok(Field::Features { width, height, values, tau_ac })
     }
 
     /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.
@@ -126,9 +123,9 @@ impl Session {
         eyes::encoder_of(&self.folder, &self.manifest)
     }
 
-    /// Relevancy from which an object counts as found, with the scene's encoder.
-    pub fn min_score(&self) -> f32 {
-        texts::min_score(&self.manifest)
+    /// What the cosines of the scene's encoder are worth.
+    pub fn calibration(&self) -> Calibration {
+        texts::calibration(&self.manifest)
     }
 }
 
@@ -141,6 +138,6 @@ pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
 /// Bytes of everything that a query needs.
 pub fn bytes(root: &Path) -> u64 {
     let model = if root.join("scene.ply").is_file() { "scene.ply" } else { "scene.safetensors" };
-    let files = [model, "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json"].into_iter();
+    let files = [model, "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json", "cameras/trained.json"].into_iter();
     files.filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
 }

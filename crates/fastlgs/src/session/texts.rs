@@ -4,8 +4,8 @@ use crate::error::{Context, bail};
 use crate::{Result, eyes};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_grid::relevancy::{CANONICAL, OFFLINE_ANYTHING, TextQuery};
-use fastlgs_grid::{Grid, query};
+use fastlgs_grid::Grid;
+use fastlgs_grid::relevancy::{CANONICAL, Calibration, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
 
@@ -16,17 +16,15 @@ const OFFLINE: &str = "offline";
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
-    anything: f32,
-    min_score: f32,
+    calibration: Calibration,
 }
 
 impl Texts {
     /// The text tower of the encoder that made the scene's embeddings.
     pub fn load(folder: &SceneFolder, manifest: &Manifest, clip_text: Option<&Path>) -> Result<Self> {
         let encoder = eyes::text_encoder_of(manifest, clip_text)?;
-        let offline = manifest.encoder == OFFLINE;
-        let canonical = if offline { Vec::new() } else { encoder.embed(&CANONICAL)? };
-        let anything = if offline { OFFLINE_ANYTHING } else { -1.0 };
+        let calibration = calibration(manifest);
+        let canonical = if manifest.encoder == OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
         let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
@@ -37,22 +35,29 @@ impl Texts {
                  run 'fastlgs train {root}' again, or name the right tower with --clip-text"
             );
         }
-        Ok(Self { encoder, canonical, anything, min_score: min_score(manifest) })
+        Ok(Self { encoder, canonical, calibration })
     }
 
     /// Prepares a text.
     pub fn query(&self, text: &str) -> Result<TextQuery> {
-        let anything = self.anything + self.encoder.advantage(text);
-        Ok(TextQuery { text: self.encoder.embed(&[text])?.remove(0), canonical: self.canonical.clone(), anything })
+        let calibration = self.calibration;
+        let anything = calibration.anything + self.encoder.advantage(text);
+        Ok(TextQuery {
+            text: self.encoder.embed(&[text])?.remove(0),
+            canonical: self.canonical.clone(),
+            negatives: Vec::new(),
+            anything,
+            calibration,
+        })
     }
 
-    /// Relevancy from which an object counts as found.
-    pub fn min_score(&self) -> f32 {
-        self.min_score
+    /// What the encoder's cosines are worth.
+    pub fn calibration(&self) -> Calibration {
+        self.calibration
     }
 }
 
-/// Relevancy from which an object counts as found, with the encoder that made a scene's embeddings.
-pub fn min_score(manifest: &Manifest) -> f32 {
-    if manifest.encoder == OFFLINE { query::MIN_SCORE } else { query::CLIP_MIN_SCORE }
+/// What the cosines of the encoder that made a scene's embeddings are worth.
+pub fn calibration(manifest: &Manifest) -> Calibration {
+    if manifest.encoder == OFFLINE { Calibration::OFFLINE } else { Calibration::CLIP }
 }

@@ -3,10 +3,11 @@
 use crate::objects;
 use crate::progress::TrainStep;
 use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::{Camera, Gaussians};
 use fastlgs_grid::mapping::PaperConfig;
-use fastlgs_grid::{consensus, tree};
+use fastlgs_grid::objects as nodes;
 use fastlgs_raster::budget::Removal;
-use fastlgs_raster::{Budget, Choice};
+use fastlgs_raster::{Budget, Choice, View};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -58,6 +59,20 @@ pub enum Exposures {
     /// Learned.
     On,
     /// None.
+    Off,
+}
+
+/// Whether cameras move while training.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Align {
+    /// Where photos that are kept aside gain by it.
+    #[default]
+    Auto,
+    /// They do.
+    On,
+    /// They do not.
     Off,
 }
 
@@ -124,6 +139,10 @@ impl Background {
     }
 }
 
+/// Pixels of the training views that stand against each Gaussian of an automatic budget. A Gaussian has 14 numbers to learn, a pixel tells three;
+/// where there are few pixels a Gaussian, as with 170,000 of them on 28 photos of 240x180, they learn the photos by heart.
+const PIXELS_A_GAUSSIAN: usize = 20;
+
 /// So many Gaussians; nothing for `auto`.
 type BudgetChoice = Option<usize>;
 
@@ -149,8 +168,8 @@ pub struct Config {
     /// Iterations, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub iterations: Option<u32>,
-    /// Gaussians: `auto` (as many as held-out quality gains from; at most 200,000 with the preset quick, 300,000 with standard, a
-    /// million with paper), or exactly how many there may be.
+    /// Gaussians: `auto` (as many as held-out quality gains from; at most one for 20 pixels of the training photos, and 200,000 with the preset
+    /// quick, 300,000 with standard, a million with paper), or exactly how many there may be.
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
     pub budget: BudgetChoice,
     /// How their number is controlled.
@@ -168,6 +187,9 @@ pub struct Config {
     /// Learn an affine exposure for each training photo.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t, num_args = 0..=1, default_missing_value = "on", require_equals = true))]
     pub exposure: Exposures,
+    /// Move the cameras of the training photos to where the scene says that they were; `auto` where photos that are kept aside gain by it.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub align: Align,
     /// Keep geometry and colour as --init-ply gives them; train features only.
     #[cfg_attr(feature = "clap", arg(long, requires = "init_ply"))]
     pub freeze: bool,
@@ -192,14 +214,11 @@ pub struct Config {
     /// Paper mapping: what is compared beside the embeddings, separated by commas (the paper's ablation).
     #[cfg_attr(feature = "clap", arg(long, value_enum, value_delimiter = ',', default_value = "keypoints,color"))]
     pub cues: Vec<Cue>,
-    /// Global mapping: share of the views that must show two regions in one mask to join them.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = consensus::Config::default().agreement))]
-    pub agreement: f32,
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = tree::Config::default().min_support))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = nodes::Config::default().min_support))]
     pub support: f32,
-    /// Global mapping: smallest object, as the mean share of the pixels of the views that show it.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = tree::Config::default().min_share))]
+    /// Global mapping: smallest object, as the share of a photo's pixels that three views must show.
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = nodes::Config::default().min_share))]
     pub min_share: f32,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
@@ -217,7 +236,7 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        let (paper, objects) = (PaperConfig::default(), tree::Config::default());
+        let (paper, objects) = (PaperConfig::default(), nodes::Config::default());
         Self {
             scene: PathBuf::new(),
             preset: Preset::default(),
@@ -228,6 +247,7 @@ impl Default for Config {
             antialias: false,
             background: Background::default(),
             exposure: Exposures::default(),
+            align: Align::default(),
             freeze: false,
             init_ply: None,
             mapping: Mapping::default(),
@@ -236,7 +256,6 @@ impl Default for Config {
             theta: paper.theta,
             alpha: paper.alpha,
             cues: vec![Cue::Keypoints, Cue::Color],
-            agreement: consensus::Config::default().agreement,
             support: objects.min_support,
             min_share: objects.min_share,
             curve: None,
@@ -253,9 +272,10 @@ impl Config {
         self.iterations.unwrap_or(self.preset.values().0)
     }
 
-    /// How many Gaussians there may be.
-    pub(super) fn budget(&self) -> Budget {
-        self.budget.map_or(Budget::Auto(self.preset.values().2), Budget::Fixed)
+    /// How many Gaussians there may be, for views of so many pixels in all.
+    pub(super) fn budget(&self, pixels: usize) -> Budget {
+        let most = self.preset.values().2.min(pixels / PIXELS_A_GAUSSIAN);
+        self.budget.map_or(Budget::Auto(most.max(1)), Budget::Fixed)
     }
 
     /// Constants of Algorithm 1.
@@ -266,11 +286,9 @@ impl Config {
 
     /// Constants of global mapping.
     pub(super) fn global(&self) -> objects::Config {
-        // Regions may be smaller than objects, which are made of them.
-        let of_regions = consensus::Config::default().min_share * self.min_share / tree::Config::default().min_share;
         objects::Config {
-            consensus: consensus::Config { agreement: self.agreement, min_share: of_regions, ..consensus::Config::default() },
-            objects: tree::Config { min_support: self.support, min_share: self.min_share, ..tree::Config::default() },
+            antialias: self.antialias,
+            objects: nodes::Config { min_support: self.support, min_share: self.min_share, ..nodes::Config::default() },
         }
     }
 }
@@ -307,6 +325,10 @@ pub struct Report {
     pub sh_degree: u32,
     /// Whether exposures were learned.
     pub exposure: bool,
+    /// What photos that were kept aside gained by aligning their cameras, in dB, where that was looked at.
+    pub alignment_gain: Option<f64>,
+    /// Whether the cameras of the training photos were moved.
+    pub aligned: bool,
     /// Whether the 2-D Mip filter was on.
     pub antialias: bool,
     /// Colour behind everything.
@@ -349,6 +371,14 @@ impl Report {
     /// How a scene was trained; nothing where it was not, or was preprocessed again since.
     pub fn of(manifest: &Manifest) -> Option<Self> {
         manifest.notes.get(NOTE).map(|note| serde_json::from_value(note.clone()).unwrap_or_default())
+    }
+
+    /// The frame of a camera, in the way the scene was trained.
+    pub fn view(&self, camera: &Camera, scene: &Gaussians) -> View {
+        let mut view = View::new(camera, scene.len(), scene.sh_degree);
+        view.antialias = u32::from(self.antialias);
+        view.background_color[..3].copy_from_slice(&self.background);
+        view
     }
 
     /// Notes it in the manifest.

@@ -6,14 +6,15 @@ mod start;
 use crate::error::{Context, bail};
 use crate::progress::{Message, TrainStep};
 use crate::{Result, Run, objects, preprocess};
-pub use config::{Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
-use fastlgs_core::{Gaussians, SceneFolder, ply};
+pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{Channels, TrainConfig, Trainer};
+use fastlgs_raster::{Alignment, Channels, Target, TrainConfig, Trainer};
+pub(crate) use start::target;
 use std::time::Instant;
 
 /// Difference of two photos in stops from which exposures are learned.
-const VARYING: f64 = 0.15;
+const VARYING: f32 = 0.15;
 
 /// Iterations from which it pays to find out first which kernels the device is fastest with.
 const WORTH_TUNING: u32 = 500;
@@ -32,25 +33,32 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     }
     let folder = SceneFolder::open(&config.scene)?;
     let mut manifest = folder.manifest()?;
-    let cameras = folder.cameras()?;
-    let training = manifest.training(&cameras);
+    let given = folder.given_cameras()?;
+    // Gaussians that were trained before were trained with the cameras as they are now.
+    let mut cameras = if config.init_ply.is_some() { folder.cameras()? } else { given.clone() };
+    let mut training = manifest.training(&cameras);
     let known = match config.mapping {
         Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(), run.seed)?),
         Mapping::Keep => Some(objects::kept(&folder, &training)?),
         Mapping::Global => None,
     };
     let codes = known.as_ref().filter(|_| by_descent);
-    let targets = training.iter().map(|c| start::target(&folder, c, codes, &config.background)).collect::<Result<Vec<_>>>()?;
+    let light = preprocess::Brightness::of(&manifest);
+    let target = |c: &Camera| Ok(Target { gain: light.gain(&c.name), ..start::target(&folder, c, codes, &config.background)? });
+    let targets = training.iter().map(target).collect::<Result<Vec<_>>>()?;
     let held_out = manifest.held_out(&cameras);
     let held_out = held_out.iter().map(|c| start::target(&folder, c, None, &config.background)).collect::<Result<Vec<_>>>()?;
-    let first = start::gaussians(config, &folder, &training, run)?;
+    let mut first = start::gaussians(config, &folder, &targets, run)?;
+    if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
+        // What most views say: where they disagree, descent from elsewhere ends between their codes.
+        objects::lift(&mut first, &folder, &training, codes, config.antialias)?;
+    }
     if config.freeze && !by_descent {
         bail!(
             "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
         );
     }
-    let spread = preprocess::brightness_spread(&manifest);
-    let settings = settings(config, &first, spread, run.seed);
+    let settings = settings(config, &first, start::pixels(&targets), light.spread_stops, run.seed);
     if settings.iterations >= WORTH_TUNING {
         fastlgs_raster::tuning::tune(run.device, false)?;
     }
@@ -82,6 +90,11 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     })?;
     drop(work);
 
+    training = trainer.cameras();
+    for camera in &training {
+        cameras.iter_mut().filter(|c| c.name == camera.name).for_each(|c| *c = camera.clone());
+    }
+    let aligned = cameras != given;
     let degree = trainer.needed_degree()?;
     let psnr = trainer.quality(&held_out, Some(degree))?;
     let mut scene = trainer.gaussians()?.with_sh_degree(degree);
@@ -94,7 +107,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             found
         }
         Some(found) => {
-            objects::lift(&mut scene, &folder, &training, &found)?;
+            objects::lift(&mut scene, &folder, &training, &found, config.antialias)?;
             found
         }
         None => {
@@ -105,6 +118,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     };
     let mapping_seconds = started.elapsed().as_secs_f64();
     grid.save(&folder)?;
+    folder.save_trained_cameras(aligned.then_some(&cameras))?;
     ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
     let report = Report {
@@ -122,6 +136,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         removals: result.removals,
         sh_degree: scene.sh_degree,
         exposure: settings.exposure,
+        alignment_gain: result.alignment_gain,
+        aligned,
         antialias: settings.antialias,
         background: [r, g, b],
         size: format!("{}x{}", cameras[0].width, cameras[0].height),
@@ -139,13 +155,13 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
 }
 
 /// What the trainer is told: options, else what the preset says.
-fn settings(config: &Config, first: &Gaussians, brightness_spread: Option<f64>, seed: u64) -> TrainConfig {
+fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread: f32, seed: u64) -> TrainConfig {
     let (_, preset_degree, _) = config.preset.values();
     let by_descent = config.feature_mode == FeatureMode::Train;
     TrainConfig {
         iterations: config.iterations(),
         seed,
-        budget: config.budget(),
+        budget: config.budget(pixels),
         strategy: match config.strategy {
             Strategy::Classic => fastlgs_raster::Strategy::Classic,
             Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
@@ -163,9 +179,14 @@ fn settings(config: &Config, first: &Gaussians, brightness_spread: Option<f64>, 
         background: config.background.color,
         learn_background: config.background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => brightness_spread.is_some_and(|stops| stops >= VARYING),
+            Exposures::Auto => brightness_spread >= VARYING,
             Exposures::On => true,
             Exposures::Off => false,
+        },
+        alignment: match config.align {
+            Align::Auto => Alignment::Auto,
+            Align::On => Alignment::On,
+            Align::Off => Alignment::Off,
         },
         ..TrainConfig::default()
     }

@@ -1,6 +1,6 @@
 //! What training starts from: first Gaussians, and the pictures that they shall show.
 
-use super::config::{Background, Config};
+use super::config::{Background, Config, Strategy};
 use crate::error::bail;
 use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
@@ -9,24 +9,38 @@ use fastlgs_grid::Grid;
 use fastlgs_raster::{Target, TargetImage, init, pack};
 use std::path::PathBuf;
 
-/// Fewest triangulated points from which training starts without random ones.
-const FEW_POINTS: usize = 500;
+/// Share of the distance to its neighbours that a Gaussian has at first with MCMC.
+const MCMC_SCALE: f32 = 0.1;
+/// Points from which training starts; where fewer are known, random ones make up for the rest.
+const ENOUGH: usize = 5000;
 
-/// The given PLY, else the scene's points, else random ones.
-pub fn gaussians(config: &Config, folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<Gaussians> {
+/// Pixels of all views.
+pub fn pixels(views: &[Target]) -> usize {
+    views.iter().map(|v| (v.camera.width * v.camera.height) as usize).sum()
+}
+
+/// The given PLY, else the scene's points, with random ones where these are too few.
+pub fn gaussians(config: &Config, folder: &SceneFolder, views: &[Target], run: &Run) -> Result<Gaussians> {
     if let Some(path) = &config.init_ply {
         return Ok(ply::read(path)?);
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
-    if points.len() < FEW_POINTS {
-        run.warn(&format!("only {} points are known; starting from random ones as well", points.len()));
-        points.extend(init::random_points(training, 10_000, &mut rng));
+    let missing = ENOUGH.saturating_sub(points.len());
+    if missing > 0 {
+        run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
+        points.extend(init::random_points(views, missing, &mut rng));
     }
     // More points than half the budget would leave no room to grow where it matters.
     rng.shuffle(&mut points);
-    points.truncate((config.budget().most() / 2).max(1));
-    Ok(init::from_points(&points))
+    points.truncate((config.budget(pixels(views)).most() / 2).max(1));
+    let mut first = init::from_points(&points);
+    if config.strategy == Strategy::Mcmc {
+        // As its authors start: what is small and solid is moved, rather than grown.
+        first.opacity_logits.fill(0.0);
+        first.log_scales.iter_mut().for_each(|s| *s += MCMC_SCALE.ln());
+    }
+    Ok(first)
 }
 
 /// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count, nor do
@@ -58,5 +72,5 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, backg
         None => Vec::new(),
         Some(grid) => folder.objects(&camera.name)?.labels.iter().map(|id| code(grid, *id)).collect(),
     };
-    Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature } })
+    Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature }, gain: [1.0; 3] })
 }

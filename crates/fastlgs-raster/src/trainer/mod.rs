@@ -1,12 +1,16 @@
 //! Training of scene and semantic field together (paper, "Training Features for Gaussians").
 
+mod alignment;
+mod watched;
+
 use crate::budget::{self, Growth, Removal};
 use crate::channels::Channels;
 use crate::checkpoint::{self, Course};
 use crate::density::{self, State};
-use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions, TargetImage};
-use crate::exposure::{Learned, LearnedExposure, RATE};
+use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
+use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::schedule::{Budget, Strategy, TrainConfig};
+use crate::target::Target;
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use fastlgs_core::camera::scene_extent;
@@ -17,42 +21,6 @@ use fastlgs_core::{Camera, Gaussians};
 use serde::Serialize;
 use std::path::Path;
 use std::time::Instant;
-
-/// A training view.
-#[derive(Clone)]
-pub struct Target {
-    /// Camera at the training resolution.
-    pub camera: Camera,
-    /// What it should see.
-    pub image: TargetImage,
-}
-
-impl Target {
-    /// The view at half the resolution: means over 2x2 pixels, of those that count.
-    fn halved(&self) -> Self {
-        let [w, h] = self.image.size;
-        let size = [w.div_ceil(2), h.div_ceil(2)];
-        let halve = |plane: &[u32]| -> Vec<u32> {
-            if plane.is_empty() {
-                return Vec::new();
-            }
-            let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (2 * x, 2 * y)));
-            pixels
-                .map(|(x, y)| {
-                    let block = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].map(|(x, y)| (x.min(w - 1), y.min(h - 1)));
-                    let bytes = block.map(|(x, y)| plane[(y * w + x) as usize].to_le_bytes());
-                    let counting = bytes.iter().filter(|b| b[3] == 255);
-                    let n = counting.clone().count() as u32;
-                    let mean =
-                        |c: usize| (counting.clone().map(|b| u32::from(b[c])).sum::<u32>() + n / 2).checked_div(n).unwrap_or(0) as u8;
-                    crate::pack([mean(0), mean(1), mean(2)], n > 0)
-                })
-                .collect()
-        };
-        let image = TargetImage { size, color: halve(&self.image.color), feature: halve(&self.image.feature) };
-        Self { camera: self.camera.resized(size[0], size[1]), image }
-    }
-}
 
 /// State of a run, for progress bars.
 #[derive(Clone, Copy, Debug)]
@@ -86,6 +54,8 @@ pub struct TrainReport {
     pub removals: Vec<Removal>,
     /// Colour and feature behind everything.
     pub background: [f32; 6],
+    /// What the watched views gained by aligning their poses, in dB, where that was looked at.
+    pub alignment_gain: Option<f64>,
     /// Adapter.
     pub adapter: String,
 }
@@ -100,17 +70,34 @@ pub struct Trainer {
     coarse: Option<bool>,
 }
 
+/// The frame of a camera as a run has it.
+fn view_of(course: &Course, gaussians: usize, camera: &Camera, sh_degree: u32) -> View {
+    let [r, g, b, x, y, z] = course.background.values;
+    View {
+        antialias: u32::from(course.config.antialias),
+        background_color: [r, g, b, 0.0],
+        background_feature: [x, y, z, 0.0],
+        ..View::new(camera, gaussians, sh_degree)
+    }
+}
+
 impl Trainer {
     /// Puts the first Gaussians and all targets on the device.
     ///
     /// # Errors
     /// When there is nothing to train, or it does not fit the device.
-    pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, targets: Vec<Target>, config: TrainConfig) -> Result<Self> {
+    pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, mut targets: Vec<Target>, config: TrainConfig) -> Result<Self> {
         if scene.is_empty() || targets.is_empty() {
             return Err(Error::Invalid("nothing to train: there are no points or no training views".to_owned()));
         }
         engine.set_state(&State::of(&scene.clone().with_sh_degree(config.sh_degree)))?;
         let cameras: Vec<Camera> = targets.iter().map(|t| t.camera.clone()).collect();
+        if config.exposure {
+            for target in &mut targets {
+                let clipped = |pixel: &&mut u32| exposure::is_clipped(**pixel, target.gain);
+                target.image.color.iter_mut().filter(clipped).for_each(|pixel| *pixel &= 0x00ff_ffff);
+            }
+        }
         let background = Learned::new(std::array::from_fn(|c| if c < 3 { config.background[c] } else { 0.0 }));
         let course = Course {
             iteration: 0,
@@ -119,8 +106,10 @@ impl Trainer {
             rng: Rng::new(config.seed, "train"),
             growth: Growth::default(),
             removals: Vec::new(),
-            exposures: if config.exposure { vec![LearnedExposure::default(); targets.len()] } else { Vec::new() },
+            exposures: targets.iter().filter(|_| config.exposure).map(|t| LearnedExposure::from_gain(t.gain)).collect(),
             background,
+            poses: cameras.iter().map(|c| c.world_to_camera).collect(),
+            alignment_gain: None,
             config,
         };
         Ok(Self { engine, extent: scene_extent(&cameras), targets, course, coarse: None })
@@ -158,13 +147,7 @@ impl Trainer {
     }
 
     fn view(&self, camera: &Camera, sh_degree: u32) -> View {
-        let [r, g, b, x, y, z] = self.course.background.values;
-        View {
-            antialias: u32::from(self.course.config.antialias),
-            background_color: [r, g, b, 0.0],
-            background_feature: [x, y, z, 0.0],
-            ..View::new(camera, self.engine.len(), sh_degree)
-        }
+        view_of(&self.course, self.engine.len(), camera, sh_degree)
     }
 
     fn step(&mut self) -> Result<()> {
@@ -173,14 +156,13 @@ impl Trainer {
         let config = self.course.config.clone();
         let iteration = self.course.iteration;
         let target = &self.targets[id];
-        let [w, h] = target.image.size;
-        let camera = if config.coarse(iteration) { target.camera.resized(w.div_ceil(2), h.div_ceil(2)) } else { target.camera.clone() };
+        let camera = if config.coarse(iteration) { target.camera.halved() } else { target.camera.clone() };
         let degree = config.degree(iteration);
         let options = StepOptions {
             channels: config.channels,
             lambda: config.lambda,
             feature_weight: config.feature_weight,
-            exposure: self.course.exposures.get(id).map_or_else(Exposure::default, LearnedExposure::exposure),
+            exposure: self.exposure(id),
         };
         let rates = config.rates(iteration, self.extent);
         let trained = match config.channels {
@@ -188,11 +170,7 @@ impl Trainer {
             Channels::Color | Channels::Both | Channels::Coupled => 0..channels(degree),
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
-        if config.strategy == Strategy::Mcmc && config.channels.color() {
-            // Weights of the means of opacity and scale in MCMC's loss.
-            let each = 0.01 / self.engine.len() as f32;
-            (step.opacity_weight, step.scale_weight) = (each, each / 3.0);
-        }
+        [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len());
         self.engine.step(self.view(&camera, degree), id, &options, &step)?;
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
@@ -200,10 +178,13 @@ impl Trainer {
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;
             if let Some(exposure) = self.course.exposures.get_mut(id) {
-                exposure.learn(&losses);
+                exposure.learn(&losses, config.progress(iteration));
+                exposure::pin_mean(&mut self.course.exposures);
             }
             if config.learn_background {
-                self.course.background.step(losses.by_background, RATE);
+                // Behind all features there is nothing: queries know no other background.
+                let [r, g, b, ..] = losses.by_background;
+                self.course.background.step([r, g, b, 0.0, 0.0, 0.0], BACKGROUND_RATE);
             }
         }
         self.course.iteration += 1;
@@ -224,7 +205,7 @@ impl Trainer {
             }
             Strategy::Mcmc => {
                 let moved = density::relocate(&mut state, &mut self.course.rng);
-                let added = density::grow(&mut state, budget, &mut self.course.rng);
+                let added = density::grow(&mut state, budget, config.rounds_left(self.course.iteration), &mut self.course.rng);
                 tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), moved, added, "density control");
             }
         }
@@ -241,53 +222,8 @@ impl Trainer {
         self.engine.set_state(state)
     }
 
-    /// Removes what no training view sees.
-    fn prune(&mut self) -> Result<()> {
-        let mut state = self.engine.state()?;
-        let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        let cameras: Vec<Camera> = self.targets.iter().map(|t| t.camera.clone()).collect();
-        let kept = budget::seen(&scene, &cameras, budget::MIN_WEIGHT);
-        let psnr_before = self.quality(&self.watched(), None)?;
-        state.keep(&kept);
-        self.replace(&state)?;
-        let psnr_after = self.quality(&self.watched(), None)?;
-        let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: kept.len(), psnr_before, psnr_after };
-        tracing::info!(?removal, "unseen Gaussians removed");
-        self.course.removals.push(removal);
-        Ok(())
-    }
-
-    /// Looks at the watched views and decides whether the scene may grow on.
-    fn watch(&mut self) -> Result<()> {
-        let degree = self.course.config.degree(self.course.iteration);
-        if let Some(db) = self.quality(&self.watched(), Some(degree))? {
-            self.course.growth.look(self.engine.len(), db);
-            tracing::debug!(iteration = self.course.iteration, db, gaussians = self.engine.len(), growth = ?self.course.growth, "watched views");
-        }
-        Ok(())
-    }
-
-    /// The training views that are kept aside while the scene grows.
-    fn watched(&self) -> Vec<Target> {
-        let count = self.targets.len();
-        (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect()
-    }
-
-    /// The lowest SH degree that shows the watched views as well as all degrees do, but for [`budget::DEGREE_LOSS`] dB; the
-    /// highest where the budget is fixed or no view is watched.
-    ///
-    /// # Errors
-    /// As [`Engine::render`].
-    pub fn needed_degree(&mut self) -> Result<u32> {
-        let (highest, watched) = (self.course.config.degree(self.course.iteration), self.watched());
-        let automatic = matches!(self.course.config.budget, Budget::Auto(_));
-        let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else { return Ok(highest) };
-        for degree in 0..highest {
-            if self.quality(&watched, Some(degree))?.is_some_and(|db| best - db <= budget::DEGREE_LOSS) {
-                return Ok(degree);
-            }
-        }
-        Ok(highest)
+    fn exposure(&self, id: usize) -> Exposure {
+        self.course.exposures.get(id).map_or_else(Exposure::default, LearnedExposure::exposure)
     }
 
     /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
@@ -298,12 +234,12 @@ impl Trainer {
     pub fn quality(&mut self, views: &[Target], sh_degree: Option<u32>) -> Result<Option<f64>> {
         let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
-        for Target { camera, image } in views {
+        for Target { camera, image, .. } in views {
             let frame = self.engine.render(self.view(camera, degree), Channels::Color)?;
             let (mut rendered, mut wanted) = (Vec::new(), Vec::new());
             for c in 0..3 {
                 for (value, packed) in frame.channels(c, c + 1).iter().zip(&image.color).filter(|(_, p)| p.to_le_bytes()[3] == 255) {
-                    rendered.push(*value);
+                    rendered.push(value.clamp(0.0, 1.0));
                     wanted.push(f32::from(packed.to_le_bytes()[c]) / 255.0);
                 }
             }
@@ -333,14 +269,14 @@ impl Trainer {
                 self.engine.losses()?;
                 started = Instant::now();
             }
-            if iteration.is_multiple_of(budget::WATCH_EVERY)
-                && matches!(self.course.config.budget, Budget::Auto(_))
-                && !self.growth_is_over()
-            {
+            if self.course.config.looks(iteration) && !self.growth_is_over() {
                 self.watch()?;
             }
             if self.course.config.refines(iteration) {
                 self.refine()?;
+            }
+            if self.course.config.aligns(iteration) {
+                self.align()?;
             }
             if self.course.config.prunes(iteration) {
                 self.prune()?;
@@ -368,6 +304,7 @@ impl Trainer {
             gaussians: self.engine.len(),
             removals: self.course.removals.clone(),
             background: self.course.background.values,
+            alignment_gain: self.course.alignment_gain,
             adapter: self.engine.name(),
         })
     }
@@ -375,14 +312,17 @@ impl Trainer {
     /// The Gaussians as they are now.
     ///
     /// # Errors
-    /// When the device failed, or a value is no longer finite.
+    /// When the device failed, or no Gaussian is finite.
     pub fn gaussians(&self) -> Result<Gaussians> {
-        let state = self.engine.state()?;
-        let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        match scene.first_not_finite() {
-            Some(i) => Err(Error::Invalid(format!("training diverged: Gaussian {i} is no longer finite; check the poses"))),
-            None => Ok(scene),
+        let mut state = self.engine.state()?;
+        let lost = state.keep_finite();
+        if lost > 0 {
+            tracing::warn!(lost, "Gaussians that were no longer finite were removed");
         }
+        if state.is_empty() {
+            return Err(Error::Invalid("training diverged: no Gaussian is finite any more; check the poses".to_owned()));
+        }
+        Ok(Gaussians::from_channels(&state.params, state.sh_degree, None))
     }
 
     /// Renders any camera with the current scene.
@@ -420,6 +360,9 @@ impl Trainer {
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;
+        for (target, pose) in self.targets.iter_mut().zip(&course.poses) {
+            target.camera.world_to_camera = *pose;
+        }
         self.course = course;
         Ok(true)
     }

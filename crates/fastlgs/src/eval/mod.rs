@@ -1,9 +1,11 @@
 //! Accuracy on held-out views. The rules are in `docs/evaluation.md`.
 
+mod color;
+
 use crate::error::{Context, bail};
 use crate::{Result, Run, Session};
 use fastlgs_core::labels::{Label, LabelledView};
-use fastlgs_core::{Camera, image_io, labels, metrics};
+use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, Field, Hit, QueryConfig};
 use rayon::prelude::*;
@@ -13,7 +15,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 /// What is measured.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
@@ -28,12 +30,19 @@ pub struct Config {
     /// Decide pixels as in the paper: by the distance of the rendered code to the object's, on the 0..255 scale.
     #[cfg_attr(feature = "clap", arg(long, value_name = "DISTANCE"))]
     pub tau_ac: Option<f32>,
-    /// Relevancy from which an object counts as found, instead of the program's constant.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "SCORE"))]
-    pub min_score: Option<f32>,
+    /// Share of the names of absent things that may be answered all the same.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms))]
+    pub false_alarms: f32,
     /// Texts that must not be found, one a line; a list of everyday things is built in.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub absent: Option<PathBuf>,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        let false_alarms = QueryConfig::default().false_alarms;
+        Self { scene: PathBuf::new(), labels: None, label_text: None, tau_ac: None, false_alarms, absent: None }
+    }
 }
 
 /// What was measured. Figures are means over all labels of all views, unless said otherwise; `docs/evaluation.md` defines them.
@@ -59,10 +68,18 @@ pub struct Report {
     pub loc_acc: Option<f64>,
     /// IoU of the object that fits each label best.
     pub oracle_miou: Option<f64>,
+    /// The same by label.
+    pub oracle_by_label: BTreeMap<String, Option<f64>>,
     /// Share of a label's pixels that no best object of another label claims.
     pub apart: Option<f64>,
     /// Whether the first-ranked object lies in the label.
     pub text_top1: Option<f64>,
+    /// Share of labels whose best object is among the first 1, 3 and 5 for its text.
+    pub oracle_ranked: [Option<f64>; 3],
+    /// By label: the place of its best object among all for its text, from 1 on; the worst over the views.
+    pub oracle_rank_by_label: BTreeMap<String, usize>,
+    /// What became of the texts.
+    pub outcomes: BTreeMap<Outcome, usize>,
     /// Area under the curve of present against absent texts.
     pub absent_auroc: Option<f64>,
     /// Absent texts that were asked.
@@ -77,6 +94,10 @@ pub struct Report {
     pub present_scores: BTreeMap<String, f64>,
     /// PSNR of the held-out views in dB.
     pub psnr: Option<f64>,
+    /// The same, with the pose of each held-out view aligned to the scene first.
+    pub psnr_aligned: Option<f64>,
+    /// And with a gain and an offset a channel fitted to each of these photos.
+    pub psnr_affine: Option<f64>,
     /// SSIM of the held-out views.
     pub ssim: Option<f64>,
     /// Gaussians.
@@ -93,6 +114,22 @@ pub struct Report {
     pub size: String,
     /// The device's name.
     pub adapter: String,
+}
+
+/// What became of a label's text.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The mask has half of the oracle's IoU at least.
+    Right,
+    /// Said to be not found.
+    Refused,
+    /// A part of the best object was taken, or what it is a part of.
+    WrongLevel,
+    /// Something else was taken.
+    WrongObject,
+    /// The best object was taken, with others that spoil its mask.
+    WrongMask,
 }
 
 /// A text that names nothing in the scene.
@@ -154,7 +191,7 @@ const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "
 #[derive(Default)]
 struct Sums {
     iou: Vec<f64>,
-    oracle: Vec<f64>,
+    oracle: BTreeMap<String, Vec<f64>>,
     apart: Vec<f64>,
     recall: Vec<f64>,
     boundary: Vec<f64>,
@@ -165,6 +202,8 @@ struct Sums {
     by_label: BTreeMap<String, Vec<f64>>,
     first_ms: Vec<f64>,
     next_ms: Vec<f64>,
+    ranks: BTreeMap<String, Vec<usize>>,
+    outcomes: BTreeMap<Outcome, usize>,
 }
 
 fn mean(values: &[f64]) -> Option<f64> {
@@ -178,10 +217,10 @@ fn mean(values: &[f64]) -> Option<f64> {
 pub fn eval(config: &Config, run: &Run) -> Result<Report> {
     let mut scene = Session::open(&config.scene, run.device)?;
     let grid = scene.grid()?;
-    let (psnr, ssim) = color_quality(&mut scene)?;
+    let color = color::quality(&mut scene)?;
     let label_text = config.label_text.as_deref();
     let views = config.labels.as_deref().map(|folder| labels::load(folder, label_text)).transpose()?.unwrap_or_default();
-    let query = QueryConfig { min_score: config.min_score.unwrap_or(scene.min_score()), ..QueryConfig::default() };
+    let query = QueryConfig { false_alarms: config.false_alarms, ..QueryConfig::default() };
     let total: usize = views.iter().map(|v| v.labels.len()).sum();
     let mut sums = Sums::default();
     for view in &views {
@@ -207,7 +246,7 @@ pub fn eval(config: &Config, run: &Run) -> Result<Report> {
         sums.apart.extend(apart(&best));
     }
     let absent = absent_scores(config, &scene, &grid, &views)?;
-    let rejected = |absent: &[(String, f64)]| absent.iter().filter(|a| a.1 < f64::from(query.min_score)).count();
+    let rejected = |absent: &[(String, f64)]| absent.iter().filter(|a| a.1 < f64::from(query.min_score())).count();
     let colored = colored_absent_scores(&absent, &scene, &grid)?;
     let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
     let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
@@ -223,17 +262,24 @@ pub fn eval(config: &Config, run: &Run) -> Result<Report> {
         macc: mean(&sums.recall),
         boundary_iou: mean(&sums.boundary),
         loc_acc: mean(&sums.localised),
-        oracle_miou: mean(&sums.oracle),
+        oracle_miou: mean(&sums.oracle.values().flatten().copied().collect::<Vec<_>>()),
+        oracle_by_label: sums.oracle.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
         apart: mean(&sums.apart),
         text_top1: mean(&sums.top1),
+        oracle_ranked: [1, 3, 5]
+            .map(|first| mean(&sums.ranks.values().flatten().map(|rank| f64::from(u8::from(*rank <= first))).collect::<Vec<_>>())),
+        oracle_rank_by_label: sums.ranks.iter().filter_map(|(k, v)| Some((k.clone(), *v.iter().max()?))).collect(),
+        outcomes: sums.outcomes,
         absent_auroc: (!auroc.is_nan()).then_some(auroc),
         absent_texts: absent.len(),
         absent_rejected: rejected(&absent),
         absent_colored_rejected: (!colored.is_empty()).then(|| rejected(&colored) as f64 / colored.len() as f64),
         absent_best: loudest.map(|(text, score)| Absent { text: text.clone(), score: *score }),
         present_scores: sums.labels.iter().cloned().zip(sums.present.iter().copied()).collect(),
-        psnr,
-        ssim,
+        psnr: color.map(|c| c.psnr),
+        psnr_aligned: color.map(|c| c.psnr_aligned),
+        psnr_affine: color.map(|c| c.psnr_affine),
+        ssim: color.map(|c| c.ssim),
         gaussians: scene.gaussians.len(),
         objects: grid.objects.len(),
         scene_bytes: crate::session::bytes(&config.scene),
@@ -242,18 +288,6 @@ pub fn eval(config: &Config, run: &Run) -> Result<Report> {
         size: format!("{}x{}", camera.width, camera.height),
         adapter: scene.engine.name(),
     })
-}
-
-/// Mean PSNR and SSIM over the held-out views.
-fn color_quality(scene: &mut Session) -> Result<(Option<f64>, Option<f64>)> {
-    let (mut psnr, mut ssim) = (Vec::new(), Vec::new());
-    for camera in scene.manifest.held_out(&scene.cameras) {
-        let frame = scene.render(&camera)?;
-        let photo = image_io::to_planar(&scene.folder.photo(&camera.name)?);
-        psnr.push(metrics::psnr(frame.channels(0, 3), &photo));
-        ssim.push(metrics::ssim(frame.channels(0, 3), &photo, camera.width as usize, camera.height as usize));
-    }
-    Ok((mean(&psnr), mean(&ssim)))
 }
 
 /// A label's true pixels, and those of the object that fits it best.
@@ -302,7 +336,7 @@ fn score_label(
     let started = Instant::now();
     let text_query = scene.text_query(&label.category)?;
     let ranked = query::rank(grid, &text_query);
-    let targets = query::select(grid, &ranked, config);
+    let targets = query::select(grid, &ranked, &text_query, config);
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
@@ -315,11 +349,21 @@ fn score_label(
     let relevancy = field.relevancy(grid, &ranked);
     sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &view.boxes(label, w, h)))));
     sums.labels.push(label.category.clone());
-    sums.present.push(best_score(&ranked));
+    sums.present.push(f64::from(query::best_score(&ranked)));
     // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
     let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
-    let (oracle, found) = best_object(grid, field, &truth);
-    sums.oracle.push(oracle);
+    let (oracle, found, id) = best_object(grid, field, &truth);
+    sums.ranks.entry(label.category.clone()).or_default().push(ranked.iter().position(|h| h.id == id).map_or(ranked.len(), |k| k) + 1);
+    let related = |hit: &Hit| grid.chain(hit.id).any(|a| a == id) || grid.chain(id).any(|a| a == hit.id);
+    let outcome = match targets.first() {
+        None => Outcome::Refused,
+        _ if iou >= 0.5 * oracle && iou > 0.0 => Outcome::Right,
+        Some(first) if first.id == id => Outcome::WrongMask,
+        Some(first) if related(first) => Outcome::WrongLevel,
+        Some(_) => Outcome::WrongObject,
+    };
+    *sums.outcomes.entry(outcome).or_default() += 1;
+    sums.oracle.entry(label.category.clone()).or_default().push(oracle);
     let inside = |mask: Vec<bool>| {
         let (hit, all) = mask.iter().zip(&truth).filter(|(m, _)| **m).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
         all > 0 && 2 * hit > all
@@ -328,11 +372,11 @@ fn score_label(
     Ok((ms, Best { truth, found }))
 }
 
-/// IoU and mask of the object that fits a mask best.
-pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool>) {
-    let masks = candidates(grid, field, truth).into_iter().map(|id| field.mask(grid, &[Hit { id, score: 0.0 }]));
-    let tried = masks.map(|mask| (metrics::iou(&mask, truth), mask));
-    tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()]))
+/// IoU, mask and id of the object that fits a mask best; id 0 where there are no objects.
+pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool>, u16) {
+    let masks = candidates(grid, field, truth).into_iter().map(|id| (field.mask(grid, &[Hit { id, score: 0.0 }]), id));
+    let tried = masks.map(|(mask, id)| (metrics::iou(&mask, truth), mask, id));
+    tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()], 0))
 }
 
 /// The objects that come nearest to a mask by their owned pixels: one of them is the best.
@@ -377,13 +421,8 @@ fn colored_absent_scores(absent: &[(String, f64)], scene: &Session, grid: &Grid)
 
 /// A text with its best score.
 fn scored(scene: &Session, grid: &Grid, text: String) -> Result<(String, f64)> {
-    let score = best_score(&query::rank(grid, &scene.text_query(&text)?));
+    let score = f64::from(query::best_score(&query::rank(grid, &scene.text_query(&text)?)));
     Ok((text, score))
-}
-
-/// What decides whether a text is found: the best score of any object, which need not be the first-ranked one's.
-fn best_score(ranked: &[Hit]) -> f64 {
-    ranked.iter().map(|hit| f64::from(hit.score)).fold(0.0, f64::max)
 }
 
 #[cfg(test)]

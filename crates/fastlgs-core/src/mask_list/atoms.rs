@@ -1,0 +1,112 @@
+//! Pixels that lie in the same set of masks: votes for these are votes for all masks at once.
+
+use super::MaskList;
+use crate::LabelMap;
+use std::collections::BTreeMap;
+
+/// A photo cut where any of its masks ends.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Atoms {
+    /// Atom of each pixel; 0 where no mask lies.
+    pub map: LabelMap,
+    /// Which masks an atom lies in.
+    pub table: Table,
+}
+
+/// Which masks the atoms of a photo lie in.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Table {
+    /// By atom: its masks, by their places in the list, rising.
+    masks: Vec<Vec<u16>>,
+    /// By mask: its pixels; 0 for a mask that was left out.
+    pub areas: Vec<u32>,
+    /// By mask: its number in all photos.
+    pub tracks: Vec<Option<u32>>,
+    /// Masks that would have needed more atoms than 16 bits can number.
+    pub left_out: usize,
+}
+
+impl Table {
+    /// The masks that an atom lies in, by their places in the list.
+    pub fn masks(&self, atom: u16) -> &[u16] {
+        &self.masks[usize::from(atom)]
+    }
+}
+
+impl MaskList {
+    /// The atoms of these masks. Masks beyond the 65,535th and those that ask for more atoms than that are left out.
+    pub fn atoms(&self) -> Atoms {
+        const MOST: usize = u16::MAX as usize;
+        // By atom: masks and pixels. Atom 0 is what lies in no mask, even if there is none.
+        let mut atoms: Vec<(Vec<u16>, u32)> = vec![(Vec::new(), self.width * self.height)];
+        let mut at = vec![0u32; (self.width * self.height) as usize];
+        let mut table = Table { tracks: self.masks.iter().map(|m| m.track).collect(), ..Table::default() };
+        for (k, mask) in self.masks.iter().enumerate() {
+            let mut common: BTreeMap<u32, u32> = BTreeMap::new();
+            self.places(mask).for_each(|p| *common.entry(at[p]).or_default() += 1);
+            // An atom that the mask holds whole is not cut.
+            let whole = |atom: u32, pixels: u32| atom > 0 && pixels == atoms[atom as usize].1;
+            let cut = common.iter().filter(|c| !whole(*c.0, *c.1)).count();
+            if k >= MOST || atoms.len() + cut > MOST {
+                table.areas.push(0);
+                table.left_out += 1;
+                continue;
+            }
+            let mut inside: BTreeMap<u32, u32> = BTreeMap::new();
+            for (&atom, &pixels) in &common {
+                let (masks, all) = &mut atoms[atom as usize];
+                if atom > 0 && pixels == *all {
+                    masks.push(k as u16);
+                    continue;
+                }
+                *all -= pixels;
+                let masks = masks.iter().copied().chain([k as u16]).collect();
+                inside.insert(atom, atoms.len() as u32);
+                atoms.push((masks, pixels));
+            }
+            for p in self.places(mask) {
+                at[p] = inside.get(&at[p]).copied().unwrap_or(at[p]);
+            }
+            table.areas.push(common.values().sum());
+        }
+        table.masks = atoms.into_iter().map(|a| a.0).collect();
+        Atoms { map: LabelMap { width: self.width, height: self.height, labels: at.into_iter().map(|a| a as u16).collect() }, table }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Level, Mask, RunLengths};
+    use super::*;
+
+    fn list(masks: &[&str]) -> MaskList {
+        let width = masks[0].len() as u32;
+        let of = |bits: &&str| Mask::new(Level::Whole, RunLengths::of(width, 1, |x, _| bits.as_bytes()[x as usize] == b'#'));
+        MaskList { width, height: 1, masks: masks.iter().map(of).collect() }
+    }
+
+    #[test]
+    fn masks_cut_each_other() {
+        let atoms = list(&["####....", "..####..", "..##....", "........"]).atoms();
+        let masks: Vec<&[u16]> = atoms.map.labels.iter().map(|a| atoms.table.masks(*a)).collect();
+        assert_eq!(masks, [&[0][..], &[0], &[0, 1, 2], &[0, 1, 2], &[1], &[1], &[], &[]]);
+        assert_eq!((atoms.table.areas, atoms.table.left_out), (vec![4, 4, 2, 0], 0));
+        assert_eq!(atoms.table.masks.len(), 4, "a mask that is an atom already makes none");
+    }
+
+    #[test]
+    fn a_photo_that_is_one_mask_keeps_atom_0_for_no_mask() {
+        let atoms = list(&["###"]).atoms();
+        assert_eq!((atoms.map.labels, atoms.table.masks), (vec![1; 3], vec![vec![], vec![0]]));
+    }
+
+    #[test]
+    fn what_16_bits_cannot_number_is_left_out() {
+        let mut masks = MaskList::new(300, 300);
+        masks.masks = (0..70_000u32)
+            .map(|p| Mask::new(Level::Whole, RunLengths::from_counts(vec![p, 1, 89_999 - p], 90_000).expect("whole")))
+            .collect();
+        let atoms = masks.atoms();
+        assert_eq!((atoms.table.left_out, atoms.map.max()), (70_000 - 65_534, 65_534));
+    }
+}

@@ -1,0 +1,143 @@
+//! The masks of one photo. They may overlap: a cup, the cup on its saucer, the handle of the cup.
+
+mod atoms;
+mod file;
+mod run_lengths;
+
+use crate::LabelMap;
+pub use atoms::{Atoms, Table};
+pub use run_lengths::RunLengths;
+use serde::{Deserialize, Serialize};
+
+/// How large a thing is that a mask stands for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Level {
+    /// An object (the paper's *whole* level).
+    #[default]
+    Whole,
+    /// A part of one.
+    Part,
+    /// A part of a part.
+    Subpart,
+}
+
+impl Level {
+    /// Coarse to fine.
+    pub const ALL: [Self; 3] = [Self::Whole, Self::Part, Self::Subpart];
+
+    /// Name in files and options.
+    pub fn name(self) -> &'static str {
+        ["whole", "part", "subpart"][self as usize]
+    }
+}
+
+/// One mask.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Mask {
+    /// What it stands for.
+    pub level: Level,
+    /// IoU with the thing that its maker predicts for it, 0 to 1; 1 where nobody said.
+    pub predicted_iou: f32,
+    /// IoU of the masks that a stricter and a laxer threshold give, 0 to 1; 1 where nobody said.
+    pub stability: f32,
+    /// Number of the thing in all photos, where a tracker gave one.
+    pub track: Option<u32>,
+    /// Its pixels.
+    pub runs: RunLengths,
+}
+
+impl Mask {
+    /// A mask of which no more is known.
+    pub fn new(level: Level, runs: RunLengths) -> Self {
+        Self { level, predicted_iou: 1.0, stability: 1.0, track: None, runs }
+    }
+}
+
+/// All masks of a photo.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MaskList {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// In the order in which they were found.
+    pub masks: Vec<Mask>,
+}
+
+impl MaskList {
+    /// No masks.
+    pub fn new(width: u32, height: u32) -> Self {
+        Self { width, height, masks: Vec::new() }
+    }
+
+    /// The masks of label maps of one size, one map a level, coarse to fine.
+    pub fn of_levels(levels: &[LabelMap; 3]) -> Self {
+        let mut list = Self::new(levels[0].width, levels[0].height);
+        for (level, map) in Level::ALL.into_iter().zip(levels) {
+            list.add(level, map);
+        }
+        list
+    }
+
+    /// Appends the masks of a label map, in the order of their labels; returns those labels.
+    pub fn add(&mut self, level: Level, map: &LabelMap) -> Vec<u16> {
+        let boxes = map.boxes();
+        let mut labels = Vec::new();
+        for (label, [x0, y0, x1, y1]) in boxes.iter().enumerate().skip(1).filter_map(|(l, b)| Some((l as u16, (*b)?))) {
+            let inside = |x: u32, y: u32| (x0..x1).contains(&x) && (y0..y1).contains(&y) && map.at(x, y) == label;
+            self.masks.push(Mask::new(level, RunLengths::of(map.width, map.height, inside)));
+            labels.push(label);
+        }
+        labels
+    }
+
+    /// Row-major places of a mask's pixels.
+    pub fn places(&self, mask: &Mask) -> impl Iterator<Item = usize> {
+        mask.runs.places(self.width, self.height)
+    }
+
+    /// Masks of a level.
+    pub fn count(&self, level: Level) -> usize {
+        self.masks.iter().filter(|m| m.level == level).count()
+    }
+
+    /// A level's masks as a label map: large ones first, so that smaller ones lie on top. Labels 1, 2, ... follow falling area.
+    pub fn painted(&self, level: Level) -> LabelMap {
+        let mut order: Vec<(usize, &Mask)> = self.masks.iter().filter(|m| m.level == level).map(|m| (m.runs.area(), m)).collect();
+        order.sort_by_key(|(area, _)| std::cmp::Reverse(*area));
+        let mut map = LabelMap::new(self.width, self.height);
+        for (label, (_, mask)) in (1..=u16::MAX).zip(order) {
+            self.places(mask).for_each(|p| map.labels[p] = label);
+        }
+        map
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn map(labels: &[u16]) -> LabelMap {
+        LabelMap { width: 4, height: 1, labels: labels.to_vec() }
+    }
+
+    #[test]
+    fn smaller_masks_lie_on_top() {
+        let mut list = MaskList::new(4, 1);
+        list.add(Level::Whole, &map(&[0, 7, 7, 0]));
+        list.add(Level::Whole, &map(&[1, 1, 1, 0]));
+        list.add(Level::Part, &map(&[0, 0, 0, 2]));
+        assert_eq!(list.painted(Level::Whole), map(&[1, 2, 2, 0]));
+        assert_eq!((list.count(Level::Whole), list.count(Level::Part), list.painted(Level::Part).max()), (2, 1, 1));
+    }
+
+    #[test]
+    fn label_maps_become_lists() {
+        let list = MaskList::of_levels(&[map(&[9, 9, 3, 3]), map(&[0; 4]), map(&[5, 0, 0, 0])]);
+        let levels: Vec<Level> = list.masks.iter().map(|m| m.level).collect();
+        assert_eq!(levels, [Level::Whole, Level::Whole, Level::Subpart]);
+        assert_eq!(list.places(&list.masks[0]).collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(MaskList::new(4, 1).add(Level::Whole, &map(&[9, 9, 3, 3])), [3, 9]);
+    }
+}

@@ -1,0 +1,69 @@
+//! What training is towards: a camera and what it should see.
+
+use crate::engine::{TargetImage, pack};
+use fastlgs_core::Camera;
+
+/// A training view.
+#[derive(Clone)]
+pub struct Target {
+    /// Camera at the training resolution.
+    pub camera: Camera,
+    /// What it should see.
+    pub image: TargetImage,
+    /// How many times brighter than the mean its photo shows things, by channel, as far as that is known before training.
+    pub gain: [f32; 3],
+}
+
+impl Target {
+    /// The view at half the resolution, over 2x2 pixels of those that count: the mean of their colours, and the code that most of them have. The mean of
+    /// two codes is near a third object's.
+    pub(crate) fn halved(&self) -> Self {
+        let [w, h] = self.image.size;
+        let size = [w.div_ceil(2), h.div_ceil(2)];
+        let halve = |plane: &[u32], of: fn(&[[u8; 4]]) -> [u8; 3]| -> Vec<u32> {
+            if plane.is_empty() {
+                return Vec::new();
+            }
+            let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (2 * x, 2 * y)));
+            pixels
+                .map(|(x, y)| {
+                    let block = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].map(|(x, y)| (x.min(w - 1), y.min(h - 1)));
+                    let bytes = block.map(|(x, y)| plane[(y * w + x) as usize].to_le_bytes());
+                    let counting: Vec<[u8; 4]> = bytes.into_iter().filter(|b| b[3] == 255).collect();
+                    pack(if counting.is_empty() { [0; 3] } else { of(&counting) }, !counting.is_empty())
+                })
+                .collect()
+        };
+        let image = TargetImage { size, color: halve(&self.image.color, mean), feature: halve(&self.image.feature, mode) };
+        Self { camera: self.camera.halved(), image, gain: self.gain }
+    }
+}
+
+fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
+    let n = pixels.len() as u32;
+    std::array::from_fn(|c| ((pixels.iter().map(|p| u32::from(p[c])).sum::<u32>() + n / 2) / n) as u8)
+}
+
+/// What most of the pixels are; of several the one that comes first.
+fn mode(pixels: &[[u8; 4]]) -> [u8; 3] {
+    let count = |pixel: &[u8; 4]| pixels.iter().filter(|p| *p == pixel).count();
+    let [x, y, z, _] = pixels.iter().rev().copied().max_by_key(count).unwrap_or_default();
+    [x, y, z]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_are_averaged_and_codes_are_not() {
+        let camera = Camera::look_at("v", glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::Y, 4, 2, 1.0);
+        let plane: Vec<u32> = [10, 20, 40, 90, 20, 30, 90, 40].map(|v| pack([v; 3], true)).to_vec();
+        let feature = plane.iter().enumerate().map(|(k, p)| if k == 5 { p & 0x00ff_ffff } else { *p }).collect();
+        let target = Target { camera, image: TargetImage { size: [4, 2], color: plane, feature }, gain: [1.0; 3] };
+        let half = target.halved().image;
+        assert_eq!(half.size, [2, 1]);
+        assert_eq!(half.color, [20, 65].map(|v| pack([v; 3], true)));
+        assert_eq!(half.feature, [20, 40].map(|v| pack([v; 3], true)));
+    }
+}

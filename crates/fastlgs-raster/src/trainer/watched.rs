@@ -1,0 +1,68 @@
+//! What views that are watched, and not trained on while the scene grows, decide: whether it may grow on, what may be removed, and how
+//! many SH degrees it needs.
+
+use super::{Trainer, view_of};
+use crate::Result;
+use crate::budget::{self, Removal};
+use crate::schedule::Budget;
+use crate::target::Target;
+use crate::view::View;
+use fastlgs_core::Gaussians;
+
+impl Trainer {
+    /// Looks at the watched views and decides whether the scene may grow on.
+    pub(super) fn watch(&mut self) -> Result<()> {
+        let degree = self.course.config.degree(self.course.iteration);
+        if let Some(db) = self.quality(&self.watched(), Some(degree))? {
+            self.course.growth.look(self.engine.len(), db);
+            tracing::debug!(iteration = self.course.iteration, db, gaussians = self.engine.len(), growth = ?self.course.growth, "watched views");
+        }
+        Ok(())
+    }
+
+    /// The training views that are kept aside while the scene grows.
+    pub(super) fn watched(&self) -> Vec<Target> {
+        let count = self.targets.len();
+        (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect()
+    }
+
+    /// The lowest SH degree that shows the watched views as well as all degrees do, but for [`budget::DEGREE_LOSS`] dB; the
+    /// highest where the budget is fixed or no view is watched.
+    ///
+    /// # Errors
+    /// As [`crate::engine::Engine::render`].
+    pub fn needed_degree(&mut self) -> Result<u32> {
+        let (highest, watched) = (self.course.config.degree(self.course.iteration), self.watched());
+        let automatic = matches!(self.course.config.budget, Budget::Auto(_));
+        let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else { return Ok(highest) };
+        for degree in 0..highest {
+            if self.quality(&watched, Some(degree))?.is_some_and(|db| best - db <= budget::DEGREE_LOSS) {
+                return Ok(degree);
+            }
+        }
+        Ok(highest)
+    }
+
+    /// Removes what no training view sees.
+    pub(super) fn prune(&mut self) -> Result<()> {
+        let mut state = self.engine.state()?;
+        let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
+        let views: Vec<View> = self.targets.iter().map(|t| view_of(&self.course, scene.len(), &t.camera, 0)).collect();
+        let largest = budget::largest_weights(&scene, &views);
+        let judges = self.judges();
+        let psnr_before = self.quality(&judges, None)?;
+        state.keep(&budget::reaching(&largest, budget::MIN_WEIGHT));
+        self.replace(&state)?;
+        let psnr_after = self.quality(&judges, None)?;
+        let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: state.len(), psnr_before, psnr_after };
+        tracing::info!(?removal, "unseen Gaussians removed");
+        self.course.removals.push(removal);
+        Ok(())
+    }
+
+    /// The views that tell what a removal costs: the watched ones, else some of all.
+    pub(super) fn judges(&self) -> Vec<Target> {
+        let watched = self.watched();
+        if watched.is_empty() { self.targets.iter().step_by(budget::WATCHED).cloned().collect() } else { watched }
+    }
+}

@@ -1,0 +1,205 @@
+//! Bundle adjustment (Triggs et al. 2000): cameras, their lenses and the points that they see are moved together until the key points
+//! agree best. Levenberg-Marquardt on the cameras, points eliminated by the Schur complement, wrong matches faded out by Cauchy's loss.
+
+mod problem;
+
+use crate::keypoints::Keypoints;
+use crate::similarity::Similarity;
+use crate::tracks::{PairMatches, TOLERANCE, Track, tracks};
+use fastlgs_core::Camera;
+use glam::Vec3;
+use problem::{Lens, Observation, Pose, Problem, Values};
+use serde::{Deserialize, Serialize};
+
+/// Matches are loosened to this many times [`TOLERANCE`] while poses are rough, then tightened.
+const ROUNDS: [f32; 4] = [4.0, 4.0, 2.0, 1.0];
+/// Fewest photos by which a lens is adjusted.
+const PHOTOS_OF_A_LENS: usize = 5;
+
+/// What was adjusted, and by how much.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Report {
+    /// Root mean square reprojection error in pixels, by the given poses and by the adjusted ones, each over the tracks that it allows.
+    pub error: [f32; 2],
+    /// Observations in these tracks.
+    pub observations: [usize; 2],
+    /// For each camera the median distance, in pixels, between where it sees its points and where it saw them as given.
+    pub moved: Vec<f32>,
+    /// For each camera the factor on its focal length.
+    pub focal: Vec<f32>,
+    /// For each camera the first radial term of its lens that its pictures still have: a ray p lands at p (1 + k1 |p|^2).
+    pub k1: Vec<f32>,
+}
+
+/// Moves `cameras` to where `matches` agree best; none where no tracks tell. Where the centres of all cameras lie as a whole stays as given.
+pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMatches]) -> Option<Report> {
+    let given = cameras.to_vec();
+    let obeying = |cameras: &[Camera], tolerance: f32| -> Vec<Track> {
+        let matches: Vec<PairMatches> = matches.iter().map(|m| m.obeying(cameras, keypoints, tolerance)).collect();
+        tracks(cameras, keypoints, &matches, tolerance)
+    };
+    let before = quality(&obeying(&given, TOLERANCE));
+    let lens = lenses(&given);
+    let mut values =
+        Values { poses: Vec::new(), lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)], points: Vec::new() };
+    for round in ROUNDS {
+        let tracks = obeying(cameras, round * TOLERANCE);
+        if tracks.is_empty() {
+            return None;
+        }
+        let problem = Problem { cameras: &given, lens: lens.clone(), seen: observations(&tracks, keypoints) };
+        values.poses = cameras.iter().map(Pose::of).collect();
+        values.points = tracks.iter().map(|t| t.position.as_dvec3()).collect();
+        problem.solve(&mut values);
+        values.apply(&problem, cameras);
+    }
+    keep_gauge(cameras, &given);
+    let after = obeying(cameras, TOLERANCE);
+    let lens_of = |view: usize| lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
+    Some(Report {
+        error: [before.0, quality(&after).0],
+        observations: [before.1, quality(&after).1],
+        moved: movements(&given, cameras, &after),
+        focal: (0..cameras.len()).map(|v| lens_of(v).log_focal.exp() as f32).collect(),
+        k1: (0..cameras.len()).map(|v| lens_of(v).k1 as f32).collect(),
+    })
+}
+
+/// Root mean square error and observations of tracks.
+fn quality(tracks: &[Track]) -> (f32, usize) {
+    let count: usize = tracks.iter().map(|t| t.seen.len()).sum();
+    let square: f32 = tracks.iter().map(|t| t.error * t.error * t.seen.len() as f32).sum();
+    ((square / count.max(1) as f32).sqrt(), count)
+}
+
+/// Cameras of equal size and intrinsics share a lens, which is adjusted where enough photos tell about it.
+fn lenses(cameras: &[Camera]) -> Vec<Option<usize>> {
+    let same = |a: &Camera, b: &Camera| (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy);
+    let mut known: Vec<&Camera> = Vec::new();
+    for camera in cameras {
+        let sharing = cameras.iter().filter(|other| same(camera, other)).count();
+        if sharing >= PHOTOS_OF_A_LENS && !known.iter().any(|other| same(camera, other)) {
+            known.push(camera);
+        }
+    }
+    cameras.iter().map(|camera| known.iter().position(|other| same(camera, other))).collect()
+}
+
+fn observations(tracks: &[Track], keypoints: &[Keypoints]) -> Vec<Vec<Observation>> {
+    let of = |&(view, k): &(usize, usize)| Observation { view, pixel: keypoints[view].positions[k].as_dvec2() };
+    tracks.iter().map(|track| track.seen.iter().map(of).collect()).collect()
+}
+
+/// Moves all cameras by the one similarity that brings them nearest to where they were.
+fn keep_gauge(cameras: &mut [Camera], given: &[Camera]) {
+    let extent = fastlgs_core::camera::scene_extent(given);
+    // With points before and above the cameras, those on a line tell the turn around it as well.
+    let places = |c: &Camera| {
+        let axes = c.world_to_camera.transpose();
+        [c.centre(), c.centre() + extent * c.forward(), c.centre() - extent * axes.y_axis.truncate()]
+    };
+    let pairs: Vec<(Vec3, Vec3)> = cameras.iter().zip(given).flat_map(|(now, then)| places(now).into_iter().zip(places(then))).collect();
+    if let Some(back) = Similarity::between(&pairs) {
+        cameras.iter_mut().for_each(|camera| back.move_camera(camera));
+    }
+}
+
+/// For each camera the median distance in pixels between where it sees the points of its tracks now and where it saw them.
+fn movements(given: &[Camera], cameras: &[Camera], tracks: &[Track]) -> Vec<f32> {
+    let mut distances: Vec<Vec<f32>> = vec![Vec::new(); cameras.len()];
+    for track in tracks {
+        for &(view, _) in &track.seen {
+            let at = |c: &Camera| c.to_pixel(c.world_to_camera.transform_point3(track.position));
+            distances[view].push(at(&given[view]).distance(at(&cameras[view])));
+        }
+    }
+    let median = |mut all: Vec<f32>| {
+        all.sort_by(f32::total_cmp);
+        all.get(all.len() / 2).copied().unwrap_or(0.0)
+    };
+    distances.into_iter().map(median).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::matching::matches as match_all;
+    use crate::ring;
+    use fastlgs_core::rng::Rng;
+    use glam::{Mat4, Quat, Vec2};
+
+    /// Photos around a cloud whose points have descriptors of their own, seen with half a pixel of noise, and a tenth of them wrongly.
+    fn noisy_ring(count: usize) -> (Vec<Camera>, Vec<Keypoints>, Vec<PairMatches>) {
+        let mut rng = Rng::new(5, "ring");
+        let (cloud, cameras) = (ring::cloud(&mut rng), ring::cameras(count));
+        let mut error = || {
+            let size = if rng.uniform() < 0.1 { 30.0 } else { 0.5 };
+            size * Vec2::new(rng.normal(), rng.normal())
+        };
+        let keypoints: Vec<Keypoints> = cameras.iter().map(|c| ring::seen(c, &cloud, &mut error)).collect();
+        let near = |a: usize| (a + 1..count.min(a + 6)).map(move |b| (a, b));
+        let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: match_all(&keypoints[a], &keypoints[b]) };
+        let matches = (0..count).flat_map(near).map(matched).collect();
+        (cameras, keypoints, matches)
+    }
+
+    /// Median distance in pixels between where two cameras see points around the origin.
+    fn off(a: &[Camera], b: &[Camera]) -> f32 {
+        let points: Vec<Vec3> = (0..8).map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5).collect();
+        let see = |c: &Camera, p: &Vec3| c.to_pixel(c.world_to_camera.transform_point3(*p));
+        let mut all: Vec<f32> =
+            a.iter().zip(b).flat_map(|(a, b)| points.iter().map(|p| see(a, p).distance(see(b, p))).collect::<Vec<_>>()).collect();
+        all.sort_by(f32::total_cmp);
+        all[all.len() / 2]
+    }
+
+    /// Mean difference in pixels of the turns from each camera to the next, which no choice of coordinates changes.
+    fn turned(a: &[Camera], b: &[Camera]) -> f32 {
+        let turn = |c: &Camera| Quat::from_mat4(&c.world_to_camera);
+        let turns = |all: &[Camera]| all.windows(2).map(|pair| turn(&pair[1]) * turn(&pair[0]).inverse()).collect::<Vec<_>>();
+        let angles = turns(a).into_iter().zip(turns(b)).map(|(a, b)| a.angle_between(b));
+        a[0].fx * angles.sum::<f32>() / (a.len() - 1) as f32
+    }
+
+    #[test]
+    fn noise_on_the_poses_is_removed() {
+        let (truth, keypoints, matches) = noisy_ring(24);
+        let mut cameras = truth.clone();
+        let mut rng = Rng::new(8, "poses");
+        for camera in &mut cameras {
+            let turn = Quat::from_scaled_axis(0.012 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+            camera.world_to_camera = Mat4::from_translation(0.02 * Vec3::new(rng.normal(), rng.normal(), rng.normal()))
+                * Mat4::from_quat(turn)
+                * camera.world_to_camera;
+        }
+        let given = cameras.clone();
+        let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
+        let [before, after] = [turned(&given, &truth), turned(&cameras, &truth)];
+        // On a small cloud a turn and a shift look much alike: what is left of both makes up for each other.
+        assert!(before > 3.0 && after < 0.2 * before, "{before} px before, {after} after");
+        assert!(report.error[1] < 0.9 && report.observations[1] > 2 * report.observations[0], "{report:?}");
+        assert!(report.moved.iter().all(|m| (0.3..20.0).contains(m)), "{:?}", report.moved);
+    }
+
+    #[test]
+    fn a_wrong_focal_length_and_a_bent_lens_are_found() {
+        let (truth, mut keypoints, matches) = noisy_ring(24);
+        let mut cameras = truth.clone();
+        cameras.iter_mut().for_each(|c| (c.fx, c.fy) = (1.03 * c.fx, 1.03 * c.fy));
+        for pixel in keypoints.iter_mut().flat_map(|k| &mut k.positions) {
+            let ray = truth[0].ray(*pixel).truncate();
+            *pixel = Vec2::new(truth[0].fx, truth[0].fy) * ray * (1.0 - 0.05 * ray.length_squared()) + Vec2::new(truth[0].cx, truth[0].cy);
+        }
+        let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
+        assert!((report.focal[0] * 1.03 - 1.0).abs() < 0.005 && (report.k1[0] + 0.05).abs() < 0.02, "{} {}", report.focal[0], report.k1[0]);
+    }
+
+    #[test]
+    fn right_poses_hardly_move() {
+        let (truth, keypoints, matches) = noisy_ring(24);
+        let mut cameras = truth.clone();
+        let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
+        assert!(off(&cameras, &truth) < 0.2 && (report.focal[0] - 1.0).abs() < 0.003, "{} {}", off(&cameras, &truth), report.focal[0]);
+        assert!(adjust(&mut cameras, &keypoints, &[]).is_none());
+    }
+}

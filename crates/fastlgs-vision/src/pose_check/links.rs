@@ -1,0 +1,81 @@
+//! What contradicts: matches of two photos against the epipolar geometry of their poses, and the groups of photos that agree.
+
+use crate::keypoints::Keypoints;
+use crate::matching::matches;
+use crate::tracks::{PairMatches, TOLERANCE, overlapping_pairs};
+use fastlgs_core::Camera;
+use rayon::prelude::*;
+
+/// Photos before and after (by name) that each is compared with.
+pub(super) const WINDOW: usize = 4;
+/// Photos that look at the same by their poses, each is compared with.
+pub(super) const OVERLAPPING: usize = 6;
+/// Least cosine between viewing directions: beyond, SIFT matches are mostly repeated texture.
+pub(super) const SAME_DIRECTION: f32 = 0.75;
+/// Fewest matches that say something.
+pub(super) const FEW: usize = 25;
+
+/// Two photos' matches, and those that obey the poses.
+pub(super) struct Link {
+    pub a: usize,
+    pub b: usize,
+    pub all: Vec<(usize, usize)>,
+    pub right: Vec<(usize, usize)>,
+}
+
+impl Link {
+    pub fn agrees(&self) -> bool {
+        self.right.len() >= FEW && 2 * self.right.len() >= self.all.len()
+    }
+
+    pub fn contradicts(&self) -> bool {
+        self.all.len() >= FEW && 10 * self.right.len() < 3 * self.all.len()
+    }
+}
+
+/// The matches that obey the poses.
+pub(super) fn right(cameras: &[Camera], keypoints: &[Keypoints], a: usize, b: usize, all: &[(usize, usize)]) -> Vec<(usize, usize)> {
+    PairMatches { a, b, pairs: all.to_vec() }.obeying(cameras, keypoints, TOLERANCE).pairs
+}
+
+pub(super) fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
+    let n = cameras.len();
+    let mut pairs = overlapping_pairs(cameras, OVERLAPPING);
+    pairs.retain(|&(a, b)| cameras[a].forward().dot(cameras[b].forward()) > SAME_DIRECTION);
+    pairs.extend((0..n).flat_map(|a| (a + 1..n.min(a + 1 + WINDOW)).map(move |b| (a, b))));
+    pairs.sort_unstable();
+    pairs.dedup();
+    matched(pairs, cameras, keypoints)
+}
+
+pub(super) fn matched(pairs: Vec<(usize, usize)>, cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
+    let link = |(a, b): (usize, usize)| {
+        let all = matches(&keypoints[a], &keypoints[b]);
+        let right = right(cameras, keypoints, a, b, &all);
+        Link { a, b, all, right }
+    };
+    pairs.into_par_iter().map(link).collect()
+}
+
+/// Group of each photo: the strongest agreeing links join first, and two groups never join against a majority of links.
+pub(super) fn groups(n: usize, links: &[Link]) -> Vec<usize> {
+    let mut group: Vec<usize> = (0..n).collect();
+    let mut agreeing: Vec<&Link> = links.iter().filter(|l| l.agrees()).collect();
+    agreeing.sort_by_key(|l| (std::cmp::Reverse(l.right.len()), l.a, l.b));
+    for link in agreeing {
+        let (a, b) = (group[link.a], group[link.b]);
+        if a == b {
+            continue;
+        }
+        let across = |l: &&Link| (group[l.a], group[l.b]) == (a, b) || (group[l.a], group[l.b]) == (b, a);
+        let (mut pro, mut contra) = (0, 0);
+        for l in links.iter().filter(across) {
+            pro += usize::from(l.agrees());
+            contra += usize::from(l.contradicts());
+        }
+        if pro > contra {
+            group.iter_mut().filter(|g| **g == b).for_each(|g| *g = a);
+        }
+    }
+    group
+}

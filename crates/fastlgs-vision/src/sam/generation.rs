@@ -1,0 +1,217 @@
+//! Automatic mask generation: a grid of prompts over the photo and over crops of it, filters, and of overlapping masks the best.
+
+use super::exports::{Exports, Logits};
+use super::windows::Grid;
+use super::{Config, Suppression};
+use crate::Result;
+use crate::masks::{BitMask, box_iou};
+use fastlgs_core::Level;
+use image::{RgbImage, imageops};
+
+/// Prompts in one inference.
+const BATCH: usize = 64;
+/// Masks at logits of plus and minus this are compared for stability.
+const STABILITY_OFFSET: f32 = 1.0;
+/// Cells below which a mask is judged at the size of the photo: on the coarse grid a border of one cell would be much of it.
+const FEW_CELLS: usize = 400;
+/// Overlap of neighbouring crops as a share of the photo's shorter side.
+const OVERLAP: f32 = 512.0 / 1500.0;
+/// What ends this close to a crop's border, as a share of the photo's longer side, was cut off by it: 20 pixels of 1,024.
+const BORDER: f32 = 20.0 / 1024.0;
+/// Shares of a photo above which a mask is a whole, or a part, where a prompt gives a single one.
+const SHARES: [f32; 2] = [0.03, 0.005];
+
+/// A mask that passed the filters.
+#[derive(Clone, Debug)]
+pub struct Candidate {
+    pub level: Level,
+    pub predicted_iou: f32,
+    pub stability: f32,
+    /// At the photo's size.
+    pub mask: BitMask,
+    /// Side of the crop that it was found in, as a share of the photo's.
+    crop: f32,
+}
+
+/// Left, top, width and height of each crop of a layer: 0 is the photo, each further one halves the sides, with some overlap.
+fn crops([w, h]: [u32; 2], layer: u32) -> Vec<[u32; 4]> {
+    let n = 1 << layer;
+    let overlap = (OVERLAP * w.min(h) as f32 * 2.0 / n as f32) as u32;
+    let side = |all: u32| if n == 1 { all } else { (overlap * (n - 1) + all).div_ceil(n) };
+    let [width, height] = [side(w), side(h)];
+    let step = |k: u32, own: u32| if n == 1 { 0 } else { k * own.saturating_sub(overlap) };
+    let all = (0..n).flat_map(|y| (0..n).map(move |x| [step(x, width), step(y, height)]));
+    all.map(|[x, y]| [x, y, width.min(w - x), height.min(h - y)]).collect()
+}
+
+/// All masks of a photo that pass the filters, and whether a prompt gave only one.
+pub fn masks(exports: &Exports, photo: &RgbImage, config: &Config) -> Result<(Vec<Candidate>, bool)> {
+    let (mut all, mut single) = (Vec::new(), false);
+    for layer in 0..=config.crop_layers {
+        for crop in crops([photo.width(), photo.height()], layer) {
+            let found = of_crop(exports, photo, crop, config, &mut single)?;
+            all.extend(found);
+        }
+    }
+    if config.crop_layers > 0 {
+        // What was found in a smaller crop is drawn more finely.
+        all = thinned(all, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| 1.0 / c.crop);
+    }
+    Ok((all, single))
+}
+
+fn of_crop(exports: &Exports, photo: &RgbImage, crop: [u32; 4], config: &Config, single: &mut bool) -> Result<Vec<Candidate>> {
+    let [x0, y0, width, height] = crop;
+    let part = imageops::crop_imm(photo, x0, y0, width, height).to_image();
+    let encoded = exports.encode(&part)?;
+    let n = config.points_per_side;
+    let at = |k: u32| (k as f32 + 0.5) / n as f32;
+    let grid: Vec<[f32; 2]> = (0..n).flat_map(|y| (0..n).map(move |x| [at(x), at(y)])).collect();
+    let batch = exports.fixed_batch();
+    let mut kept: Vec<Candidate> = Vec::new();
+    for points in grid.chunks(batch.unwrap_or(BATCH)) {
+        let mut asked = points.to_vec();
+        asked.resize(batch.unwrap_or(points.len()), points[0]);
+        let logits = exports.decode(&encoded, &asked)?;
+        for prompt in 0..points.len() {
+            let own = of_prompt(&logits, prompt, [width, height], config);
+            *single |= logits.masks == 1;
+            kept.extend(own.into_iter().filter_map(|candidate| placed(candidate, photo, crop)));
+        }
+        // As they come in, so that memory does not grow with the prompts.
+        kept = thinned(kept, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| c.predicted_iou);
+    }
+    Ok(kept)
+}
+
+/// The masks of a prompt that the model believes in, at the size of the crop.
+fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) -> Vec<Candidate> {
+    let cells = logits.rows * logits.columns;
+    // Of four masks the first is meant for prompts of several points.
+    let skipped = usize::from(logits.masks == 4);
+    let grid = |mask: usize| Grid {
+        logits: &logits.values[(prompt * logits.masks + mask) * cells..][..cells],
+        columns: logits.columns,
+        shown: logits.shown,
+        scale: logits.scale,
+    };
+    let mut masks: Vec<(usize, usize)> = (skipped..logits.masks).map(|mask| (grid(mask).area(0.0), mask)).collect();
+    masks.sort_by_key(|m| std::cmp::Reverse(m.0));
+    let mut out = Vec::new();
+    for ((area, mask), level) in masks.into_iter().zip(Level::ALL) {
+        let predicted_iou = logits.scores[prompt * logits.masks + mask];
+        if area == 0 || predicted_iou < config.predicted_iou {
+            continue;
+        }
+        let grid = grid(mask);
+        let Some(window) = grid.window(-STABILITY_OFFSET) else { continue };
+        let few = area < FEW_CELLS;
+        let above = |threshold: f32| if few { window.area(crop, threshold) } else { grid.area(threshold) };
+        let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
+        if stability < config.stability {
+            continue;
+        }
+        if let Some(mask) = window.mask(crop) {
+            let share = mask.area() as f32 / (crop[0] * crop[1]) as f32;
+            let by_size = Level::ALL[SHARES.iter().filter(|s| share < **s).count()];
+            out.push(Candidate { level: if logits.masks == 1 { by_size } else { level }, predicted_iou, stability, mask, crop: 1.0 });
+        }
+    }
+    out
+}
+
+/// A crop's mask in the photo; none if the crop's border cut it off.
+fn placed(candidate: Candidate, photo: &RgbImage, [x0, y0, width, height]: [u32; 4]) -> Option<Candidate> {
+    let near = (BORDER * photo.width().max(photo.height()) as f32) as u32;
+    let [l, t, r, b] = candidate.mask.bounds;
+    let inner = [(l, x0 == 0), (t, y0 == 0), (width - r, x0 + width == photo.width()), (height - b, y0 + height == photo.height())];
+    let cut_off = inner.iter().any(|(distance, at_photos_border)| !at_photos_border && *distance <= near);
+    let mask = BitMask { bounds: [l + x0, t + y0, r + x0, b + y0], ..candidate.mask };
+    (!cut_off).then_some(Candidate { mask, crop: width as f32 / photo.width() as f32, ..candidate })
+}
+
+/// Of candidates whose boxes overlap by more than `most`, and that compete, the one with the highest score; of equal ones the first.
+fn thinned(
+    mut candidates: Vec<Candidate>,
+    most: f32,
+    compete: impl Fn(&Candidate, &Candidate) -> bool,
+    score: impl Fn(&Candidate) -> f32,
+) -> Vec<Candidate> {
+    candidates.sort_by(|a, b| score(b).total_cmp(&score(a)));
+    let mut kept: Vec<Candidate> = Vec::new();
+    for c in candidates {
+        if !kept.iter().any(|k| compete(k, &c) && box_iou(k.mask.bounds, c.mask.bounds) > most) {
+            kept.push(c);
+        }
+    }
+    kept
+}
+
+/// Of the masks of a level those that repeat no better one, are no small part of another, and are good enough at all: what LangSplat's
+/// preprocessing leaves of SAM's masks.
+pub fn suppressed(mut candidates: Vec<Candidate>, rule: &Suppression) -> Vec<Candidate> {
+    let score = |c: &Candidate| c.predicted_iou * c.stability;
+    candidates.sort_by(|a, b| score(b).total_cmp(&score(a)));
+    let areas: Vec<f32> = candidates.iter().map(|c| c.mask.area() as f32).collect();
+    let gives_way = |k: usize, other: usize| {
+        let common = candidates[k].mask.common(&candidates[other].mask) as f32;
+        let [own, theirs] = [k, other].map(|c| common / areas[c]);
+        let repeats = other < k && common / (areas[k] + areas[other] - common) > rule.iou;
+        repeats || (own >= rule.held && theirs < 0.5 && own * theirs < rule.inner)
+    };
+    let all = 0..candidates.len();
+    let stays = |k: &usize| score(&candidates[*k]) > rule.score && !all.clone().any(|other| other != *k && gives_way(*k, other));
+    let mut kept: Vec<Candidate> = all.clone().filter(stays).map(|k| candidates[k].clone()).collect();
+    // A level is never left empty.
+    if kept.is_empty() {
+        candidates.truncate(3);
+        kept = candidates;
+    }
+    kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn candidate(bounds: [u32; 4], predicted_iou: f32) -> Candidate {
+        let mask = BitMask::of(bounds, |_, _| true).unwrap();
+        Candidate { level: Level::Whole, predicted_iou, stability: 1.0, mask, crop: 1.0 }
+    }
+
+    #[test]
+    fn crops_cover_the_photo_and_overlap() {
+        assert_eq!(crops([1500, 1000], 0), [[0, 0, 1500, 1000]]);
+        let four = crops([1500, 1000], 1);
+        // 341 pixels of overlap: (341 + 1500) / 2 and (341 + 1000) / 2, rounded up.
+        assert_eq!(four[0], [0, 0, 921, 671]);
+        assert_eq!((four[3][0] + four[3][2], four[3][1] + four[3][3]), (1500, 1000));
+        assert_eq!(crops([40, 30], 2).len(), 16);
+    }
+
+    #[test]
+    fn what_a_crop_cut_off_is_left_to_the_others() {
+        let photo = RgbImage::new(200, 100);
+        let of = |bounds: [u32; 4], crop: [u32; 4]| placed(candidate(bounds, 1.0), &photo, crop).map(|c| c.mask.bounds);
+        assert_eq!(of([0, 40, 30, 60], [0, 0, 120, 100]), Some([0, 40, 30, 60]), "the photo's own border cuts nothing");
+        assert_eq!(of([90, 40, 119, 60], [0, 0, 120, 100]), None);
+        assert_eq!(of([10, 40, 40, 60], [80, 0, 120, 100]), Some([90, 40, 120, 60]));
+    }
+
+    #[test]
+    fn the_better_of_two_boxes_stays() {
+        let all = vec![candidate([0, 0, 10, 10], 0.8), candidate([0, 0, 10, 9], 0.9), candidate([20, 0, 30, 10], 0.7)];
+        let kept = thinned(all, 0.7, |_, _| true, |c| c.predicted_iou);
+        assert_eq!(kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(), [0.9, 0.7]);
+    }
+
+    #[test]
+    fn repetitions_and_small_parts_go() {
+        let rule = Suppression { iou: 0.8, score: 0.7, inner: 0.5, held: 0.85 };
+        let scores = |all: Vec<Candidate>| suppressed(all, &rule).iter().map(|c| c.predicted_iou).collect::<Vec<_>>();
+        // The second repeats the first, the third is a small part of it, the fourth is too bad, the fifth is alone.
+        let all = [([0, 0, 10, 10], 0.95), ([0, 0, 10, 9], 0.9), ([0, 0, 3, 3], 0.8), ([20, 0, 30, 10], 0.6), ([40, 0, 50, 10], 0.75)];
+        assert_eq!(scores(all.map(|(b, s)| candidate(b, s)).to_vec()), [0.95, 0.75]);
+        assert_eq!(scores(vec![candidate([0, 0, 10, 10], 0.3)]), [0.3], "never none");
+    }
+}

@@ -1,0 +1,372 @@
+//! Plane sweep (Collins 1996; depth maps merged as by Schoenberger et al. 2016): a point wherever photos with known poses agree on the
+//! depth of a patch, so that training starts with surfaces also between the key points.
+
+use crate::tracks::Track;
+use fastlgs_core::dataset::SfmPoint;
+use fastlgs_core::{Camera, image_io, vectorised};
+use glam::{Mat3, Vec2, Vec3};
+use image::RgbImage;
+use rayon::prelude::*;
+
+/// Longer side of the swept photos: one point a pixel of these is as dense as a start needs.
+const SIDE: u32 = 240;
+/// Depths that are tried, uniform in 1 / depth.
+const PLANES: usize = 96;
+/// Photos that each is compared with.
+const NEIGHBOURS: usize = 4;
+/// Angles, in degrees, under which a neighbour may see what a photo sees: less tells no depth, more changes what patches look like.
+const PARALLAX: [f32; 2] = [2.0, 30.0];
+/// Half the side of a patch.
+const HALF: usize = 3;
+/// Correlation from which a patch is recognised.
+const ALIKE: f32 = 0.7;
+/// By how much it has to exceed that at any other depth.
+const UNIQUE: f32 = 0.05;
+/// Planes around the best that are the same depth still.
+const NEAR: usize = 3;
+/// Least deviation of a patch's grey values, of 255: less is noise.
+const TEXTURE: f32 = 3.0;
+/// Other photos that have to find the same depth, within a pixel.
+const WITNESSES: usize = 2;
+/// A point speaks for the pixels around it up to this distance, where these lie as deep but for this share.
+const SPACING: usize = 1;
+const SAME_DEPTH: f32 = 0.05;
+/// Fewest tracks of a photo that tell between which depths to look.
+const FEW: usize = 10;
+/// Share of the tracks' nearest and farthest depths that is not trusted, and how much room is left beyond the others.
+const OUTLIERS: f32 = 0.02;
+const ROOM: f32 = 1.3;
+
+/// A swept photo.
+struct View {
+    camera: Camera,
+    grey: Vec<f32>,
+    color: RgbImage,
+    /// Nearest and farthest depth.
+    bounds: Option<[f32; 2]>,
+}
+
+impl View {
+    fn width(&self) -> usize {
+        self.camera.width as usize
+    }
+
+    fn height(&self) -> usize {
+        self.camera.height as usize
+    }
+
+    /// A pixel's number, if it lies inside.
+    fn at(&self, pixel: Vec2) -> Option<usize> {
+        let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < self.camera.width as f32 && pixel.y < self.camera.height as f32;
+        inside.then(|| pixel.y as usize * self.width() + pixel.x as usize)
+    }
+
+    /// The world's point at a depth before the middle of a pixel.
+    fn point(&self, pixel: usize, depth: f32) -> Vec3 {
+        let middle = Vec2::new((pixel % self.width()) as f32 + 0.5, (pixel / self.width()) as f32 + 0.5);
+        self.camera.world_to_camera.inverse().transform_point3(self.camera.ray(middle) * depth)
+    }
+
+    /// Where a point of the world is seen, and at what depth.
+    fn see(&self, point: Vec3) -> Option<(usize, f32)> {
+        let q = self.camera.world_to_camera.transform_point3(point);
+        if q.z <= 0.0 { None } else { Some((self.at(self.camera.to_pixel(q))?, q.z)) }
+    }
+}
+
+/// Points of the surfaces that the photos of `cameras` agree on; `tracks` tell between which depths to look. `advance` is called after
+/// each photo.
+///
+/// # Errors
+/// What `photo` fails with, and what `advance` returns.
+pub fn points<E: Send>(
+    cameras: &[Camera],
+    tracks: &[Track],
+    photo: impl Fn(&Camera) -> Result<RgbImage, E> + Sync,
+    advance: impl Fn() -> Result<(), E> + Sync,
+) -> Result<Vec<SfmPoint>, E> {
+    let bounds = bounds(cameras, tracks);
+    let view = |(camera, bounds): (&Camera, Option<[f32; 2]>)| {
+        let camera = &camera.shrunk_to(SIDE);
+        let color = image_io::resize(&photo(camera)?, camera.width, camera.height);
+        let grey = color.pixels().map(|p| 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])).collect();
+        Ok(View { camera: camera.clone(), grey, color, bounds })
+    };
+    let views: Vec<View> = cameras.par_iter().zip(bounds).map(view).collect::<Result<_, E>>()?;
+    let neighbours: Vec<Vec<usize>> = (0..views.len()).map(|v| neighbours(&views, v)).collect();
+    let depths = (0..views.len()).into_par_iter().map(|v| {
+        let depths = depths(&views, v, &neighbours[v]);
+        advance().map(|()| depths)
+    });
+    let depths = depths.collect::<Result<Vec<_>, E>>()?;
+    Ok(merged(&views, &neighbours, &depths))
+}
+
+/// Between which depths each camera sees tracks; where it sees too few, between which it would see all.
+fn bounds(cameras: &[Camera], tracks: &[Track]) -> Vec<Option<[f32; 2]>> {
+    let mut own: Vec<Vec<f32>> = vec![Vec::new(); cameras.len()];
+    let depth = |view: usize, p: Vec3| cameras[view].world_to_camera.transform_point3(p).z;
+    for track in tracks {
+        track.seen.iter().for_each(|&(view, _)| own[view].push(depth(view, track.position)));
+    }
+    let all = |view: usize| tracks.iter().map(|t| depth(view, t.position)).filter(|z| *z > 0.0).collect::<Vec<_>>();
+    let of = |(view, mut depths): (usize, Vec<f32>)| {
+        if depths.len() < FEW {
+            depths = all(view);
+        }
+        depths.sort_by(f32::total_cmp);
+        let last = depths.len().checked_sub(1)?;
+        let cut = (OUTLIERS * last as f32) as usize;
+        Some([depths[cut] / ROOM, depths[last - cut] * ROOM])
+    };
+    own.into_iter().enumerate().map(of).collect()
+}
+
+/// The nearest photos from which a view's middle is seen under a telling angle.
+fn neighbours(views: &[View], view: usize) -> Vec<usize> {
+    let own = &views[view];
+    let Some([near, far]) = own.bounds else { return Vec::new() };
+    let middle = own.camera.centre() + own.camera.forward() * (near * far).sqrt();
+    let angle = |other: &View| (own.camera.centre() - middle).angle_between(other.camera.centre() - middle).to_degrees();
+    let turned = |other: &View| own.camera.forward().angle_between(other.camera.forward()).to_degrees();
+    let telling = |&(_, angle): &(usize, f32)| (PARALLAX[0]..PARALLAX[1]).contains(&angle);
+    let others = (0..views.len()).filter(|&v| v != view && turned(&views[v]) < PARALLAX[1]);
+    let mut others: Vec<(usize, f32)> = others.map(|v| (v, angle(&views[v]))).filter(telling).collect();
+    others.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
+    others.into_iter().take(NEIGHBOURS).map(|o| o.0).collect()
+}
+
+/// Depth of each pixel where the patch around it is found in the neighbours at one depth alone; else 0.
+fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
+    let own = &views[view];
+    let (w, h) = (own.width(), own.height());
+    let mut out = vec![0.0; w * h];
+    let (Some([near, far]), true) = (own.bounds, neighbours.len() >= WITNESSES) else { return out };
+    let inverse = |plane: f32| 1.0 / far + (1.0 / near - 1.0 / far) * plane / (PLANES - 1) as f32;
+    let patches = Patches::of(&own.grey, w, h);
+    let mut work = Work::new(w * h);
+    // [plane][pixel]: the mean of the two neighbours that see a patch best, as others may not see it at all.
+    let mut scores = vec![-1.0f32; PLANES * w * h];
+    for (plane, scores) in scores.chunks_exact_mut(w * h).enumerate() {
+        let mut second = vec![-1.0f32; w * h];
+        for &other in neighbours {
+            warp(own, &views[other], 1.0 / inverse(plane as f32), &mut work.warped);
+            correlate(&own.grey, &patches, w, h, &mut work);
+            for ((best, second), score) in scores.iter_mut().zip(&mut second).zip(&work.score) {
+                *second = second.max(score.min(*best));
+                *best = best.max(*score);
+            }
+        }
+        scores.iter_mut().zip(second).for_each(|(best, second)| *best = 0.5 * (*best + second));
+    }
+    for (pixel, depth) in out.iter_mut().enumerate() {
+        let score = |plane: usize| scores[plane * w * h + pixel];
+        let best = (0..PLANES).max_by(|a, b| score(*a).total_cmp(&score(*b))).unwrap_or(0);
+        let elsewhere = (0..PLANES).filter(|p| p.abs_diff(best) > NEAR).map(score).fold(-1.0, f32::max);
+        if best == 0 || best == PLANES - 1 || score(best) < ALIKE || score(best) - elsewhere < UNIQUE || patches.deviation[pixel] < TEXTURE
+        {
+            continue;
+        }
+        // The top of the parabola through three planes.
+        let [before, top, after] = [score(best - 1), score(best), score(best + 1)];
+        let shift = 0.5 * (before - after) / (before - 2.0 * top + after).min(-1e-6);
+        *depth = 1.0 / inverse(best as f32 + shift.clamp(-0.5, 0.5));
+    }
+    out
+}
+
+/// Means and deviations of the patches of a photo.
+struct Patches {
+    mean: Vec<f32>,
+    deviation: Vec<f32>,
+}
+
+impl Patches {
+    fn of(grey: &[f32], w: usize, h: usize) -> Self {
+        let mut work = Work::new(grey.len());
+        work.warped.copy_from_slice(grey);
+        let (mut mean, mut square) = (vec![0.0; grey.len()], vec![0.0; grey.len()]);
+        boxed(&work.warped, w, h, &mut work.rows, &mut mean);
+        work.product.iter_mut().zip(grey).for_each(|(p, g)| *p = g * g);
+        boxed(&work.product, w, h, &mut work.rows, &mut square);
+        let deviation = mean.iter().zip(&square).map(|(m, s)| (s - m * m).max(0.0).sqrt()).collect();
+        Self { mean, deviation }
+    }
+}
+
+/// Planes that are used again and again.
+struct Work {
+    warped: Vec<f32>,
+    product: Vec<f32>,
+    rows: Vec<f32>,
+    mean: Vec<f32>,
+    square: Vec<f32>,
+    cross: Vec<f32>,
+    score: Vec<f32>,
+}
+
+impl Work {
+    fn new(pixels: usize) -> Self {
+        let plane = || vec![0.0; pixels];
+        Self { warped: plane(), product: plane(), rows: plane(), mean: plane(), square: plane(), cross: plane(), score: plane() }
+    }
+}
+
+/// What `other` shows at a depth before each pixel of `own`; not a number outside.
+fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
+    let relative = other.camera.world_to_camera * own.camera.world_to_camera.inverse();
+    // A ray r (z = 1) of own, at this depth, is seen along R r + t / depth.
+    let (turn, shift) = (Mat3::from_mat4(relative), relative.w_axis.truncate() / depth);
+    let (w, h) = (other.width(), other.height());
+    let step = turn * (own.camera.ray(Vec2::new(1.0, 0.0)) - own.camera.ray(Vec2::ZERO));
+    for (y, row) in out.chunks_exact_mut(own.width()).enumerate() {
+        let first = turn * own.camera.ray(Vec2::new(0.5, y as f32 + 0.5)) + shift;
+        for (x, value) in row.iter_mut().enumerate() {
+            let q = first + x as f32 * step;
+            let p = other.camera.to_pixel(q) - 0.5;
+            let inside = q.z > 0.0 && p.x >= 0.0 && p.y >= 0.0 && p.x < (w - 1) as f32 && p.y < (h - 1) as f32;
+            if !inside {
+                *value = f32::NAN;
+                continue;
+            }
+            let (x0, y0) = (p.x as usize, p.y as usize);
+            let (u, v) = (p.x - x0 as f32, p.y - y0 as f32);
+            let at = y0 * w + x0;
+            let [a, b, c, d] = [other.grey[at], other.grey[at + 1], other.grey[at + w], other.grey[at + w + 1]];
+            *value = (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v;
+        }
+    }
+}
+
+vectorised! {
+    /// Correlation of each patch of `grey` with that of `work.warped` into `work.score`: 1 where they are alike, -1 where one is cut off.
+    fn correlate(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Work) = correlate_body
+}
+
+#[inline(always)]
+fn correlate_body<const FMA: bool>(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Work) {
+    boxed(&work.warped, w, h, &mut work.rows, &mut work.mean);
+    work.product.iter_mut().zip(&work.warped).for_each(|(p, v)| *p = v * v);
+    boxed(&work.product, w, h, &mut work.rows, &mut work.square);
+    work.product.iter_mut().zip(&work.warped).zip(grey).for_each(|((p, v), g)| *p = v * g);
+    boxed(&work.product, w, h, &mut work.rows, &mut work.cross);
+    for p in 0..w * h {
+        let covariance = work.cross[p] - work.mean[p] * patches.mean[p];
+        let deviation = (work.square[p] - work.mean[p] * work.mean[p]).max(0.25).sqrt();
+        let score = covariance / (deviation * patches.deviation[p].max(0.5));
+        work.score[p] = if score.is_nan() { -1.0 } else { score };
+    }
+}
+
+/// Means over patches; not a number where a patch is cut off.
+#[inline(always)]
+fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
+    const SIDES: usize = 2 * HALF + 1;
+    const SHARE: f32 = 1.0 / (SIDES * SIDES) as f32;
+    rows.fill(f32::NAN);
+    out.fill(f32::NAN);
+    if w < SIDES || h < SIDES {
+        return;
+    }
+    for (from, to) in plane.chunks_exact(w).zip(rows.chunks_exact_mut(w)) {
+        for x in 0..w - SIDES + 1 {
+            to[x + HALF] = (0..SIDES).map(|k| from[x + k]).sum();
+        }
+    }
+    for y in HALF..h - HALF {
+        let to = &mut out[y * w..][..w];
+        to.fill(0.0);
+        for k in 0..SIDES {
+            let from = &rows[(y + k - HALF) * w..][..w];
+            to.iter_mut().zip(from).for_each(|(t, f)| *t += f * SHARE);
+        }
+    }
+}
+
+/// One point for what several depth maps agree on, and none for what is seen again from elsewhere or beside it.
+fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec<SfmPoint> {
+    let mut used: Vec<Vec<bool>> = depths.iter().map(|d| vec![false; d.len()]).collect();
+    let mut out = Vec::new();
+    for (v, view) in views.iter().enumerate() {
+        for pixel in 0..depths[v].len() {
+            if depths[v][pixel] <= 0.0 || used[v][pixel] {
+                continue;
+            }
+            let point = view.point(pixel, depths[v][pixel]);
+            let (mut sum, mut count) = (point, 1);
+            for &other in &neighbours[v] {
+                let Some((there, _)) = views[other].see(point) else { continue };
+                let seen = views[other].point(there, depths[other][there]);
+                let apart = (pixel as isize - view.see(seen).map_or(-1, |s| s.0 as isize)).unsigned_abs();
+                // The same pixel, or one that touches it.
+                let touches = [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
+                if depths[other][there] > 0.0 && touches {
+                    (sum, count) = (sum + seen, count + 1);
+                }
+            }
+            if count > WITNESSES {
+                let position = sum / count as f32;
+                let color = view.color.get_pixel((pixel % view.width()) as u32, (pixel / view.width()) as u32).0;
+                out.push(SfmPoint { position, color });
+                views.iter().zip(depths).zip(&mut used).for_each(|((view, depths), used)| cover(view, depths, position, used));
+            }
+        }
+    }
+    out
+}
+
+/// Marks the pixels around a point that lie about as deep as it: a point a pixel would be denser than a start needs.
+fn cover(view: &View, depths: &[f32], point: Vec3, used: &mut [bool]) {
+    let Some((pixel, depth)) = view.see(point) else { return };
+    let (x, y) = (pixel % view.width(), pixel / view.width());
+    for y in y.saturating_sub(SPACING)..(y + SPACING + 1).min(view.height()) {
+        for x in x.saturating_sub(SPACING)..(x + SPACING + 1).min(view.width()) {
+            let at = y * view.width() + x;
+            used[at] |= (depths[at] / depth - 1.0).abs() < SAME_DEPTH;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Grey of a point of a wall: waves of several lengths.
+    fn texture(p: Vec3) -> f32 {
+        let wave = |k: f32| (k * p.x + 0.7 * k * p.y).sin() * (0.6 * k * p.y - 0.3 * k * p.x + k).cos();
+        127.0 + 40.0 * wave(7.0) + 30.0 * wave(19.0) + 25.0 * wave(41.0)
+    }
+
+    /// A photo of the wall z = 0, of which the part right of x = 1 is bare.
+    fn photo(camera: &Camera) -> RgbImage {
+        let (eye, turn) = (camera.centre(), Mat3::from_mat4(camera.world_to_camera).transpose());
+        RgbImage::from_fn(camera.width, camera.height, |x, y| {
+            let ray = turn * camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+            let p = eye - ray * (eye.z / ray.z);
+            let grey = if p.x > 1.0 { 90.0 } else { texture(p) };
+            image::Rgb([grey as u8, (0.5 * grey) as u8, 10])
+        })
+    }
+
+    #[test]
+    fn a_wall_is_found_where_it_has_texture() {
+        let eye = |k: usize| Vec3::new(-1.0 + 0.5 * k as f32, 0.3, 4.0);
+        let cameras: Vec<Camera> = (0..5).map(|k| Camera::look_at(&k.to_string(), eye(k), Vec3::ZERO, Vec3::Y, 160, 120, 0.8)).collect();
+        // Tracks tell no more than about how far the wall is.
+        let track =
+            |k: usize| Track { seen: (0..5).map(|v| (v, k)).collect(), position: Vec3::new(0.1 * k as f32 - 1.0, 0.0, 0.0), error: 0.5 };
+        let tracks: Vec<Track> = (0..20).map(track).collect();
+        let found = points(&cameras, &tracks, |c| Ok::<_, ()>(photo(c)), || Ok(())).unwrap();
+        assert!(found.len() > 1000, "{} points", found.len());
+        let near = found.iter().filter(|p| p.position.z.abs() < 0.05).count();
+        assert!(near as f32 > 0.98 * found.len() as f32, "{near} of {} points lie on the wall", found.len());
+        let bare = found.iter().filter(|p| p.position.x > 1.1).count();
+        assert!(bare < found.len() / 50, "{bare} points where there is nothing to see");
+        let right = |p: &&SfmPoint| (f32::from(p.color[0]) - texture(p.position)).abs() < 25.0;
+        assert!(found.iter().filter(right).count() as f32 > 0.95 * found.len() as f32, "points have the wall's colours");
+        assert!(
+            points(&cameras, &[], |c| Ok::<_, ()>(photo(c)), || Ok(())).unwrap().is_empty(),
+            "without tracks nothing tells where to look"
+        );
+    }
+}

@@ -1,0 +1,123 @@
+//! Tracks: matches of pairs of photos, merged into what one point of the scene looks like in all photos that see it.
+
+use crate::keypoints::{Keypoints, epipolar_error, fundamental};
+use crate::triangulate::{Located, locate};
+use fastlgs_core::Camera;
+use fastlgs_core::dataset::SfmPoint;
+use glam::Vec3;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// A matched pair of photos.
+#[derive(Clone, Debug)]
+pub struct PairMatches {
+    /// Index of the earlier photo.
+    pub a: usize,
+    /// Index of the later photo.
+    pub b: usize,
+    /// (key point in a, key point in b).
+    pub pairs: Vec<(usize, usize)>,
+}
+
+/// Largest distance of a match to its epipolar line, in pixels, and of a key point to where its track's point is seen.
+pub const TOLERANCE: f32 = 2.0;
+
+/// For each photo the `count` others that look at the same from nearby: pairs (a, b), a < b, sorted.
+pub fn overlapping_pairs(cameras: &[Camera], count: usize) -> Vec<(usize, usize)> {
+    let span = fastlgs_core::camera::scene_extent(cameras);
+    let mut pairs = std::collections::BTreeSet::new();
+    for (i, a) in cameras.iter().enumerate() {
+        let cost = |b: &Camera| a.centre().distance(b.centre()) / span + 2.0 * (1.0 - a.forward().dot(b.forward()));
+        let mut others: Vec<usize> = (0..cameras.len()).filter(|&j| j != i && a.forward().dot(cameras[j].forward()) > 0.3).collect();
+        others.sort_by(|&x, &y| cost(&cameras[x]).total_cmp(&cost(&cameras[y])).then(x.cmp(&y)));
+        pairs.extend(others.into_iter().take(count).map(|j| (i.min(j), i.max(j))));
+    }
+    pairs.into_iter().collect()
+}
+
+impl PairMatches {
+    /// Those that agree with the poses within `tolerance` pixels.
+    pub fn obeying(&self, cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32) -> Self {
+        let f = fundamental(&cameras[self.a], &cameras[self.b]);
+        let error = |i: usize, j: usize| epipolar_error(&f, keypoints[self.a].positions[i], keypoints[self.b].positions[j]);
+        let pairs = self.pairs.iter().filter(|(i, j)| error(*i, *j) < tolerance).copied().collect();
+        Self { pairs, ..*self }
+    }
+}
+
+/// A point of the scene and the key points that show it.
+#[derive(Clone, Debug)]
+pub struct Track {
+    /// (photo, key point), one a photo.
+    pub seen: Vec<(usize, usize)>,
+    /// In the world.
+    pub position: Vec3,
+    /// Root mean square of its reprojection errors in pixels.
+    pub error: f32,
+}
+
+/// Key points that are one another's matches, directly or over other photos; the first matches of a list count first, and a match that
+/// would bring two key points of one photo together is left out.
+fn merged(matches: &[PairMatches]) -> Vec<Vec<(usize, usize)>> {
+    let mut group: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+    let mut members: Vec<Vec<(usize, usize)>> = Vec::new();
+    for m in matches {
+        for &(i, j) in &m.pairs {
+            let [a, b] = [(m.a, i), (m.b, j)].map(|point| {
+                *group.entry(point).or_insert_with(|| {
+                    members.push(vec![point]);
+                    members.len() - 1
+                })
+            });
+            let (from, to) = if members[a].len() < members[b].len() { (a, b) } else { (b, a) };
+            let clash = members[from].iter().any(|(photo, _)| members[to].iter().any(|(other, _)| other == photo));
+            if a != b && !clash {
+                let moved = std::mem::take(&mut members[from]);
+                moved.iter().for_each(|point| *group.get_mut(point).expect("every member has a group") = to);
+                members[to].extend(moved);
+            }
+        }
+    }
+    members.retain(|track| track.len() >= 2);
+    members.iter_mut().for_each(|track| track.sort_unstable());
+    members
+}
+
+/// The tracks whose key points agree within `tolerance` pixels; those that do not agree are left out of theirs.
+pub fn tracks(cameras: &[Camera], keypoints: &[Keypoints], matches: &[PairMatches], tolerance: f32) -> Vec<Track> {
+    let located = |seen: Vec<(usize, usize)>| {
+        let views: Vec<_> = seen.iter().map(|&(photo, k)| (&cameras[photo], keypoints[photo].positions[k])).collect();
+        let Located { position, error, agreeing } = locate(&views, tolerance)?;
+        Some(Track { seen: agreeing.into_iter().map(|k| seen[k]).collect(), position, error })
+    };
+    merged(matches).into_par_iter().filter_map(located).collect()
+}
+
+/// One coloured point a track; `colors` are those of each photo's key points.
+pub fn points(tracks: &[Track], colors: &[Vec<[u8; 3]>]) -> Vec<SfmPoint> {
+    let color = |track: &Track| {
+        let sum = track.seen.iter().fold([0u32; 3], |sum, &(photo, k)| std::array::from_fn(|c| sum[c] + u32::from(colors[photo][k][c])));
+        sum.map(|s| (s / track.seen.len() as u32) as u8)
+    };
+    tracks.iter().map(|track| SfmPoint { position: track.position, color: color(track) }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_track_has_each_photo_once() {
+        let pair = |a, b, pairs: &[(usize, usize)]| PairMatches { a, b, pairs: pairs.to_vec() };
+        // Key point 0 of all photos is one point; photo 2's key point 7 claims to be it as well, over photo 1.
+        let matches = [pair(0, 1, &[(0, 0), (5, 5)]), pair(0, 2, &[(0, 0)]), pair(1, 2, &[(0, 7), (5, 6)])];
+        assert_eq!(merged(&matches), [vec![(0, 0), (1, 0), (2, 0)], vec![(0, 5), (1, 5), (2, 6)]]);
+    }
+
+    #[test]
+    fn the_nearest_photos_are_compared() {
+        let at = |x: f32| Camera::look_at("a", Vec3::new(x, 0.0, 3.0), Vec3::ZERO, Vec3::Y, 320, 240, 0.8);
+        let pairs = overlapping_pairs(&[at(3.0), at(0.0), at(3.0)], 1);
+        assert!(pairs.contains(&(0, 2)), "the twin camera is the nearest: {pairs:?}");
+    }
+}
