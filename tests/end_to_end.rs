@@ -186,6 +186,12 @@ fn onnx_exports_of_sam_and_clip() {
     let inside: Vec<_> = photo.pixels().zip(mask.pixels()).filter(|(_, m)| m[0] > 0).map(|(p, _)| p.0.map(f64::from)).collect();
     let redness = inside.iter().map(|p| p[0] - (p[1] + p[2]) / 2.0).sum::<f64>() / inside.len() as f64;
     assert!(redness > 20.0, "{redness} over {} pixels", inside.len());
+    // What its cosines are worth is assumed until it is measured, which holds for these very files.
+    assert_eq!(red["calibrated"], false, "{red}");
+    let towers = ["--clip-image", text(&image), "--clip-text", text(&words)];
+    let measured = json(&[&["models", "calibrate"], &towers[..]].concat());
+    assert!(measured["texts"]["temperature"].as_f64().is_some_and(|t| t > 0.0), "{measured}");
+    assert_eq!(ask("red")["calibrated"], true);
     // Embeddings of another encoder are not compared.
     let manifest = std::fs::read_to_string(scene.join("scene.json")).expect("the manifest");
     std::fs::write(scene.join("scene.json"), manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\"")).expect("a file");
@@ -300,7 +306,7 @@ fn every_way_to_ask_ends_in_the_same_object() {
     let photo = fastlgs_core::image_io::load_rgb(&f.photos.join("images/008.png")).expect("the photo");
     let crop = image::imageops::crop_imm(&photo, middle[0], middle[1], middle[2] - middle[0], middle[3] - middle[1]).to_image();
     fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");
-    let picture = ask(&["--image", text(&file("crop.png")), "--false-alarms", "0.8"]);
+    let picture = ask(&["--image", text(&file("crop.png")), "--false-alarms", "1"]);
     // The picture may be as like a part of it.
     let found = &picture["objects"][0];
     assert!(found["id"] == id || found["parent"] == id, "{picture}");
@@ -314,6 +320,52 @@ fn every_way_to_ask_ends_in_the_same_object() {
     fails(&["query", text(&f.scene), "--point", "4000,1"], &["4000,1", "outside"]);
     fails(&["query", text(&f.scene), "--image", "nowhere.png"], &["nowhere.png"]);
     fails(&["query", text(&f.scene), "-", "cat"], &["standard input"]);
+    fails(&["query", text(&f.scene), "cat", "--point", "1,1"], &["one way"]);
+    fails(&["query", text(&f.scene), " "], &["text is empty"]);
+}
+
+#[test]
+fn names_can_be_taught() {
+    let Some(f) = fixture() else { return };
+    let file = |name: &str| f.dir.path().join(name);
+    let ask = |name: &str| json(&["query", text(&f.scene), name, "--view", "008"]);
+    let cat = ask("cat");
+    assert_eq!((&cat["found"], &cat["taught"]), (&Value::Bool(true), &Value::Bool(false)), "{cat}");
+    let id = cat["objects"][0]["id"].to_string();
+    let taught = json(&["teach", "Kocur  domowy", text(&f.scene), "--object", &id]);
+    assert_eq!((taught["name"].as_str(), taught["examples"].as_u64()), (Some("kocur domowy"), Some(1)), "{taught}");
+    let answer = ask("kocur Domowy");
+    assert_eq!((&answer["found"], &answer["taught"]), (&Value::Bool(true), &Value::Bool(true)), "{answer}");
+    assert_eq!(answer["objects"][0]["id"], cat["objects"][0]["id"]);
+    // A pixel shows an object too, and a picture the thing.
+    let bounds: Vec<u64> = cat["objects"][0]["bbox2d"].as_array().expect("a box").iter().map(|v| v.as_u64().expect("a number")).collect();
+    let middle = format!("{},{}", (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2);
+    let shown = json(&["teach", "w srodku", text(&f.scene), "--view", "008", "--point", &middle]);
+    assert_eq!(ask("w srodku")["objects"][0]["id"], shown["object"]);
+    assert_eq!(json(&["teach", "w srodku", text(&f.scene), "--image", text(&f.photos.join("images/008.png"))])["examples"], 2);
+
+    // Names go out and come back; those of another encoder are refused where they are asked for.
+    let kept = file("names.json");
+    json(&["names", "export", text(&kept)]);
+    assert!(json(&["names", "list"])["names"].as_array().is_some_and(|n| n.len() >= 2));
+    json(&["names", "remove", "kocur domowy"]);
+    fails(&["names", "remove", "kocur domowy"], &["never taught"]);
+    let foreign = std::fs::read_to_string(&kept).expect("a file").replace("\"offline ", "\"another ");
+    std::fs::write(&kept, foreign).expect("a file");
+    assert!(json(&["names", "import", text(&kept)])["came"].as_u64().is_some_and(|n| n >= 2));
+    fails(&["query", text(&f.scene), "kocur domowy"], &["another encoder", "names remove"]);
+    std::fs::write(&kept, "{}x").expect("a file");
+    fails(&["names", "import", text(&kept)], &["names.json"]);
+    for (args, words) in [
+        (&["teach", "  ", text(&f.scene), "--object", "1"][..], "name is empty"),
+        (&["teach", "x", text(&f.scene), "--object", "9999"], "none is 9999"),
+        (&["teach", "x", text(&f.scene)], "show the thing"),
+        (&["teach", "x", text(&f.scene), "--view", "nowhere", "--point", "1,1"], "nowhere"),
+    ] {
+        fails(args, &[words]);
+    }
+    json(&["names", "remove", "kocur domowy"]);
+    json(&["names", "remove", "w srodku"]);
 }
 
 #[test]

@@ -349,7 +349,7 @@ fn nearest(rendered: &[f32], codes: &Vectors) -> u16 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fastlgs_grid::relevancy::Calibration;
+    use fastlgs_grid::calibration::Calibration;
 
     #[test]
     fn the_nearest_code_decides() {
@@ -361,13 +361,7 @@ mod tests {
     fn the_most_relevant_layer_counts() {
         let layer = |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
         let layers = [layer([1.0, 0.0, 0.0, 2.0]), layer([0.0, 1.0, 3.0, 0.0])];
-        let text = TextQuery {
-            text: vec![1.0, 0.0],
-            canonical: Vec::new(),
-            negatives: Vec::new(),
-            anything: 0.5,
-            calibration: Calibration::OFFLINE,
-        };
+        let text = TextQuery { anything: 0.5, ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::OFFLINE) };
         let found = relevancy(&layers, &text);
         assert!(found[0] > 0.9 && found[1] > 0.9);
         assert_eq!(thresholds(&found).len(), 64);

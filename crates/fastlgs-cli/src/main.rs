@@ -34,6 +34,11 @@ enum Command {
     Render(fastlgs::render::Config),
     /// Finds what a text names: mask, heat map, JSON.
     Query(commands::query::Args),
+    /// Teaches a name by showing a thing; every scene of the same encoder then answers to it.
+    #[command(after_help = "Example: fastlgs teach \"my mug\" scenes/desk --view 0003.jpg --point 210,144")]
+    Teach(fastlgs::names::Lesson),
+    /// Lists, forgets, exports or imports the names that were taught.
+    Names(commands::names::Args),
     /// Shows a scene in the browser, with an HTTP interface.
     Serve(commands::serve::Args),
     /// Measures accuracy on held-out views against labels.
@@ -84,6 +89,8 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         Command::Batch(args) => commands::batch::run(&args, common, run),
         Command::Render(config) => report::give(common, &fastlgs::render(&config, run)?),
         Command::Query(args) => commands::query::run(&args, common, run),
+        Command::Teach(lesson) => report::give(common, &fastlgs::names::teach(&lesson, run)?),
+        Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),
         Command::Eval(config) => report::give(common, &fastlgs::eval(&config, run)?),
         Command::Bench(args) => report::give(common, &fastlgs_bench::run(&args, run)?),

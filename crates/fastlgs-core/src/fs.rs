@@ -53,6 +53,15 @@ pub fn cache_dir() -> PathBuf {
         .unwrap_or_else(|| std::env::temp_dir().join("fastlgs"))
 }
 
+/// Where what the user has made is kept: `FASTLGS_DATA`, else `fastlgs` in the user's data folder.
+pub fn data_dir() -> PathBuf {
+    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    variable("FASTLGS_DATA")
+        .or_else(|| variable("XDG_DATA_HOME").map(|p| p.join("fastlgs")))
+        .or_else(|| variable("HOME").map(|p| p.join(".local/share/fastlgs")))
+        .unwrap_or_else(|| std::env::temp_dir().join("fastlgs-data"))
+}
+
 /// Reads a whole file.
 ///
 /// # Errors

@@ -5,8 +5,9 @@
 
 use fastlgs_core::SceneFolder;
 use fastlgs_grid::Grid;
+use fastlgs_grid::calibration::Calibration;
 use fastlgs_grid::query::{QueryConfig, rank, select};
-use fastlgs_grid::relevancy::{Calibration, TextQuery};
+use fastlgs_grid::relevancy::TextQuery;
 use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -17,9 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let asked = grid.objects.get(object.wrapping_sub(1)).ok_or_else(|| format!("{scene} has objects 1 to {}", grid.objects.len()))?;
     let embedding = asked.embeddings.first().ok_or("this object was seen from too far to be embedded")?;
 
-    let calibration = Calibration::OFFLINE;
-    let query =
-        TextQuery { text: embedding.clone(), canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration };
+    let query = TextQuery::new(vec![embedding.clone()], Calibration::OFFLINE);
     let ranked = rank(&grid, &query);
     for hit in ranked.iter().take(5) {
         println!("object {:4}  score {:.3}", hit.id, hit.score);

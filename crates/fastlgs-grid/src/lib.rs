@@ -1,6 +1,7 @@
 //! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`tree`], [`support`] and [`objects`]), objects get low-dimensional codes
 //! ([`codes`]) and keep all their embeddings ([`grid`]), and a text finds its object ([`relevancy`], [`query`]).
 
+pub mod calibration;
 pub mod codes;
 pub mod evidence;
 pub mod grid;

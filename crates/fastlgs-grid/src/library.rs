@@ -228,17 +228,15 @@ impl Library {
     /// # Errors
     /// A query of another encoder; the system's refusal to read the file.
     pub fn search(&self, query: &TextQuery, scenes: usize) -> Result<Vec<Found>> {
-        if query.text.len() != self.dimension && !self.is_empty() {
-            let reason = format!(
-                "the library's embeddings have {} numbers, the text's {}: they are of different encoders",
-                self.dimension,
-                query.text.len()
-            );
+        let length = query.meant.first().map_or(0, Vec::len);
+        if length != self.dimension && !self.is_empty() {
+            let reason =
+                format!("the library's embeddings have {} numbers, the text's {length}: they are of different encoders", self.dimension);
             return Err(Error::Core(CoreError::Invalid(reason)));
         }
         // By scene: its likeliest object, whose score is that of the one most like the text.
         let mut best: BTreeMap<usize, (f32, Found)> = BTreeMap::new();
-        for (row, object) in self.in_full(&self.nearest(&query.text))? {
+        for (row, object) in self.in_full(&self.nearest(&query.meant))? {
             let query::Evidence { rank, score, .. } = query::evidence(&object, query);
             let own = (rank, Found { scene: row.scene as usize, hit: Hit { id: row.id, score }, support: row.support });
             let of_scene = best.entry(own.1.scene).or_insert(own);
@@ -253,14 +251,15 @@ impl Library {
         Ok(found.into_iter().map(|f| f.1).take(scenes).collect())
     }
 
-    /// The objects whose short embeddings come nearest to the text, in the order of the file.
-    fn nearest(&self, text: &[f32]) -> Vec<usize> {
-        let along: Vec<f32> = self.basis.chunks_exact(self.dimension.max(1)).map(|b| dot(b, text)).collect();
-        let most = along.iter().fold(1e-9f32, |m, v| m.max(v.abs()));
-        let along: Vec<i16> = quantised(&along, most).map(i16::from).collect();
+    /// The objects whose short embeddings come nearest to what is meant, in the order of the file.
+    fn nearest(&self, meant: &[Vec<f32>]) -> Vec<usize> {
+        let along = |one: &Vec<f32>| -> Vec<f32> { self.basis.chunks_exact(self.dimension.max(1)).map(|b| dot(b, one)).collect() };
+        let along: Vec<Vec<f32>> = meant.iter().map(along).collect();
+        let most = along.iter().flatten().fold(1e-9f32, |m, v| m.max(v.abs()));
+        let along: Vec<Vec<i16>> = along.iter().map(|a| quantised(a, most).map(i16::from).collect()).collect();
         let near = |row: &Row| {
             let own = self.short[row.first * COMPONENTS..(row.first + row.count) * COMPONENTS].chunks_exact(COMPONENTS);
-            own.map(|e| dot8(e, &along)).max().unwrap_or(i32::MIN)
+            own.flat_map(|e| along.iter().map(move |a| dot8(e, a))).max().unwrap_or(i32::MIN)
         };
         let mut scored: Vec<(i32, u32)> =
             self.rows.par_iter().enumerate().with_min_len(4096).map(|(k, row)| (near(row), k as u32)).collect();
@@ -303,7 +302,7 @@ impl Library {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::relevancy::Calibration;
+    use crate::calibration::Calibration;
     use fastlgs_core::rng::Rng;
 
     const DIMENSION: usize = 384;
@@ -359,13 +358,7 @@ mod tests {
         assert_eq!((library.len(), library.scenes.len()), (2400, 40));
         let (mut same, mut asked) = (0, 0);
         for concept in concepts.iter().take(50) {
-            let query = TextQuery {
-                text: concept.clone(),
-                canonical: Vec::new(),
-                negatives: Vec::new(),
-                anything: 0.6,
-                calibration: Calibration::OFFLINE,
-            };
+            let query = TextQuery::new(vec![concept.clone()], Calibration::OFFLINE);
             let mut exact: Vec<(f32, f32, usize, Hit)> = Vec::new();
             for (k, (_, grid)) in scenes.iter().enumerate() {
                 let ranked = query::rank(grid, &query);
@@ -381,8 +374,7 @@ mod tests {
         }
         // Embeddings are rounded: what is nearly level may change places.
         assert!(same * 100 >= asked * 90, "{same} of {asked} as by asking each scene");
-        let short =
-            TextQuery { text: vec![1.0], canonical: Vec::new(), negatives: Vec::new(), anything: 0.6, calibration: Calibration::OFFLINE };
+        let short = TextQuery::new(vec![vec![1.0]], Calibration::OFFLINE);
         assert!(library.search(&short, 5).unwrap_err().to_string().contains("different encoders"));
     }
 
@@ -415,13 +407,7 @@ mod tests {
         let library = Library::open(&path).unwrap();
         let mut milliseconds: Vec<f64> = (0..20)
             .map(|k| {
-                let query = TextQuery {
-                    text: concepts[k].clone(),
-                    canonical: Vec::new(),
-                    negatives: Vec::new(),
-                    anything: 0.6,
-                    calibration: Calibration::OFFLINE,
-                };
+                let query = TextQuery::new(vec![concepts[k].clone()], Calibration::OFFLINE);
                 let started = std::time::Instant::now();
                 assert_eq!(library.search(&query, 10).unwrap().len(), 10);
                 started.elapsed().as_secs_f64() * 1e3

@@ -62,29 +62,47 @@ const BEST_SHARE: f32 = 0.5;
 /// its size. A thing is as likely to be meant as a pixel is to show it: there are ever more parts the smaller they are, of which some look like
 /// anything. Whether the text names anything at all: how much more its best views, with half of its area, are like the text than like
 /// anything, since an object is seldom recognised from everywhere; a single view that fools the encoder counts little.
+///
+/// The very object that was shown as an example is meant beyond doubt.
 pub fn evidence(object: &Object, query: &TextQuery) -> Evidence {
     let total: f32 = object.areas.iter().sum();
     let views = || object.embeddings.iter().zip(object.areas.iter().map(|area| area / total));
-    let cosine: f32 = views().map(|(e, weight)| weight * query.cosine(e)).sum();
+    let cosine = mean_cosine(object, query);
     let negative: f32 = views().map(|(e, weight)| weight * query.negative(e)).sum();
     if object.embeddings.is_empty() || total <= 0.0 || negative >= cosine {
         return Evidence { rank: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
     }
+    if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
+        return Evidence { rank: f32::INFINITY, score: 1.0, error: 0.0 };
+    }
     let temperature = query.calibration.temperature;
     let variance: f32 = views().map(|(e, weight)| (weight * (query.cosine(e) - cosine)).powi(2)).sum();
     let size = object.areas.iter().fold(LEAST_AREA, |most, area| area.max(most)).ln();
-    let mut margins: Vec<(f32, f32)> = views().map(|(e, weight)| (query.cosine(e) - query.canonical(e), weight)).collect();
+    let score = query.calibration.confidence(temperature * margin(object, query));
+    Evidence { rank: temperature * cosine + size, score, error: temperature * variance.sqrt() }
+}
+
+/// Mean cosine over an object's views, weighted by area.
+pub fn mean_cosine(object: &Object, query: &TextQuery) -> f32 {
+    let total: f32 = object.areas.iter().sum();
+    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total * query.cosine(e)).sum()
+}
+
+/// By how much the views that are most like what is meant, with half of the object's area, are more like it than like anything.
+pub fn margin(object: &Object, query: &TextQuery) -> f32 {
+    let margin_of = |(e, area): (&Vec<f32>, &f32)| (query.cosine(e) - query.canonical(e), *area);
+    let mut margins: Vec<(f32, f32)> = object.embeddings.iter().zip(&object.areas).map(margin_of).collect();
     margins.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let (mut margin, mut share) = (0.0, 0.0);
-    for (own, weight) in margins {
-        margin += own * weight;
-        share += weight;
-        if share >= BEST_SHARE {
+    let wanted = BEST_SHARE * object.areas.iter().sum::<f32>();
+    let (mut sum, mut share) = (0.0, 0.0);
+    for (own, area) in margins {
+        sum += own * area;
+        share += area;
+        if share >= wanted {
             break;
         }
     }
-    let score = query.calibration.confidence(temperature * margin / share);
-    Evidence { rank: temperature * cosine + size, score, error: temperature * variance.sqrt() }
+    sum / share
 }
 
 /// All objects, the likeliest first.
@@ -133,12 +151,12 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     chosen
 }
 
-/// The part of the `targets` that is meant, going down their trees; the targets themselves where no part is relevant.
-pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Found {
+/// The part of the `targets` that is meant, going down their trees; nothing where no part is found.
+pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Option<Found> {
     let inside = |id: u16| grid.chain(id).skip(1).any(|above| targets.iter().any(|t| t.id == above));
     let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside(h.id)).collect();
     let parts = select(grid, &below, query, config);
-    if parts.is_empty() { Found { ranked: targets.to_vec(), targets: targets.to_vec() } } else { Found { ranked: below, targets: parts } }
+    (!parts.is_empty()).then_some(Found { ranked: below, targets: parts })
 }
 
 /// The objects of an answer.
@@ -228,7 +246,7 @@ fn features(values: &[f32]) -> impl Iterator<Item = Vec3> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::relevancy::Calibration;
+    use crate::calibration::Calibration;
     use fastlgs_core::shares::pack;
 
     /// Object 2 lies in object 1; 3 is elsewhere.
@@ -250,7 +268,7 @@ mod tests {
     }
 
     fn query(text: [f32; 2]) -> TextQuery {
-        TextQuery { text: text.to_vec(), canonical: Vec::new(), negatives: Vec::new(), anything: 0.6, calibration: Calibration::OFFLINE }
+        TextQuery::new(vec![text.to_vec()], Calibration::OFFLINE)
     }
 
     fn find(grid: &Grid, text: [f32; 2], config: &QueryConfig) -> Vec<u16> {
@@ -301,11 +319,22 @@ mod tests {
     }
 
     #[test]
+    fn what_was_shown_is_meant_beyond_doubt() {
+        let mut grid = grid();
+        // A larger thing that looks nearly the same.
+        (grid.objects[2].embeddings, grid.objects[2].areas) = (vec![vec![0.81, 0.586]], vec![0.9]);
+        let shown = TextQuery::of_examples(grid.objects[1].embeddings.clone(), Calibration::OFFLINE_PICTURES);
+        let ranked = rank(&grid, &shown);
+        assert_eq!((ranked[0].id, ranked[0].score), (2, 1.0));
+        assert_eq!(ids(&select(&grid, &ranked, &shown, &QueryConfig::default())), [2]);
+    }
+
+    #[test]
     fn parts_are_looked_for_inside_their_object() {
         let targets = [Hit { id: 1, score: 0.9 }];
-        let ask = |text| ids(&part(&grid(), &targets, &query(text), &QueryConfig::default()).targets);
-        assert_eq!(ask([0.3, 0.954]), [2], "3 is nearer but lies elsewhere");
-        assert_eq!(ask([0.0, -1.0]), [1], "no such part");
+        let ask = |text| part(&grid(), &targets, &query(text), &QueryConfig::default()).map(|found| ids(&found.targets));
+        assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "3 is nearer but lies elsewhere");
+        assert_eq!(ask([0.0, -1.0]), None, "no such part");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! CLIP (Radford et al. 2021) from ONNX exports of its two towers.
 
 use crate::clip_tokens::{CONTEXT, ClipTokens};
-use crate::crops::{self, Surround};
+use crate::crops;
 use crate::encoder::{Encoder, TextEncoder, normalise};
 use crate::runtime::{Array, Model};
 use crate::{Error, Result};
@@ -97,7 +97,7 @@ impl Encoder for ClipImage {
             let mut values = Vec::with_capacity(batch.len() * 3 * plane);
             for &label in batch {
                 let bounds = boxes[usize::from(label)].expect("filtered above");
-                let crop = crops::crop(photo, masks, label, bounds, self.size, Surround::Neutral);
+                let crop = crops::bicubic(photo, masks, label, bounds, self.size);
                 values.extend(crop.planar.iter().enumerate().map(|(i, v)| (v / 255.0 - self.mean[i / plane]) / self.deviation[i / plane]));
             }
             let input = Array::new([batch.len(), 3, self.size, self.size], values);

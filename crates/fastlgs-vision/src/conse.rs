@@ -10,17 +10,21 @@ use crate::{Result, names, places};
 use fastlgs_core::LabelMap;
 use fastlgs_core::rng::Rng;
 use image::RgbImage;
+use rayon::prelude::*;
+
+/// Changes when the same mask gets another embedding: those of different versions cannot be compared.
+pub const VERSION: u32 = 1;
 
 /// Classes that take part in an embedding.
 const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2.
 const SIZE: usize = 260;
-/// Dimensions of the dense embedding.
-pub const DENSE: usize = 32;
 /// Weight of what surrounds a mask, for masks that fill their box.
 const CONTEXT: f32 = 0.25;
-/// Crops in one inference.
-const BATCH: usize = 8;
+/// Dimensions of the dense embedding.
+pub const DENSE: usize = 32;
+/// Masks in one inference.
+const BATCH: usize = 4;
 
 /// Features of the cells of a photo.
 #[derive(Clone, Debug)]
@@ -58,15 +62,11 @@ impl Conse {
         Ok(Self { classifier, class_embeddings, projection })
     }
 
-    /// Class probabilities `[n][1000]` of crops.
+    /// Class probabilities of each crop.
     fn classify(&self, crops: &[crops::Crop]) -> Result<Vec<Vec<f32>>> {
-        let mut out = Vec::with_capacity(crops.len());
-        for batch in crops.chunks(BATCH) {
-            let data = batch.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
-            let logits = self.classifier.run(vec![("image", Array::new([batch.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0);
-            out.extend(logits.values.chunks_exact(logits.shape[1]).map(softmax));
-        }
-        Ok(out)
+        let data = crops.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
+        let logits = self.classifier.run(vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0);
+        Ok(logits.values.chunks_exact(logits.shape[1]).map(softmax).collect())
     }
 
     /// The ConSE embedding of class probabilities.
@@ -119,13 +119,12 @@ impl Conse {
     /// it, unless the mask is a frame or a twig around which other things fill the box.
     fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let photo = &exposure::lifted(photo);
-        let boxes = masks.boxes();
+        let (boxes, areas) = (masks.boxes(), masks.areas());
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
         let views = [Surround::Neutral, Surround::Context];
         let cut = |&(label, bounds): &(u16, [u32; 4])| views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s));
-        let crops: Vec<_> = present.iter().flat_map(cut).collect();
-        let probabilities = self.classify(&crops)?;
-        let areas = masks.areas();
+        let of_batch = |batch: &[(u16, [u32; 4])]| self.classify(&batch.iter().flat_map(cut).collect::<Vec<_>>());
+        let probabilities = present.par_chunks(BATCH).map(of_batch).collect::<Result<Vec<_>>>()?.concat();
         let box_area = |[x0, y0, x1, y1]: [u32; 4]| ((x1 - x0) * (y1 - y0)).max(1) as f32;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         for ((label, bounds), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {

@@ -1,7 +1,8 @@
 //! Crops of masks for image encoders.
 
 use fastlgs_core::LabelMap;
-use image::RgbImage;
+use image::imageops::{FilterType, resize};
+use image::{Rgb, RgbImage};
 
 /// A square crop, `size` x `size`, planar RGB in [0, 255].
 pub struct Crop {
@@ -51,4 +52,51 @@ pub fn crop(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], si
         }
     }
     Crop { planar }
+}
+
+/// Side of a crop's box over that of the mask's.
+const MARGIN: f32 = 1.05;
+
+/// The same with grey around the mask, scaled as CLIP's own preprocessing does: bicubic, antialiased.
+pub fn bicubic(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], size: usize) -> Crop {
+    let [x0, y0, x1, y1] = bounds.map(|v| v as f32);
+    let (sx, sy) = (photo.width() as f32 / masks.width as f32, photo.height() as f32 / masks.height as f32);
+    let side = (((x1 - x0) * sx).max((y1 - y0) * sy) * MARGIN).round().max(4.0) as u32;
+    let corner = |a: f32, b: f32, scale: f32| ((a + b) / 2.0 * scale - side as f32 / 2.0).round() as i64;
+    let (left, top) = (corner(x0, x1, sx), corner(y0, y1, sy));
+    let pixel = |i: u32, j: u32| {
+        let (x, y) = (u32::try_from(left + i64::from(i)).ok()?, u32::try_from(top + i64::from(j)).ok()?);
+        let mask = |v: u32, scale: f32, end: u32| ((v as f32 / scale) as u32).min(end - 1);
+        let shown = x < photo.width() && y < photo.height() && masks.at(mask(x, sx, masks.width), mask(y, sy, masks.height)) == label;
+        shown.then(|| *photo.get_pixel(x, y))
+    };
+    let cut = RgbImage::from_fn(side, side, |i, j| pixel(i, j).unwrap_or(Rgb([127; 3])));
+    let scaled = resize(&cut, size as u32, size as u32, FilterType::CatmullRom);
+    let mut planar = vec![0.0; 3 * size * size];
+    for (p, pixel) in scaled.pixels().enumerate() {
+        (0..3).for_each(|k| planar[k * size * size + p] = f32::from(pixel[k]));
+    }
+    Crop { planar }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn crops_show_their_mask_and_hide_the_rest() {
+        // A red block in a green picture; the mask is taller than the block.
+        let within = |v: u32| (24..40).contains(&v);
+        let photo = RgbImage::from_fn(64, 64, |x, y| Rgb(if within(x) && within(y) { [255, 0, 0] } else { [0, 255, 0] }));
+        let labels = (0..64 * 64).map(|p| u16::from(within(p % 64) && (20..44).contains(&(p / 64)))).collect();
+        let masks = LabelMap { width: 64, height: 64, labels };
+        let bounds = masks.boxes()[1].expect("a mask");
+        let at = |crop: &Crop, x: usize, y: usize| [0, 1, 2].map(|k| crop.planar[k * 1024 + y * 32 + x]);
+        let [sampled, scaled] = [crop(&photo, &masks, 1, bounds, 32, Surround::Neutral), bicubic(&photo, &masks, 1, bounds, 32)];
+        for crop in [&sampled, &scaled] {
+            assert_eq!([at(crop, 16, 16), at(crop, 16, 3), at(crop, 1, 16)], [[255.0, 0.0, 0.0], [0.0, 255.0, 0.0], [127.0; 3]]);
+        }
+        let context = crop(&photo, &masks, 1, bounds, 32, Surround::Context);
+        assert_eq!(at(&context, 1, 16), [0.0, 255.0, 0.0]);
+    }
 }

@@ -9,7 +9,9 @@ use fastlgs_grid::mapping::Mask;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
-use fastlgs_vision::{ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, models, places};
+use fastlgs_vision::{
+    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, models, places,
+};
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -153,7 +155,8 @@ impl Eyes {
         })
     }
 
-    fn clip_files(&self) -> Result<[PathBuf; 2]> {
+    /// CLIP's towers.
+    pub(crate) fn clip_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.clip_image, &self.clip_text) {
             (Some(image), Some(text)) => [image.clone(), text.clone()],
             _ => Named::find(&self.clip)?.pair()?,
@@ -258,13 +261,25 @@ impl Eyes {
                 let files = self.files()?.into_iter().filter(|(role, _)| role.starts_with("clip"));
                 Some(files.map(|(_, f)| f.sha256).collect::<Vec<_>>().join(" "))
             }
-            EncoderKind::Offline => Some(format!("offline {}", models::offline_stamp())),
+            EncoderKind::Offline => Some(format!("offline {} {}", conse::VERSION, models::offline_stamp())),
         })
     }
 
     /// Whether masks of a level are kept.
     pub fn keeps(&self, level: Level) -> bool {
         level == Level::Whole || self.levels.iter().any(|l| l == level.name())
+    }
+}
+
+/// The manifest's name of the encoder that comes with the program.
+pub(crate) const OFFLINE: &str = "offline";
+
+/// What embeddings of a scene can be compared with: those that the same files made.
+pub(crate) fn identity_of(manifest: &Manifest) -> String {
+    let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {}", file.sha256));
+    match manifest.encoder.as_str() {
+        OFFLINE => format!("offline {}", conse::VERSION),
+        other => file("clip_image").or_else(|| file("clip_text")).unwrap_or_else(|| other.to_owned()),
     }
 }
 

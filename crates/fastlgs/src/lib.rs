@@ -11,13 +11,16 @@
 //! Nothing here prints or ends the process. Who calls hears of progress and warnings through [`progress::Sink`], which also cancels.
 //! Files are read and written in a scene folder ([`fastlgs_core::SceneFolder`]); a stage that fails leaves earlier results whole.
 
+mod absent;
 mod cache;
+pub mod calibrate;
 mod error;
 pub mod eval;
 pub mod export;
 pub mod eyes;
 pub mod library;
 mod masks;
+pub mod names;
 pub mod objects;
 pub mod preprocess;
 pub mod progress;

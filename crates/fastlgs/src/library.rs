@@ -128,7 +128,7 @@ impl Search {
         let started = Instant::now();
         let mut query = self.texts.query(text)?;
         for negative in &self.config.negatives {
-            query.canonical.push(self.texts.query(negative)?.text);
+            query.negatives.extend(self.texts.query(negative)?.meant);
         }
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();

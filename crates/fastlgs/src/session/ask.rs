@@ -2,16 +2,17 @@
 
 use super::Session;
 use crate::Result;
+use crate::calibrate::Calibrations;
 use crate::error::{Context, bail};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
-use fastlgs_grid::relevancy::{Calibration, TextQuery};
+use fastlgs_grid::relevancy::TextQuery;
 use image::RgbImage;
 
 /// One question.
 pub enum Ask {
-    /// Words; "A of B" means the part A of B where there is one.
+    /// Words, or a name that was taught. "A of B" means the part A of B where that answers better than the whole phrase.
     Text(String),
     /// A picture of the thing, with its name.
     Image(String, RgbImage),
@@ -21,8 +22,8 @@ pub enum Ask {
 
 /// What a question means, before any view is looked at.
 pub enum Meaning {
-    /// Embedded words or pictures: first what is looked for; then, for "A of B", A.
-    Embedded(TextQuery, Option<TextQuery>),
+    /// Embedded words or pictures; for "A of B" also B and A.
+    Embedded(TextQuery, Option<[TextQuery; 2]>),
     /// A pixel of the view.
     Point(u32, u32),
 }
@@ -41,7 +42,7 @@ impl Ask {
     pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
         let with_negatives = |mut query: TextQuery| -> Result<TextQuery> {
             for text in negatives {
-                query.negatives.push(session.text_query(text)?.text);
+                query.negatives.extend(session.text_query(text)?.meant);
             }
             Ok(query)
         };
@@ -49,11 +50,10 @@ impl Ask {
             Self::Point(x, y) => Meaning::Point(*x, *y),
             Self::Image(name, photo) => Meaning::Embedded(with_negatives(picture(session, name, photo)?)?, None),
             Self::Text(text) => {
-                let whole = |text: &str| with_negatives(session.text_query(text)?);
-                match part_of(text) {
-                    Some((part, object)) => Meaning::Embedded(whole(object)?, Some(whole(part)?)),
-                    None => Meaning::Embedded(whole(text)?, None),
-                }
+                let embedded = |text: &str| with_negatives(session.text_query(text)?);
+                let split = part_of(text).filter(|_| !session.is_taught(text));
+                let split = split.map(|(part, object)| Ok::<_, crate::Error>([embedded(object)?, embedded(part)?])).transpose()?;
+                Meaning::Embedded(embedded(text)?, split)
             }
         })
     }
@@ -68,16 +68,14 @@ fn part_of(text: &str) -> Option<(&str, &str)> {
 }
 
 /// A picture as a query: the whole of it is embedded like a mask.
-fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result<TextQuery> {
+pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result<TextQuery> {
     let (width, height) = photo.dimensions();
     let everything = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
     let encoder = session.image_encoder()?;
     let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let embedding =
         embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    // Pictures are about as far from each other with any encoder.
-    let calibration = Calibration { measured: false, ..Calibration::OFFLINE };
-    Ok(TextQuery { text: embedding, canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration })
+    Ok(TextQuery::of_examples(vec![embedding], Calibrations::of(&session.manifest).pictures))
 }
 
 impl Meaning {
@@ -92,13 +90,17 @@ impl Meaning {
     /// The objects that are meant.
     pub fn find(&self, grid: &Grid, field: &Field, camera: &Camera, config: &QueryConfig) -> Result<Found> {
         match self {
-            Self::Embedded(query, None) => {
+            Self::Embedded(query, split) => {
                 let ranked = query::rank(grid, query);
-                Ok(Found { targets: query::select(grid, &ranked, query, config), ranked })
-            }
-            Self::Embedded(object, Some(part)) => {
-                let targets = query::select(grid, &query::rank(grid, object), object, config);
-                Ok(query::part(grid, &targets, part, config))
+                let whole = Found { targets: query::select(grid, &ranked, query, config), ranked };
+                let Some([object, part]) = split else { return Ok(whole) };
+                let ranked = query::rank(grid, object);
+                let around = Found { targets: query::select(grid, &ranked, object, config), ranked };
+                Ok(match query::part(grid, &around.targets, part, config) {
+                    Some(part) if query::best_score(&part.ranked) > query::best_score(&whole.ranked) => part,
+                    _ if !whole.targets.is_empty() => whole,
+                    _ => around,
+                })
             }
             Self::Point(x, y) => {
                 if *x >= camera.width || *y >= camera.height {

@@ -13,14 +13,14 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::Field;
-use fastlgs_grid::relevancy::{Calibration, TextQuery};
+use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::Encoder;
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 pub use texts::Texts;
-pub use views::{ViewChoice, parse_size};
+pub use views::{ViewChoice, parse_point, parse_size};
 
 /// A trained scene on a device.
 pub struct Session {
@@ -110,22 +110,35 @@ impl Session {
         Ok(Field::Features { width, height, values, tau_ac })
     }
 
-    /// Prepares a text with the encoder that made the scene's embeddings; the first one loads it.
-    pub fn text_query(&self, text: &str) -> Result<TextQuery> {
+    /// The text tower of the encoder that made the scene's embeddings; the first call loads it.
+    fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
             let _ = self.texts.set(Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?);
         }
-        self.texts.get().expect("set above").query(text)
+        Ok(self.texts.get().expect("set above"))
+    }
+
+    /// Prepares a text.
+    ///
+    /// # Errors
+    /// As [`Texts::query`], and where the text tower cannot be loaded.
+    pub fn text_query(&self, text: &str) -> Result<TextQuery> {
+        self.texts()?.query(text)
+    }
+
+    /// Whether the user has taught a name.
+    pub fn is_taught(&self, text: &str) -> bool {
+        self.texts().is_ok_and(|texts| texts.is_taught(text))
+    }
+
+    /// Forgets the text tower, so that the next text is asked with the names as they are then.
+    pub fn forget_texts(&mut self) {
+        self.texts = OnceCell::new();
     }
 
     /// The image tower that made the scene's embeddings.
     pub fn image_encoder(&self) -> Result<Box<dyn Encoder>> {
         eyes::encoder_of(&self.folder, &self.manifest)
-    }
-
-    /// What the cosines of the scene's encoder are worth.
-    pub fn calibration(&self) -> Calibration {
-        texts::calibration(&self.manifest)
     }
 }
 

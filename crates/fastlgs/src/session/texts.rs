@@ -1,30 +1,30 @@
-//! The text tower of a scene's encoder, with what its scores are judged by.
+//! The text tower of a scene's encoder, with what its scores are judged by and the names that were taught.
 
+use crate::calibrate::Calibrations;
 use crate::error::{Context, bail};
+use crate::names::Names;
 use crate::{Result, eyes};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
-use fastlgs_grid::relevancy::{CANONICAL, Calibration, TextQuery};
+use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
-
-/// The manifest's name of the encoder that comes with the program.
-const OFFLINE: &str = "offline";
 
 /// A loaded text tower.
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
-    calibration: Calibration,
+    calibrations: Calibrations,
+    names: Names,
+    identity: String,
 }
 
 impl Texts {
     /// The text tower of the encoder that made the scene's embeddings.
     pub fn load(folder: &SceneFolder, manifest: &Manifest, clip_text: Option<&Path>) -> Result<Self> {
         let encoder = eyes::text_encoder_of(manifest, clip_text)?;
-        let calibration = calibration(manifest);
-        let canonical = if manifest.encoder == OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
+        let canonical = if manifest.encoder == eyes::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
         let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
@@ -35,29 +35,35 @@ impl Texts {
                  run 'fastlgs train {root}' again, or name the right tower with --clip-text"
             );
         }
-        Ok(Self { encoder, canonical, calibration })
+        let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
+        Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
     }
 
-    /// Prepares a text.
+    /// Whether the user has taught this name.
+    pub fn is_taught(&self, text: &str) -> bool {
+        self.names.of(text).is_some()
+    }
+
+    /// Prepares a text: the examples of a name that was taught, else its embedding.
+    ///
+    /// # Errors
+    /// An empty text, or a name that was taught with another encoder only.
     pub fn query(&self, text: &str) -> Result<TextQuery> {
-        let calibration = self.calibration;
+        if text.trim().is_empty() {
+            bail!("the text is empty; say what to look for");
+        }
+        if let Some(examples) = self.names.of(text) {
+            let own = examples.iter().filter(|e| e.encoder == self.identity);
+            let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
+            if meant.is_empty() {
+                bail!(
+                    "'{text}' was taught with another encoder than that of this scene: teach it here as well, or forget it: fastlgs names remove '{text}'"
+                );
+            }
+            return Ok(TextQuery::of_examples(meant, self.calibrations.pictures));
+        }
+        let calibration = self.calibrations.texts;
         let anything = calibration.anything + self.encoder.advantage(text);
-        Ok(TextQuery {
-            text: self.encoder.embed(&[text])?.remove(0),
-            canonical: self.canonical.clone(),
-            negatives: Vec::new(),
-            anything,
-            calibration,
-        })
+        Ok(TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(self.encoder.embed(&[text])?, calibration) })
     }
-
-    /// What the encoder's cosines are worth.
-    pub fn calibration(&self) -> Calibration {
-        self.calibration
-    }
-}
-
-/// What the cosines of the encoder that made a scene's embeddings are worth.
-pub fn calibration(manifest: &Manifest) -> Calibration {
-    if manifest.encoder == OFFLINE { Calibration::OFFLINE } else { Calibration::CLIP }
 }

@@ -60,3 +60,12 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     let sizes = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     sizes.filter(|(w, h)| (1..=16384).contains(w) && (1..=16384).contains(h)).ok_or_else(|| format!("'{text}' is not a size like 640x480"))
 }
+
+/// Parses `120,45`.
+///
+/// # Errors
+/// Anything that is no pixel.
+pub fn parse_point(text: &str) -> Result<(u32, u32), String> {
+    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+    numbers.ok_or_else(|| format!("'{text}' is not a pixel like 120,45"))
+}

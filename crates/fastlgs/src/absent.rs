@@ -1,0 +1,48 @@
+//! Names of things that are not there: what must not be found.
+
+/// Things that are in neither of the project's scenes; those that a label names are left out.
+pub(crate) const ABSENT: [&str; 40] = [
+    "elephant",
+    "airplane",
+    "pizza",
+    "submarine",
+    "toothbrush",
+    "volcano",
+    "guitar",
+    "penguin",
+    "traffic light",
+    "banana",
+    "helicopter",
+    "snowman",
+    "tractor",
+    "sushi",
+    "lighthouse",
+    "giraffe",
+    "microwave oven",
+    "jellyfish",
+    "castle",
+    "sailboat",
+    "hamburger",
+    "parachute",
+    "cactus",
+    "ice cream",
+    "fire engine",
+    "octopus",
+    "washing machine",
+    "canoe",
+    "trombone",
+    "strawberry",
+    "tank",
+    "rocket",
+    "goldfish",
+    "bulldozer",
+    "sunglasses",
+    "stethoscope",
+    "ambulance",
+    "zebra",
+    "broccoli",
+    "umbrella",
+];
+
+/// Each of these goes before each absent thing as well: a colour that is there makes nothing else be there.
+pub(crate) const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "brown", "wooden"];

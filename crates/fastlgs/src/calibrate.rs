@@ -1,0 +1,213 @@
+//! What the cosines of an encoder are worth: known for the offline encoder, measured on generated scenes for others and kept beside the model.
+
+use crate::absent::{ABSENT, COLORS};
+use crate::error::{Context, bail};
+use crate::eyes::{self, EncoderKind, Eyes};
+use crate::{Result, Run, masks};
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::synth::{Kind, Thing, World};
+use fastlgs_core::{LabelMap, fs};
+use fastlgs_grid::calibration::{Calibration, Samples};
+use fastlgs_grid::grid::Object;
+use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
+use fastlgs_grid::{Grid, query};
+use fastlgs_vision::{Encoder, models};
+use glam::Vec3;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// What cosines with texts, and cosines with other pictures, are worth.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Calibrations {
+    /// Of masks with texts.
+    pub texts: Calibration,
+    /// Of masks with pictures and with things that were shown.
+    pub pictures: Calibration,
+}
+
+/// A measurement as it is kept beside the model, with the files that it holds for.
+#[derive(Serialize, Deserialize)]
+struct Kept {
+    sha256: [String; 2],
+    #[serde(flatten)]
+    calibrations: Calibrations,
+}
+
+/// Where the measurement of a CLIP is kept.
+fn beside(image_tower: &Path) -> PathBuf {
+    image_tower.with_extension("calibration.json")
+}
+
+impl Calibrations {
+    /// The offline encoder's.
+    pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
+
+    /// What is assumed of a CLIP that was not measured: pictures about as far from each other as with the offline encoder.
+    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration { measured: false, ..Calibration::OFFLINE_PICTURES } };
+
+    /// Those of the encoder that made a scene's embeddings.
+    pub fn of(manifest: &Manifest) -> Self {
+        if manifest.encoder == eyes::OFFLINE {
+            return Self::OFFLINE;
+        }
+        let (image, text) = (manifest.models.get("clip_image"), manifest.models.get("clip_text"));
+        let kept: Option<Kept> = image.and_then(|image| fs::read_json(&beside(&image.path)).ok());
+        let same = |kept: &Kept| [image, text].iter().zip(&kept.sha256).all(|(file, sum)| file.is_some_and(|f| f.sha256 == *sum));
+        kept.filter(same).map_or(Self::CLIP, |kept| kept.calibrations)
+    }
+}
+
+/// What was measured.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Report {
+    /// What texts are worth.
+    pub texts: Calibration,
+    /// What pictures are worth.
+    pub pictures: Calibration,
+    /// Things that were looked at.
+    pub things: usize,
+    /// Names of absent things that were asked for.
+    pub absent: usize,
+    /// The file that keeps it.
+    pub kept: PathBuf,
+    /// Seconds that it took.
+    pub seconds: f64,
+}
+
+/// Seeds of the generated tables.
+const TABLES: [u64; 3] = [1, 2, 3];
+/// Photos of each scene.
+const VIEWS: usize = 12;
+/// Their size.
+const SIZE: (u32, u32) = (480, 360);
+/// Smallest share of a photo in which a thing is looked at.
+const LEAST_AREA: f32 = 0.0005;
+
+/// A generated scene: its things, and what the encoder makes of them.
+struct Known {
+    things: Vec<Thing>,
+    grid: Grid,
+}
+
+/// Measures what the cosines of CLIP's towers are worth, on generated scenes whose things are known, and keeps it beside the image tower.
+///
+/// # Errors
+/// Towers that cannot be loaded or that tell nothing apart, and a folder that cannot be written.
+pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
+    let clock = Instant::now();
+    if eyes.encoder != EncoderKind::Clip {
+        bail!(
+            "the offline encoder comes calibrated, imported embeddings cannot be: name CLIP's towers, with --clip or --clip-image and --clip-text"
+        );
+    }
+    let image_tower = eyes.clip_files()?[0].clone();
+    let encoder = eyes.encoder(Path::new(""), &Default::default())?;
+    let texts = eyes.text_encoder()?;
+    let pictures = models::pictures_dir();
+    let mut worlds = TABLES.iter().map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed)).collect::<Result<Vec<_>, _>>()?;
+    // The room shows pictures that may not be installed; the tables do without.
+    worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
+    let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
+    let known = worlds.into_iter().map(|world| seen(world, encoder.as_ref(), || work.advance())).collect::<Result<Vec<_>>>()?;
+    let canonical = texts.embed(&CANONICAL)?;
+    let anything = Calibration::CLIP.anything;
+    let query = |text: &str| -> Result<TextQuery> {
+        let anything = anything + texts.advantage(text);
+        Ok(TextQuery { canonical: canonical.clone(), anything, ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP) })
+    };
+    let there = |name: &str| known.iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
+    // With a colour before it, too: a colour that is there makes nothing else be there.
+    let absent = ABSENT.into_iter().filter(|name| !there(name)).zip(COLORS.into_iter().cycle());
+    let absent: Vec<String> = absent.flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")]).collect();
+    let blind = || format!("{}: the encoder tells the generated things not apart by their names; is it CLIP?", image_tower.display());
+    let of_texts = Calibration::measured(&by_names(&known, &absent, query)?, anything).with_context(blind)?;
+    let of_pictures = Calibration::measured(&by_examples(&known), anything).with_context(blind)?;
+    let calibrations = Calibrations { texts: of_texts, pictures: of_pictures };
+    let files = eyes.files()?;
+    let sum = |role: &str| files.get(role).map(|f| f.sha256.clone()).unwrap_or_default();
+    let kept = beside(&image_tower);
+    fs::write_json(&kept, &Kept { sha256: ["clip_image", "clip_text"].map(sum), calibrations })?;
+    Ok(Report {
+        texts: of_texts,
+        pictures: of_pictures,
+        things: known.iter().map(|k| k.things.len()).sum(),
+        absent: absent.len(),
+        kept,
+        seconds: clock.elapsed().as_secs_f64(),
+    })
+}
+
+/// Renders a generated scene and embeds all its things with their exact masks.
+fn seen(world: World, encoder: &dyn Encoder, advance: impl Fn() -> Result<()>) -> Result<Known> {
+    let things = world.things.clone();
+    let chain =
+        |id: u16| std::iter::successors(Some(id).filter(|id| *id > 0), |id| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0));
+    let depth = |id: u16| chain(id).count();
+    let depths = (1..=things.len() as u16).map(depth).max().unwrap_or(0);
+    let mut found = Vec::new();
+    for (index, camera) in world.cameras.iter().enumerate() {
+        let view = world.render(index, 2);
+        for layer in 1..=depths {
+            let labels = view.instances.labels.iter().map(|id| chain(*id).find(|a| depth(*a) == layer).unwrap_or(0)).collect();
+            let masks = masks::described(&camera.name, &view.photo, index, &LabelMap { labels, ..view.instances }, encoder)?;
+            found.extend(masks.into_iter().filter(|m| m.area >= LEAST_AREA));
+        }
+        advance()?;
+    }
+    let object_of: Vec<u16> = found.iter().map(|m| m.label).collect();
+    let mut grid = Grid::build(&found, &object_of, vec![Vec3::ZERO; things.len()]);
+    grid.objects.iter_mut().zip(&things).for_each(|(object, thing)| object.parent = thing.parent);
+    Ok(Known { things, grid })
+}
+
+impl Known {
+    /// Things that were seen, with their names.
+    fn objects(&self) -> impl Iterator<Item = (&Object, &str)> {
+        let named = self.grid.objects.iter().zip(self.things.iter().map(|t| t.name.as_str()));
+        named.filter(|(object, _)| !object.embeddings.is_empty())
+    }
+
+    /// Things that neither contain another one nor lie in it.
+    fn others(&self, of: u16) -> impl Iterator<Item = &Object> {
+        let nested = move |id: u16| self.grid.chain(id).any(|a| a == of) || self.grid.chain(of).any(|a| a == id);
+        self.objects().map(|o| o.0).filter(move |o| !nested(o.id))
+    }
+
+    /// By how much the best thing exceeds "anything".
+    fn best(&self, query: &TextQuery) -> Option<f32> {
+        self.objects().map(|(object, _)| query::margin(object, query)).max_by(f32::total_cmp)
+    }
+}
+
+/// Samples of things with their own names, with those of others, and of scenes with names of absent things.
+fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<TextQuery>) -> Result<Samples> {
+    let mut samples = Samples::default();
+    for scene in known {
+        for (object, name) in scene.objects() {
+            let query = query(name)?;
+            samples.right.push(query::mean_cosine(object, &query));
+            samples.wrong.extend(scene.others(object.id).map(|other| query::mean_cosine(other, &query)));
+        }
+        for name in absent {
+            samples.absent.extend(scene.best(&query(name)?));
+        }
+    }
+    Ok(samples)
+}
+
+/// Samples of things with one view of their own, with one of others, and of scenes with views of things that they lack.
+fn by_examples(known: &[Known]) -> Samples {
+    let mut samples = Samples::default();
+    for (place, scene) in known.iter().enumerate() {
+        for (object, name) in scene.objects().filter(|(object, _)| object.embeddings.len() > 1) {
+            let query = TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
+            let rest = Object { embeddings: object.embeddings[1..].to_vec(), areas: object.areas[1..].to_vec(), ..object.clone() };
+            samples.right.push(query::mean_cosine(&rest, &query));
+            samples.wrong.extend(scene.others(object.id).map(|other| query::mean_cosine(other, &query)));
+            let elsewhere = known.iter().enumerate().filter(|(k, other)| *k != place && other.things.iter().all(|t| t.name != name));
+            samples.absent.extend(elsewhere.filter_map(|(_, other)| other.best(&query)));
+        }
+    }
+    samples
+}
