@@ -321,6 +321,11 @@ fn every_way_to_ask_ends_in_the_same_object() {
     fails(&["query", text(&f.scene), "--image", "nowhere.png"], &["nowhere.png"]);
     fails(&["query", text(&f.scene), "-", "cat"], &["standard input"]);
     fails(&["query", text(&f.scene), "cat", "--point", "1,1"], &["one way"]);
+    let said = fastlgs(&["query", text(&f.scene), "cat", "--view", "008"]);
+    let said = String::from_utf8_lossy(&said.stdout).into_owned();
+    assert!(said.starts_with("cat: found, confidence ") && said.contains(" pixels in 008.png"), "{said}");
+    fails(&["export", text(&f.scene), text(&file("cat.xyz"))], &["cat.xyz", ".spz"]);
+    assert!(!file("cat.xyz").exists());
     fails(&["query", text(&f.scene), " "], &["text is empty"]);
 }
 

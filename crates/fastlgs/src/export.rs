@@ -91,14 +91,21 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         camera_path::write(&config.output, &cameras)?;
         return Ok(Report::Path { scene: config.scene.clone(), output: config.output.clone(), frames: cameras.len() });
     }
+    let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    let folder = config.output.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || config.output.is_dir();
+    if !folder && !["", "ply", "spz", "glb"].contains(&ending) {
+        let path = config.output.display();
+        bail!(
+            "{path}: nothing is written as .{ending}; there are .ply, .spz, .glb and .json, and folders, whose names have no ending or end with /"
+        );
+    }
     let mut scene = Session::open(&config.scene, run.device)?;
     let held_out = held_out(&scene);
     let before = pictures(&mut scene, &held_out)?;
     let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
     scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
-    let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let (written, precision) = match ending {
-        "ply" | "spz" | "glb" => {
+        "ply" | "spz" | "glb" if !folder => {
             selection::write(&config.output, &scene.gaussians, &scene.cameras)?;
             let written = match ending {
                 "ply" => ply::read(&config.output)?,

@@ -4,7 +4,7 @@ use super::library;
 use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::{Result, bail};
-use fastlgs::session::answer::{CANDIDATES, Question, Report};
+use fastlgs::session::answer::{CANDIDATES, ObjectReport, Question, Report};
 use fastlgs::session::ask::Ask;
 use fastlgs::session::{ViewChoice, parse_point, parse_size, selection};
 use fastlgs::{Run, Session};
@@ -83,12 +83,48 @@ fn parse_share(text: &str) -> Result<f32, String> {
     text.parse().ok().filter(|share| (0.0..=1.0).contains(share)).ok_or_else(|| "a share from 0 to 1 is needed".into())
 }
 
+/// An answer in a few words.
+fn told(report: &Report) -> String {
+    let Report { text, view, score, .. } = report;
+    let of = |object: &ObjectReport| {
+        let place = object.bbox2d.map_or_else(|| "not in this view".to_owned(), |[x0, y0, x1, y1]| format!("at {x0},{y0} to {x1},{y1}"));
+        format!("  #{}: {} pixels {place}, confidence {:.2}", object.id, thousands(object.pixels), object.score)
+    };
+    let sure = if report.calibrated { "" } else { " (of an encoder that was not calibrated)" };
+    let taught = if report.taught { ", taught" } else { "" };
+    if !report.found {
+        return format!("{text}: not found; the nearest object has a confidence of {score:.2}{sure}{taught}");
+    }
+    let count = if report.objects.len() == 1 { "1 object".to_owned() } else { format!("{} objects", report.objects.len()) };
+    let shown = match &report.seen_best {
+        Some(best) => format!("hidden in {view}; seen best in {best}"),
+        None => format!("{} pixels in {view}", thousands(report.pixels)),
+    };
+    let mut lines = vec![format!("{text}: found, confidence {score:.2}{sure}{taught}, {count}, {shown} ({:.0} ms)", report.ms.total)];
+    if report.objects.len() > 1 {
+        lines.extend(report.objects.iter().map(of));
+    }
+    let files = [("mask", &report.mask), ("heat map", &report.heatmap)];
+    lines.extend(files.into_iter().filter_map(|(what, path)| Some(format!("  {what}: {}", path.as_ref()?.display()))));
+    lines.join("\n")
+}
+
+/// 19580 as 19,580.
+fn thousands(number: usize) -> String {
+    let digits = number.to_string();
+    let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or_default()).collect();
+    groups.join(",")
+}
+
 /// A view as it was last rendered.
 struct Shown {
     place: usize,
     field: Field,
     color: Option<Frame>,
 }
+
+/// Pixels of an answer from which a person sees it.
+const VISIBLE: usize = 30;
 
 /// What questions are put to, and how.
 struct Asker<'a> {
@@ -116,7 +152,8 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         let config = fastlgs::library::Config { scenes: args.scenes, false_alarms: args.false_alarms, negatives, clip_text };
         return library::run(root, config, &texts, common, run);
     }
-    if !args.text.is_empty() && !(args.point.is_empty() && args.image.is_empty()) {
+    let shown = !args.point.is_empty() || !args.image.is_empty();
+    if shown && !args.text.is_empty() {
         bail!("ask in one way: a text, or --point, or --image");
     }
     let lines = args.text.iter().any(|t| t == "-");
@@ -159,12 +196,12 @@ impl Asker<'_> {
         }
         let found = answers.iter().any(|a| a.found);
         let single = answers.len() == 1;
-        if single {
+        if common.json.is_some() && single {
             report::give(common, &answers.remove(0))?;
         } else if common.json.is_some() {
             report::give(common, &answers)?;
-        } else {
-            answers.iter().try_for_each(|answer| report::give(common, answer).map(|_| ()))?;
+        } else if !common.quiet {
+            answers.iter().for_each(|answer| println!("{}", told(answer)));
         }
         if !found && !common.quiet {
             let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
@@ -223,6 +260,10 @@ impl Asker<'_> {
                 let selected = selection::gaussians(&scene.gaussians, grid, &ids);
                 selection::export(path, &scene.gaussians, &scene.cameras, &selected, keep)?;
             }
+        }
+        if report.found && report.pixels < VISIBLE {
+            let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
+            report.seen_best = self.scene.seen_best(&self.grid, &ids)?;
         }
         Ok(report)
     }

@@ -84,6 +84,8 @@ pub struct Report {
     pub candidates: Vec<Hit>,
     /// Pixels of the mask.
     pub pixels: usize,
+    /// The view that shows it best, where this one hardly does and another was looked for.
+    pub seen_best: Option<String>,
     /// File of the mask, where it was written.
     pub mask: Option<PathBuf>,
     /// File of the heat map, where it was written.
@@ -160,6 +162,7 @@ impl Answer<'_> {
             objects: targets.iter().map(|t| self.object(session, camera.width, t)).collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),
+            seen_best: None,
             mask: None,
             heatmap: None,
             gaussians: session.gaussians.len(),

@@ -23,7 +23,7 @@ pub enum Ask {
 /// What a question means, before any view is looked at.
 pub enum Meaning {
     /// Embedded words or pictures; for "A of B" also B and A.
-    Embedded(TextQuery, Option<[TextQuery; 2]>),
+    Embedded(Box<TextQuery>, Option<Box<[TextQuery; 2]>>),
     /// A pixel of the view.
     Point(u32, u32),
 }
@@ -48,12 +48,13 @@ impl Ask {
         };
         Ok(match self {
             Self::Point(x, y) => Meaning::Point(*x, *y),
-            Self::Image(name, photo) => Meaning::Embedded(with_negatives(picture(session, name, photo)?)?, None),
+            Self::Image(name, photo) => Meaning::Embedded(Box::new(with_negatives(picture(session, name, photo)?)?), None),
             Self::Text(text) => {
                 let embedded = |text: &str| with_negatives(session.text_query(text)?);
                 let split = part_of(text).filter(|_| !session.is_taught(text));
-                let split = split.map(|(part, object)| Ok::<_, crate::Error>([embedded(object)?, embedded(part)?])).transpose()?;
-                Meaning::Embedded(embedded(text)?, split)
+                let split =
+                    split.map(|(part, object)| Ok::<_, crate::Error>(Box::new([embedded(object)?, embedded(part)?]))).transpose()?;
+                Meaning::Embedded(Box::new(embedded(text)?), split)
             }
         })
     }
@@ -93,7 +94,7 @@ impl Meaning {
             Self::Embedded(query, split) => {
                 let ranked = query::rank(grid, query);
                 let whole = Found { targets: query::select(grid, &ranked, query, config), ranked };
-                let Some([object, part]) = split else { return Ok(whole) };
+                let Some([object, part]) = split.as_deref() else { return Ok(whole) };
                 let ranked = query::rank(grid, object);
                 let around = Found { targets: query::select(grid, &ranked, object, config), ranked };
                 Ok(match query::part(grid, &around.targets, part, config) {

@@ -12,7 +12,7 @@ use crate::{Result, eyes, train};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::Field;
+use fastlgs_grid::query::{Field, Hit};
 use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
@@ -108,6 +108,27 @@ impl Session {
         // Codes that were trained make up for what passes through; those that were lifted do not.
         let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
         Ok(Field::Features { width, height, values, tau_ac })
+    }
+
+    /// The view that shows most of some objects; nothing where none does.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn seen_best(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
+        /// Longer side of the small pictures that are looked at.
+        const SIDE: u32 = 128;
+        let targets: Vec<Hit> = ids.iter().map(|id| Hit { id: *id, score: 1.0 }).collect();
+        let mut best = (0, None);
+        for camera in self.cameras.clone() {
+            let longer = camera.width.max(camera.height);
+            let side = |v: u32| (v * SIDE.min(longer) / longer).max(1);
+            let small = camera.resized(side(camera.width), side(camera.height));
+            let pixels = self.field(&small, None)?.mask(grid, &targets).iter().filter(|m| **m).count();
+            if pixels > best.0 {
+                best = (pixels, Some(camera.name));
+            }
+        }
+        Ok(best.1)
     }
 
     /// The text tower of the encoder that made the scene's embeddings; the first call loads it.
