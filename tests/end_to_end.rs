@@ -201,6 +201,9 @@ fn onnx_exports_of_sam_and_clip() {
     std::fs::write(&words, b"short").expect("a file");
     fails(&["query", text(&scene), "red"], &["text.onnx", "made with"]);
     fails(&["preprocess", text(&f.photos), "-o", text(&file("x")), "--segmenter", "sam", "--sam", "sam9"], &["sam9", "slimsam"]);
+    let unused = file("x");
+    let alone = ["preprocess", text(&f.photos), "-o", text(&unused), "--encoder", "clip", "--clip-text", text(&image)];
+    fails(&alone, &["image.onnx", "--clip-image"]);
     args[3] = "unused";
     *args.last_mut().expect("options") = text(&image);
     fails(&args, &["image.onnx", "no text tower"]);

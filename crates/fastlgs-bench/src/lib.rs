@@ -6,6 +6,7 @@ mod chart;
 mod command;
 mod disturb;
 mod growth;
+mod names;
 mod plot;
 mod report;
 mod size;
@@ -41,6 +42,8 @@ enum What {
     Stability(stability::Args),
     /// Seconds and memory of global mapping as photos, masks and Gaussians grow.
     Growth(growth::Args),
+    /// What texts give on scenes that nothing was chosen on, and how much more where they were seen.
+    Names(names::Args),
     /// The other benches' results and sample pictures in one HTML file.
     Report(report::Args),
     /// Masks and embeddings alone, on labelled photos.
@@ -59,6 +62,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         What::Size(args) => size::run(args, run),
         What::Stability(args) => stability::run(args, run),
         What::Growth(args) => growth::run(args, run),
+        What::Names(args) => names::run(args, run),
         What::Report(args) => report::run(args, run),
         What::Vision(args) => vision::run(args, run),
     }

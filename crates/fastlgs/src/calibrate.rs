@@ -2,8 +2,10 @@
 
 use crate::absent::{ABSENT, COLORS};
 use crate::error::{Context, bail};
+use crate::eval::best_object;
 use crate::eyes::{self, EncoderKind, Eyes};
-use crate::{Result, Run, masks};
+use crate::{Result, Run, Session, masks};
+use fastlgs_core::labels::LabelledView;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::synth::{Kind, Thing, World};
 use fastlgs_core::{LabelMap, fs};
@@ -35,7 +37,7 @@ struct Kept {
 }
 
 /// Where the measurement of a CLIP is kept.
-fn beside(image_tower: &Path) -> PathBuf {
+pub fn beside(image_tower: &Path) -> PathBuf {
     image_tower.with_extension("calibration.json")
 }
 
@@ -179,6 +181,37 @@ impl Known {
         self.objects().map(|(object, _)| query::margin(object, query)).max_by(f32::total_cmp)
     }
 }
+
+/// Samples of a trained scene whose labels say what is in it: what `bench names` measures from other scenes.
+///
+/// # Errors
+/// Labels of views that the scene lacks, and a device that fails.
+pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples> {
+    let grid = scene.grid()?;
+    let seen = || grid.objects.iter().filter(|o| !o.embeddings.is_empty());
+    let mut samples = Samples::default();
+    for view in views {
+        let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
+        let field = scene.field(&camera, None)?;
+        for label in &view.labels {
+            let (iou, _, id) = best_object(&grid, &field, &view.mask(label, camera.width, camera.height));
+            let Some(own) = seen().find(|o| o.id == id && iou >= SAME) else { continue };
+            let query = scene.text_query(&label.category)?;
+            let nested = |other: u16| grid.chain(other).any(|a| a == id) || grid.chain(id).any(|a| a == other);
+            samples.right.push(query::mean_cosine(own, &query));
+            samples.wrong.extend(seen().filter(|o| !nested(o.id)).map(|other| query::mean_cosine(other, &query)));
+        }
+    }
+    let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
+    for name in ABSENT.into_iter().filter(|name| !there(name)) {
+        let query = scene.text_query(name)?;
+        samples.absent.extend(seen().map(|object| query::margin(object, &query)).max_by(f32::total_cmp));
+    }
+    Ok(samples)
+}
+
+/// IoU with a label from which an object is what it names.
+const SAME: f64 = 0.5;
 
 /// Samples of things with their own names, with those of others, and of scenes with names of absent things.
 fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<TextQuery>) -> Result<Samples> {

@@ -159,7 +159,9 @@ impl Eyes {
     pub(crate) fn clip_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.clip_image, &self.clip_text) {
             (Some(image), Some(text)) => [image.clone(), text.clone()],
-            _ => Named::find(&self.clip)?.pair()?,
+            (None, Some(text)) => bail!("{}: a text tower needs the image tower that belongs to it: --clip-image FILE", text.display()),
+            (Some(image), None) => bail!("{}: an image tower needs the text tower that belongs to it: --clip-text FILE", image.display()),
+            (None, None) => Named::find(&self.clip)?.pair()?,
         })
     }
 

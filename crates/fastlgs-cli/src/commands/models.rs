@@ -3,10 +3,10 @@
 use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::Result;
-use fastlgs::Run;
 use fastlgs::eyes::{EncoderKind, Eyes};
+use fastlgs::{Run, calibrate};
 use fastlgs_core::scene_folder::ModelFile;
-use fastlgs_vision::pull::{self, HOST, NAMED, Named};
+use fastlgs_vision::pull::{self, HOST, NAMED, Named, Role};
 use fastlgs_vision::{models, places};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -58,7 +58,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         Action::Calibrate { clip, clip_image, clip_text } => {
             let (clip, clip_image, clip_text) = (clip.clone(), clip_image.clone(), clip_text.clone());
             let eyes = Eyes { encoder: EncoderKind::Clip, clip, clip_image, clip_text, ..Eyes::default() };
-            return report::give(common, &fastlgs::calibrate::calibrate(&eyes, run)?);
+            return report::give(common, &calibrate::calibrate(&eyes, run)?);
         }
         Action::Pull { name, base_url } => {
             let model = Named::find(name)?;
@@ -77,7 +77,8 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
     let named = NAMED.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
-        serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files })
+        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrate::beside(&image).is_file());
+        serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files, "calibrated": calibrated })
     });
     let value = serde_json::json!({
         "folder": places::offline_dir(),
@@ -86,6 +87,11 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         "packages": packages,
         "files": files,
         "can_be_pulled": named,
+        "of_the_paper": {
+            "sam": "ViT-H, sam_vit_h_4b8939",
+            "clip": "OpenCLIP ViT-B/16, laion2b_s34b_b88k (laion/CLIP-ViT-B-16-laion2B-s34B-b88K)",
+            "how": "export them to ONNX and name the files: --sam-encoder, --sam-decoder, --clip-image, --clip-text",
+        },
     });
     report::give(common, &value)
 }

@@ -13,18 +13,33 @@ pub fn adam(step: &Step, gradients: &[f32], params: &mut [f32], moment1: &mut [f
 
 /// One trained value.
 #[inline]
-pub(crate) fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f32, moment1: &mut f32, moment2: &mut f32) {
-    let mut g = gradient;
-    if channel == 10 {
-        let opacity = sigmoid(*param);
-        g += step.opacity_weight * opacity * (1.0 - opacity);
+fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f32, moment1: &mut f32, moment2: &mut f32) {
+    let g = gradient + price(step, channel, *param);
+    let next = moved(step, step.rates[channel.min(BASE_CHANNELS)], g, *param, moment1, moment2);
+    *param = if FEATURES.contains(&channel) { next.clamp(0.0, 1.0) } else { next };
+}
+
+/// Channels of the feature, which stays in the unit cube.
+pub(crate) const FEATURES: std::ops::Range<usize> = 14..BASE_CHANNELS;
+
+/// What a value's price adds to its gradient: opacity and scales have one.
+#[inline]
+pub(crate) fn price(step: &Step, channel: usize, param: f32) -> f32 {
+    match channel {
+        10 if step.opacity_weight != 0.0 => {
+            let opacity = sigmoid(param);
+            step.opacity_weight * opacity * (1.0 - opacity)
+        }
+        3..6 if step.scale_weight != 0.0 => step.scale_weight * param.exp(),
+        _ => 0.0,
     }
-    if (3..6).contains(&channel) {
-        g += step.scale_weight * param.exp();
-    }
+}
+
+/// The next value; moments change with it.
+#[inline(always)]
+pub(crate) fn moved(step: &Step, rate: f32, g: f32, param: f32, moment1: &mut f32, moment2: &mut f32) -> f32 {
     let m1 = 0.9 * *moment1 + 0.1 * g;
     let m2 = 0.999 * *moment2 + 0.001 * g * g;
     (*moment1, *moment2) = (m1, m2);
-    let next = *param - step.rates[channel.min(BASE_CHANNELS)] * (m1 / step.correction1) / ((m2 / step.correction2).sqrt() + step.epsilon);
-    *param = if (14..BASE_CHANNELS).contains(&channel) { next.clamp(0.0, 1.0) } else { next };
+    param - rate * (m1 / step.correction1) / ((m2 / step.correction2).sqrt() + step.epsilon)
 }

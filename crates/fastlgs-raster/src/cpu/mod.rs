@@ -29,7 +29,7 @@ mod tile_load;
 mod tile_ranges;
 
 pub use adam::adam;
-pub(crate) use adam::adam_one;
+pub(crate) use adam::{FEATURES, moved, price};
 pub use blend::blend;
 pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;

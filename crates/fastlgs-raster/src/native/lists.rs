@@ -19,7 +19,7 @@ pub(crate) struct Lists {
     footprints: Vec<Footprint>,
 }
 
-/// Tile rows are listed in so many parts, whatever the number of threads: sums then always have the same order.
+/// Gaussians are listed in so many parts, whatever the number of threads.
 const PARTS: usize = 16;
 
 /// Projects the Gaussians, whose channels `param(i, channel)` gives.
@@ -54,70 +54,48 @@ impl Lists {
         self.splats = project(view, param).into_iter().map(|p| p.splat).collect();
     }
 
+    /// Counting sort by tile of the tiles that each Gaussian touches, which keeps the order of depths within a tile.
     fn fill(&mut self, view: &View, order: &[u32]) {
-        let rows = view.tiles[1] as usize;
-        let part = |k: usize| (k * rows / PARTS) as u32..((k + 1) * rows / PARTS) as u32;
-        let parts: Vec<Part> = (0..PARTS).into_par_iter().map(|k| Part::new(view, part(k), order, self)).collect();
-        for (k, part_of) in parts.into_iter().enumerate() {
-            let shift = self.gaussians.len() as u32;
-            for (tile, range) in part_of.ranges.into_iter().enumerate() {
-                self.ranges[(part(k).start * view.tiles[0]) as usize + tile] = range.map(|p| p + shift);
-            }
-            for (slot, place) in part_of.places {
-                self.places[slot as usize] = place + shift;
-            }
-            self.gaussians.extend(part_of.gaussians);
-        }
-    }
-}
-
-/// Lists of some tile rows.
-struct Part {
-    ranges: Vec<[u32; 2]>,
-    gaussians: Vec<u32>,
-    /// (index in `Lists::places`, pair of the part).
-    places: Vec<(u32, u32)>,
-}
-
-impl Part {
-    fn new(view: &View, rows: std::ops::Range<u32>, order: &[u32], lists: &Lists) -> Self {
-        let tiles_x = view.tiles[0];
-        let tiles = (rows.len() as u32 * tiles_x) as usize;
-        let mut found: Vec<(u32, u32, u32)> = Vec::new(); // tile of the part, Gaussian, slot
-        let mut ends = vec![0u32; tiles + 1];
-        for &g in order {
-            let footprint = &lists.footprints[g as usize];
-            let (top, bottom) = (footprint[1][2] as u32, footprint[1][3] as u32);
-            if bottom <= rows.start || top >= rows.end {
-                continue;
-            }
-            let above: usize = (top..rows.start).map(|row| span(footprint, row, tiles_x).len()).sum();
-            let mut slot = lists.first[g as usize] + above as u32;
-            for row in top.max(rows.start)..bottom.min(rows.end) {
-                for x in span(footprint, row, tiles_x) {
-                    let tile = (row - rows.start) * tiles_x + x;
-                    ends[tile as usize + 1] += 1;
-                    found.push((tile, g, slot));
-                    slot += 1;
+        let (tiles_x, tiles) = (view.tiles[0], self.ranges.len());
+        let footprints = &self.footprints;
+        let touched = |gaussians: &[u32]| {
+            let (mut found, mut counts) = (Vec::new(), vec![0u32; tiles]);
+            for &g in gaussians {
+                let footprint = &footprints[g as usize];
+                for row in footprint[1][2] as u32..(footprint[1][3] as u32).min(view.tiles[1]) {
+                    for tile in span(footprint, row, tiles_x).map(|x| row * tiles_x + x) {
+                        counts[tile as usize] += 1;
+                        found.push(tile);
+                    }
                 }
             }
+            (found, counts)
+        };
+        let parts = order.par_chunks(order.len().div_ceil(PARTS).max(1));
+        let (found, mut next): (Vec<Vec<u32>>, Vec<Vec<u32>>) = parts.map(touched).unzip();
+        let mut end = 0;
+        for (tile, range) in self.ranges.iter_mut().enumerate() {
+            range[0] = end;
+            for counts in &mut next {
+                end += std::mem::replace(&mut counts[tile], end);
+            }
+            range[1] = end;
         }
-        for tile in 0..tiles {
-            ends[tile + 1] += ends[tile];
-        }
-        let ranges = (0..tiles).map(|t| [ends[t], ends[t + 1]]).collect();
-        let mut next = ends;
-        let mut gaussians = vec![0; found.len()];
-        let places = found
-            .into_iter()
-            .map(|(tile, g, slot)| {
-                let place = next[tile as usize];
-                next[tile as usize] += 1;
-                gaussians[place as usize] = g;
-                (slot, place)
+        self.gaussians = vec![0; end as usize];
+        let mut tiles = found.iter().zip(&mut next).flat_map(|(found, next)| {
+            found.iter().map(move |tile| {
+                let place = next[*tile as usize];
+                next[*tile as usize] += 1;
+                place
             })
-            .collect();
-        Self { ranges, gaussians, places }
+        });
+        for &g in order {
+            let own = self.first[g as usize] as usize..self.first[g as usize + 1] as usize;
+            for (slot, place) in self.places[own].iter_mut().zip(&mut tiles) {
+                *slot = place;
+                self.gaussians[place as usize] = g;
+            }
+        }
     }
 }
 

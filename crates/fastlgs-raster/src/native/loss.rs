@@ -17,39 +17,41 @@ pub struct Scratch {
     blurred: Vec<f32>,
 }
 
-/// out += weight * row.
-type Axpy<'a> = (&'a mut [f32], &'a [f32], f32);
+/// Weights of SSIM's window.
+type Window = [f32; 2 * SSIM_RADIUS + 1];
 
 vectorised! {
-    /// Adds a multiple of one row to another.
-    fn axpy(job: Axpy<'_>) = axpy_body
+    /// Weighted sums of the same places of some rows: of neighbours along a row, the rows are that row shifted.
+    fn blur(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) = blur_body
 }
 
 #[inline(always)]
-fn axpy_body<const FMA: bool>((out, row, weight): Axpy<'_>) {
-    for (o, r) in out.iter_mut().zip(row) {
-        *o = madd::<FMA>(weight, *r, *o);
+fn blur_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) {
+    let rows = rows.map(|row| &row[..out.len()]);
+    for i in 0..out.len() {
+        let mut sum = 0.0;
+        for k in 0..window.len() {
+            sum = madd::<FMA>(window[k], rows[k][i], sum);
+        }
+        out[i] = sum;
     }
 }
 
 /// Blurs a row; `padded` holds it with SSIM_RADIUS zeros on both sides.
-fn blur_row(window: &[f32], padded: &[f32], out: &mut [f32]) {
-    out.fill(0.0);
-    let w = out.len();
-    for (k, weight) in window.iter().enumerate() {
-        axpy((out, &padded[k..k + w], *weight));
-    }
+fn blur_row(window: &Window, padded: &[f32], out: &mut [f32]) {
+    blur(window, &std::array::from_fn(|k| &padded[k..k + out.len()]), out);
 }
 
 /// Blurs `lines` maps along columns into `out`, for row `j` of `rows` `[h][lines * w]`.
-fn blur_columns(window: &[f32], rows: &[f32], line: usize, h: usize, j: usize, out: &mut [f32]) {
-    out.fill(0.0);
-    for (k, weight) in window.iter().enumerate() {
-        let row = (j + k).wrapping_sub(SSIM_RADIUS);
-        if row < h {
-            axpy((out, &rows[row * line..(row + 1) * line], *weight));
-        }
-    }
+fn blur_columns(window: &Window, rows: &[f32], line: usize, h: usize, j: usize, out: &mut [f32]) {
+    let inside = |k: usize| Some((j + k).wrapping_sub(SSIM_RADIUS)).filter(|row| *row < h);
+    let row = |k: usize| {
+        let row = inside(k).unwrap_or(j);
+        &rows[row * line..(row + 1) * line]
+    };
+    // Beyond the picture there are zeros.
+    let window = std::array::from_fn(|k| inside(k).map_or(0.0, |_| window[k]));
+    blur(&window, &std::array::from_fn(row), out);
 }
 
 /// What is compared in row `j`: x, y and the weight of each pixel.

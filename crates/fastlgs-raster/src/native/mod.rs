@@ -1,5 +1,6 @@
 //! The fast CPU backend: the same frames and gradients as the shaders', with vectors and all cores.
 
+mod adam;
 pub(crate) mod blend;
 mod ceiling;
 mod lists;
@@ -14,7 +15,7 @@ use crate::view::{Perturb, Step, TILE, View};
 use crate::{Error, Result};
 use blend::{Blended, Given, Job, Tile};
 use fastlgs_core::Shares;
-use fastlgs_core::gaussians::channels as channels_of;
+use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{KEPT, pack};
 pub(crate) use lists::Lists;
 use rayon::prelude::*;
@@ -204,25 +205,28 @@ impl CpuEngine {
     fn update(&mut self, view: &View, channels: Channels, step: &Step) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
         let (slots, width) = (&self.slots, channels_of(self.sh_degree));
+        let rates: Vec<f32> = (0..adam::BLOCK * width).map(|k| step.rates[(k % width).min(BASE_CHANNELS)]).collect();
         let (lengths, counts) = self.stats.split_at_mut(self.n);
-        let rows = self.params.par_chunks_exact_mut(width).zip(self.moment1.par_chunks_exact_mut(width));
-        let rows = rows.zip(self.moment2.par_chunks_exact_mut(width)).zip(self.gradients.par_chunks_exact_mut(width));
-        let rows = rows.zip(lengths.par_iter_mut().zip(counts)).enumerate().with_min_len(256);
-        rows.for_each(|(i, ((((params, m1), m2), gradients), (length, count)))| {
-            let places = &lists.places[lists.first[i] as usize..lists.first[i + 1] as usize];
-            let mut slot = [0.0; 12];
-            for place in places {
-                slot.iter_mut().zip(&slots[*place as usize]).for_each(|(sum, value)| *sum += value);
+        let size = adam::BLOCK * width;
+        let blocks = self.params.par_chunks_mut(size).zip(self.moment1.par_chunks_mut(size)).zip(self.moment2.par_chunks_mut(size));
+        let blocks = blocks.zip(self.gradients.par_chunks_mut(size));
+        let stats = lengths.par_chunks_mut(adam::BLOCK).zip(counts.par_chunks_mut(adam::BLOCK));
+        blocks.zip(stats).enumerate().for_each(|(block, ((((params, moment1), moment2), gradients), (lengths, counts)))| {
+            for (k, (params, gradients)) in params.chunks_exact(width).zip(gradients.chunks_exact_mut(width)).enumerate() {
+                let i = block * adam::BLOCK + k;
+                let places = &lists.places[lists.first[i] as usize..lists.first[i + 1] as usize];
+                let mut slot = [0.0; 12];
+                for place in places {
+                    slot.iter_mut().zip(&slots[*place as usize]).for_each(|(sum, value)| *sum += value);
+                }
+                let put = |c: usize, value: f32| gradients[c] = value;
+                let drawn = cpu::backward_one(view, channels, |c| params[c], !places.is_empty(), &lists.splats[i], &slot, put);
+                if let Some(moved) = drawn.filter(|_| channels.color()) {
+                    lengths[k] += moved;
+                    counts[k] += 1.0;
+                }
             }
-            let put = |c: usize, value: f32| gradients[c] = value;
-            let drawn = cpu::backward_one(view, channels, |c| params[c], !places.is_empty(), &lists.splats[i], &slot, put);
-            if let Some(moved) = drawn.filter(|_| channels.color()) {
-                *length += moved;
-                *count += 1.0;
-            }
-            for c in step.first_channel as usize..step.end_channel as usize {
-                cpu::adam_one(step, c, gradients[c], &mut params[c], &mut m1[c], &mut m2[c]);
-            }
+            adam::block(step, width, &rates, adam::Values { params, moment1, moment2, gradients });
         });
     }
 }

@@ -170,7 +170,14 @@ fn mean(values: &[f64]) -> Option<f64> {
 /// # Errors
 /// A scene that was never trained, labels that fit no held-out view, or a device that fails.
 pub fn eval(config: &Config, run: &Run) -> Result<Report> {
-    let mut scene = Session::open(&config.scene, run.device)?;
+    eval_session(Session::open(&config.scene, run.device)?, config)
+}
+
+/// The same for a scene that is open already.
+///
+/// # Errors
+/// As [`eval`].
+pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
     let label_text = config.label_text.as_deref();

@@ -7,6 +7,7 @@ pub mod selection;
 mod texts;
 mod views;
 
+use crate::calibrate::Calibrations;
 use crate::error::{Context, bail};
 use crate::{Result, eyes, train};
 use fastlgs_core::scene_folder::Manifest;
@@ -38,6 +39,8 @@ pub struct Session {
     pub clip_text: Option<PathBuf>,
     /// How it was trained.
     pub trained: train::Report,
+    /// What cosines are worth, where that is not to be what is known of the scene's encoder.
+    pub calibrations: Option<Calibrations>,
     texts: OnceCell<Texts>,
 }
 
@@ -57,7 +60,7 @@ impl Session {
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
         let cameras = folder.cameras()?;
-        Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, trained, texts: OnceCell::new() })
+        Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, trained, calibrations: None, texts: OnceCell::new() })
     }
 
     /// Puts other Gaussians in the place of the scene's.
@@ -134,7 +137,9 @@ impl Session {
     /// The text tower of the encoder that made the scene's embeddings; the first call loads it.
     fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
-            let _ = self.texts.set(Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?);
+            let mut texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
+            texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
+            let _ = self.texts.set(texts);
         }
         Ok(self.texts.get().expect("set above"))
     }

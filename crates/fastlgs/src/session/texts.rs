@@ -15,7 +15,8 @@ use std::path::Path;
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
-    calibrations: Calibrations,
+    /// What cosines are worth.
+    pub calibrations: Calibrations,
     names: Names,
     identity: String,
 }

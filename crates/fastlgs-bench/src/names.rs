@@ -1,0 +1,103 @@
+//! `fastlgs bench names`: what texts give on scenes that nothing was chosen on.
+//!
+//! What a cosine is worth and how high absent names score is measured on all scenes but one and applied to that one; and, to compare, measured on
+//! all of them. The gap between the two says how much the figures owe to having seen the scene.
+
+use crate::table;
+use anyhow::{Context, Result, bail};
+use fastlgs::calibrate::{self, Calibrations};
+use fastlgs::{Run, Session, eval};
+use fastlgs_core::labels;
+use fastlgs_grid::calibration::{Calibration, Samples};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
+pub struct Args {
+    /// Trained scene folders of one encoder, two at least.
+    #[arg(required = true, num_args = 2..)]
+    scenes: Vec<PathBuf>,
+    /// Their folders of labels, in the same order.
+    #[arg(long, required = true, value_delimiter = ',')]
+    labels: Vec<PathBuf>,
+    /// Folder for the table (names.md, names.csv, names.json).
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+}
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    if args.scenes.len() != args.labels.len() {
+        bail!("{} scenes and {} folders of labels: name one for each scene", args.scenes.len(), args.labels.len());
+    }
+    let work = run.work("names", 3 * args.scenes.len() as u64);
+    let mut samples = Vec::new();
+    for (root, folder) in args.scenes.iter().zip(&args.labels) {
+        samples.push(calibrate::samples_of(&mut Session::open(root, run.device)?, &labels::load(folder, None)?)?);
+        work.advance()?;
+    }
+    let mut rows = Vec::new();
+    for (place, (root, folder)) in args.scenes.iter().zip(&args.labels).enumerate() {
+        let others = |left_out: Option<usize>| samples.iter().enumerate().filter(move |(k, _)| Some(*k) != left_out).map(|s| s.1);
+        let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
+            let mut scene = Session::open(root, run.device)?;
+            let texts = measured(others(left_out)).with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
+            scene.calibrations = Some(Calibrations { texts, ..Calibrations::of(&scene.manifest) });
+            let config = eval::Config { scene: root.clone(), labels: Some(folder.clone()), ..eval::Config::default() };
+            let report = eval::eval_session(scene, &config)?;
+            work.advance()?;
+            Ok((texts, report))
+        };
+        let (texts, left_out) = judged(Some(place))?;
+        let (_, seen) = judged(None)?;
+        rows.push(json!({
+            "scene": root.file_name().unwrap_or(root.as_os_str()).to_string_lossy(),
+            "labels": left_out.labels_scored,
+            "objects": left_out.objects,
+            "oracle_miou": left_out.oracle_miou,
+            "miou_left_out": left_out.miou,
+            "miou_seen": seen.miou,
+            "first_left_out": left_out.oracle_ranked[0],
+            "first_seen": seen.oracle_ranked[0],
+            "absent_rejected_left_out": rejected(&left_out),
+            "absent_rejected_seen": rejected(&seen),
+            "auroc": left_out.absent_auroc,
+            "outcomes_left_out": left_out.outcomes,
+            "calibration_left_out": texts,
+        }));
+    }
+    let mean = |column: &str| rows.iter().map(|row| table::number(row, column)).sum::<f64>() / rows.len() as f64;
+    let (left_out, seen) = (mean("miou_left_out"), mean("miou_seen"));
+    if let Some(folder) = &args.output {
+        table::write(folder, "names", &COLUMNS, &rows)?;
+    }
+    Ok(json!({ "rows": rows, "miou_left_out": left_out, "miou_seen": seen, "gap": seen - left_out }))
+}
+
+/// Columns of the table.
+const COLUMNS: [&str; 9] = [
+    "scene",
+    "labels",
+    "objects",
+    "oracle_miou",
+    "miou_left_out",
+    "miou_seen",
+    "absent_rejected_left_out",
+    "absent_rejected_seen",
+    "auroc",
+];
+
+fn rejected(report: &eval::Report) -> f64 {
+    report.absent_rejected as f64 / report.absent_texts.max(1) as f64
+}
+
+/// What follows from the samples of some scenes.
+fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>) -> Option<Calibration> {
+    let mut all = Samples::default();
+    for scene in scenes {
+        all.right.extend(&scene.right);
+        all.wrong.extend(&scene.wrong);
+        all.absent.extend(&scene.absent);
+    }
+    Calibration::measured(&all, Calibration::OFFLINE.anything)
+}

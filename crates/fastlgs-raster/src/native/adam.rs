@@ -1,0 +1,56 @@
+//! Adam over the values of some Gaussians at once.
+
+use super::simd::vectorised;
+use crate::cpu::{FEATURES, moved, price};
+use crate::view::Step;
+
+/// Gaussians whose values lie together in the cache.
+pub const BLOCK: usize = 32;
+
+/// Channels of a Gaussian with colour of the highest degree.
+const MOST: usize = fastlgs_core::gaussians::channels(3);
+
+/// Values of up to [`BLOCK`] Gaussians, each `[gaussians][channels]`.
+pub struct Values<'a> {
+    pub params: &'a mut [f32],
+    pub moment1: &'a mut [f32],
+    pub moment2: &'a mut [f32],
+    pub gradients: &'a [f32],
+}
+
+/// The next values of the trained channels. `rates` are those of [`BLOCK`] Gaussians, like the values.
+pub fn block(step: &Step, width: usize, rates: &[f32], values: Values) {
+    let Values { params, moment1, moment2, gradients } = values;
+    let trained = step.first_channel as usize..(step.end_channel as usize).min(width);
+    let mut priced = [0.0; BLOCK * MOST];
+    let priced = &mut priced[..params.len()];
+    priced.copy_from_slice(gradients);
+    for (row, gradients) in params.chunks_exact(width).zip(priced.chunks_exact_mut(width)) {
+        [3, 4, 5, 10].into_iter().filter(|c| trained.contains(c)).for_each(|c| gradients[c] += price(step, c, row[c]));
+    }
+    if trained == (0..width) {
+        adam(step, &rates[..params.len()], priced, params, moment1, moment2);
+    } else {
+        for first in (0..params.len()).step_by(width) {
+            let own = first + trained.start..first + trained.end;
+            let (params, moment1, moment2) = (&mut params[own.clone()], &mut moment1[own.clone()], &mut moment2[own.clone()]);
+            adam(step, &rates[own.clone()], &priced[own], params, moment1, moment2);
+        }
+    }
+    for row in params.chunks_exact_mut(width) {
+        FEATURES.filter(|c| trained.contains(c)).for_each(|c| row[c] = row[c].clamp(0.0, 1.0));
+    }
+}
+
+vectorised! {
+    /// Adam on values with their gradients.
+    fn adam(step: &Step, rates: &[f32], gradients: &[f32], params: &mut [f32], moment1: &mut [f32], moment2: &mut [f32]) = adam_body
+}
+
+#[inline(always)]
+fn adam_body<const FMA: bool>(step: &Step, rates: &[f32], gradients: &[f32], params: &mut [f32], moment1: &mut [f32], moment2: &mut [f32]) {
+    let moments = moment1.iter_mut().zip(moment2);
+    for (((param, rate), g), (m1, m2)) in params.iter_mut().zip(rates).zip(gradients).zip(moments) {
+        *param = moved(step, *rate, *g, *param, m1, m2);
+    }
+}
