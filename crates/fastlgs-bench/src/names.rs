@@ -5,8 +5,8 @@
 
 use crate::table;
 use anyhow::{Context, Result, bail};
-use fastlgs::calibrate::{self, Calibrations};
-use fastlgs::{Run, Session, eval};
+use fastlgs::calibrations::Calibrations;
+use fastlgs::{Run, Session, calibrate, eval};
 use fastlgs_core::labels;
 use fastlgs_grid::calibration::{Calibration, Samples};
 use serde_json::{Value, json};

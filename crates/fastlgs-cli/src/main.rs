@@ -36,7 +36,7 @@ enum Command {
     Query(commands::query::Args),
     /// Teaches a name by showing a thing; every scene of the same encoder then answers to it.
     #[command(after_help = "Example: fastlgs teach \"my mug\" scenes/desk --view 0003.jpg --point 210,144")]
-    Teach(fastlgs::names::Lesson),
+    Teach(fastlgs::teach::Lesson),
     /// Lists, forgets, exports or imports the names that were taught.
     Names(commands::names::Args),
     /// Shows a scene in the browser, with an HTTP interface.
@@ -89,7 +89,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         Command::Batch(args) => commands::batch::run(&args, common, run),
         Command::Render(config) => report::give(common, &fastlgs::render(&config, run)?),
         Command::Query(args) => commands::query::run(&args, common, run),
-        Command::Teach(lesson) => report::give(common, &fastlgs::names::teach(&lesson, run)?),
+        Command::Teach(lesson) => report::give(common, &fastlgs::teach::teach(&lesson, run)?),
         Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),
         Command::Eval(config) => report::give(common, &fastlgs::eval(&config, run)?),

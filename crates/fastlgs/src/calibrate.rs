@@ -1,12 +1,12 @@
-//! What the cosines of an encoder are worth: known for the offline encoder, measured on generated scenes for others and kept beside the model.
+//! Measures what the cosines of an encoder are worth: on generated scenes whose things are known, and on labelled ones.
 
 use crate::absent::{ABSENT, COLORS};
+use crate::calibrations::{Calibrations, Kept, beside};
 use crate::error::{Context, bail};
 use crate::eval::best_object;
-use crate::eyes::{self, EncoderKind, Eyes};
+use crate::eyes::{EncoderKind, Eyes};
 use crate::{Result, Run, Session, masks};
 use fastlgs_core::labels::LabelledView;
-use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::synth::{Kind, Thing, World};
 use fastlgs_core::{LabelMap, fs};
 use fastlgs_grid::calibration::{Calibration, Samples};
@@ -18,47 +18,6 @@ use glam::Vec3;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-
-/// What cosines with texts, and cosines with other pictures, are worth.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Calibrations {
-    /// Of masks with texts.
-    pub texts: Calibration,
-    /// Of masks with pictures and with things that were shown.
-    pub pictures: Calibration,
-}
-
-/// A measurement as it is kept beside the model, with the files that it holds for.
-#[derive(Serialize, Deserialize)]
-struct Kept {
-    sha256: [String; 2],
-    #[serde(flatten)]
-    calibrations: Calibrations,
-}
-
-/// Where the measurement of a CLIP is kept.
-pub fn beside(image_tower: &Path) -> PathBuf {
-    image_tower.with_extension("calibration.json")
-}
-
-impl Calibrations {
-    /// The offline encoder's.
-    pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
-
-    /// What is assumed of a CLIP that was not measured: pictures about as far from each other as with the offline encoder.
-    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration { measured: false, ..Calibration::OFFLINE_PICTURES } };
-
-    /// Those of the encoder that made a scene's embeddings.
-    pub fn of(manifest: &Manifest) -> Self {
-        if manifest.encoder == eyes::OFFLINE {
-            return Self::OFFLINE;
-        }
-        let (image, text) = (manifest.models.get("clip_image"), manifest.models.get("clip_text"));
-        let kept: Option<Kept> = image.and_then(|image| fs::read_json(&beside(&image.path)).ok());
-        let same = |kept: &Kept| [image, text].iter().zip(&kept.sha256).all(|(file, sum)| file.is_some_and(|f| f.sha256 == *sum));
-        kept.filter(same).map_or(Self::CLIP, |kept| kept.calibrations)
-    }
-}
 
 /// What was measured.
 #[derive(Clone, Debug, Serialize, Deserialize)]

@@ -14,6 +14,7 @@
 mod absent;
 mod cache;
 pub mod calibrate;
+pub mod calibrations;
 mod error;
 pub mod eval;
 pub mod export;
@@ -27,6 +28,7 @@ pub mod progress;
 pub mod render;
 pub mod session;
 pub mod synth;
+pub mod teach;
 pub mod train;
 
 pub use error::{Error, Result, one_sentence};

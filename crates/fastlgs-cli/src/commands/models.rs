@@ -4,7 +4,7 @@ use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::eyes::{EncoderKind, Eyes};
-use fastlgs::{Run, calibrate};
+use fastlgs::{Run, calibrate, calibrations};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_vision::pull::{self, HOST, NAMED, Named, Role};
 use fastlgs_vision::{models, places};
@@ -77,7 +77,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
     let named = NAMED.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
-        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrate::beside(&image).is_file());
+        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::beside(&image).is_file());
         serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files, "calibrated": calibrated })
     });
     let value = serde_json::json!({

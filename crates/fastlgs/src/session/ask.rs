@@ -2,7 +2,7 @@
 
 use super::Session;
 use crate::Result;
-use crate::calibrate::Calibrations;
+use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;

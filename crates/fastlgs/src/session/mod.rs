@@ -7,7 +7,7 @@ pub mod selection;
 mod texts;
 mod views;
 
-use crate::calibrate::Calibrations;
+use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use crate::{Result, eyes, train};
 use fastlgs_core::scene_folder::Manifest;

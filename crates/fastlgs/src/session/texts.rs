@@ -1,6 +1,6 @@
 //! The text tower of a scene's encoder, with what its scores are judged by and the names that were taught.
 
-use crate::calibrate::Calibrations;
+use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use crate::names::Names;
 use crate::{Result, eyes};
