@@ -1,8 +1,11 @@
-//! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`tree`], [`support`] and [`objects`]), objects get low-dimensional codes
-//! ([`codes`]) and keep all their embeddings ([`grid`]), and a text finds its object ([`relevancy`], [`query`]).
+//! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`consensus`], [`election`],
+//! [`tree`], [`support`] and [`objects`]), objects get low-dimensional codes ([`codes`]) and keep all their embeddings ([`grid`]), and a text
+//! finds its object ([`relevancy`], [`query`]).
 
 pub mod calibration;
 pub mod codes;
+pub mod consensus;
+pub mod election;
 pub mod evidence;
 pub mod grid;
 pub mod library;
@@ -10,7 +13,7 @@ pub mod mapping;
 pub mod objects;
 pub mod query;
 pub mod relevancy;
-pub mod seen;
+pub mod sightings;
 pub mod support;
 pub mod tree;
 

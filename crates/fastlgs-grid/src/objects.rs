@@ -13,15 +13,13 @@ pub struct Config {
     pub min_share: f32,
     /// Least support by masks.
     pub min_support: f32,
-    /// Least share of its support by masks that fit no other node much better.
-    pub min_own: f32,
     /// Of a node and one below it that has more than this share of its pixels, only the better supported one is an object.
     pub same: f32,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { min_views: 3, min_share: 0.0005, min_support: 0.4, min_own: 0.1, same: 0.7 }
+        Self { min_views: 3, min_share: 0.0005, min_support: 0.4, same: 0.7 }
     }
 }
 
@@ -74,7 +72,7 @@ pub fn choose(tree: &Tree, support: &[Support], pixels: usize, config: &Config) 
     let of = |node: Node| &support[node.place()];
     for (place, s) in support.iter().enumerate() {
         let small = (s.reached_by(config.min_views) as f32) < config.min_share * pixels as f32;
-        match [s.areas.len() < config.min_views, small, s.iou < config.min_support || s.own < config.min_own].iter().position(|bad| *bad) {
+        match [s.areas.len() < config.min_views, small, s.iou < config.min_support].iter().position(|bad| *bad) {
             Some(reason) => chosen.dropped[reason] += 1,
             None => {
                 kept.insert(Node(place as u32));
@@ -122,7 +120,7 @@ mod tests {
     }
 
     fn shown(area: u32, iou: f32) -> Support {
-        Support { iou, own: 1.0, areas: (0..4).map(|v| (area, v)).collect() }
+        Support { iou, areas: (0..4).map(|v| (area, v)).collect() }
     }
 
     #[test]
@@ -139,16 +137,8 @@ mod tests {
     }
 
     #[test]
-    fn what_only_borrows_the_masks_of_others_is_no_object() {
-        // A union of which one half has masks, and that half.
-        let support = [shown(500, 0.9), Support { own: 0.0, ..shown(900, 0.5) }];
-        let chosen = choose(&tree(&[Some(1), None]), &support, 10_000, &Config::default());
-        assert_eq!((chosen.nodes, chosen.dropped), (vec![Node(0)], [0, 0, 1, 0]));
-    }
-
-    #[test]
     fn glimpses_from_afar_make_nothing_smaller() {
-        let near = |areas: &[u32]| Support { iou: 1.0, own: 1.0, areas: areas.iter().copied().zip(0..).collect() };
+        let near = |areas: &[u32]| Support { iou: 1.0, areas: areas.iter().copied().zip(0..).collect() };
         let config = Config { min_share: 0.01, ..Config::default() };
         let objects = |areas: &[u32]| choose(&tree(&[None]), &[near(areas)], 10_000, &config).nodes.len();
         assert_eq!((objects(&[100, 120, 110]), objects(&[100, 120, 110, 1, 1, 1, 1, 1]), objects(&[100, 120, 90])), (1, 1, 0));

@@ -1,4 +1,4 @@
-//! Global mapping, second step: how well the photos' masks fit each node of the tree.
+//! Global mapping, fourth step: how well the photos' masks fit each node of the tree.
 
 use crate::tree::{Node, Tree};
 use fastlgs_core::LabelMap;
@@ -10,8 +10,6 @@ use rayon::prelude::*;
 pub struct Support {
     /// Mean IoU of the node with the best mask of each view, weighted by the node's pixels there.
     pub iou: f32,
-    /// Share of that where the mask fits no other node much better.
-    pub own: f32,
     /// (pixels, view) of the views that show it.
     pub areas: Vec<(u32, u32)>,
 }
@@ -46,9 +44,6 @@ impl Shown {
     }
 }
 
-/// Share of the best node's fit to a mask with which the mask speaks for another node too.
-const OWN: f32 = 0.8;
-
 /// A node in a view: its pixels, and how many of them lie in each mask, rising by mask.
 type Held = (u32, Vec<(u16, u32)>);
 
@@ -61,27 +56,25 @@ pub fn support(tree: &Tree, views: &[Shown], tables: &[Table]) -> Vec<Support> {
     let seen: Vec<_> = views.par_iter().zip(tables).map(|(shown, table)| of_view(&children, shown, table)).collect();
     let mut all = vec![(Support::default(), 0.0f32); tree.parents.len()];
     for (view, shown) in seen.into_iter().enumerate() {
-        for (node, area, iou, own) in shown.into_iter().filter(|s| s.1 >= MIN_PIXELS) {
+        for (node, area, iou) in shown.into_iter().filter(|s| s.1 >= MIN_PIXELS) {
             let (support, weight) = &mut all[node];
             support.areas.push((area, view as u32));
             support.iou += area as f32 * iou;
-            support.own += if own { area as f32 * iou } else { 0.0 };
             *weight += area as f32;
         }
     }
-    let mean = |(s, weight): (Support, f32)| Support { iou: s.iou / weight.max(1.0), own: s.own / s.iou.max(1e-6), ..s };
+    let mean = |(s, weight): (Support, f32)| Support { iou: s.iou / weight.max(1.0), ..s };
     all.into_iter().map(mean).collect()
 }
 
 /// Nodes that a view shows: place, pixels, and the IoU of the mask that fits best.
-fn of_view(children: &[Vec<usize>], shown: &Shown, table: &Table) -> Vec<(usize, u32, f32, bool)> {
+fn of_view(children: &[Vec<usize>], shown: &Shown, table: &Table) -> Vec<(usize, u32, f32)> {
     let mut held: Vec<Option<Held>> = vec![None; children.len()];
     for same in shown.0.chunk_by(|a, b| a.0 == b.0) {
         let mut masks: Vec<(u16, u32)> = same.iter().flat_map(|s| table.masks(s.1).iter().map(|m| (*m, s.2))).collect();
         masks.sort_unstable();
         held[same[0].0.place()] = Some((same.iter().map(|s| s.2).sum(), summed(masks)));
     }
-    let mut best_fit = vec![0.0f32; table.areas.len().max(1)];
     let mut out = Vec::new();
     for (node, below) in children.iter().enumerate() {
         for &child in below {
@@ -92,15 +85,11 @@ fn of_view(children: &[Vec<usize>], shown: &Shown, table: &Table) -> Vec<(usize,
             };
         }
         if let Some((area, masks)) = &held[node] {
-            let iou = |&(mask, common): &(u16, u32)| (common as f32 / (area + table.areas[usize::from(mask)] - common) as f32, mask);
-            let (fit, mask) = masks.iter().map(iou).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
-            // What lies in the node comes before it: where that is all the view shows of it, the mask is no word for the node.
-            let best = &mut best_fit[usize::from(mask)];
-            out.push((node, *area, fit, mask, fit > *best));
-            *best = fit.max(*best);
+            let iou = |&(mask, common): &(u16, u32)| common as f32 / (area + table.areas[usize::from(mask)] - common) as f32;
+            out.push((node, *area, masks.iter().map(iou).fold(0.0, f32::max)));
         }
     }
-    out.into_iter().map(|(node, area, fit, mask, better)| (node, area, fit, better && fit >= OWN * best_fit[usize::from(mask)])).collect()
+    out
 }
 
 /// Both lists as one that rises by mask.
@@ -131,9 +120,6 @@ mod tests {
         let found = support(&tree, &[(); 3].map(|()| shown.clone()), &[(); 3].map(|()| atoms.table.clone()));
         let iou: Vec<f32> = found.iter().map(|s| s.iou).collect();
         assert_eq!(iou, [1.0, 0.5, 1.0, 0.0, 0.8]);
-        // Node 1 borrows the mask of 2, and 4 adds to it what no mask holds.
-        let own: Vec<f32> = found.iter().map(|s| s.own).collect();
-        assert_eq!(own, [1.0, 0.0, 1.0, 0.0, 0.0]);
         assert_eq!((found[2].areas.clone(), found[2].pixels()), (vec![(400, 0), (400, 1), (400, 2)], 1200.0));
         assert_eq!((found[2].reached_by(3), found[2].reached_by(4)), (400, 0));
     }

@@ -1,16 +1,9 @@
-//! Global mapping, first step: the views' masks grow a tree over the Gaussians.
-//!
-//! Neighbouring sets of Gaussians are joined, those first that most masks hold together, as all views see it ([`Seen::agreement`]): parts come
-//! to be before the things that they are parts of, and these before what they stand on. The order of the photos plays no part, a wrong mask in
-//! one view is outvoted by the others, and what one view cuts apart or glues together the majority mends. Nothing is decided here by a
-//! threshold: which of the nodes are objects is asked of the masks again ([`crate::support`], [`crate::objects`]).
+//! Global mapping, third step: the elected sets are nested in each other.
 
-use crate::seen::{Seen, Vote};
-use fastlgs_core::mask_list::Table;
-use rayon::prelude::*;
-use std::borrow::Cow;
+use crate::consensus::Proposal;
+use crate::sightings::Sightings;
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, BTreeSet, BinaryHeap};
+use std::collections::BTreeMap;
 
 /// A node of a [`Tree`], by its number from 0; no node has a higher number than the one above it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -32,170 +25,52 @@ pub struct Tree {
     pub of: Vec<Option<Node>>,
 }
 
-/// What makes a set of Gaussians large enough to be a node.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Config {
-    /// So many views must show it.
-    pub min_views: usize,
-    /// And so many pixels of it each.
-    pub min_pixels: f32,
-}
-
-/// Agreement below which nothing is joined: no masks but those of a few views hold both.
-const LEAST_AGREEMENT: f32 = 0.02;
-/// Growth from which a set is looked at anew: what it gained before changes little.
-const GROWN: f32 = 1.05;
-/// What agrees at least this share of what a node's own do is more of the same; what agrees less makes a new node above it.
-const SAME_LEVEL: f32 = 0.85;
-
-/// A set of Gaussians that is still growing.
-struct Set {
-    /// What it sees; a single Gaussian's is worked out where it is needed, since all together would not fit.
-    seen: Option<Seen>,
-    near: BTreeSet<u32>,
-    /// Those of its Gaussians that belong to no node yet.
-    loose: Vec<u32>,
-    node: Option<Node>,
-    /// The agreement at which that node came to be.
-    level: f32,
-    /// Changes when it has grown, with its weight then; the last version of all is that of a set that is gone.
-    version: u32,
-    weight: f32,
-}
-
-const GONE: u32 = u32::MAX;
-
-/// Sets that grow, and the nodes that they have become.
-struct Growing<'a> {
-    votes: &'a [Vec<Vote>],
-    tables: &'a [Table],
-    sets: Vec<Set>,
-    tree: Tree,
-    /// By node: the one that it has become one with.
-    dissolved: Vec<Option<Node>>,
-}
-
-/// Agreement as bits, so that it has an order; then the pair, and the versions in which they agreed.
-type Offer = (u32, Reverse<(u32, u32)>, u32, u32);
-
-impl Growing<'_> {
-    fn seen(&self, set: u32) -> Cow<'_, Seen> {
-        let single = || Cow::Owned(Seen::of(&self.votes[set as usize], self.tables));
-        self.sets[set as usize].seen.as_ref().map_or_else(single, Cow::Borrowed)
-    }
-
-    /// What joining two sets is worth; none where nothing speaks for it.
-    fn offer(&self, a: u32, b: u32) -> Option<Offer> {
-        let (a, b) = (a.min(b), a.max(b));
-        let agreed = self.seen(a).agreement(&self.seen(b));
-        let versions = [a, b].map(|s| self.sets[s as usize].version);
-        (agreed >= LEAST_AGREEMENT).then_some((agreed.to_bits(), Reverse((a, b)), versions[0], versions[1]))
-    }
-
-    /// A new node above some others.
-    fn new_node(&mut self, below: &[Node]) -> Node {
-        self.tree.parents.push(None);
-        self.dissolved.push(None);
-        let node = Node(self.tree.parents.len() as u32 - 1);
-        below.iter().for_each(|below| self.tree.parents[below.place()] = Some(node));
-        node
-    }
-
-    fn settle(&mut self, loose: Vec<u32>, node: Node) {
-        loose.into_iter().for_each(|g| self.tree.of[g as usize] = Some(node));
-    }
-
-    /// Joins two sets; returns the one that is left, whose neighbours are those of both, and which of them are new to it.
-    fn join(&mut self, a: u32, b: u32, agreed: f32, config: &Config) -> (u32, Vec<u32>) {
-        // The one with more neighbours swallows the other.
-        let (keep, gone) = if self.sets[a as usize].near.len() >= self.sets[b as usize].near.len() { (a, b) } else { (b, a) };
-        let whole = self.seen(keep).merged(&self.seen(gone));
-        let empty = Set { seen: None, near: BTreeSet::new(), loose: Vec::new(), node: None, level: 0.0, version: GONE, weight: 0.0 };
-        let other = std::mem::replace(&mut self.sets[gone as usize], empty);
-        let mut loose = std::mem::take(&mut self.sets[keep as usize].loose);
-        loose.extend(other.loose);
-        let set = &self.sets[keep as usize];
-        let (node, level) = match (set.node.map(|n| (n, set.level)), other.node.map(|n| (n, other.level))) {
-            (None, None) if whole.reached_by(config.min_views, self.tables.len()) < config.min_pixels => (None, 0.0),
-            (None, None) => (Some(self.new_node(&[])), agreed),
-            (Some(x), Some(y)) if agreed < SAME_LEVEL * x.1.max(y.1) => (Some(self.new_node(&[x.0, y.0])), agreed),
-            (Some(x), Some(y)) => {
-                // The later one, so that what lies in it has lower numbers.
-                let (gone, stays) = (x.0.min(y.0), x.0.max(y.0));
-                self.dissolved[gone.place()] = Some(stays);
-                (Some(stays), x.1.max(y.1))
-            }
-            (Some((node, level)), None) | (None, Some((node, level))) if agreed < SAME_LEVEL * level => {
-                (Some(self.new_node(&[node])), agreed)
-            }
-            (Some((node, level)), None) | (None, Some((node, level))) => (Some(node), level),
-        };
-        if let Some(node) = node {
-            self.settle(std::mem::take(&mut loose), node);
-        }
-        let set = &mut self.sets[keep as usize];
-        let weight = whole.weight();
-        if weight > GROWN * set.weight {
-            (set.version, set.weight) = (set.version + 1, weight);
-        }
-        (set.seen, set.loose, set.node, set.level) = (Some(whole), loose, node, level);
-        set.near.remove(&gone);
-        let mut new = Vec::new();
-        for &c in other.near.iter().filter(|c| **c != keep) {
-            self.sets[c as usize].near.remove(&gone);
-            if self.sets[c as usize].near.insert(keep) {
-                new.push(c);
-            }
-            self.sets[keep as usize].near.insert(c);
-        }
-        (keep, new)
-    }
-
-    /// The tree of the nodes that are left.
-    fn finished(self) -> Tree {
-        let left = |node: Node| std::iter::successors(Some(node), |n| self.dissolved[n.place()]).last().unwrap_or(node);
-        let mut number = vec![Node(0); self.dissolved.len()];
-        let stays = (0..self.dissolved.len()).filter(|n| self.dissolved[*n].is_none());
-        stays.clone().enumerate().for_each(|(place, node)| number[node] = Node(place as u32));
-        let renamed = |node: Option<Node>| node.map(|n| number[left(n).place()]);
-        Tree {
-            parents: stays.map(|node| renamed(self.tree.parents[node])).collect(),
-            of: self.tree.of.iter().map(|node| renamed(*node)).collect(),
-        }
-    }
-}
+/// Sets of which this share is the same are the same thing, and a set of which less than this is left is no more what masks elected.
+const ALIKE: f32 = 0.7;
 
 impl Tree {
-    /// Grows the tree. `votes` holds each Gaussian's, rising by view; `tables` are those of all views; `near` are pairs of neighbours.
-    pub fn grow(mut votes: Vec<Vec<Vote>>, tables: &[Table], near: &[(u32, u32)], config: &Config) -> Self {
-        // A Gaussian that mostly shows where no mask is belongs to no object.
-        votes.par_iter_mut().filter(|v| !Seen::of(v, tables).is_covered()).for_each(|v| *v = Vec::new());
-        let set = |g: usize| {
-            let weight = votes[g].iter().map(|v| v.weight()).sum();
-            Set { seen: None, near: BTreeSet::new(), loose: vec![g as u32], node: None, level: 0.0, version: 0, weight }
-        };
-        let sets = (0..votes.len()).map(set).collect();
-        let tree = Self { parents: Vec::new(), of: vec![None; votes.len()] };
-        let mut growing = Growing { votes: &votes, tables, sets, tree, dissolved: Vec::new() };
-        for &(a, b) in near.iter().filter(|(a, b)| !votes[*a as usize].is_empty() && !votes[*b as usize].is_empty()) {
-            growing.sets[a as usize].near.insert(b);
-            growing.sets[b as usize].near.insert(a);
-        }
-        let mut queue: BinaryHeap<Offer> = near.par_iter().filter_map(|&(a, b)| growing.offer(a, b)).collect::<Vec<_>>().into();
-        while let Some((agreed, Reverse((a, b)), va, vb)) = queue.pop() {
-            let now = [a, b].map(|s| growing.sets[s as usize].version);
-            if now.contains(&GONE) {
+    /// Nests sets of Gaussians that masks elected, those first that most masks stand behind.
+    ///
+    /// Masks of neighbouring things cut their common border now here, now there, so that sets overlap a little. Of two that do, the larger one gives
+    /// way, since it changes less by it: it takes the smaller one whole where it holds most of it, and leaves it whole otherwise. A set that would
+    /// change an elected one too much, or is nearly the same, is left out.
+    pub fn nest(sightings: &Sightings, elected: &[Proposal]) -> Self {
+        let weights: Vec<f32> = (0..sightings.gaussians() as u32).map(|g| sightings.weight(g)).collect();
+        let weight = |set: &[u32]| -> f32 { set.iter().map(|g| weights[*g as usize]).sum() };
+        let mut kept = compatible(elected, &weights);
+        kept.sort_by(|a, b| weight(&a.set).total_cmp(&weight(&b.set)));
+
+        let (mut parents, mut sizes): (Vec<Option<Node>>, Vec<f32>) = Default::default();
+        let mut of: Vec<Option<Node>> = vec![None; weights.len()];
+        // By Gaussian: the largest node so far; and the Gaussians of the nodes that lie in no other one so far.
+        let mut largest: Vec<Option<Node>> = of.clone();
+        let mut roots: BTreeMap<Node, Vec<u32>> = BTreeMap::new();
+        for proposal in kept {
+            let mut common: BTreeMap<Node, f32> = BTreeMap::new();
+            let met = proposal.set.iter().filter_map(|g| Some((largest[*g as usize]?, weights[*g as usize])));
+            met.for_each(|(node, weight)| *common.entry(node).or_default() += weight);
+            let is_inside = |node: &Node| 2.0 * common[node] > sizes[node.place()];
+            let inside: Vec<Node> = common.keys().copied().filter(is_inside).collect();
+            // What it keeps of its own, and what it gains with the nodes inside.
+            let own: Vec<u32> = proposal.set.iter().copied().filter(|g| largest[*g as usize].is_none_or(|node| is_inside(&node))).collect();
+            let (was, left) = (weight(&proposal.set), weight(&own));
+            let now = left + inside.iter().map(|node| sizes[node.place()] - common[node]).sum::<f32>();
+            if left < ALIKE * (was + now - left) {
                 continue;
             }
-            if now != [va, vb] {
-                // One of them has grown since: ask the views again.
-                queue.extend(growing.offer(a, b));
-                continue;
+            let node = Node(parents.len() as u32);
+            parents.push(None);
+            sizes.push(now);
+            own.iter().for_each(|g| of[*g as usize] = of[*g as usize].or(Some(node)));
+            let mut set: Vec<u32> = own.iter().copied().filter(|g| largest[*g as usize].is_none()).collect();
+            for inner in inside {
+                parents[inner.place()] = Some(node);
+                set.extend(roots.remove(&inner).unwrap_or_default());
             }
-            let (keep, new) = growing.join(a, b, f32::from_bits(agreed), config);
-            queue.extend(new.into_iter().filter_map(|c| growing.offer(keep, c)));
+            set.iter().for_each(|g| largest[*g as usize] = Some(node));
+            roots.insert(node, set);
         }
-        growing.finished()
+        Self { parents, of }
     }
 
     /// The nodes that Gaussians belong to at first hand, and for each Gaussian the place of its own among them, from 1 on; 0 for none.
@@ -219,49 +94,64 @@ impl Tree {
     }
 }
 
+/// Those of the sets that can stand beside all before them.
+fn compatible<'a>(elected: &'a [Proposal], weights: &[f32]) -> Vec<&'a Proposal> {
+    let sizes: Vec<f32> = elected.iter().map(|p| p.set.iter().map(|g| weights[*g as usize]).sum()).collect();
+    let mut holders: Vec<Vec<u32>> = vec![Vec::new(); weights.len()];
+    let mut kept = Vec::new();
+    for (place, proposal) in elected.iter().enumerate() {
+        let mut common: BTreeMap<u32, f32> = BTreeMap::new();
+        for &g in &proposal.set {
+            holders[g as usize].iter().for_each(|other| *common.entry(*other).or_default() += weights[g as usize]);
+        }
+        let stands_beside = |(other, common): (&u32, &f32)| {
+            let (a, b) = (sizes[place], sizes[*other as usize]);
+            let (small, large) = (a.min(b), a.max(b));
+            let change = if 2.0 * common > small { small - common } else { *common };
+            *common <= ALIKE * (small + large - common) && change <= (1.0 - ALIKE) * large
+        };
+        if common.iter().all(stands_beside) {
+            proposal.set.iter().for_each(|g| holders[*g as usize].push(place as u32));
+            kept.push(proposal);
+        }
+    }
+    kept
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fastlgs_core::mask_list::{Mask, RunLengths};
-    use fastlgs_core::{Level, MaskList};
+    use crate::sightings::Vote;
 
-    const WIDTH: u32 = 16;
-
-    /// A row of 12 Gaussians that cover a pixel each; every view has its masks, given by their first pixel and the one after their last.
-    /// `order`: the views' numbers.
-    fn grown(views: &[&[[u32; 2]]], order: &[usize]) -> Tree {
-        let list = |masks: &[[u32; 2]]| {
-            let mask = |[from, to]: &[u32; 2]| Mask::new(Level::Whole, RunLengths::of(WIDTH, 1, |x, _| (*from..*to).contains(&x)));
-            MaskList { masks: masks.iter().map(mask).collect(), ..MaskList::new(WIDTH, 1) }.atoms()
-        };
-        let atoms: Vec<_> = order.iter().map(|v| list(views[*v])).collect();
-        let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
-        let votes = |g: u32| atoms.iter().enumerate().map(|(v, a)| Vote::new(v as u16, a.map.at(g, 0), 50.0)).collect();
-        let near: Vec<(u32, u32)> = (0..11).map(|g| (g, g + 1)).collect();
-        Tree::grow((0..12).map(votes).collect(), &tables, &near, &Config { min_views: 3, min_pixels: 100.0 })
-    }
-
-    /// The Gaussians of every node, sorted.
-    fn sets(tree: &Tree) -> BTreeSet<Vec<usize>> {
+    /// The tree of sets of 20 Gaussians of one pixel each, and the Gaussians of its nodes.
+    fn nested(sets: &[std::ops::Range<u32>]) -> (Tree, Vec<Vec<usize>>) {
+        let votes = vec![vec![Vote::new(0, 0, 1.0)]; 20];
+        let elected: Vec<Proposal> = sets.iter().map(|set| Proposal { set: set.clone().collect(), masks: Vec::new() }).collect();
+        let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
+        let tree = Tree::nest(&Sightings::new(&votes, &[table]), &elected);
         let mut sets = vec![Vec::new(); tree.parents.len()];
         for (g, node) in tree.of.iter().enumerate() {
             node.iter().flat_map(|n| tree.upwards(*n)).for_each(|n| sets[n.place()].push(g));
         }
-        sets.into_iter().collect()
+        (tree, sets)
     }
 
     #[test]
-    fn parts_come_before_wholes_and_the_majority_of_views_decides() {
-        // A handle of 2 on a cup of 6 on a saucer of 10; one view glues all, another cuts the cup, and two pixels have no mask.
-        let good: &[[u32; 2]] = &[[0, 10], [0, 6], [0, 2]];
-        let views = [good, good, good, &[[0, 10]], &[[0, 10], [0, 3], [3, 6]]];
-        let tree = grown(&views, &[0, 1, 2, 3, 4]);
-        let found = sets(&tree);
-        for wanted in [0..2, 0..6, 0..10] {
-            assert!(found.contains(&wanted.clone().collect::<Vec<_>>()), "{wanted:?} in {found:?}");
-        }
-        assert_eq!(tree.of[10..], [None, None]);
-        assert_eq!(found, sets(&grown(&views, &[4, 2, 0, 3, 1])), "the order of the views plays no part");
+    fn of_two_that_overlap_the_larger_gives_way() {
+        // A part that reaches out of its whole, and a neighbour that the whole reaches into.
+        let (tree, sets) = nested(&[2..12, 1..4, 11..16]);
+        assert_eq!(sets, [(1..4).collect::<Vec<_>>(), (11..16).collect(), (1..11).collect()]);
+        assert_eq!(tree.parents, [Some(Node(2)), None, None]);
+        assert_eq!(tree.of[3..6], [Some(Node(0)), Some(Node(2)), Some(Node(2))]);
+    }
+
+    #[test]
+    fn what_is_the_same_or_would_change_others_too_much_is_left_out() {
+        assert_eq!(nested(&[0..10, 0..9]).1, [(0..10).collect::<Vec<_>>()]);
+        assert_eq!(nested(&[0..10, 5..15]).1, [(0..10).collect::<Vec<_>>()], "half of it is the other's");
+        assert_eq!(nested(&[10..20, 8..12]).1.len(), 2);
+        // Two neighbours take too much of it together, though neither does alone.
+        assert_eq!(nested(&[4..14, 1..6, 12..17]).1.len(), 2);
     }
 
     #[test]

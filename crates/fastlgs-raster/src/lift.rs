@@ -5,7 +5,6 @@ use crate::native::Lists;
 use crate::native::blend::{self, Job, Tile};
 use crate::view::{TILE, View};
 use fastlgs_core::{Gaussians, LabelMap};
-use kiddo::{KdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
 /// How much one Gaussian contributes to the pixels of one label of one view: the sum of its blending weights
@@ -112,24 +111,6 @@ pub fn largest_weights(scene: &Gaussians, view: &View) -> Vec<f32> {
     largest
 }
 
-/// Pairs of neighbouring Gaussians (a < b, sorted): each with its `k` nearest by centre.
-pub fn neighbours(scene: &Gaussians, k: usize) -> Vec<(u32, u32)> {
-    let mut tree: KdTree<f64, 3> = KdTree::new();
-    for (i, mean) in scene.means.iter().enumerate() {
-        tree.add(&mean.as_dvec3().to_array(), i as u64);
-    }
-    let mut pairs: Vec<(u32, u32)> = (0..scene.len())
-        .into_par_iter()
-        .flat_map_iter(|i| {
-            let near = tree.nearest_n::<SquaredEuclidean>(&scene.means[i].as_dvec3().to_array(), k + 1);
-            near.into_iter().map(move |n| (n.item as u32, i as u32)).filter(|(a, b)| a != b).map(|(a, b)| (a.min(b), a.max(b)))
-        })
-        .collect();
-    pairs.sort_unstable();
-    pairs.dedup();
-    pairs
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -148,6 +129,5 @@ mod tests {
         let of = |g: u32, l: u16| votes.iter().find(|v| (v.gaussian, v.label) == (g, l)).map_or(0.0, |v| v.weight);
         assert!((of(0, 1) - of(0, 2)).abs() < 0.01 * of(0, 1), "the border cuts it in halves");
         assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden one has little to say");
-        assert_eq!(neighbours(&scene, 1), [(0, 1)]);
     }
 }

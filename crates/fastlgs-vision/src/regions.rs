@@ -170,6 +170,40 @@ impl Hierarchy {
         out
     }
 
+    /// All nodes of at least `least` pixels, large ones first, but of those that lie in each other and have more than the share `alike` of their pixels
+    /// in common only the one that stands for the longest span of dissimilarity.
+    pub fn lasting(&self, least: f32, alike: f32) -> Vec<usize> {
+        let area = |i: usize| self.nodes[i].area;
+        let span = |i: usize| self.nodes[i].parent.map_or(0.0, |p| self.nodes[p].height - self.nodes[i].height);
+        let upwards = |i: usize| std::iter::successors(Some(i), |i| self.nodes[*i].parent);
+        let mut order: Vec<usize> = (0..self.nodes.len()).filter(|i| area(*i) >= least).collect();
+        order.sort_by(|a, b| span(*b).total_cmp(&span(*a)).then(a.cmp(b)));
+        let mut kept = vec![false; self.nodes.len()];
+        // By node: the largest kept one in it.
+        let mut largest = vec![0.0f32; self.nodes.len()];
+        for &i in &order {
+            let around = upwards(i).skip(1).find(|j| kept[*j]);
+            if largest[i] <= alike * area(i) && around.is_none_or(|j| area(i) <= alike * area(j)) {
+                kept[i] = true;
+                upwards(i).for_each(|j| largest[j] = largest[j].max(area(i)));
+            }
+        }
+        order.retain(|i| kept[*i]);
+        order.sort_by(|a, b| area(*b).total_cmp(&area(*a)).then(a.cmp(b)));
+        order
+    }
+
+    /// Whether each node lies in one of `cut`, and is none of them.
+    pub fn is_below(&self, cut: &[usize]) -> Vec<bool> {
+        let mut below = vec![false; self.nodes.len()];
+        let mut stack: Vec<usize> = cut.iter().flat_map(|i| self.nodes[*i].children).flatten().collect();
+        while let Some(i) = stack.pop() {
+            below[i] = true;
+            stack.extend(self.nodes[i].children.into_iter().flatten());
+        }
+        below
+    }
+
     /// Disjoint nodes that cover the picture with the largest total `value` (dynamic programming from the leaves).
     pub fn best_cut(&self, value: impl Fn(usize) -> f32) -> Vec<usize> {
         // Children precede their parents.
@@ -222,5 +256,10 @@ mod tests {
         let cut = tree.best_cut(|i| if i == 3 { 5.0 } else { 1.0 });
         assert_eq!(cut.len(), 2);
         assert!(cut.contains(&3));
+        let below = tree.is_below(&cut);
+        assert_eq!((below.iter().filter(|b| **b).count(), below[3], below[4]), (2, false, false));
+        assert_eq!(tree.lasting(1.0, 0.85).len(), 5);
+        assert_eq!(tree.lasting(1.5 * 120.0, 0.85), [4, 3], "large ones first");
+        assert_eq!(tree.lasting(1.5 * 120.0, 0.5), [3], "the whole picture never stood for long");
     }
 }

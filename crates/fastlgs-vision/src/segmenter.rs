@@ -6,8 +6,11 @@ use crate::edges::Hed;
 use crate::exposure;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::color::lab;
-use fastlgs_core::{LabelMap, MaskList, image_io};
+use fastlgs_core::{LabelMap, Level, MaskList, image_io};
 use image::RgbImage;
+
+/// Changes when [`OfflineSegmenter`] gives the same photo other masks.
+pub const VERSION: u32 = 1;
 
 /// Finds masks.
 pub trait Segmenter: Sync {
@@ -20,8 +23,8 @@ pub trait Segmenter: Sync {
     fn segment(&self, view: &str, photo: &RgbImage) -> Result<MaskList>;
 }
 
-/// Learned edges (HED), colour and the classifier's dense opinion, turned into a region hierarchy whose most lasting
-/// regions are the objects.
+/// Learned edges (HED), colour and the classifier's dense opinion, turned into a region hierarchy whose lasting regions
+/// are the masks.
 pub struct OfflineSegmenter {
     edges: Hed,
     classifier: Conse,
@@ -35,13 +38,12 @@ const DENSE_SIDES: [u32; 2] = [480, 832];
 const MIN_AREA: f32 = 0.003;
 /// Features of a pixel: L, a, b, then the dense embedding.
 const FEATURES: usize = 3 + DENSE_SIDES.len() * DENSE;
+/// Of regions that share more than this of their pixels one is a mask.
+const ALIKE: f32 = 0.85;
 /// Between these dissimilarities a region may stand as an object: below, pieces are always joined; above, never.
 const WHOLE_HEIGHTS: [f32; 2] = [0.25, 0.45];
 /// The same for parts.
 const PART_HEIGHTS: [f32; 2] = [0.08, 0.20];
-/// The same for parts of parts.
-const SUBPART_HEIGHTS: [f32; 2] = [0.03, 0.09];
-
 impl OfflineSegmenter {
     /// Loads edge detector and classifier.
     ///
@@ -96,11 +98,15 @@ impl Segmenter for OfflineSegmenter {
         let (basins, count) = watershed(&edges, w, h);
         let features = self.features(photo, &small)?;
         let tree = Hierarchy::build(&basins, count, w, &edges, &features, FEATURES, dissimilarity);
-        let paint = |[low, high]: [f32; 2]| {
-            let cut = tree.best_cut(|i| persistence(&tree, i, low, high));
-            label_map(&tree, &cut, &basins, w, h).resized(photo.width(), photo.height())
-        };
-        Ok(MaskList::of_levels(&[WHOLE_HEIGHTS, PART_HEIGHTS, SUBPART_HEIGHTS].map(paint)))
+        // What stands at several levels is a mask at each: consensus of the views decides which of them are things.
+        let [whole, part] =
+            [WHOLE_HEIGHTS, PART_HEIGHTS].map(|[low, high]| tree.is_below(&tree.best_cut(|i| persistence(&tree, i, low, high))));
+        let mut list = MaskList::new(photo.width(), photo.height());
+        for node in tree.lasting(MIN_AREA * (w * h) as f32, ALIKE) {
+            let level = Level::ALL[usize::from(whole[node]) + usize::from(part[node])];
+            list.add(level, &region(&tree, node, &basins, w, h).resized(photo.width(), photo.height()));
+        }
+        Ok(list)
     }
 }
 
@@ -129,18 +135,10 @@ fn persistence(tree: &Hierarchy, i: usize, low: f32, high: f32) -> f32 {
     node.area * (end.clamp(low, high) - node.height.clamp(low, high))
 }
 
-/// Paints the regions of a cut, largest first; tiny ones are left unlabelled.
-fn label_map(tree: &Hierarchy, cut: &[usize], basins: &[u32], w: usize, h: usize) -> LabelMap {
-    let total = (w * h) as f32;
-    let mut regions: Vec<usize> = cut.iter().copied().filter(|&i| tree.nodes[i].area >= MIN_AREA * total).collect();
-    regions.sort_by(|&a, &b| tree.nodes[b].area.total_cmp(&tree.nodes[a].area).then(a.cmp(&b)));
-    let mut label_of = vec![0u16; basins.iter().max().map_or(0, |b| *b as usize + 1)];
-    for (k, &region) in regions.iter().enumerate().take(usize::from(u16::MAX)) {
-        for leaf in tree.leaves(region) {
-            label_of[leaf] = k as u16 + 1;
-        }
-    }
-    let mut map = LabelMap::new(w as u32, h as u32);
-    map.labels.iter_mut().zip(basins).for_each(|(l, b)| *l = label_of[*b as usize]);
-    map
+/// The pixels of a region, as label 1.
+fn region(tree: &Hierarchy, node: usize, basins: &[u32], w: usize, h: usize) -> LabelMap {
+    let mut is_its = vec![false; tree.nodes.len()];
+    tree.leaves(node).into_iter().for_each(|leaf| is_its[leaf] = true);
+    let labels = basins.iter().map(|b| u16::from(is_its[*b as usize])).collect();
+    LabelMap { width: w as u32, height: h as u32, labels }
 }

@@ -10,7 +10,7 @@ use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
-    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, models, places,
+    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, models, places, segmenter,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -251,7 +251,7 @@ impl Eyes {
                 let sums: Vec<&str> = files.iter().filter(|(role, _)| role.starts_with("sam")).map(|(_, f)| f.sha256.as_str()).collect();
                 Some(format!("sam {:?} {}", self.sam_config(), sums.join(" ")))
             }
-            SegmenterKind::Offline => Some(format!("offline {}", models::offline_stamp())),
+            SegmenterKind::Offline => Some(format!("offline {} {}", segmenter::VERSION, models::offline_stamp())),
         })
     }
 

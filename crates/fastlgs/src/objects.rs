@@ -7,10 +7,10 @@ use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as nodes, Chosen};
 use fastlgs_grid::query::smallest_objects;
-use fastlgs_grid::seen::Vote;
+use fastlgs_grid::sightings::{Sightings, Vote};
 use fastlgs_grid::support::{Shown, Support, support};
-use fastlgs_grid::tree::{self, Tree};
-use fastlgs_grid::{Grid, codes, evidence};
+use fastlgs_grid::tree::Tree;
+use fastlgs_grid::{Grid, codes, consensus, election, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
@@ -25,8 +25,6 @@ pub struct Config {
     pub antialias: bool,
 }
 
-/// Neighbours of each Gaussian in the graph that the tree grows over.
-const NEIGHBOURS: usize = 10;
 /// Views in which an object is embedded: those that show most of it.
 const EMBEDDED_VIEWS: usize = 5;
 
@@ -84,9 +82,6 @@ pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], gr
     Ok(())
 }
 
-/// Nodes of the tree may be this much smaller than the smallest object, which is made of them.
-const NODE_OF_OBJECT: f32 = 0.5;
-
 /// What global mapping makes of masks, before its objects are embedded.
 pub struct Mapped {
     /// The objects, as nodes of a tree.
@@ -97,8 +92,8 @@ pub struct Mapped {
     pub summary: Summary,
 }
 
-/// Global mapping up to the objects: the views' masks grow a tree over the Gaussians, and its nodes that masks support become the objects, whose
-/// numbers the Gaussians get. The folder needs masks and cameras.
+/// Global mapping up to the objects: masks propose sets of Gaussians and elect some of them, these are nested, and the nodes that masks support
+/// become the objects, whose numbers the Gaussians get. The folder needs masks and cameras.
 pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
     let pixels = (training[0].width * training[0].height) as usize;
     let clock = std::time::Instant::now();
@@ -110,9 +105,12 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
         run.warn(&format!("{left_out} masks cut others into more pieces than can be numbered; they were left out"));
     }
     told("votes", votes.iter().map(Vec::len).sum());
-    let near = lift::neighbours(scene, NEIGHBOURS);
-    let least = NODE_OF_OBJECT * config.objects.min_share * pixels as f32;
-    let tree = Tree::grow(votes, &tables, &near, &tree::Config { min_views: config.objects.min_views, min_pixels: least });
+    let sightings = Sightings::new(&votes, &tables);
+    let proposals = consensus::proposals(&sightings, config.objects.min_views);
+    told("proposals", proposals.len());
+    let elected = election::elected(proposals, config.objects.min_views);
+    told("elected", elected.len());
+    let tree = Tree::nest(&sightings, &elected);
     told("nodes", tree.parents.len());
     let (owners, labels) = tree.labels();
     told("labels", owners.len());

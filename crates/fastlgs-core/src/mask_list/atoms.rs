@@ -27,6 +27,11 @@ pub struct Table {
 }
 
 impl Table {
+    /// How many atoms there are, with the one that lies in no mask.
+    pub fn count(&self) -> usize {
+        self.masks.len()
+    }
+
     /// The masks that an atom lies in, by their places in the list.
     pub fn masks(&self, atom: u16) -> &[u16] {
         &self.masks[usize::from(atom)]

@@ -1,0 +1,108 @@
+//! Global mapping, first step: every mask proposes a thing, and the other views' masks say what it is.
+//!
+//! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing, where it fits at
+//! all, and what most of all these masks' pixels hold is the thing as more views see it; and so on, until nothing changes. Such a set is its own
+//! consensus: the order of photos and masks plays no part in it, a view that cuts the thing apart or glues it to another one has no voice, masks
+//! that are missing are not missed, and a thing, its parts, and what it stands on are all found, each from its own masks. (As MaskClustering,
+//! 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in two; but there a mask belongs to one thing only.)
+
+use crate::sightings::{Fit, MIN_PIXELS, MaskId, Scratch, Sightings};
+use rayon::prelude::*;
+
+/// A set of Gaussians that masks agree on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Proposal {
+    /// Its Gaussians, rising.
+    pub set: Vec<u32>,
+    /// The masks that show it, at most one a view, rising.
+    pub masks: Vec<Fit>,
+}
+
+/// A mask shows a thing where their IoU is at least this: so no mask can show two things that share nothing.
+const SHOWS: f32 = 0.5;
+/// Most rounds; nearly all sets rest after four.
+const ROUNDS: usize = 8;
+/// Masks that propose at the same time, before those that are explained fall out.
+const BATCH: usize = 256;
+
+/// What the masks of the views propose, each once; at least `min_views` views show every one of them.
+pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
+    // What trackers hold together comes first; then single masks, scattered, so that a batch seldom holds a thing twice.
+    let mut seeds: Vec<Vec<MaskId>> = sightings.tracks();
+    let mut single: Vec<MaskId> = (0..sightings.pixels.len() as MaskId).filter(|m| sightings.pixels[*m as usize] >= MIN_PIXELS).collect();
+    single.sort_by_key(|mask| (mask.wrapping_mul(0x9e37_79b1), *mask));
+    seeds.extend(single.into_iter().map(|mask| vec![mask]));
+    let mut explained = vec![false; sightings.pixels.len()];
+    let mut found: Vec<Proposal> = Vec::new();
+    let mut seeds = seeds.into_iter().peekable();
+    while seeds.peek().is_some() {
+        let fresh = |seed: &Vec<MaskId>| seed.iter().any(|mask| !explained[*mask as usize]);
+        let batch: Vec<Vec<MaskId>> = seeds.by_ref().filter(fresh).take(BATCH).collect();
+        let rest = |scratch: &mut Scratch, seed: &Vec<MaskId>| at_rest(sightings, seed, min_views, scratch);
+        let new: Vec<Option<Proposal>> = batch.par_iter().map_init(|| sightings.scratch(), rest).collect();
+        for proposal in new.into_iter().flatten() {
+            proposal.masks.iter().for_each(|fit| explained[fit.mask as usize] = true);
+            found.push(proposal);
+        }
+    }
+    found.sort_by(|a, b| a.masks.iter().map(|fit| fit.mask).cmp(b.masks.iter().map(|fit| fit.mask)));
+    found.dedup_by(|a, b| a.masks == b.masks);
+    found
+}
+
+/// What the views make of the thing that some masks show.
+fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &mut Scratch) -> Option<Proposal> {
+    let mut asked = seed.to_vec();
+    let mut found = None;
+    for _ in 0..ROUNDS {
+        let set = sightings.held_by(asked.iter().copied(), scratch);
+        let mut masks = sightings.best_fits(&set, scratch);
+        masks.retain(|fit| fit.iou >= SHOWS);
+        let rests = masks.iter().map(|fit| fit.mask).eq(asked.iter().copied());
+        asked = masks.iter().map(|fit| fit.mask).collect();
+        found = (masks.len() >= min_views).then_some(Proposal { set, masks });
+        if rests || asked.is_empty() {
+            break;
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sightings::Vote;
+    use fastlgs_core::mask_list::{Mask, RunLengths, Table};
+    use fastlgs_core::{Level, MaskList};
+
+    /// The sets that views of a row of 12 Gaussians, 50 pixels each, propose; masks are given by their first Gaussian, the one after their last,
+    /// and the number of a tracker.
+    pub fn proposed(views: &[&[(u32, u32, Option<u32>)]]) -> Vec<Vec<u32>> {
+        let atoms = |masks: &[(u32, u32, Option<u32>)]| {
+            let mask = |&(from, to, track): &(u32, u32, Option<u32>)| Mask {
+                track,
+                ..Mask::new(Level::Whole, RunLengths::of(12, 1, |x, _| (from..to).contains(&x)))
+            };
+            MaskList { masks: masks.iter().map(mask).collect(), ..MaskList::new(12, 1) }.atoms()
+        };
+        let atoms: Vec<_> = views.iter().map(|masks| atoms(masks)).collect();
+        let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
+        let votes = |g| atoms.iter().enumerate().map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 50.0)).collect();
+        let votes: Vec<Vec<Vote>> = (0..12).map(votes).collect();
+        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(&votes, &tables), 3).into_iter().map(|p| p.set).collect();
+        sets.sort();
+        sets
+    }
+
+    #[test]
+    fn parts_and_wholes_are_found_and_the_views_that_show_them_decide() {
+        // A handle of 2 on a cup of 6 on a saucer of 10; one view glues all, another cuts the cup.
+        let good: &[_] = &[(0, 10, None), (0, 6, None), (0, 2, None)];
+        let (glued, cut): (&[_], &[_]) = (&[(0, 10, None)], &[(0, 10, None), (0, 3, None), (3, 6, None)]);
+        let wanted = [0..2, 0..6, 0..10].map(|range| range.collect::<Vec<u32>>());
+        let found = proposed(&[good, good, good, glued, cut]);
+        assert_eq!(found, proposed(&[cut, glued, good, good, good]), "the order of the views plays no part");
+        assert!(wanted.iter().all(|set| found.contains(set)), "{found:?}");
+        assert_eq!(proposed(&[good, good, glued, glued, glued]), [wanted[2].clone()], "two views of the cup are too few");
+    }
+}

@@ -1,0 +1,65 @@
+//! Global mapping, second step: the masks elect which of the proposals are things.
+
+use crate::consensus::Proposal;
+use crate::sightings::{Fit, MaskId};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// The proposals that masks stand behind, those first that most do.
+///
+/// Every mask has a vote for the proposal that fits it best. The one with the fewest votes goes, and its voters turn to the next that fits them,
+/// until all that are left have `least` votes: so of many that are nearly the same the best takes the others' voters, and what only borrows the
+/// masks of other things goes. The order is by the sum of the voters' IoU.
+pub fn elected(proposals: Vec<Proposal>, least: usize) -> Vec<Proposal> {
+    let mut ballots: BTreeMap<MaskId, Vec<(f32, usize)>> = BTreeMap::new();
+    for (place, proposal) in proposals.iter().enumerate() {
+        proposal.masks.iter().for_each(|&Fit { mask, iou }| ballots.entry(mask).or_default().push((iou, place)));
+    }
+    // The favourite last.
+    ballots.values_mut().for_each(|ballot| ballot.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))));
+    let mut voters: Vec<Vec<MaskId>> = vec![Vec::new(); proposals.len()];
+    ballots.iter().for_each(|(mask, ballot)| ballot.last().iter().for_each(|best| voters[best.1].push(*mask)));
+    let mut standing: BTreeSet<(usize, usize)> = voters.iter().enumerate().map(|(place, v)| (v.len(), place)).collect();
+    while let Some(&(votes, last)) = standing.first().filter(|(votes, _)| *votes < least) {
+        standing.remove(&(votes, last));
+        for mask in std::mem::take(&mut voters[last]) {
+            let ballot = ballots.get_mut(&mask).expect("every voter has a ballot");
+            while ballot.pop_if(|(_, place)| !standing.contains(&(voters[*place].len(), *place))).is_some() {}
+            if let Some(&(_, next)) = ballot.last() {
+                standing.remove(&(voters[next].len(), next));
+                voters[next].push(mask);
+                standing.insert((voters[next].len(), next));
+            }
+        }
+    }
+    let share =
+        |(_, place): &(usize, usize)| (voters[*place].iter().map(|mask| ballots[mask].last().map_or(0.0, |b| b.0)).sum::<f32>(), *place);
+    let mut order: Vec<(f32, usize)> = standing.iter().map(share).collect();
+    order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut proposals: Vec<Option<Proposal>> = proposals.into_iter().map(Some).collect();
+    order.into_iter().filter_map(|(_, place)| proposals[place].take()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn votes_go_to_the_next_best() {
+        let proposal = |name: u32, fits: &[(MaskId, f32)]| Proposal {
+            set: vec![name],
+            masks: fits.iter().map(|&(mask, iou)| Fit { mask, iou }).collect(),
+        };
+        let all = vec![
+            proposal(0, &[(0, 0.9), (1, 0.7), (2, 0.7)]),
+            // Nearly the same, and a little better in one view.
+            proposal(1, &[(0, 0.8), (1, 0.8), (2, 0.6)]),
+            // Borrows the masks of 0, and has one of its own.
+            proposal(2, &[(1, 0.5), (2, 0.5), (9, 0.6)]),
+            proposal(3, &[(3, 0.9), (4, 0.9), (5, 0.9)]),
+        ];
+        let names = |least| elected(all.clone(), least).iter().map(|p| p.set[0]).collect::<Vec<_>>();
+        assert_eq!(names(1), [3, 0, 1, 2]);
+        assert_eq!(names(3), [3, 0]);
+        assert!(names(4).is_empty());
+    }
+}

@@ -1,0 +1,246 @@
+//! What the photos' masks, which may overlap, hold of every Gaussian, looked up either way.
+
+use fastlgs_core::mask_list::Table;
+use rayon::prelude::*;
+
+/// How much of a Gaussian falls on an atom of a view: six bytes, since a scene has hundreds of millions of them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Vote {
+    /// Index of the training view.
+    pub view: u16,
+    /// Atom of the view's masks.
+    pub atom: u16,
+    /// Upper half of a 32-bit float.
+    weight: u16,
+}
+
+impl Vote {
+    /// `weight`: sum of blending weights, in pixels.
+    pub fn new(view: u16, atom: u16, weight: f32) -> Self {
+        Self { view, atom, weight: (weight.to_bits().saturating_add(0x8000) >> 16) as u16 }
+    }
+
+    /// Sum of blending weights in pixels, to three digits.
+    pub fn weight(self) -> f32 {
+        f32::from_bits(u32::from(self.weight) << 16)
+    }
+}
+
+/// A mask by its number among those of all views, which follow each other.
+pub type MaskId = u32;
+
+/// Of a view: the atoms of each mask, and the Gaussians that fall on each atom.
+struct Held {
+    /// Number of the view's first mask.
+    first: MaskId,
+    /// By mask.
+    atoms: Vec<Vec<u16>>,
+    /// (Gaussian, its vote for the atom), atom by atom.
+    votes: Vec<(u32, Vote)>,
+    /// By atom: where its votes begin; one more at the end.
+    begin: Vec<usize>,
+}
+
+impl Held {
+    fn of(&self, atom: u16) -> &[(u32, Vote)] {
+        let at = usize::from(atom);
+        &self.votes[self.begin[at]..self.begin[at + 1]]
+    }
+}
+
+/// All votes, by Gaussian and by mask.
+pub struct Sightings<'a> {
+    votes: &'a [Vec<Vote>],
+    tables: &'a [Table],
+    held: Vec<Held>,
+    /// By view: the number of its first atom among those of all views; one more at the end.
+    first_atom: Vec<u32>,
+    /// By mask of all views: its pixels, as far as Gaussians show there.
+    pub pixels: Vec<f32>,
+}
+
+/// A mask that fits a set of Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Fit {
+    /// The mask.
+    pub mask: MaskId,
+    /// IoU of both, where the Gaussians show in the mask's view.
+    pub iou: f32,
+}
+
+/// Sums that one search after the other uses; all zero between them.
+pub struct Scratch {
+    gaussians: Vec<f32>,
+    atoms: Vec<f32>,
+    masks: Vec<f32>,
+}
+
+/// Fewest pixels with which a view shows a thing, or a mask tells of one.
+pub const MIN_PIXELS: f32 = 30.0;
+
+impl<'a> Sightings<'a> {
+    /// `votes` holds each Gaussian's, rising by view; `tables` are those of all views.
+    pub fn new(votes: &'a [Vec<Vote>], tables: &'a [Table]) -> Self {
+        let mut by_view: Vec<Vec<(u32, Vote)>> = vec![Vec::new(); tables.len()];
+        for (g, votes) in votes.iter().enumerate() {
+            votes.iter().for_each(|vote| by_view[usize::from(vote.view)].push((g as u32, *vote)));
+        }
+        let mut first = 0;
+        let mut place = |table: &Table| {
+            first += table.areas.len() as MaskId;
+            first - table.areas.len() as MaskId
+        };
+        let firsts: Vec<MaskId> = tables.iter().map(&mut place).collect();
+        let of_view = |((mut votes, table), first): ((Vec<(u32, Vote)>, &Table), MaskId)| {
+            votes.sort_by_key(|(g, vote)| (vote.atom, *g));
+            let mut atoms = vec![Vec::new(); table.areas.len()];
+            let count = table.count();
+            (0..count as u16).for_each(|atom| table.masks(atom).iter().for_each(|m| atoms[usize::from(*m)].push(atom)));
+            let begin = (0..=count).map(|atom| votes.partition_point(|v| usize::from(v.1.atom) < atom)).collect();
+            Held { first, atoms, votes, begin }
+        };
+        let held: Vec<Held> = by_view.into_par_iter().zip(tables).zip(firsts).map(of_view).collect();
+        let pixels = |view: &Held| -> Vec<f32> {
+            let of_atom: Vec<f32> =
+                (0..view.begin.len() as u32 - 1).map(|a| view.of(a as u16).iter().map(|v| v.1.weight()).sum()).collect();
+            view.atoms.iter().map(|atoms| atoms.iter().map(|a| of_atom[usize::from(*a)]).sum()).collect()
+        };
+        let pixels = held.par_iter().map(pixels).collect::<Vec<_>>().concat();
+        let first_atom = (0..=tables.len()).map(|v| tables[..v].iter().map(|t| t.count() as u32).sum()).collect();
+        Self { votes, tables, held, first_atom, pixels }
+    }
+
+    /// Room for [`Self::held_by`] and [`Self::best_fits`].
+    pub fn scratch(&self) -> Scratch {
+        let atoms = self.first_atom.last().map_or(0, |count| *count as usize);
+        Scratch { gaussians: vec![0.0; self.votes.len()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
+    }
+
+    /// How many Gaussians there are.
+    pub fn gaussians(&self) -> usize {
+        self.votes.len()
+    }
+
+    /// The pixels of a Gaussian in all views.
+    pub fn weight(&self, gaussian: u32) -> f32 {
+        self.votes[gaussian as usize].iter().map(|v| v.weight()).sum()
+    }
+
+    fn view_of(&self, mask: MaskId) -> usize {
+        self.held.partition_point(|view| view.first <= mask) - 1
+    }
+
+    /// Masks that a tracker holds for one thing, by thing.
+    pub fn tracks(&self) -> Vec<Vec<MaskId>> {
+        let mut tracks = std::collections::BTreeMap::<u32, Vec<MaskId>>::new();
+        for (table, held) in self.tables.iter().zip(&self.held) {
+            for (track, mask) in table.tracks.iter().zip(held.first..).filter_map(|(track, mask)| Some(((*track)?, mask))) {
+                tracks.entry(track).or_default().push(mask);
+            }
+        }
+        tracks.into_values().collect()
+    }
+
+    /// The Gaussians most of whose pixels lie in these masks, in the views of the masks; rising.
+    pub fn held_by(&self, masks: impl Iterator<Item = MaskId>, scratch: &mut Scratch) -> Vec<u32> {
+        let (mut met, mut asked) = (Vec::new(), vec![false; self.tables.len()]);
+        for mask in masks {
+            let view = self.view_of(mask);
+            asked[view] = true;
+            let held = &self.held[view];
+            for (g, vote) in held.atoms[(mask - held.first) as usize].iter().flat_map(|atom| held.of(*atom)) {
+                add(&mut scratch.gaussians, *g, vote.weight(), &mut met);
+            }
+        }
+        let mut met = listed(met);
+        met.retain(|g| {
+            let inside = std::mem::take(&mut scratch.gaussians[*g as usize]);
+            let shown: f32 = self.votes[*g as usize].iter().filter(|v| asked[usize::from(v.view)]).map(|v| v.weight()).sum();
+            2.0 * inside > shown
+        });
+        met
+    }
+
+    /// Of each view that shows these Gaussians the mask that fits them best, if one holds any of them at all.
+    pub fn best_fits(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
+        let mut atoms = Vec::new();
+        for vote in set.iter().flat_map(|g| &self.votes[*g as usize]) {
+            let atom = self.first_atom[usize::from(vote.view)] + u32::from(vote.atom);
+            add(&mut scratch.atoms, atom, vote.weight(), &mut atoms);
+        }
+        let (mut met, mut shown) = (Vec::new(), vec![0.0f32; self.tables.len()]);
+        for atom in listed(atoms) {
+            let weight = std::mem::take(&mut scratch.atoms[atom as usize]);
+            let view = self.first_atom.partition_point(|first| *first <= atom) - 1;
+            shown[view] += weight;
+            for mask in self.tables[view].masks((atom - self.first_atom[view]) as u16) {
+                add(&mut scratch.masks, self.held[view].first + MaskId::from(*mask), weight, &mut met);
+            }
+        }
+        let mut best: Vec<Option<Fit>> = vec![None; self.tables.len()];
+        for mask in listed(met) {
+            let common = std::mem::take(&mut scratch.masks[mask as usize]);
+            let view = self.view_of(mask);
+            let iou = common / (shown[view] + self.pixels[mask as usize] - common);
+            if shown[view] >= MIN_PIXELS && best[view].is_none_or(|fit| iou > fit.iou) {
+                best[view] = Some(Fit { mask, iou });
+            }
+        }
+        best.into_iter().flatten().collect()
+    }
+}
+
+/// Adds to a sum, and notes whose it is when it was none before.
+fn add(sums: &mut [f32], of: u32, weight: f32, met: &mut Vec<u32>) {
+    let sum = &mut sums[of as usize];
+    if *sum == 0.0 {
+        met.push(of);
+    }
+    *sum += weight;
+}
+
+/// Rising, each once: a sum that stayed 0 was noted again.
+fn listed(mut met: Vec<u32>) -> Vec<u32> {
+    met.sort_unstable();
+    met.dedup();
+    met
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::mask_list::{Mask, RunLengths};
+    use fastlgs_core::{Level, MaskList};
+
+    #[test]
+    fn votes_keep_three_digits() {
+        for weight in [0.02, 1.0, 3.3, 700.0, 1e6] {
+            assert!((Vote::new(0, 0, weight).weight() / weight - 1.0).abs() < 0.005, "{weight}");
+        }
+    }
+
+    #[test]
+    fn masks_hold_gaussians_and_fit_them() {
+        // Ten Gaussians in a row, 40 pixels each in both views: masks of 0..4 and 0..2, and of 0..5.
+        let atoms = |ends: &[u32], track: Option<u32>| {
+            let mask = |end: &u32| Mask { track, ..Mask::new(Level::Whole, RunLengths::of(10, 1, |x, _| x < *end)) };
+            MaskList { masks: ends.iter().map(mask).collect(), ..MaskList::new(10, 1) }.atoms()
+        };
+        let atoms = [atoms(&[4, 2], None), atoms(&[5], Some(7))];
+        let tables = atoms.each_ref().map(|a| a.table.clone());
+        let votes = |g| atoms.iter().enumerate().map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 40.0)).collect();
+        let votes: Vec<Vec<Vote>> = (0..10).map(votes).collect();
+        let sightings = Sightings::new(&votes, &tables);
+        assert_eq!(
+            (sightings.pixels.as_slice(), sightings.weight(3), sightings.tracks()),
+            (&[160.0, 80.0, 200.0][..], 80.0, vec![vec![2]])
+        );
+        let mut scratch = sightings.scratch();
+        assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
+        assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "half of what shows of 4 is not most of it");
+        let fits = sightings.best_fits(&[0, 1, 2, 3], &mut scratch);
+        assert_eq!(fits, [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
+        assert_eq!(sightings.best_fits(&[8], &mut scratch), []);
+        assert!([scratch.gaussians, scratch.atoms, scratch.masks].concat().iter().all(|sum| *sum == 0.0));
+    }
+}
