@@ -42,6 +42,16 @@ struct Held {
 }
 
 impl Held {
+    fn new(mut votes: Vec<(u32, Vote)>, table: &Table, first: MaskId) -> Self {
+        votes.sort_by_key(|(g, vote)| (vote.atom, *g));
+        let mut atoms = vec![Vec::new(); table.areas.len()];
+        for atom in 0..table.count() {
+            table.masks(atom as u16).iter().for_each(|m| atoms[usize::from(*m)].push(atom as u16));
+        }
+        let begin = (0..=table.count()).map(|atom| votes.partition_point(|v| usize::from(v.1.atom) < atom)).collect();
+        Self { first, atoms, votes, begin }
+    }
+
     fn of(&self, atom: u16) -> &[(u32, Vote)] {
         let at = usize::from(atom);
         &self.votes[self.begin[at]..self.begin[at + 1]]
@@ -91,14 +101,7 @@ impl<'a> Sightings<'a> {
             first - table.areas.len() as MaskId
         };
         let firsts: Vec<MaskId> = tables.iter().map(&mut place).collect();
-        let of_view = |((mut votes, table), first): ((Vec<(u32, Vote)>, &Table), MaskId)| {
-            votes.sort_by_key(|(g, vote)| (vote.atom, *g));
-            let mut atoms = vec![Vec::new(); table.areas.len()];
-            let count = table.count();
-            (0..count as u16).for_each(|atom| table.masks(atom).iter().for_each(|m| atoms[usize::from(*m)].push(atom)));
-            let begin = (0..=count).map(|atom| votes.partition_point(|v| usize::from(v.1.atom) < atom)).collect();
-            Held { first, atoms, votes, begin }
-        };
+        let of_view = |((votes, table), first)| Held::new(votes, table, first);
         let held: Vec<Held> = by_view.into_par_iter().zip(tables).zip(firsts).map(of_view).collect();
         let pixels = |view: &Held| -> Vec<f32> {
             let of_atom: Vec<f32> =
