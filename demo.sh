@@ -25,8 +25,7 @@ fi
 scene=scenes/$name
 mkdir -p "$scene"
 
-echo "== preprocess"; $fastlgs preprocess "$photos" -o "$scene" --max-side "$max_side"
-echo "== train";      $fastlgs train "$scene" --preset quick
+echo "== make";       $fastlgs make "$photos" -o "$scene" --max-side "$max_side"
 labelled=$(ls "$photos/labels" 2>/dev/null | sed 's/\.json$//')
 view=$(echo "$labelled" | head -n 1)
 [ -n "$view" ] && set -- --view "$view" || set --

@@ -85,6 +85,25 @@ fn a_batch_keeps_what_is_there_and_makes_what_changed() {
 }
 
 #[test]
+fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
+    let Some(l) = library() else { return };
+    let (photos, scene) = (l.dir.path().join("made photos"), l.dir.path().join("made scene"));
+    json(&["synth", "table", "-o", text(&photos), "--views", "8", "--size", "96x72"]);
+    let args = ["make", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"];
+    let made = json(&args);
+    assert_eq!((made["state"].as_str(), made["photos"][0].as_u64(), made["photos"][1].as_u64()), (Some("made"), Some(7), Some(1)), "{made}");
+    let stamp = || std::fs::metadata(scene.join("scene.ply")).expect("a scene").modified().expect("a time");
+    let before = stamp();
+    let said = String::from_utf8(fastlgs(&args).stdout).expect("words");
+    assert!(said.contains("was there already") && said.contains("fastlgs serve '"), "{said}");
+    assert_eq!(before, stamp());
+    // Another photo takes the first one's place.
+    std::fs::copy(photos.join("images/001.png"), photos.join("images/000.png")).expect("a photo");
+    assert_eq!(json(&args)["state"], "made");
+    fails(&["make", text(&photos.join("none")), "-o", text(&scene)], &["none", "cannot be opened"]);
+}
+
+#[test]
 fn a_library_names_the_scenes_that_hold_a_thing() {
     let Some(l) = library() else { return };
     let scenes = l.dir.path().join("library");

@@ -22,6 +22,10 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Makes a scene that answers, from photos: preprocess and train in one.
+    #[command(after_help = "Example: fastlgs make photos/fox -o scenes/fox --max-side 480\n\n\
+Called again, it keeps what is there, goes on where it was broken off, or makes anew what other photos or options ask for.")]
+    Make(fastlgs::make::Config),
     /// Photos (with poses) -> masks, embeddings, key points and the object grid.
     #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
     Preprocess(fastlgs::preprocess::Config),
@@ -84,6 +88,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
     let console = console::Console::new(common);
     let run = &common.run(&console);
     match command {
+        Command::Make(config) => commands::make::run(&config, common, run),
         Command::Preprocess(config) => report::give(common, &fastlgs::preprocess(&config, run)?),
         Command::Train(args) => commands::train::run(&args, common, &console),
         Command::Batch(args) => commands::batch::run(&args, common, run),

@@ -4,6 +4,7 @@
 //!
 //! * [`preprocess`](preprocess()): photos (with poses) to masks, embeddings, key points and points;
 //! * [`train`](train()): Gaussians with colour, then [`objects`] on them;
+//! * [`make`](make()): both, where they were not done before;
 //! * [`Session`]: an opened scene that renders and answers;
 //! * [`eval`](eval()), [`export`](export()), [`synth`](synth()): accuracy, other formats, generated scenes;
 //! * [`render`](render()), [`library`]: pictures of views, and which of many scenes hold a thing.
@@ -20,6 +21,7 @@ pub mod eval;
 pub mod export;
 pub mod eyes;
 pub mod library;
+pub mod make;
 mod masks;
 pub mod names;
 pub mod objects;
@@ -34,6 +36,7 @@ pub mod train;
 pub use error::{Error, Result, one_sentence};
 pub use eval::eval;
 pub use export::export;
+pub use make::make;
 pub use preprocess::preprocess;
 pub use progress::{Run, Silent};
 pub use render::render;

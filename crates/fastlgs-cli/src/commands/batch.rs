@@ -4,8 +4,7 @@ use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Parser;
-use fastlgs::{Run, preprocess, train};
-use fastlgs_core::SceneFolder;
+use fastlgs::{Run, make, preprocess, train};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -29,9 +28,6 @@ pub struct Args {
     #[arg(long, value_name = "OPTIONS", default_value = "", allow_hyphen_values = true)]
     train: String,
 }
-
-/// Note of the manifest: what a scene was made with.
-const NOTE: &str = "batch";
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let mut names: BTreeMap<String, &Path> = BTreeMap::new();
@@ -117,26 +113,9 @@ impl<C: clap::Args> Options<C> {
 }
 
 /// Makes a scene unless it is there; whether it was made or kept, and the report of its training.
-fn make(args: &Args, photos: &Path, scene: &Path, run: &Run) -> Result<(&'static str, train::Report)> {
+fn make(args: &Args, photos: &Path, scene: &Path, run: &Run) -> Result<(make::State, train::Report)> {
     let photos = photos.canonicalize()?;
-    let with = json!([env!("CARGO_PKG_VERSION"), photos, args.preprocess, args.train, run.seed]);
-    let folder = SceneFolder::new(scene);
-    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(NOTE) == Some(&with));
-    if let Some(train) = known.as_ref().and_then(train::Report::of) {
-        return Ok(("kept", train));
-    }
-    // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
-    let begun = known.is_some() && folder.root.join("checkpoints/train").exists();
-    let mut training: Options<train::Config> = Options::parse("train", &[scene], &args.train, run)?;
-    if begun {
-        training.config.resume = true;
-    } else {
-        let options: Options<preprocess::Config> = Options::parse("preprocess", &[&photos, Path::new("-o"), scene], &args.preprocess, run)?;
-        fastlgs::preprocess(&options.config, &options.run(run))?;
-        let mut manifest = folder.manifest()?;
-        manifest.notes.insert(NOTE.to_owned(), with);
-        folder.save_manifest(&manifest)?;
-    }
-    let report = fastlgs::train(&training.config, &training.run(run))?;
-    Ok(("made", report))
+    let training: Options<train::Config> = Options::parse("train", &[scene], &args.train, run)?;
+    let options: Options<preprocess::Config> = Options::parse("preprocess", &[&photos, Path::new("-o"), scene], &args.preprocess, run)?;
+    Ok(make::scene(&options.config, &training.config, [&options.run(run), &training.run(run)])?)
 }

@@ -4,6 +4,7 @@ pub mod batch;
 mod bind;
 pub mod info;
 mod library;
+pub mod make;
 pub mod models;
 pub mod names;
 pub mod query;

@@ -1,0 +1,50 @@
+//! `fastlgs make`: from photos to a scene that answers, and what to do with it.
+
+use crate::outcome::Outcome;
+use crate::{report, ui};
+use anyhow::Result;
+use fastlgs::Run;
+use fastlgs::make::{self, Config, State};
+
+pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
+    let made = fastlgs::make(config, run)?;
+    if common.json.is_some() {
+        return report::give(common, &made);
+    }
+    if !common.quiet {
+        println!("{}", words(&made, &config.preprocess.output.display().to_string()));
+    }
+    Ok(Outcome::Done)
+}
+
+fn words(made: &make::Report, scene: &str) -> String {
+    let train = &made.train;
+    let seconds = train.seconds + train.mapping_seconds;
+    let how = match made.state {
+        State::Made => format!("trained and mapped in {seconds:.0} s ({})", train.adapter),
+        State::Kept => "was there already, made from the same photos with the same options".to_owned(),
+    };
+    let [training, held_out] = made.photos;
+    let colour = train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} photos that were kept aside")).unwrap_or_default();
+    // A name that a shell would take apart is quoted.
+    let plain = scene.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c));
+    let scene = if plain { scene.to_owned() } else { format!("'{}'", scene.replace('\'', "'\\''")) };
+    format!(
+        "{scene}: {how}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nask it:      fastlgs query {scene} \"a thing\"\nlook at it:  fastlgs serve {scene}",
+        train.gaussians, train.objects
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_next_commands_can_be_copied() {
+        let train = fastlgs::train::Report { gaussians: 12, objects: 3, psnr_held_out: Some(31.26), ..Default::default() };
+        let made = make::Report { state: State::Kept, photos: [7, 1], train };
+        let said = words(&made, "my photos/fox");
+        assert!(said.contains("7 photos, 12 Gaussians, 3 objects and parts; colour 31.3 dB on 1 photos"), "{said}");
+        assert!(said.ends_with("fastlgs serve 'my photos/fox'"), "{said}");
+    }
+}

@@ -1,0 +1,131 @@
+//! The main job in one go: from photos to a scene that answers. What was done is not done again.
+
+use crate::error::Context;
+use crate::{Result, Run, preprocess, train};
+use fastlgs_core::SceneFolder;
+use fastlgs_core::scene_folder::Manifest;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::path::Path;
+use std::time::UNIX_EPOCH;
+
+/// What is made, and how thoroughly.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Photos, scene, and how they are preprocessed.
+    #[cfg_attr(feature = "clap", command(flatten))]
+    pub preprocess: preprocess::Config,
+    /// How long is trained.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = train::Preset::Quick))]
+    pub effort: train::Preset,
+}
+
+/// Whether there was something to do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum State {
+    /// The scene was made.
+    Made,
+    /// It was there, made from the same photos with the same options.
+    Kept,
+}
+
+/// What was made.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// Whether there was something to do.
+    pub state: State,
+    /// The photos that the scene was trained on, and those that were kept aside.
+    pub photos: [usize; 2],
+    /// How it was trained.
+    pub train: train::Report,
+}
+
+/// Note of the manifest: what a scene was made with.
+const NOTE: &str = "made";
+
+/// Makes the scene `config.preprocess.output`. A run that was broken off goes on where it was.
+///
+/// # Errors
+/// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
+pub fn make(config: &Config, run: &Run) -> Result<Report> {
+    let train = train::Config { scene: config.preprocess.output.clone(), preset: config.effort, ..Default::default() };
+    let (state, train) = scene(&config.preprocess, &train, [run, run])?;
+    let folder = SceneFolder::open(&config.preprocess.output)?;
+    let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
+    Ok(Report { state, photos: [manifest.training(&cameras).len(), manifest.held_out(&cameras).len()], train })
+}
+
+/// Makes a scene with all options of both stages, each in a run of its own. `train.scene` must be `preprocess.output`.
+///
+/// # Errors
+/// Those of both stages.
+pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run; 2]) -> Result<(State, train::Report)> {
+    let photos = &preprocess.photos;
+    let photos = photos.canonicalize().with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
+    let seeds = runs.map(|run| run.seed);
+    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, preprocess, train, files(&photos)?]));
+    let folder = SceneFolder::new(&preprocess.output);
+    let now = with()?;
+    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(NOTE) == Some(&now));
+    if let Some(report) = known.as_ref().and_then(train::Report::of) {
+        return Ok((State::Kept, report));
+    }
+    // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
+    let begun = known.is_some() && folder.root.join("checkpoints/train").exists();
+    if !begun {
+        crate::preprocess(preprocess, runs[0])?;
+        let mut manifest: Manifest = folder.manifest()?;
+        // Poses that were found now lie beside the photos.
+        manifest.notes.insert(NOTE.to_owned(), with()?);
+        folder.save_manifest(&manifest)?;
+    }
+    let report = crate::train(&train::Config { resume: begun || train.resume, ..train.clone() }, runs[1])?;
+    Ok((State::Made, report))
+}
+
+/// What tells whether a folder's files are still the same: names, sizes and times of all of them.
+fn files(folder: &Path) -> Result<Value> {
+    let refused = |error| fastlgs_core::Error::io(folder)(error);
+    let mut found = serde_json::Map::new();
+    for entry in std::fs::read_dir(folder).map_err(refused)? {
+        let entry = entry.map_err(refused)?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        // Through links, which folders of photos often are.
+        let Some(about) = std::fs::metadata(entry.path()).ok().filter(|_| !name.starts_with('.')) else { continue };
+        let value = if about.is_dir() {
+            // A scene may lie among its photos, and change.
+            if entry.path().join("scene.json").exists() {
+                continue;
+            }
+            files(&entry.path())?
+        } else {
+            let changed = about.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map(|time| time.as_secs());
+            json!([about.len(), changed])
+        };
+        found.insert(name, value);
+    }
+    Ok(Value::Object(found))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn changed_photos_are_noticed() {
+        let dir = tempfile::tempdir().unwrap();
+        let images = dir.path().join("images");
+        std::fs::create_dir(&images).unwrap();
+        std::fs::write(images.join("a.jpg"), "1").unwrap();
+        let before = files(dir.path()).unwrap();
+        assert_eq!(before, files(dir.path()).unwrap());
+        std::fs::write(images.join("b.jpg"), "1").unwrap();
+        let more = files(dir.path()).unwrap();
+        assert_ne!(before, more);
+        std::fs::write(images.join("b.jpg"), "12").unwrap();
+        assert_ne!(more, files(dir.path()).unwrap());
+    }
+}
