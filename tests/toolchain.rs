@@ -91,7 +91,11 @@ fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
     json(&["synth", "table", "-o", text(&photos), "--views", "8", "--size", "96x72"]);
     let args = ["make", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"];
     let made = json(&args);
-    assert_eq!((made["state"].as_str(), made["photos"][0].as_u64(), made["photos"][1].as_u64()), (Some("made"), Some(7), Some(1)), "{made}");
+    assert_eq!(
+        (made["state"].as_str(), made["photos"][0].as_u64(), made["photos"][1].as_u64()),
+        (Some("made"), Some(7), Some(1)),
+        "{made}"
+    );
     let stamp = || std::fs::metadata(scene.join("scene.ply")).expect("a scene").modified().expect("a time");
     let before = stamp();
     let said = String::from_utf8(fastlgs(&args).stdout).expect("words");

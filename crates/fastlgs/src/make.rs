@@ -6,7 +6,7 @@ use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
 /// What is made, and how thoroughly.
@@ -66,7 +66,10 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let photos = &preprocess.photos;
     let photos = photos.canonicalize().with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
     let seeds = runs.map(|run| run.seed);
-    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, preprocess, train, files(&photos)?]));
+    // A scene may be moved.
+    let how = preprocess::Config { photos: photos.clone(), output: PathBuf::new(), ..preprocess.clone() };
+    let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
+    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, how, files(&photos)?]));
     let folder = SceneFolder::new(&preprocess.output);
     let now = with()?;
     let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(NOTE) == Some(&now));

@@ -4,7 +4,8 @@ use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Parser;
-use fastlgs::{Run, make, preprocess, train};
+use fastlgs::make::{self, State};
+use fastlgs::{Run, preprocess, train};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -113,7 +114,7 @@ impl<C: clap::Args> Options<C> {
 }
 
 /// Makes a scene unless it is there; whether it was made or kept, and the report of its training.
-fn make(args: &Args, photos: &Path, scene: &Path, run: &Run) -> Result<(make::State, train::Report)> {
+fn make(args: &Args, photos: &Path, scene: &Path, run: &Run) -> Result<(State, train::Report)> {
     let photos = photos.canonicalize()?;
     let training: Options<train::Config> = Options::parse("train", &[scene], &args.train, run)?;
     let options: Options<preprocess::Config> = Options::parse("preprocess", &[&photos, Path::new("-o"), scene], &args.preprocess, run)?;

@@ -25,7 +25,8 @@ fn words(made: &make::Report, scene: &str) -> String {
         State::Kept => "was there already, made from the same photos with the same options".to_owned(),
     };
     let [training, held_out] = made.photos;
-    let colour = train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} photos that were kept aside")).unwrap_or_default();
+    let colour =
+        train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} photos that were kept aside")).unwrap_or_default();
     // A name that a shell would take apart is quoted.
     let plain = scene.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c));
     let scene = if plain { scene.to_owned() } else { format!("'{}'", scene.replace('\'', "'\\''")) };
