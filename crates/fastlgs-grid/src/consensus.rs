@@ -2,7 +2,7 @@
 //!
 //! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing, where it fits at
 //! all, and what most of all these masks' pixels hold is the thing as more views see it; and so on, until nothing changes. Such a set is its own
-//! consensus: the order of photos and masks plays no part in it, a view that cuts the thing apart or glues it to another one has no voice, masks
+//! consensus: whichever of its masks it starts from, a view that cuts the thing apart or glues it to another one has no voice, masks
 //! that are missing are not missed, and a thing, its parts, and what it stands on are all found, each from its own masks. (As MaskClustering,
 //! 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in two; but there a mask belongs to one thing only.)
 
@@ -39,7 +39,7 @@ pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
         let fresh = |seed: &Vec<MaskId>| seed.iter().any(|mask| !explained[*mask as usize]);
         let batch: Vec<Vec<MaskId>> = seeds.by_ref().filter(fresh).take(BATCH).collect();
         let rest = |scratch: &mut Scratch, seed: &Vec<MaskId>| at_rest(sightings, seed, min_views, scratch);
-        let new: Vec<Option<Proposal>> = batch.par_iter().map_init(|| sightings.scratch(), rest).collect();
+        let new: Vec<Option<Proposal>> = batch.par_iter().with_min_len(BATCH / 16).map_init(|| sightings.scratch(), rest).collect();
         for proposal in new.into_iter().flatten() {
             proposal.masks.iter().for_each(|fit| explained[fit.mask as usize] = true);
             found.push(proposal);
@@ -75,19 +75,22 @@ mod tests {
     use fastlgs_core::mask_list::{Mask, RunLengths, Table};
     use fastlgs_core::{Level, MaskList};
 
-    /// The sets that views of a row of 12 Gaussians, 50 pixels each, propose; masks are given by their first Gaussian, the one after their last,
-    /// and the number of a tracker.
-    pub fn proposed(views: &[&[(u32, u32, Option<u32>)]]) -> Vec<Vec<u32>> {
-        let atoms = |masks: &[(u32, u32, Option<u32>)]| {
-            let mask = |&(from, to, track): &(u32, u32, Option<u32>)| Mask {
-                track,
-                ..Mask::new(Level::Whole, RunLengths::of(12, 1, |x, _| (from..to).contains(&x)))
-            };
+    /// A mask by its first Gaussian, the one after its last, and the number that a tracker gave it.
+    type Range = (u32, u32, Option<u32>);
+
+    /// The sets that views of a row of 12 Gaussians propose, each of 50 pixels where `shows(view, gaussian)`.
+    fn proposed(views: &[&[Range]], shows: impl Fn(usize, u32) -> bool) -> Vec<Vec<u32>> {
+        let atoms = |masks: &&[Range]| {
+            let runs = |from, to| RunLengths::of(12, 1, |x, _| (from..to).contains(&x));
+            let mask = |&(from, to, track): &Range| Mask { track, ..Mask::new(Level::Whole, runs(from, to)) };
             MaskList { masks: masks.iter().map(mask).collect(), ..MaskList::new(12, 1) }.atoms()
         };
-        let atoms: Vec<_> = views.iter().map(|masks| atoms(masks)).collect();
+        let atoms: Vec<_> = views.iter().map(atoms).collect();
         let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
-        let votes = |g| atoms.iter().enumerate().map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 50.0)).collect();
+        let votes = |g| {
+            let shown = atoms.iter().enumerate().filter(|(view, _)| shows(*view, g));
+            shown.map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 50.0)).collect()
+        };
         let votes: Vec<Vec<Vote>> = (0..12).map(votes).collect();
         let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(&votes, &tables), 3).into_iter().map(|p| p.set).collect();
         sets.sort();
@@ -100,9 +103,17 @@ mod tests {
         let good: &[_] = &[(0, 10, None), (0, 6, None), (0, 2, None)];
         let (glued, cut): (&[_], &[_]) = (&[(0, 10, None)], &[(0, 10, None), (0, 3, None), (3, 6, None)]);
         let wanted = [0..2, 0..6, 0..10].map(|range| range.collect::<Vec<u32>>());
-        let found = proposed(&[good, good, good, glued, cut]);
-        assert_eq!(found, proposed(&[cut, glued, good, good, good]), "the order of the views plays no part");
+        let found = proposed(&[good, good, good, glued, cut], |_, _| true);
+        assert_eq!(found, proposed(&[cut, glued, good, good, good], |_, _| true), "the order of the views plays no part");
         assert!(wanted.iter().all(|set| found.contains(set)), "{found:?}");
-        assert_eq!(proposed(&[good, good, glued, glued, glued]), [wanted[2].clone()], "two views of the cup are too few");
+        assert_eq!(proposed(&[good, good, glued, glued, glued], |_, _| true), [wanted[2].clone()], "two views of the cup are too few");
+    }
+    #[test]
+    fn a_tracker_joins_what_no_photo_shows_together() {
+        // Each of three views shows another third of one thing.
+        let thirds = |track| [0, 1, 2].map(|view| [(4 * view, 4 * view + 4, track)]);
+        let found = |track| proposed(&thirds(track).each_ref().map(|masks| masks.as_slice()), |view, g| g as usize / 4 == view);
+        assert_eq!(found(Some(7)), [(0..12).collect::<Vec<u32>>()]);
+        assert!(found(None).is_empty());
     }
 }

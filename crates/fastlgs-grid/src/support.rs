@@ -1,5 +1,6 @@
 //! Global mapping, fourth step: how well the photos' masks fit each node of the tree.
 
+use crate::sightings::MIN_PIXELS;
 use crate::tree::{Node, Tree};
 use fastlgs_core::LabelMap;
 use fastlgs_core::mask_list::Table;
@@ -28,9 +29,6 @@ impl Support {
     }
 }
 
-/// Fewest pixels with which a view shows a node.
-const MIN_PIXELS: u32 = 30;
-
 /// The pixels of a view by what they show.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shown(Vec<(Node, u16, u32)>);
@@ -56,7 +54,7 @@ pub fn support(tree: &Tree, views: &[Shown], tables: &[Table]) -> Vec<Support> {
     let seen: Vec<_> = views.par_iter().zip(tables).map(|(shown, table)| of_view(&children, shown, table)).collect();
     let mut all = vec![(Support::default(), 0.0f32); tree.parents.len()];
     for (view, shown) in seen.into_iter().enumerate() {
-        for (node, area, iou) in shown.into_iter().filter(|s| s.1 >= MIN_PIXELS) {
+        for (node, area, iou) in shown.into_iter().filter(|s| s.1 as f32 >= MIN_PIXELS) {
             let (support, weight) = &mut all[node];
             support.areas.push((area, view as u32));
             support.iou += area as f32 * iou;
