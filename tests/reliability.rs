@@ -83,6 +83,31 @@ fn training_survives_kills() {
 }
 
 #[test]
+fn a_killed_make_goes_on() {
+    let Some(f) = fixture() else { return };
+    let (photos, scene) = (f.dir.path().join("photos"), f.dir.path().join("made"));
+    let make = ["make", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"];
+    let begun = scene.join("checkpoints/train.json");
+    let mut child =
+        Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(make).arg("-q").stdout(Stdio::null()).spawn().expect("the binary starts");
+    while !begun.is_file() {
+        let ended = child.try_wait().expect("a child");
+        assert!(ended.is_none(), "it ended before its first checkpoint: {ended:?}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    child.kill().expect("a child");
+    child.wait().expect("an end");
+    let output = run::fastlgs(&[&make[..], &["-v"]].concat());
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("training goes on from its checkpoint"), "{said}");
+    assert_eq!(json(&[&make[..], &["-q"]].concat())["state"], "kept");
+    let anew = f.dir.path().join("anew");
+    json(&["make", text(&photos), "-o", text(&anew), "--segmenter", "import", "--device", "cpu"]);
+    assert!(results(&scene) == results(&anew), "a broken make ends in the same bytes");
+}
+
+#[test]
 fn a_full_disk_leaves_earlier_results_whole() {
     let Some(f) = fixture() else { return };
     let scene = f.dir.path().join("full");

@@ -77,8 +77,9 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         return Ok((State::Kept, report));
     }
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
-    let begun = known.is_some() && folder.root.join("checkpoints/train").exists();
+    let begun = known.is_some() && train::is_begun(&folder);
     if !begun {
+        train::forget(&folder);
         crate::preprocess(preprocess, runs[0])?;
         let mut manifest: Manifest = folder.manifest()?;
         // Poses that were found now lie beside the photos.

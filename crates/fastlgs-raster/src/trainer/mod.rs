@@ -356,13 +356,17 @@ impl Trainer {
         let Some((course, state, stats)) = checkpoint::load(path)? else { return Ok(false) };
         if course.config != self.course.config {
             let header = path.with_extension("json");
-            return Err(Error::Invalid(format!("{}: the checkpoint was made with other options; leave out --resume", header.display())));
+            return Err(Error::Invalid(format!(
+                "{}: the checkpoint was made with other options; leave out --resume, or delete it",
+                header.display()
+            )));
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;
         for (target, pose) in self.targets.iter_mut().zip(&course.poses) {
             target.camera.world_to_camera = *pose;
         }
+        tracing::info!(iteration = course.iteration, "training goes on from its checkpoint");
         self.course = course;
         Ok(true)
     }

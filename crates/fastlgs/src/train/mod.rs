@@ -11,6 +11,7 @@ use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_raster::{Alignment, Channels, Target, TrainConfig, Trainer};
 pub(crate) use start::target;
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// Difference of two photos in stops from which exposures are learned.
@@ -18,6 +19,21 @@ const VARYING: f32 = 0.15;
 
 /// Iterations from which it pays to find out first which kernels the device is fastest with.
 const WORTH_TUNING: u32 = 500;
+
+/// Where steps of an unfinished run are kept: a header of this name with the ending json, and what it names.
+fn checkpoint(folder: &SceneFolder) -> PathBuf {
+    folder.root.join("checkpoints/train")
+}
+
+/// Whether a run was broken off that `config.resume` goes on with.
+pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
+    checkpoint(folder).with_extension("json").is_file()
+}
+
+/// Forgets a run that was broken off.
+pub(crate) fn forget(folder: &SceneFolder) {
+    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
+}
 
 /// Trains the scene folder `config.scene`: Gaussians, their objects, and the table of these.
 ///
@@ -66,7 +82,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    let checkpoint = folder.root.join("checkpoints/train");
+    let checkpoint = checkpoint(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
         run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
     }
@@ -150,7 +166,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     report.note(&mut manifest)?;
     folder.save_manifest(&manifest)?;
     // Checkpoints serve a broken run only.
-    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
+    forget(&folder);
     Ok(report)
 }
 
