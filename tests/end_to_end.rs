@@ -387,21 +387,21 @@ fn preprocessing_does_again_only_what_changed() {
     let run = || json(&["preprocess", text(&photos), "-o", text(&scene), "--memory", "20M"]);
     let counts = |report: &Value, stage: &str| [0, 1].map(|k| report["cached"][stage][k].as_u64().expect("a number"));
     let first = run();
-    let results = || ["points.safetensors", "embeddings.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
+    let results = || ["points.safetensors", "pairs.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
     let before = results();
-    assert_eq!([counts(&first, "masks"), counts(&first, "embeddings"), counts(&first, "poses")], [[0, 8], [0, 8], [0, 1]]);
+    assert_eq!([counts(&first, "masks"), counts(&first, "poses")], [[0, 8], [0, 1]]);
     let second = run();
-    for stage in ["masks", "embeddings", "poses", "key points", "matches"] {
+    for stage in ["masks", "poses", "key points", "matches"] {
         let [there, all] = counts(&second, stage);
         assert_eq!(there, all, "{stage}");
     }
     assert!(before == results(), "what is taken from the cache gives the same bytes");
-    // A photo changes: its own masks, embeddings and matches are made again, and no others.
+    // A photo changes: its own masks and matches are made again, and no others.
     let path = photos.join("images/003.png");
     let changed = image::imageops::huerotate(&fastlgs_core::image_io::load_rgb(&path).expect("a photo"), 90);
     fastlgs_core::image_io::save_png(&path, changed).expect("a photo");
     let third = run();
-    assert_eq!([counts(&third, "masks"), counts(&third, "embeddings"), counts(&third, "poses")], [[7, 8], [7, 8], [0, 1]]);
+    assert_eq!([counts(&third, "masks"), counts(&third, "poses")], [[7, 8], [0, 1]]);
     assert!(before != results());
 }
 

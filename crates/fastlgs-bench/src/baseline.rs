@@ -54,7 +54,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let views = labels::load(&Path::new(&scene.manifest.photos).join("labels"), None)?;
     let started = Instant::now();
     let field = match args.method.as_str() {
-        "raw" => PerPixel::raw(&scene)?,
+        "raw" => PerPixel::raw(&scene, run)?,
         "lerf" => PerPixel::lerf(&scene, run)?,
         "langsplat" => PerPixel::langsplat(&scene, run)?,
         "separated" => PerPixel::of_codes(&scene, separated(&scene, &grid, run.seed)?),
@@ -114,8 +114,8 @@ struct PerPixel {
 }
 
 impl PerPixel {
-    fn raw(scene: &Session) -> Result<Self> {
-        let (masks, _) = fastlgs_grid::evidence::load(&scene.folder)?;
+    fn raw(scene: &Session, run: &Run) -> Result<Self> {
+        let masks = fastlgs::masks::evidence(&scene.folder, &scene.manifest.training(&scene.cameras), run)?;
         let lifted = lifted(scene, |view, camera| {
             let map = scene.folder.masks(camera)?.painted(Level::Whole);
             let own = masks.iter().filter(|m| m.view == view);

@@ -1,46 +1,99 @@
-//! What preprocessing knows of the masks, kept for whichever mapping comes after: `embeddings.safetensors`.
+//! What Algorithm 1 goes by, kept in the scene folder: which masks share key points (`pairs.safetensors`), and what describes each mask
+//! (`embeddings.safetensors`).
 
 use crate::Result;
 use crate::mapping::{Correspondences, Mask};
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 use fastlgs_core::{Error, SceneFolder};
+use std::collections::BTreeMap;
+use std::io::ErrorKind;
+use std::path::PathBuf;
 
-const FILE: &str = "embeddings.safetensors";
+/// A mask by its view's place among the training views, and its label there.
+pub type Place = (usize, u16);
 
-/// Writes masks (view, label, area, embedding, histogram) and key-point pairs between them.
+/// Key-point pairs between masks of a later and an earlier view.
+pub type Pairs = BTreeMap<[Place; 2], u32>;
+
+/// Where descriptions of masks are kept.
+pub fn masks_path(folder: &SceneFolder) -> PathBuf {
+    folder.root.join("embeddings.safetensors")
+}
+
+fn pairs_path(folder: &SceneFolder) -> PathBuf {
+    folder.root.join("pairs.safetensors")
+}
+
+/// Writes which masks share key points.
 ///
 /// # Errors
 /// The system's refusal.
-pub fn save(folder: &SceneFolder, masks: &[Mask], pairs: &Correspondences) -> Result<()> {
+pub fn save_pairs(folder: &SceneFolder, pairs: &Pairs) -> Result<()> {
+    let number = |(view, label): Place| [view as f32, f32::from(label)];
+    let row = |(&[later, earlier], &count): (&[Place; 2], &u32)| [&number(later)[..], &number(earlier), &[count as f32]].concat();
+    let rows: Vec<f32> = pairs.iter().flat_map(row).collect();
+    Ok(save_tensors(&pairs_path(folder), &[("pairs", vec![pairs.len(), 5], rows.as_slice())])?)
+}
+
+/// Reads what [`save_pairs`] wrote, as pairs of places in `masks`; key points on masks that are not among them are left out.
+///
+/// # Errors
+/// Missing or damaged file.
+pub fn load_pairs(folder: &SceneFolder, masks: &[Mask]) -> Result<Correspondences> {
+    let path = pairs_path(folder);
+    let tensors = load_tensors(&path)?;
+    let rows = tensors.get("pairs").filter(|t| matches!(t.0[..], [_, 5]));
+    let rows = rows.ok_or_else(|| Error::format(&path, "tensor 'pairs' is missing; run 'fastlgs preprocess' again"))?;
+    let index: BTreeMap<Place, usize> = masks.iter().enumerate().map(|(i, m)| ((m.view, m.label), i)).collect();
+    let place = |of: &[f32]| index.get(&(of[0] as usize, of[1] as u16)).copied();
+    let pair = |row: &[f32]| Some(((place(&row[..2])?, place(&row[2..4])?), row[4] as u32));
+    Ok(rows.1.chunks_exact(5).filter_map(pair).collect())
+}
+
+/// Writes what describes each mask: view, label, area, embedding, histogram.
+///
+/// # Errors
+/// The system's refusal.
+pub fn save_masks(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
     let n = masks.len();
     let width = |f: fn(&Mask) -> &Vec<f32>| masks.first().map_or(0, |m| f(m).len());
     let places: Vec<f32> = masks.iter().flat_map(|m| [m.view as f32, f32::from(m.label), m.area]).collect();
     let embeddings: Vec<f32> = masks.iter().flat_map(|m| m.embedding.iter().copied()).collect();
     let histograms: Vec<f32> = masks.iter().flat_map(|m| m.histogram.iter().copied()).collect();
-    let rows: Vec<f32> = pairs.iter().flat_map(|(&(later, earlier), &count)| [later as f32, earlier as f32, count as f32]).collect();
     let tensors = [
         ("view_label_area", vec![n, 3], places.as_slice()),
         ("embeddings", vec![n, width(|m| &m.embedding)], &embeddings),
         ("histograms", vec![n, width(|m| &m.histogram)], &histograms),
-        ("pairs", vec![pairs.len(), 3], &rows),
     ];
-    Ok(save_tensors(&folder.root.join(FILE), &tensors)?)
+    Ok(save_tensors(&masks_path(folder), &tensors)?)
 }
 
-/// Reads what [`save`] wrote.
+/// Removes what [`save_masks`] wrote, if it did: other masks are to come.
+///
+/// # Errors
+/// The system's refusal.
+pub fn forget_masks(folder: &SceneFolder) -> Result<()> {
+    let path = masks_path(folder);
+    match std::fs::remove_file(&path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::io(&path)(error).into()),
+        _ => Ok(()),
+    }
+}
+
+/// Reads what [`save_masks`] wrote.
 ///
 /// # Errors
 /// Missing or damaged file.
-pub fn load(folder: &SceneFolder) -> Result<(Vec<Mask>, Correspondences)> {
-    let path = folder.root.join(FILE);
+pub fn load_masks(folder: &SceneFolder) -> Result<Vec<Mask>> {
+    let path = masks_path(folder);
     let tensors = load_tensors(&path)?;
     let get = |name: &str| {
         let found = tensors.get(name).filter(|t| t.0.len() == 2);
         found.ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing; run 'fastlgs preprocess' again")))
     };
-    let (places, embeddings, histograms, rows) = (get("view_label_area")?, get("embeddings")?, get("histograms")?, get("pairs")?);
+    let (places, embeddings, histograms) = (get("view_label_area")?, get("embeddings")?, get("histograms")?);
     let n = places.0[0];
-    if embeddings.0[0] != n || histograms.0[0] != n || places.0[1] != 3 || rows.0[1] != 3 {
+    if embeddings.0[0] != n || histograms.0[0] != n || places.0[1] != 3 {
         return Err(Error::format(&path, "its tensors differ in length; run 'fastlgs preprocess' again").into());
     }
     let row = |t: &(Vec<usize>, Vec<f32>), i: usize| t.1[i * t.0[1]..(i + 1) * t.0[1]].to_vec();
@@ -54,8 +107,7 @@ pub fn load(folder: &SceneFolder) -> Result<(Vec<Mask>, Correspondences)> {
             histogram: row(histograms, i),
         }
     });
-    let pairs = rows.1.chunks_exact(3).map(|r| ((r[0] as usize, r[1] as usize), r[2] as u32)).collect();
-    Ok((masks.collect(), pairs))
+    Ok(masks.collect())
 }
 
 #[cfg(test)]
@@ -67,10 +119,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let mask = |view, label| Mask { view, label, area: 0.25, embedding: vec![0.5, 0.25], histogram: vec![1.0, 0.0, 0.0] };
-        let pairs = Correspondences::from([((1, 0), 7)]);
-        save(&folder, &[mask(0, 1), mask(3, 2)], &pairs).unwrap();
-        let (masks, read) = load(&folder).unwrap();
-        assert_eq!((masks.len(), masks[1].view, masks[1].label, read), (2, 3, 2, pairs));
+        save_masks(&folder, &[mask(0, 1), mask(3, 2)]).unwrap();
+        let masks = load_masks(&folder).unwrap();
+        assert_eq!((masks.len(), masks[1].view, masks[1].label), (2, 3, 2));
         assert_eq!(masks[0].histogram, [1.0, 0.0, 0.0]);
+        // The second names a mask that is too small to be described.
+        save_pairs(&folder, &Pairs::from([([(3, 2), (0, 1)], 7), ([(3, 9), (0, 1)], 2)])).unwrap();
+        assert_eq!(load_pairs(&folder, &masks).unwrap(), Correspondences::from([((1, 0), 7)]));
     }
 }

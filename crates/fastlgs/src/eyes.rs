@@ -255,18 +255,6 @@ impl Eyes {
         })
     }
 
-    /// What embeddings depend on beside photo and masks.
-    pub fn encoder_identity(&self) -> Result<Option<String>> {
-        Ok(match self.encoder {
-            EncoderKind::Import => None,
-            EncoderKind::Clip => {
-                let files = self.files()?.into_iter().filter(|(role, _)| role.starts_with("clip"));
-                Some(files.map(|(_, f)| f.sha256).collect::<Vec<_>>().join(" "))
-            }
-            EncoderKind::Offline => Some(format!("offline {} {}", conse::VERSION, models::offline_stamp())),
-        })
-    }
-
     /// Whether masks of a level are kept.
     pub fn keeps(&self, level: Level) -> bool {
         level == Level::Whole || self.levels.iter().any(|l| l == level.name())
@@ -328,7 +316,7 @@ struct Recorded {
 impl Recorded {
     fn load(folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
         let views = manifest.training(&folder.cameras()?);
-        Ok(Self { folder: folder.clone(), views, masks: evidence::load(folder)?.0 })
+        Ok(Self { folder: folder.clone(), views, masks: evidence::load_masks(folder)? })
     }
 }
 

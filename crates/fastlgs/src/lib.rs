@@ -22,7 +22,7 @@ pub mod export;
 pub mod eyes;
 pub mod library;
 pub mod make;
-mod masks;
+pub mod masks;
 pub mod names;
 pub mod objects;
 pub mod preprocess;

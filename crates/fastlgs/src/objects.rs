@@ -29,8 +29,9 @@ pub struct Config {
 const EMBEDDED_VIEWS: usize = 5;
 
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
-pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, seed: u64) -> Result<Grid> {
-    let (masks, pairs) = evidence::load(folder)?;
+pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, run: &Run) -> Result<Grid> {
+    let masks = masks::evidence(folder, training, run)?;
+    let pairs = evidence::load_pairs(folder, &masks)?;
     let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
     let mut contacts = BTreeSet::new();
@@ -46,7 +47,7 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         map.save(&folder.objects_path(&camera.name))?;
         contacts.extend(map.contacts());
     }
-    Ok(Grid::build(&masks, &object_of, codes::separated(usize::from(count), &contacts, seed)))
+    Ok(Grid::build(&masks, &object_of, codes::separated(usize::from(count), &contacts, run.seed)))
 }
 
 /// The objects that an earlier run found, whose maps must be there for all training views.

@@ -114,7 +114,7 @@ pub struct Report {
     pub held_out: usize,
     /// Size of the first working photo.
     pub size: String,
-    /// Masks of the highest level on all training photos.
+    /// Masks of all levels on all training photos.
     pub masks: usize,
     /// Mean number of masks a photo, by level.
     pub masks_per_photo: BTreeMap<String, f64>,

@@ -1,17 +1,16 @@
-//! Masks of the training photos, and what describes each.
+//! Masks of the training photos.
 
 use super::config::Config;
 use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::error::Context;
-use crate::{Result, Run, masks};
+use crate::{Result, Run};
 use fastlgs_core::{Level, SceneFolder};
-use fastlgs_grid::mapping::Mask;
-use fastlgs_vision::{Encoder, Segmenter};
+use fastlgs_vision::Segmenter;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Writes the masks of every training photo; returns the mean number of masks a photo by level.
+/// Writes the masks of every training photo; returns their number, and the mean number a photo by level.
 pub(super) fn segment(
     config: &Config,
     segmenter: &dyn Segmenter,
@@ -19,7 +18,7 @@ pub(super) fn segment(
     folder: &SceneFolder,
     cache: &Cache,
     run: &Run,
-) -> Result<BTreeMap<String, f64>> {
+) -> Result<(usize, BTreeMap<String, f64>)> {
     let work = run.work("masks", training.len() as u64);
     let identity = config.eyes.segmenter_identity()?;
     let of_photo = |photo: &Known| -> Result<[usize; 3]> {
@@ -37,35 +36,6 @@ pub(super) fn segment(
     let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
     let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));
-    Ok(kept.map(|level| (level.name().to_owned(), mean(level as usize))).collect())
-}
-
-/// Embedding and colour distribution of every mask, sorted by view and label.
-pub(super) fn describe(
-    config: &Config,
-    encoder: &dyn Encoder,
-    training: &[Known],
-    folder: &SceneFolder,
-    cache: &Cache,
-    run: &Run,
-) -> Result<Vec<Mask>> {
-    let work = run.work("embeddings", training.len() as u64);
-    let identity = config.eyes.encoder_identity()?;
-    let of_photo = |(view, photo): (usize, &Known)| -> Result<Vec<Mask>> {
-        let name = &photo.camera.name;
-        let labels = masks::whole(folder, &photo.camera)?;
-        let make = || masks::described(name, &folder.photo(name)?, 0, &labels, encoder);
-        let of_view: Vec<Mask> = match &identity {
-            Some(identity) => {
-                let inputs = [&photo.key, bytemuck::cast_slice(&labels.labels), identity.as_bytes()];
-                cache.get("embeddings", &cache::key(&inputs), make)?
-            }
-            None => make()?,
-        };
-        work.advance()?;
-        // A photo keeps what is known of it when others come or go before it.
-        Ok(of_view.into_iter().map(|mask| Mask { view, ..mask }).collect())
-    };
-    let found = training.par_iter().enumerate().map(of_photo).collect::<Result<Vec<_>>>()?;
-    Ok(found.into_iter().flatten().collect())
+    let means = kept.map(|level| (level.name().to_owned(), mean(level as usize))).collect();
+    Ok((counts.iter().flatten().sum(), means))
 }

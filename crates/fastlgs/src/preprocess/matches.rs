@@ -4,7 +4,7 @@ use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::{Error, Result, Run, masks};
 use fastlgs_core::{Camera, SceneFolder};
-use fastlgs_grid::mapping::{Correspondences, Mask};
+use fastlgs_grid::evidence::Pairs;
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::matching;
 use fastlgs_vision::tracks::{self, PairMatches};
@@ -67,25 +67,19 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
 }
 
 /// Counts the key-point pairs between the masks of matched photos.
-pub(super) fn correspondences(
-    masks: &[Mask],
-    folder: &SceneFolder,
-    cameras: &[Camera],
-    points: &[Keypoints],
-    matches: &[PairMatches],
-) -> Result<Correspondences> {
-    let index: BTreeMap<(usize, u16), usize> = masks.iter().enumerate().map(|(i, m)| ((m.view, m.label), i)).collect();
-    let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<Option<usize>>> {
+pub(super) fn between_masks(folder: &SceneFolder, cameras: &[Camera], points: &[Keypoints], matches: &[PairMatches]) -> Result<Pairs> {
+    let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<u16>> {
         let map = masks::whole(folder, camera)?;
         let label = |p: &Vec2| map.at((p.x as u32).min(map.width - 1), (p.y as u32).min(map.height - 1));
-        Ok(points[view].positions.iter().map(|p| index.get(&(view, label(p))).copied()).collect())
+        Ok(points[view].positions.iter().map(label).collect())
     };
-    let mask_at: Vec<Vec<Option<usize>>> = cameras.iter().enumerate().map(of_view).collect::<Result<_>>()?;
-    let mut out = Correspondences::new();
+    let label_at: Vec<Vec<u16>> = cameras.iter().enumerate().map(of_view).collect::<Result<_>>()?;
+    let mut out = Pairs::new();
     for m in matches {
         for &(i, j) in &m.pairs {
-            if let (Some(a), Some(b)) = (mask_at[m.a][i], mask_at[m.b][j]) {
-                *out.entry((b, a)).or_default() += 1;
+            let (a, b) = (label_at[m.a][i], label_at[m.b][j]);
+            if a > 0 && b > 0 {
+                *out.entry([(m.b, b), (m.a, a)]).or_default() += 1;
             }
         }
     }

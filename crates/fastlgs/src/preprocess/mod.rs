@@ -8,6 +8,7 @@ mod poses;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
+use crate::eyes::EncoderKind;
 use crate::{Result, Run};
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
@@ -45,6 +46,8 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     // Opened first: a missing model should not cost the minutes before.
     let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
     let encoder = config.eyes.encoder(&config.photos, &lenses)?;
+    // Of use here only for what other programs embedded, whose files may go.
+    let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
     dataset.warnings.iter().for_each(|warning| run.warn(warning));
     let folder = SceneFolder::new(&config.output);
     let cache = Cache::new(&folder);
@@ -91,12 +94,10 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         bail!("{}: only {} photos are left for training; at least 2 are needed", config.photos.display(), training.len());
     }
 
-    let mask_counts = masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
+    evidence::forget_masks(&folder)?;
+    let (mask_count, masks_per_photo) = masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
     drop(segmenter);
     lap("masks");
-    let masks = masks::describe(config, encoder.as_ref(), &training, &folder, &cache, run)?;
-    drop(encoder);
-    lap("embeddings");
     let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
     let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
     let matches = matches::between(&kept, &matches, &poses, &keypoints);
@@ -122,9 +123,12 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         points.clone_from(&dataset.points);
     }
     folder.save_points(&points)?;
-    let pairs = matches::correspondences(&masks, &folder, &poses, &keypoints, &matches)?;
-    evidence::save(&folder, &masks, &pairs)?;
+    evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &matches)?)?;
     lap("points");
+    if let Some(encoder) = imported {
+        crate::masks::describe(&folder, &poses, encoder.as_ref(), None, run)?;
+        lap("embeddings");
+    }
     manifest.seconds = seconds.clone();
     light.note(&mut manifest)?;
     folder.save_manifest(&manifest)?;
@@ -135,8 +139,8 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         training_photos: poses.len(),
         held_out: cameras.len() - poses.len(),
         size: format!("{}x{}", cameras[0].width, cameras[0].height),
-        masks: masks.len(),
-        masks_per_photo: mask_counts,
+        masks: mask_count,
+        masks_per_photo,
         key_point_matches: matches.iter().map(|m| m.pairs.len()).sum(),
         points: points.len(),
         sift: keypoints::backend().to_owned(),

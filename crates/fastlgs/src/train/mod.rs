@@ -54,7 +54,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let mut cameras = if config.init_ply.is_some() { folder.cameras()? } else { given.clone() };
     let mut training = manifest.training(&cameras);
     let known = match config.mapping {
-        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(), run.seed)?),
+        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(), run)?),
         Mapping::Keep => Some(objects::kept(&folder, &training)?),
         Mapping::Global => None,
     };
