@@ -30,17 +30,11 @@ labelled=$(ls "$photos/labels" 2>/dev/null | sed 's/\.json$//')
 view=$(echo "$labelled" | head -n 1)
 [ -n "$view" ] && set -- --view "$view" || set --
 echo "== render";     $fastlgs render "$scene" "$@" --what color,depth,feature,objects -o "$scene/pictures"
-for text in "${present[@]}"; do
-    echo "== query \"$text\""
-    $fastlgs query "$scene" "$text" "$@" --heatmap -o "$scene/pictures" || [ $? = 3 ]
-done
-for text in "${absent[@]}"; do
-    echo "== query \"$text\" (not in the scene)"
-    $fastlgs query "$scene" "$text" "$@" || [ $? = 3 ]
-done
+echo "== query: what is there, and \"${absent[*]}\", which is not"
+$fastlgs query "$scene" "${present[@]}" "${absent[@]}" "$@" --heatmap -o "$scene/pictures" || [ $? = 3 ]
 if [ -n "$labelled" ]; then
     echo "== eval"; $fastlgs eval "$scene" --labels "$photos/labels"
 else
     echo "== eval"; $fastlgs eval "$scene"
 fi
-echo "demo: $(( $(date +%s) - began )) seconds after set-up; pictures are in $scene/pictures"
+echo "demo: $(( $(date +%s) - began )) seconds after set-up; look at $scene/pictures/sheet.png"

@@ -6,6 +6,7 @@ use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs::session::answer::{CANDIDATES, ObjectReport, Question, Report};
 use fastlgs::session::ask::Ask;
+use fastlgs::session::sheet::{self, Tile};
 use fastlgs::session::{ViewChoice, parse_point, parse_size, selection};
 use fastlgs::{Run, Session};
 use fastlgs_core::{Camera, image_io};
@@ -109,12 +110,21 @@ fn told(report: &Report) -> String {
     lines.join("\n")
 }
 
+/// An answer in the words under its picture.
+fn in_short(report: &Report) -> String {
+    let verdict = if report.found { "found" } else { "not found" };
+    format!("{verdict}, {:.2}, {} pixels", report.score, thousands(report.pixels))
+}
+
 /// 19580 as 19,580.
 fn thousands(number: usize) -> String {
     let digits = number.to_string();
     let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or_default()).collect();
     groups.join(",")
 }
+
+/// Tiles of a view in a row of a contact sheet.
+const IN_A_ROW: usize = 4;
 
 /// A view as it was last rendered.
 struct Shown {
@@ -134,6 +144,7 @@ struct Asker<'a> {
     cameras: Vec<Camera>,
     config: QueryConfig,
     shown: Option<Shown>,
+    tiles: Vec<Tile>,
 }
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
@@ -171,7 +182,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         scene.text_query("warm up")?;
     }
     scene.warm_up()?;
-    let mut asker = Asker { args, scene, grid, cameras, config, shown: None };
+    let mut asker = Asker { args, scene, grid, cameras, config, shown: None, tiles: Vec::new() };
     if lines { asker.answer_lines() } else { asker.answer_arguments(common) }
 }
 
@@ -194,6 +205,7 @@ impl Asker<'_> {
                 answers.push(self.answer(ask, place)?);
             }
         }
+        let sheet = self.sheet()?;
         let found = answers.iter().any(|a| a.found);
         let single = answers.len() == 1;
         if common.json.is_some() && single {
@@ -202,12 +214,21 @@ impl Asker<'_> {
             report::give(common, &answers)?;
         } else if !common.quiet {
             answers.iter().for_each(|answer| println!("{}", told(answer)));
+            sheet.iter().for_each(|path| println!("all of it on one sheet: {}", path.display()));
         }
         if !found && !common.quiet {
             let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
             eprintln!("nothing in this scene matches {}", names.join(", "));
         }
         Ok(if found { Outcome::Done } else { Outcome::NotFound })
+    }
+
+    /// Writes the contact sheet of all answers: where one view was asked in rows of [`IN_A_ROW`], else a row for each view.
+    fn sheet(&self) -> Result<Option<PathBuf>> {
+        let Some(path) = self.args.output.as_ref().map(|folder| folder.join("sheet.png")) else { return Ok(None) };
+        let columns = if self.cameras.len() == 1 { IN_A_ROW } else { self.tiles.len() / self.cameras.len() };
+        image_io::save_png(&path, sheet::sheet(&self.tiles, columns))?;
+        Ok(Some(path))
     }
 
     /// Each line of standard input is a text; each answer a line of JSON, also where something is wrong with the question.
@@ -238,6 +259,9 @@ impl Asker<'_> {
         let field = self.scene.field(&self.cameras[place], self.args.tau_ac)?;
         let ms = started.elapsed().as_secs_f64() * 1e3;
         let color = self.args.output.as_ref().map(|_| self.scene.render(&self.cameras[place])).transpose()?;
+        if let Some(frame) = &color {
+            self.tiles.extend(sheet::of_view(&self.scene, &self.grid, &self.cameras[place], frame, &field));
+        }
         self.shown = Some(Shown { place, field, color });
         Ok(ms)
     }
@@ -251,8 +275,10 @@ impl Asker<'_> {
         let question = Question { ask, negatives: &args.negative, config: self.config, dilate, candidates: CANDIDATES };
         let (answer, mut report) = question.put(scene, grid, field, camera, render_ms)?;
         let targets = &answer.found.targets;
+        let mut tile = None;
         if let (Some(folder), Some(color)) = (&args.output, color) {
-            answer.write(folder, color, args.heatmap, &mut report)?;
+            let picture = answer.write(folder, color, args.heatmap, &mut report)?;
+            tile = Some(Tile { picture, title: report.text.clone(), note: in_short(&report) });
         }
         for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
             if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
@@ -265,6 +291,7 @@ impl Asker<'_> {
             let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
             report.seen_best = self.scene.seen_best(&self.grid, &ids)?;
         }
+        self.tiles.extend(tile);
         Ok(report)
     }
 }

@@ -8,6 +8,7 @@ use fastlgs_core::{Camera, image_io, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{Field, Found, Hit, QueryConfig, best_score};
 use fastlgs_raster::Frame;
+use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -194,16 +195,17 @@ impl Answer<'_> {
         }
     }
 
-    /// Writes mask, overlay and, where wanted, heat map; names them in `report`.
+    /// Writes mask, overlay and, where wanted, heat map; names them in `report`, and returns the overlay.
     ///
     /// # Errors
     /// The system's refusal.
-    pub fn write(&self, folder: &Path, frame: &Frame, heat: bool, report: &mut Report) -> Result<()> {
+    pub fn write(&self, folder: &Path, frame: &Frame, heat: bool, report: &mut Report) -> Result<RgbImage> {
         let (w, h) = (frame.width, frame.height);
         let safe: String = report.text.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect();
         let view = report.view.clone();
         let path = |what: &str| folder.join(format!("{view}.{safe}.{what}.png"));
         let color = image_io::from_planar(frame.channels(0, 3), w, h);
+        let lit = overlay(&color, &self.mask);
         if self.found.targets.is_empty() {
             // A mask of an earlier run would contradict the answer.
             for what in ["mask", "overlay"] {
@@ -211,13 +213,13 @@ impl Answer<'_> {
             }
         } else {
             image_io::save_png(&path("mask"), mask_picture(&self.mask, w, h))?;
-            image_io::save_png(&path("overlay"), overlay(&color, &self.mask))?;
+            image_io::save_png(&path("overlay"), lit.clone())?;
             report.mask = Some(path("mask"));
         }
         if heat {
             image_io::save_png(&path("heatmap"), heatmap(&color, &self.field.relevancy(self.grid, &self.found.ranked)))?;
             report.heatmap = Some(path("heatmap"));
         }
-        Ok(())
+        Ok(lit)
     }
 }

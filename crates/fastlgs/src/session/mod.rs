@@ -4,6 +4,7 @@ pub mod answer;
 pub mod ask;
 pub mod pictures;
 pub mod selection;
+pub mod sheet;
 mod texts;
 mod views;
 

@@ -1,0 +1,121 @@
+//! A contact sheet: pictures in rows, each over its words.
+
+use super::Session;
+use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
+use fastlgs_core::{Camera, image_io, turbo};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::Field;
+use fastlgs_raster::Frame;
+use image::imageops::{FilterType, overlay, resize};
+use image::{Rgb, RgbImage};
+
+/// A picture and what is said of it.
+pub struct Tile {
+    /// The picture, of any size.
+    pub picture: RgbImage,
+    /// What it is.
+    pub title: String,
+    /// What there is to know; may be empty.
+    pub note: String,
+}
+
+/// What a view shows: its photo, where there is one, the render, and the objects.
+pub fn of_view(session: &Session, grid: &Grid, camera: &Camera, frame: &Frame, field: &Field) -> Vec<Tile> {
+    let tile = |picture: RgbImage, title: &str| Tile { picture, title: title.to_owned(), note: camera.name.clone() };
+    let owners = field.owners(grid);
+    let objects = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(owners.at(x, y))));
+    let render = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
+    let photo = session.folder.photo(&camera.name).ok().map(|photo| tile(photo, "photo"));
+    photo.into_iter().chain([tile(render, "render"), tile(objects, "objects")]).collect()
+}
+
+/// Longer side of a picture on the sheet.
+const SIDE: u32 = 320;
+/// Room around a picture.
+const GAP: u32 = 10;
+/// Height of the letters of a title, and of a note.
+const LETTERS: [f32; 2] = [19.0, 15.0];
+/// Room for the words under a picture.
+const WORDS: u32 = 48;
+const PAPER: Rgb<u8> = Rgb([255; 3]);
+const INK: [Rgb<u8>; 2] = [Rgb([20; 3]), Rgb([90; 3])];
+
+/// Puts tiles into rows of `columns`.
+pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
+    let columns = columns.clamp(1, tiles.len().max(1)) as u32;
+    let scaled: Vec<RgbImage> = tiles.iter().map(|tile| fitted(&tile.picture)).collect();
+    let width = scaled.iter().map(RgbImage::width).max().unwrap_or(SIDE) + GAP;
+    let height = scaled.iter().map(RgbImage::height).max().unwrap_or(0) + WORDS + GAP;
+    let rows = (tiles.len() as u32).div_ceil(columns);
+    let mut page = RgbImage::from_pixel(columns * width + GAP, rows * height + GAP, PAPER);
+    for (place, (tile, picture)) in (0..).zip(tiles.iter().zip(&scaled)) {
+        let (left, top) = (GAP + place % columns * width, GAP + place / columns * height);
+        overlay(&mut page, picture, i64::from(left), i64::from(top));
+        let base = (top + picture.height()) as f32;
+        write(&mut page, &tile.title, [left as f32, base + LETTERS[0] + 2.0], width - GAP, LETTERS[0], INK[0]);
+        write(&mut page, &tile.note, [left as f32, base + LETTERS[0] + LETTERS[1] + 5.0], width - GAP, LETTERS[1], INK[1]);
+    }
+    page
+}
+
+/// A picture whose longer side is [`SIDE`].
+fn fitted(picture: &RgbImage) -> RgbImage {
+    let scale = SIDE as f32 / picture.width().max(picture.height()).max(1) as f32;
+    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
+    resize(picture, side(picture.width()), side(picture.height()), FilterType::Triangle)
+}
+
+/// Writes a line whose letters stand on `base`; what does not fit is cut off.
+fn write(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32, ink: Rgb<u8>) {
+    let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT).expect("the font is part of the program");
+    let font = font.as_scaled(PxScale::from(size));
+    let end = base[0] + room as f32;
+    let mut pen = base[0];
+    for letter in words.chars() {
+        let glyph = font.scaled_glyph(letter);
+        let (id, advance) = (glyph.id, font.h_advance(glyph.id));
+        if pen + advance > end {
+            break;
+        }
+        let glyph = id.with_scale_and_position(font.scale(), point(pen, base[1]));
+        if let Some(outline) = font.outline_glyph(glyph) {
+            let corner = outline.px_bounds().min;
+            outline.draw(|x, y, cover| {
+                let (x, y) = (corner.x as i64 + i64::from(x), corner.y as i64 + i64::from(y));
+                let inside = x >= 0 && y >= 0 && x < i64::from(page.width()) && y < i64::from(page.height());
+                if inside {
+                    let pixel = page.get_pixel_mut(x as u32, y as u32);
+                    *pixel = Rgb([0, 1, 2].map(|k| (f32::from(pixel[k]) * (1.0 - cover) + f32::from(ink[k]) * cover) as u8));
+                }
+            });
+        }
+        pen += advance;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_stand_in_rows_over_their_words() {
+        let tile = |color: [u8; 3], title: &str| Tile {
+            picture: RgbImage::from_pixel(64, 32, Rgb(color)),
+            title: title.to_owned(),
+            note: "0.98, 120 pixels, and more than there is room for on one line of a sheet".to_owned(),
+        };
+        let page = sheet(&[tile([255, 0, 0], "photo"), tile([0, 255, 0], ""), tile([0, 0, 255], "Füchse")], 2);
+        assert_eq!(page.dimensions(), (2 * (SIDE + GAP) + GAP, 2 * (SIDE / 2 + WORDS + GAP) + GAP));
+        let [second_column, second_row] = [2 * GAP + SIDE, 2 * GAP + SIDE / 2 + WORDS].map(|v| v + 5);
+        assert_eq!(page.get_pixel(GAP + 5, GAP + 5), &Rgb([255, 0, 0]));
+        assert_eq!(page.get_pixel(second_column, GAP + 5), &Rgb([0, 255, 0]));
+        assert_eq!(page.get_pixel(GAP + 5, second_row), &Rgb([0, 0, 255]));
+        // Words are dark on white, under their picture and no further to the right.
+        let dark = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
+            x.flat_map(|x| y.clone().map(move |y| (x, y))).filter(|&(x, y)| page.get_pixel(x, y)[0] < 128).count()
+        };
+        let under = GAP + SIDE / 2..GAP + SIDE / 2 + 22;
+        assert!(dark(GAP..GAP + SIDE, under.clone()) > 20);
+        assert_eq!((dark(GAP + SIDE..2 * GAP + SIDE, 0..page.height()), dark(second_column..page.width(), under)), (0, 0));
+    }
+}
