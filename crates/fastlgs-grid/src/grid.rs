@@ -90,6 +90,18 @@ impl Grid {
         std::iter::successors(Some(id).filter(known), up).take(self.objects.len())
     }
 
+    /// Sums over each object and all that lies in it. What contains an object has a lower number.
+    pub fn with_parts(&self, values: &[f32]) -> Vec<f32> {
+        let mut sums = values.to_vec();
+        for k in (0..sums.len()).rev() {
+            // A damaged file might go in circles.
+            if let Some(above) = usize::from(self.objects[k].parent).checked_sub(1).filter(|above| *above < k) {
+                sums[above] += sums[k];
+            }
+        }
+        sums
+    }
+
     /// For each id 0..=K whether the object belongs to one of `targets`: is one, or lies inside one.
     pub fn members(&self, targets: &[u16]) -> Vec<bool> {
         let inside = |id: u16| self.chain(id).any(|above| targets.contains(&above));

@@ -65,15 +65,13 @@ pub struct Library {
     whole: Mutex<(File, u64)>,
 }
 
-/// The best object of a scene.
+/// A scene, by the object that is most like what is asked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Found {
     /// Index into [`Library::scenes`].
     pub scene: usize,
-    /// The object and its relevancy.
+    /// The object and its score.
     pub hit: Hit,
-    /// How well masks bear it out.
-    pub support: f32,
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f32 {
@@ -222,8 +220,8 @@ impl Library {
         self.rows.is_empty()
     }
 
-    /// The likeliest object of each scene that may hold what is asked for, likeliest first; at most `scenes` of them. Scores are what
-    /// [`query::best_score`] says of the scene, up to the rounding of embeddings.
+    /// Of each scene that may hold what is asked for the object that is most like it by itself, likeliest scene first; at most `scenes` of them.
+    /// What a scene then answers, and how sure that is, [`query::rank`] tells.
     ///
     /// # Errors
     /// A query of another encoder; the system's refusal to read the file.
@@ -234,17 +232,15 @@ impl Library {
                 format!("the library's embeddings have {} numbers, the text's {length}: they are of different encoders", self.dimension);
             return Err(Error::Core(CoreError::Invalid(reason)));
         }
-        // By scene: its likeliest object, whose score is that of the one most like the text.
         let mut best: BTreeMap<usize, (f32, Found)> = BTreeMap::new();
         for (row, object) in self.in_full(&self.nearest(&query.meant))? {
-            let query::Evidence { rank, score, .. } = query::evidence(&object, query);
-            let own = (rank, Found { scene: row.scene as usize, hit: Hit { id: row.id, score }, support: row.support });
+            let Some(margin) = query::margin(&object, query) else { continue };
+            let hit = Hit { id: row.id, score: query.calibration.confidence(query.calibration.temperature * margin) };
+            let own = (margin, Found { scene: row.scene as usize, hit });
             let of_scene = best.entry(own.1.scene).or_insert(own);
-            let score = of_scene.1.hit.score.max(score);
-            if rank > of_scene.0 {
+            if margin > of_scene.0 {
                 *of_scene = own;
             }
-            of_scene.1.hit.score = score;
         }
         let mut found: Vec<(f32, Found)> = best.into_values().collect();
         found.sort_by(|(a, x), (b, y)| b.total_cmp(a).then(x.scene.cmp(&y.scene)));
@@ -361,9 +357,10 @@ mod tests {
             let query = TextQuery::new(vec![concept.clone()], Calibration::OFFLINE);
             let mut exact: Vec<(f32, f32, usize, Hit)> = Vec::new();
             for (k, (_, grid)) in scenes.iter().enumerate() {
-                let ranked = query::rank(grid, &query);
-                let rank = query::evidence(&grid.objects[usize::from(ranked[0].id) - 1], &query).rank;
-                exact.push((rank, query::best_score(&ranked), k, ranked[0]));
+                let own = |object: &Object| (query::margin(object, &query).unwrap(), object.id);
+                let (margin, id) = grid.objects.iter().map(own).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
+                let score = Calibration::OFFLINE.confidence(Calibration::OFFLINE.temperature * margin);
+                exact.push((margin, score, k, Hit { id, score }));
             }
             exact.sort_by(|a, b| b.0.total_cmp(&a.0));
             for (found, (_, score, scene, hit)) in library.search(&query, 5).unwrap().iter().zip(&exact) {

@@ -42,7 +42,7 @@ pub struct Hit {
 /// What a text says for an object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// What objects are ranked by: log-odds that this one is meant, up to a constant.
+    /// What objects are ranked by: the higher, the likelier this one is meant.
     pub rank: f32,
     /// Share of absent names that no object of a scene is as like as this one is like the text.
     pub score: f32,
@@ -50,68 +50,125 @@ pub struct Evidence {
     pub error: f32,
 }
 
-/// Least size of an object, as a share of a photo.
-const LEAST_AREA: f32 = 1e-4;
+/// Least share of the scene that an object counts for, and least excess of likeness.
+const LEAST: f32 = 1e-6;
 
-/// Share of an object's area, over its views, in which it must be like the text to be there.
-const BEST_SHARE: f32 = 0.5;
-
-/// What a text says for an object.
+/// What a text says for each object.
 ///
-/// Which object is meant: the mean cosine over its views, weighted by area, times what a unit of cosine is worth with the encoder, and the logarithm of
-/// its size. A thing is as likely to be meant as a pixel is to show it: there are ever more parts the smaller they are, of which some look like
-/// anything. Whether the text names anything at all: how much more its best views, with half of its area, are like the text than like
-/// anything, since an object is seldom recognised from everywhere; a single view that fools the encoder counts little.
+/// Of many objects whose cosines are noisy some are like any text. A place belongs to an object, to parts of it and to what it is a part of, and
+/// all of them were embedded: the mean over them is less noisy ([`places`]). An object is as like the text as its places are; which one is meant
+/// is told by how much it stands out by that from half of the scene's surface, and by how much surface there is: a small fragment stands out by
+/// chance. How much size counts, and how far an object's own embeddings are believed, follows from how well the encoder tells things apart.
 ///
-/// The very object that was shown as an example is meant beyond doubt.
-pub fn evidence(object: &Object, query: &TextQuery) -> Evidence {
-    let total: f32 = object.areas.iter().sum();
-    let views = || object.embeddings.iter().zip(object.areas.iter().map(|area| area / total));
-    let cosine = mean_cosine(object, query);
-    let negative: f32 = views().map(|(e, weight)| weight * query.negative(e)).sum();
-    if object.embeddings.is_empty() || total <= 0.0 || negative >= cosine {
-        return Evidence { rank: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
-    }
-    if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
-        return Evidence { rank: f32::INFINITY, score: 1.0, error: 0.0 };
-    }
-    let temperature = query.calibration.temperature;
-    let variance: f32 = views().map(|(e, weight)| (weight * (query.cosine(e) - cosine)).powi(2)).sum();
-    let size = object.areas.iter().fold(LEAST_AREA, |most, area| area.max(most)).ln();
-    let score = query.calibration.confidence(temperature * margin(object, query));
-    Evidence { rank: temperature * cosine + size, score, error: temperature * variance.sqrt() }
-}
-
-/// Mean cosine over an object's views, weighted by area.
-pub fn mean_cosine(object: &Object, query: &TextQuery) -> f32 {
-    let total: f32 = object.areas.iter().sum();
-    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total * query.cosine(e)).sum()
-}
-
-/// By how much the views that are most like what is meant, with half of the object's area, are more like it than like anything.
-pub fn margin(object: &Object, query: &TextQuery) -> f32 {
-    let margin_of = |(e, area): (&Vec<f32>, &f32)| (query.cosine(e) - query.canonical(e), *area);
-    let mut margins: Vec<(f32, f32)> = object.embeddings.iter().zip(&object.areas).map(margin_of).collect();
-    margins.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let wanted = BEST_SHARE * object.areas.iter().sum::<f32>();
-    let (mut sum, mut share) = (0.0, 0.0);
-    for (own, area) in margins {
-        sum += own * area;
-        share += area;
-        if share >= wanted {
-            break;
+/// Whether the text names anything at all is told by the place that exceeds "anything" most.
+///
+/// What no view shows or what is nearer to a negative is not meant; the very object that was shown as an example is meant beyond doubt.
+pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
+    let Surface { shares, bare, total } = &Surface::of(grid);
+    let calibration = &query.calibration;
+    let cosines: Vec<Option<f32>> = grid.objects.iter().map(|object| mean_cosine(object, query)).collect();
+    let (around, margins) = (pooled(grid, 0.0, |k| cosines[k]), places(grid, query));
+    let sums = grid.with_parts(&around.iter().zip(bare).map(|(place, share)| place * share).collect::<Vec<_>>());
+    let anything = |object: &Object| mean_over_views(object, |e| query.canonical(e));
+    let anything: f32 = grid.objects.iter().zip(shares).map(|(object, share)| share * anything(object)).sum();
+    // Where most of the scene is what is meant, it stands out from "anything" at least.
+    let usual = median(&around, bare, *total).min(anything / shares.iter().sum::<f32>().max(LEAST));
+    let of_object = |(k, object): (usize, &Object)| {
+        let cosine = cosines[k].filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e)));
+        let Some(cosine) = cosine else { return Evidence { rank: f32::NEG_INFINITY, score: 0.0, error: 0.0 } };
+        if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
+            return Evidence { rank: f32::INFINITY, score: 1.0, error: 0.0 };
         }
+        let all_over = if shares[k] > 0.0 { sums[k] / shares[k] } else { around[k] };
+        let likeness = calibration.trust() * cosine + (1.0 - calibration.trust()) * all_over;
+        let excess = (likeness - usual).max(LEAST);
+        let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
+        Evidence {
+            rank: excess.ln() + calibration.size_exponent() * (shares[k] / total).max(LEAST).ln(),
+            score: calibration.confidence(calibration.temperature * margins[k]),
+            error: variance.sqrt() / excess,
+        }
+    };
+    grid.objects.iter().enumerate().map(of_object).collect()
+}
+
+/// By how much each object's own places, which none of its parts shows, are more like what is meant than like anything.
+pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
+    pooled(grid, query.calibration.trust(), |k| margin(&grid.objects[k], query))
+}
+
+/// Of each object what is its own, as far as that is to be trusted, and else the mean of it and all that it lies in; least where nothing is known.
+fn pooled(grid: &Grid, trust: f32, own: impl Fn(usize) -> Option<f32>) -> Vec<f32> {
+    let of_object = |object: &Object| {
+        let (mut sum, mut count) = (0.0, 0.0f32);
+        grid.chain(object.id).filter_map(|above| own(usize::from(above) - 1)).for_each(|v| (sum, count) = (sum + v, count + 1.0));
+        let around = if count > 0.0 { sum / count } else { -1.0 };
+        trust * own(usize::from(object.id) - 1).unwrap_or(around) + (1.0 - trust) * around
+    };
+    grid.objects.iter().map(of_object).collect()
+}
+
+/// The value that half of the weight lies below.
+fn median(values: &[f32], weights: &[f32], total: f32) -> f32 {
+    let mut order: Vec<usize> = (0..values.len()).collect();
+    order.sort_by(|a, b| values[*a].total_cmp(&values[*b]));
+    let mut below = 0.0;
+    let half = order.into_iter().find(|k| {
+        below += weights[*k];
+        below >= 0.5 * total
+    });
+    half.map_or(0.0, |k| values[k])
+}
+
+/// How much of the scene's surface each object shows in all its views together.
+struct Surface {
+    /// With all its parts.
+    shares: Vec<f32>,
+    /// Without them.
+    bare: Vec<f32>,
+    /// Of all objects.
+    total: f32,
+}
+
+impl Surface {
+    fn of(grid: &Grid) -> Self {
+        let seen = |object: &Object| object.areas.iter().sum::<f32>() / object.areas.len().max(1) as f32 * object.views as f32;
+        let mut bare: Vec<f32> = grid.objects.iter().map(seen).collect();
+        for object in &grid.objects {
+            if let Some(above) = bare.get_mut(usize::from(object.parent).wrapping_sub(1)) {
+                *above -= seen(object);
+            }
+        }
+        bare.iter_mut().for_each(|share| *share = share.max(0.0));
+        Self { shares: grid.with_parts(&bare), total: bare.iter().sum::<f32>().max(LEAST), bare }
     }
-    sum / share
+}
+
+/// The mean over an object's views, weighted by area; 0 where there are none.
+fn mean_over_views(object: &Object, of: impl Fn(&[f32]) -> f32) -> f32 {
+    let total: f32 = object.areas.iter().sum();
+    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total.max(LEAST) * of(e)).sum()
+}
+
+/// Whether any view tells what an object looks like.
+fn is_seen(object: &Object) -> bool {
+    !object.embeddings.is_empty() && object.areas.iter().sum::<f32>() > 0.0
+}
+
+/// Mean cosine over an object's views, weighted by area; nothing where no view shows it.
+pub fn mean_cosine(object: &Object, query: &TextQuery) -> Option<f32> {
+    is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e)))
+}
+
+/// By how much an object is more like what is meant than like anything: the mean over its views, weighted by area. Nothing where no view shows it.
+pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
+    is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
 }
 
 /// All objects, the likeliest first.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
-    let mut hits: Vec<(f32, Hit)> = Vec::with_capacity(grid.objects.len());
-    for object in &grid.objects {
-        let Evidence { rank, score, .. } = evidence(object, query);
-        hits.push((rank, Hit { id: object.id, score }));
-    }
+    let hit = |(object, Evidence { rank, score, .. }): (&Object, Evidence)| (rank, Hit { id: object.id, score });
+    let mut hits: Vec<(f32, Hit)> = grid.objects.iter().zip(evidence(grid, query)).map(hit).collect();
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
 }
@@ -134,7 +191,8 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 /// The target objects; empty means "not found". The likeliest one, and those elsewhere that are found and cannot be told from it: by no more than
 /// the errors of both.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
-    let of = |hit: &Hit| evidence(&grid.objects[usize::from(hit.id) - 1], query);
+    let evidence = evidence(grid, query);
+    let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
     let Some(best) = ranked.first().filter(|_| best_score(ranked) >= config.min_score()) else { return Vec::new() };
     let first = of(best);
     let mut chosen = vec![*best];
@@ -247,6 +305,7 @@ fn features(values: &[f32]) -> impl Iterator<Item = Vec3> {
 mod tests {
     use super::*;
     use crate::calibration::Calibration;
+    use fastlgs_core::rng::Rng;
     use fastlgs_core::shares::pack;
 
     /// Object 2 lies in object 1; 3 is elsewhere.
@@ -290,17 +349,71 @@ mod tests {
     #[test]
     fn of_things_that_are_as_like_the_text_the_larger_is_meant() {
         let mut grid = grid();
+        grid.objects[1].embeddings = vec![vec![0.999, 0.045]];
         grid.objects[2].embeddings = vec![vec![0.999, 0.045]];
         assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [1]);
         grid.objects[2].areas = vec![0.3];
         assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [3]);
     }
 
+    /// An object of which `cosine` is known, and how like a canonical phrase it is.
+    fn known(id: u16, parent: u16, area: f32, cosines: Vec<[f32; 2]>) -> Object {
+        let (code, areas, views) = (Vec3::ZERO, vec![area; cosines.len()], cosines.len());
+        Object { id, parent, support: 1.0, code, embeddings: cosines.into_iter().map(|c| c.to_vec()).collect(), areas, views }
+    }
+
+    #[test]
+    fn what_is_like_the_text_all_over_is_meant_and_not_a_fragment_that_looks_so() {
+        let thing = |id, parent, area, cosine: f32| known(id, parent, area, vec![[cosine, 0.0]; 3]);
+        let parts = (2..6).map(|id| thing(id, 1, 0.04, 0.62));
+        let wall = [thing(6, 0, 0.6, 0.35), thing(7, 6, 0.01, 0.8)];
+        let grid = Grid { objects: std::iter::once(thing(1, 0, 0.2, 0.6)).chain(parts).chain(wall).collect() };
+        assert_eq!(rank(&grid, &query([1.0, 0.0]))[0].id, 1);
+        // An encoder that tells things apart is believed.
+        let sure = Calibration { separation: 6.0, ..Calibration::OFFLINE };
+        assert_eq!(rank(&grid, &TextQuery { calibration: sure, ..query([1.0, 0.0]) })[0].id, 7);
+    }
+
+    #[test]
+    fn with_clips_statistics_the_text_decides() {
+        let rng = &mut Rng::new(5, "clip");
+        let mut scene = || -> Grid {
+            let mut objects: Vec<Object> = Vec::new();
+            for id in 1..=200u16 {
+                let parent = if rng.uniform() < 0.2 { 0 } else { (rng.uniform() * f32::from(id - 1)) as u16 };
+                let around = objects.get(usize::from(parent).wrapping_sub(1)).map_or(0.4, |o| o.areas[0]);
+                // Right for text 1 only, which means any of them.
+                let right = if id == 1 { 0.08 } else { 0.0 };
+                let own = 0.20 + right + 0.02 * rng.normal();
+                let cosines = (0..5).map(|_| [own, 0.21 + 0.015 * rng.normal()]).collect();
+                objects.push(known(id, parent, around * rng.range(0.05, 0.6), cosines));
+            }
+            // The right one is any of them.
+            let place = 1 + (rng.uniform() * 199.0) as usize;
+            let (first, other) = (objects[0].embeddings.clone(), objects[place].embeddings.clone());
+            (objects[0].embeddings, objects[place].embeddings) = (other, first);
+            objects[place].support = 0.5;
+            Grid { objects }
+        };
+        let query = TextQuery { canonical: vec![vec![0.0, 1.0]], ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
+        let (mut ours, mut cosines) = (0, 0);
+        const TEXTS: i32 = 1000;
+        for _ in 0..TEXTS {
+            let grid = scene();
+            let own = |o: &&Object| mean_cosine(o, &query).unwrap();
+            let best = grid.objects.iter().max_by(|a, b| own(a).total_cmp(&own(b))).unwrap();
+            cosines += i32::from(best.support == 0.5);
+            ours += i32::from(grid.objects[usize::from(rank(&grid, &query)[0].id) - 1].support == 0.5);
+        }
+        println!("first by cosine {cosines}, by rank {ours} of {TEXTS}");
+        assert!(ours + TEXTS / 50 >= cosines, "first by cosine {cosines}, by rank {ours} of {TEXTS}");
+    }
+
     #[test]
     fn what_is_nearer_to_a_negative_is_not_meant() {
         let mut query = query([0.95, 0.31]);
         let find = |query: &TextQuery| ids(&select(&grid(), &rank(&grid(), query), query, &QueryConfig::default()))[0];
-        grid().objects.iter().for_each(|o| assert!(evidence(o, &query).rank.is_finite()));
+        assert!(evidence(&grid(), &query).iter().all(|e| e.rank.is_finite()));
         query.negatives.push(vec![1.0, 0.0]);
         assert_eq!(find(&query), 2, "object 1 is nearer to the negative");
     }
@@ -310,12 +423,12 @@ mod tests {
         let seen = |recognised: usize| {
             let view = |k: usize| if k < recognised { vec![1.0, 0.0] } else { vec![0.0, 1.0] };
             let object = Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() };
-            evidence(&object, &query([1.0, 0.0])).score
+            rank(&Grid { objects: vec![object] }, &query([1.0, 0.0]))[0].score
         };
         assert!(seen(1) < 0.05, "{}", seen(1));
         assert!(seen(4) > 0.9, "recognised from most sides: {}", seen(4));
         let unseen = Object { embeddings: Vec::new(), areas: Vec::new(), ..grid().objects[0].clone() };
-        assert_eq!(evidence(&unseen, &query([1.0, 0.0])).score, 0.0);
+        assert_eq!(rank(&Grid { objects: vec![unseen] }, &query([1.0, 0.0]))[0].score, 0.0);
     }
 
     #[test]
@@ -332,6 +445,9 @@ mod tests {
     #[test]
     fn parts_are_looked_for_inside_their_object() {
         let targets = [Hit { id: 1, score: 0.9 }];
+        // An encoder that tells a part by itself.
+        let calibration = Calibration { separation: 4.0, ..Calibration::OFFLINE };
+        let query = |text| TextQuery { calibration, ..query(text) };
         let ask = |text| part(&grid(), &targets, &query(text), &QueryConfig::default()).map(|found| ids(&found.targets));
         assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "3 is nearer but lies elsewhere");
         assert_eq!(ask([0.0, -1.0]), None, "no such part");

@@ -13,14 +13,12 @@ use image::RgbImage;
 use rayon::prelude::*;
 
 /// Changes when the same mask gets another embedding: those of different versions cannot be compared.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 
 /// Classes that take part in an embedding.
 const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2.
 const SIZE: usize = 260;
-/// Weight of what surrounds a mask, for masks that fill their box.
-const CONTEXT: f32 = 0.25;
 /// Dimensions of the dense embedding.
 pub const DENSE: usize = 32;
 /// Masks in one inference.
@@ -62,11 +60,10 @@ impl Conse {
         Ok(Self { classifier, class_embeddings, projection })
     }
 
-    /// Class probabilities of each crop.
-    fn classify(&self, crops: &[crops::Crop]) -> Result<Vec<Vec<f32>>> {
+    /// Class logits of each crop.
+    fn logits(&self, crops: &[crops::Crop]) -> Result<Array> {
         let data = crops.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
-        let logits = self.classifier.run(vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0);
-        Ok(logits.values.chunks_exact(logits.shape[1]).map(softmax).collect())
+        Ok(self.classifier.run(vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0))
     }
 
     /// The ConSE embedding of class probabilities.
@@ -115,21 +112,24 @@ impl Conse {
         DenseMap { channels: DENSE, values, ..*map }
     }
 
-    /// Class probabilities of each label 1..=max; empty for labels that do not occur. What surrounds a mask helps to name
-    /// it, unless the mask is a frame or a twig around which other things fill the box.
+    /// Class probabilities of each label 1..=max; empty for labels that do not occur. A mask is looked at twice, by itself and with what
+    /// surrounds it; the mean of both logits is what both views of it allow for.
     fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let photo = &exposure::lifted(photo);
-        let (boxes, areas) = (masks.boxes(), masks.areas());
+        let boxes = masks.boxes();
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
         let views = [Surround::Neutral, Surround::Context];
         let cut = |&(label, bounds): &(u16, [u32; 4])| views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s));
-        let of_batch = |batch: &[(u16, [u32; 4])]| self.classify(&batch.iter().flat_map(cut).collect::<Vec<_>>());
+        let of_batch = |batch: &[(u16, [u32; 4])]| -> Result<Vec<Vec<f32>>> {
+            let logits = self.logits(&batch.iter().flat_map(cut).collect::<Vec<_>>())?;
+            let classes = logits.shape[1];
+            let mean = |pair: &[f32]| -> Vec<f32> { (0..classes).map(|k| 0.5 * (pair[k] + pair[classes + k])).collect() };
+            Ok(logits.values.chunks_exact(views.len() * classes).map(|pair| softmax(&mean(pair))).collect())
+        };
         let probabilities = present.par_chunks(BATCH).map(of_batch).collect::<Result<Vec<_>>>()?.concat();
-        let box_area = |[x0, y0, x1, y1]: [u32; 4]| ((x1 - x0) * (y1 - y0)).max(1) as f32;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
-        for ((label, bounds), pair) in present.iter().zip(probabilities.chunks_exact(views.len())) {
-            let context = CONTEXT * areas[usize::from(*label)] as f32 / box_area(*bounds);
-            out[usize::from(*label) - 1] = pair[0].iter().zip(&pair[1]).map(|(a, b)| (1.0 - context) * a + context * b).collect();
+        for ((label, _), own) in present.iter().zip(probabilities) {
+            out[usize::from(*label) - 1] = own;
         }
         Ok(out)
     }

@@ -134,11 +134,11 @@ impl Known {
         let nested = move |id: u16| self.grid.chain(id).any(|a| a == of) || self.grid.chain(of).any(|a| a == id);
         self.objects().map(|o| o.0).filter(move |o| !nested(o.id))
     }
+}
 
-    /// By how much the best thing exceeds "anything".
-    fn best(&self, query: &TextQuery) -> Option<f32> {
-        self.objects().map(|(object, _)| query::margin(object, query)).max_by(f32::total_cmp)
-    }
+/// By how much the likest place of a scene exceeds "anything".
+fn best(grid: &Grid, query: &TextQuery) -> Option<f32> {
+    query::places(grid, query).into_iter().max_by(f32::total_cmp)
 }
 
 /// Samples of a trained scene whose labels say what is in it: what `bench names` measures from other scenes.
@@ -157,14 +157,13 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
             let Some(own) = seen().find(|o| o.id == id && iou >= SAME) else { continue };
             let query = scene.text_query(&label.category)?;
             let nested = |other: u16| grid.chain(other).any(|a| a == id) || grid.chain(id).any(|a| a == other);
-            samples.right.push(query::mean_cosine(own, &query));
-            samples.wrong.extend(seen().filter(|o| !nested(o.id)).map(|other| query::mean_cosine(other, &query)));
+            samples.right.extend(query::mean_cosine(own, &query));
+            samples.wrong.extend(seen().filter(|o| !nested(o.id)).filter_map(|other| query::mean_cosine(other, &query)));
         }
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
     for name in ABSENT.into_iter().filter(|name| !there(name)) {
-        let query = scene.text_query(name)?;
-        samples.absent.extend(seen().map(|object| query::margin(object, &query)).max_by(f32::total_cmp));
+        samples.absent.extend(best(&grid, &scene.text_query(name)?));
     }
     Ok(samples)
 }
@@ -178,27 +177,40 @@ fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<T
     for scene in known {
         for (object, name) in scene.objects() {
             let query = query(name)?;
-            samples.right.push(query::mean_cosine(object, &query));
-            samples.wrong.extend(scene.others(object.id).map(|other| query::mean_cosine(other, &query)));
+            samples.right.extend(query::mean_cosine(object, &query));
+            samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
         }
-        for name in absent {
-            samples.absent.extend(scene.best(&query(name)?));
-        }
+    }
+    // How far an object is believed by itself follows from how well things are told apart.
+    let separation = samples.separation();
+    for name in absent {
+        let mut query = query(name)?;
+        query.calibration.separation = separation;
+        samples.absent.extend(known.iter().filter_map(|scene| best(&scene.grid, &query)));
     }
     Ok(samples)
 }
 
 /// Samples of things with one view of their own, with one of others, and of scenes with views of things that they lack.
-fn by_examples(known: &[Known]) -> Samples {
+fn by_examples<'a>(known: &'a [Known]) -> Samples {
     let mut samples = Samples::default();
-    for (place, scene) in known.iter().enumerate() {
-        for (object, name) in scene.objects().filter(|(object, _)| object.embeddings.len() > 1) {
-            let query = TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
+    let shown = |object: &Object| TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
+    let several = |scene: &'a Known| scene.objects().filter(|(object, _)| object.embeddings.len() > 1);
+    for scene in known {
+        for (object, _) in several(scene) {
+            let query = shown(object);
             let rest = Object { embeddings: object.embeddings[1..].to_vec(), areas: object.areas[1..].to_vec(), ..object.clone() };
-            samples.right.push(query::mean_cosine(&rest, &query));
-            samples.wrong.extend(scene.others(object.id).map(|other| query::mean_cosine(other, &query)));
+            samples.right.extend(query::mean_cosine(&rest, &query));
+            samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
+        }
+    }
+    let separation = samples.separation();
+    for (place, scene) in known.iter().enumerate() {
+        for (object, name) in several(scene) {
+            let mut query = shown(object);
+            query.calibration.separation = separation;
             let elsewhere = known.iter().enumerate().filter(|(k, other)| *k != place && other.things.iter().all(|t| t.name != name));
-            samples.absent.extend(elsewhere.filter_map(|(_, other)| other.best(&query)));
+            samples.absent.extend(elsewhere.filter_map(|(_, other)| best(&other.grid, &query)));
         }
     }
     samples

@@ -7,6 +7,7 @@ use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
 use fastlgs_grid::library::{self, Entry, Found, Library};
+use fastlgs_grid::query;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::{Instant, UNIX_EPOCH};
@@ -31,6 +32,7 @@ pub struct Config {
 
 /// An opened library with the encoder of its texts.
 pub struct Search {
+    root: PathBuf,
     config: Config,
     texts: Texts,
     index: Library,
@@ -115,7 +117,7 @@ impl Search {
         let index = up_to_date(root, &scenes, run)?;
         let index_ms = started.elapsed().as_secs_f64() * 1e3;
         let texts = Texts::load(&first_folder, manifest, config.clip_text.as_deref())?;
-        let search = Self { config, texts, index, skipped, index_ms };
+        let search = Self { root: root.to_owned(), config, texts, index, skipped, index_ms };
         search.ask("warm up")?;
         Ok(search)
     }
@@ -135,14 +137,16 @@ impl Search {
         let best = self.index.search(&query, self.config.scenes)?;
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
         let least = 1.0 - self.config.false_alarms;
-        let row = |f: &Found| Row {
-            scene: self.index.scenes[f.scene].path.clone(),
-            object: f.hit.id,
-            score: f.hit.score,
-            support: f.support,
-            found: f.hit.score >= least,
+        // As the scene itself would answer.
+        let row = |f: &Found| -> Result<Row> {
+            let scene = self.index.scenes[f.scene].path.clone();
+            let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
+            let ranked = query::rank(&grid, &query);
+            let (object, score) = (ranked.first().map_or(f.hit.id, |hit| hit.id), query::best_score(&ranked));
+            Ok(Row { scene, object, score, support: grid.objects[usize::from(object) - 1].support, found: score >= least })
         };
-        let rows: Vec<Row> = best.iter().map(row).collect();
+        let mut rows = best.iter().map(row).collect::<Result<Vec<Row>>>()?;
+        rows.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.scene.cmp(&b.scene)));
         Ok(Report {
             text: text.to_owned(),
             found: rows.iter().any(|r| r.found),

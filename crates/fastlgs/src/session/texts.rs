@@ -7,6 +7,7 @@ use crate::{Result, eyes};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
+use fastlgs_grid::calibration::Calibration;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
@@ -63,8 +64,10 @@ impl Texts {
             }
             return Ok(TextQuery::of_examples(meant, self.calibrations.pictures));
         }
-        let calibration = self.calibrations.texts;
-        let anything = calibration.anything + self.encoder.advantage(text);
+        let advantage = self.encoder.advantage(text);
+        // Only the offline encoder gives one, for what it measures by itself.
+        let calibration = if advantage > 0.0 { Calibration::OFFLINE_COLORED } else { self.calibrations.texts };
+        let anything = calibration.anything + advantage;
         Ok(TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(self.encoder.embed(&[text])?, calibration) })
     }
 }
