@@ -97,6 +97,7 @@ fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>) -> Option<Calibration
     for scene in scenes {
         all.right.extend(&scene.right);
         all.wrong.extend(&scene.wrong);
+        all.margins.extend(&scene.margins);
         all.absent.extend(&scene.absent);
     }
     Calibration::measured(&all, Calibration::OFFLINE.anything)

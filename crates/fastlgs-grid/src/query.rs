@@ -67,7 +67,8 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let Surface { shares, bare, total } = &Surface::of(grid);
     let calibration = &query.calibration;
     let cosines: Vec<Option<f32>> = grid.objects.iter().map(|object| mean_cosine(object, query)).collect();
-    let (around, margins) = (pooled(grid, 0.0, |k| cosines[k]), places(grid, query));
+    let around = |object: &Object| mean_of(grid.chain(object.id).filter_map(|above| cosines[usize::from(above) - 1])).map_or(-1.0, |m| m.0);
+    let (around, margins): (Vec<f32>, _) = (grid.objects.iter().map(around).collect(), places(grid, query));
     let sums = grid.with_parts(&around.iter().zip(bare).map(|(place, share)| place * share).collect::<Vec<_>>());
     let anything = |object: &Object| mean_over_views(object, |e| query.canonical(e));
     let anything: f32 = grid.objects.iter().zip(shares).map(|(object, share)| share * anything(object)).sum();
@@ -92,20 +93,25 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     grid.objects.iter().enumerate().map(of_object).collect()
 }
 
-/// By how much each object's own places, which none of its parts shows, are more like what is meant than like anything.
+/// By how much each object's own places, which none of its parts shows, are more like what is meant than like anything: what the object's own
+/// embeddings say, as far as they are believed, and else the mean of it and all that it lies in. A mean of many varies less than one alone, so that
+/// it is stretched to vary as much: else things that lie in nothing would be found where those in deep trees are not.
 pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
-    pooled(grid, query.calibration.trust(), |k| margin(&grid.objects[k], query))
+    let calibration = &query.calibration;
+    let margins: Vec<Option<f32>> = grid.objects.iter().map(|object| margin(object, query)).collect();
+    let trust = calibration.trust();
+    let of_object = |(object, own): (&Object, &Option<f32>)| {
+        let Some((mean, count)) = mean_of(grid.chain(object.id).filter_map(|above| margins[usize::from(above) - 1])) else { return -1.0 };
+        let around = calibration.wrong + (mean - calibration.wrong) / calibration.spread_of_mean(count);
+        trust * own.unwrap_or(around) + (1.0 - trust) * around
+    };
+    grid.objects.iter().zip(&margins).map(of_object).collect()
 }
 
-/// Of each object what is its own, as far as that is to be trusted, and else the mean of it and all that it lies in; least where nothing is known.
-fn pooled(grid: &Grid, trust: f32, own: impl Fn(usize) -> Option<f32>) -> Vec<f32> {
-    let of_object = |object: &Object| {
-        let (mut sum, mut count) = (0.0, 0.0f32);
-        grid.chain(object.id).filter_map(|above| own(usize::from(above) - 1)).for_each(|v| (sum, count) = (sum + v, count + 1.0));
-        let around = if count > 0.0 { sum / count } else { -1.0 };
-        trust * own(usize::from(object.id) - 1).unwrap_or(around) + (1.0 - trust) * around
-    };
-    grid.objects.iter().map(of_object).collect()
+/// The mean of some values and their number; nothing where there are none.
+fn mean_of(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
+    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0));
+    (count > 0.0).then(|| (sum / count, count))
 }
 
 /// The value that half of the weight lies below.

@@ -163,7 +163,9 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
     for name in ABSENT.into_iter().filter(|name| !there(name)) {
-        samples.absent.extend(best(&grid, &scene.text_query(name)?));
+        let query = scene.text_query(name)?;
+        samples.margins.extend(seen().filter_map(|o| query::margin(o, &query)));
+        samples.absent.extend(best(&grid, &query));
     }
     Ok(samples)
 }
@@ -181,12 +183,12 @@ fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<T
             samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
         }
     }
-    // How far an object is believed by itself follows from how well things are told apart.
-    let separation = samples.separation();
-    for name in absent {
-        let mut query = query(name)?;
-        query.calibration.separation = separation;
-        samples.absent.extend(known.iter().filter_map(|scene| best(&scene.grid, &query)));
+    let mut queries = absent.iter().map(|name| query(name)).collect::<Result<Vec<_>>>()?;
+    let objects = || known.iter().flat_map(Known::objects).map(|o| o.0);
+    samples.margins = queries.iter().flat_map(|query| objects().filter_map(|o| query::margin(o, query))).collect();
+    for query in &mut queries {
+        query.calibration = query.calibration.so_far(&samples);
+        samples.absent.extend(known.iter().filter_map(|scene| best(&scene.grid, query)));
     }
     Ok(samples)
 }
@@ -204,14 +206,18 @@ fn by_examples<'a>(known: &'a [Known]) -> Samples {
             samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
         }
     }
-    let separation = samples.separation();
-    for (place, scene) in known.iter().enumerate() {
+    let mut elsewhere = Vec::new();
+    for scene in known {
         for (object, name) in several(scene) {
-            let mut query = shown(object);
-            query.calibration.separation = separation;
-            let elsewhere = known.iter().enumerate().filter(|(k, other)| *k != place && other.things.iter().all(|t| t.name != name));
-            samples.absent.extend(elsewhere.filter_map(|(_, other)| best(&other.grid, &query)));
+            let lack = |other: &&Known| other.things.iter().all(|t| t.name != name);
+            elsewhere.extend(known.iter().filter(lack).map(|other| (shown(object), other)));
         }
+    }
+    let of_pair = |(query, other): &(TextQuery, &Known)| other.objects().filter_map(|(o, _)| query::margin(o, query)).collect::<Vec<_>>();
+    samples.margins = elsewhere.iter().flat_map(of_pair).collect();
+    for (query, other) in &mut elsewhere {
+        query.calibration = query.calibration.so_far(&samples);
+        samples.absent.extend(best(&other.grid, query));
     }
     samples
 }
