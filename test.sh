@@ -16,7 +16,7 @@ lap() { printf 'test: %s took %d s\n' "$1" $((SECONDS - began)); began=$SECONDS;
 began=$SECONDS
 cargo fmt --all --check
 # shellcheck disable=SC2086
-cargo clippy --release --locked --all-targets $with --quiet -- -D warnings
+cargo clippy --release --locked --workspace --all-targets $with,fastlgs-py/load-ort,fastlgs-py/opencv --quiet -- -D warnings
 # Also what a build without OpenCV has: key points in pure Rust.
 cargo clippy --release --locked -p fastlgs-cli --quiet -- -D warnings
 lap "formatting and clippy"
@@ -26,6 +26,8 @@ lap "documentation"
 tests/wasm.sh
 if [ "${FASTLGS_TEST_ALL:-}" ]; then tests/packages.sh; fi
 lap "wasm and packages"
+tests/python.sh
+lap "Python"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
 # Counts of kills, damaged inputs and benches are part of the log, and so is what takes longest.
 # shellcheck disable=SC2086

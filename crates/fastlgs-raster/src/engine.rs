@@ -115,7 +115,7 @@ pub struct Losses {
 }
 
 /// Runs the passes.
-pub trait Engine {
+pub trait Engine: Send {
     /// The adapter, for reports.
     fn name(&self) -> String;
     /// Number of Gaussians.

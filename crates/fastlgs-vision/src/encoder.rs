@@ -16,7 +16,7 @@ pub trait Encoder: Sync {
 }
 
 /// Embeds texts.
-pub trait TextEncoder {
+pub trait TextEncoder: Send {
     /// One embedding a text, to be multiplied with those of masks.
     ///
     /// # Errors

@@ -26,7 +26,7 @@ pub struct Config {
 }
 
 /// Views in which an object is embedded: those that show most of it.
-const EMBEDDED_VIEWS: usize = 5;
+const EMBEDDED_VIEWS: usize = 3;
 
 /// Algorithm 1 of the paper over the masks that preprocessing left; writes the object maps.
 pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, run: &Run) -> Result<Grid> {

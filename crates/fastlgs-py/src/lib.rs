@@ -1,0 +1,103 @@
+//! `fastlgs._fastlgs`: the pipeline as a Python module. `python/fastlgs/__init__.pyi` says what there is; names, units and conventions are those of the
+//! libraries beneath.
+
+mod answer;
+mod camera;
+mod options;
+mod scene;
+mod stage;
+
+use pyo3::create_exception;
+use pyo3::exceptions::PyException;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+create_exception!(fastlgs, Error, PyException, "What went wrong, in one sentence that names the file and the mend.");
+
+/// An error of the pipeline as Python's.
+fn raised(error: impl Into<fastlgs::Error>) -> PyErr {
+    Error::new_err(fastlgs::one_sentence(&error.into()))
+}
+
+/// From photos to a scene that answers; what was made before from the same photos with the same options is kept.
+#[pyfunction]
+#[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, effort = None, **options))]
+fn make<'py>(
+    py: Python<'py>,
+    photos: std::path::PathBuf,
+    output: std::path::PathBuf,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    effort: Option<&str>,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let known = fastlgs::preprocess::Config { photos, output, ..Default::default() };
+    let effort = effort.map(|effort| options::value_of("effort", effort)).transpose()?.unwrap_or_default();
+    let config = fastlgs::make::Config { preprocess: options::with(&known, options)?, effort };
+    let made = stage::run(py, progress, device, seed, move |run| fastlgs::make(&config, run))?;
+    options::to_python(py, &made)
+}
+
+/// Photos to masks, key points, poses and points, in the scene folder `output`.
+#[pyfunction]
+#[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, **options))]
+fn preprocess<'py>(
+    py: Python<'py>,
+    photos: std::path::PathBuf,
+    output: std::path::PathBuf,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let config = options::with(&fastlgs::preprocess::Config { photos, output, ..Default::default() }, options)?;
+    let found = stage::run(py, progress, device, seed, move |run| fastlgs::preprocess(&config, run))?;
+    options::to_python(py, &found)
+}
+
+/// Gaussians with colour and objects for the scene folder `scene`.
+#[pyfunction]
+#[pyo3(signature = (scene, *, progress = None, device = "auto", seed = 0, **options))]
+fn train<'py>(
+    py: Python<'py>,
+    scene: std::path::PathBuf,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let config = options::with(&fastlgs::train::Config { scene, ..Default::default() }, options)?;
+    let trained = stage::run(py, progress, device, seed, move |run| fastlgs::train(&config, run))?;
+    options::to_python(py, &trained)
+}
+
+/// A generated scene with exact poses, depths and masks, in the folder `output`.
+#[pyfunction]
+#[pyo3(signature = (kind, output, *, progress = None, device = "auto", seed = 0, **options))]
+fn synth<'py>(
+    py: Python<'py>,
+    kind: String,
+    output: std::path::PathBuf,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    options: Option<&Bound<'py, PyDict>>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let config = options::with(&fastlgs::synth::Config { kind, output, ..Default::default() }, options)?;
+    let written = stage::run(py, progress, device, seed, move |run| fastlgs::synth(&config, run))?;
+    options::to_python(py, &written)
+}
+
+#[pymodule]
+fn _fastlgs(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("Error", module.py().get_type::<Error>())?;
+    module.add_class::<scene::Scene>()?;
+    module.add_class::<answer::Answer>()?;
+    module.add_class::<camera::Camera>()?;
+    module.add_function(wrap_pyfunction!(make, module)?)?;
+    module.add_function(wrap_pyfunction!(preprocess, module)?)?;
+    module.add_function(wrap_pyfunction!(train, module)?)?;
+    module.add_function(wrap_pyfunction!(synth, module)?)
+}

@@ -1,0 +1,305 @@
+//! Scenes.
+
+use crate::answer::Answer;
+use crate::camera::Camera;
+use crate::options::to_python;
+use crate::{Error, raised};
+use fastlgs::Session;
+use fastlgs::session::answer::{CANDIDATES, Question};
+use fastlgs::session::ask::Ask;
+use fastlgs::session::selection;
+use fastlgs_core::gaussians::rest_len;
+use fastlgs_grid::Grid;
+use fastlgs_grid::grid::Object;
+use fastlgs_grid::query::{Field, QueryConfig};
+use glam::Vec3;
+use image::RgbImage;
+use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray3};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde_json::json;
+use std::path::PathBuf;
+use std::sync::{Mutex, PoisonError};
+
+/// A trained scene on a device.
+#[pyclass(frozen, module = "fastlgs")]
+pub struct Scene {
+    opened: Mutex<Opened>,
+}
+
+struct Opened {
+    session: Session,
+    grid: Grid,
+    /// The view that was asked last, rendered.
+    shown: Option<(fastlgs_core::Camera, Field)>,
+}
+
+/// Fewest pixels of an answer that a person sees.
+const VISIBLE: usize = 30;
+
+/// Which view is meant.
+#[derive(Clone)]
+enum Which {
+    First,
+    Named(String),
+    Given(fastlgs_core::Camera),
+}
+
+impl Which {
+    /// A view's name or a `Camera`; the first view where nothing is said.
+    fn of(view: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
+        let Some(view) = view else { return Ok(Self::First) };
+        if let Ok(camera) = view.cast::<Camera>() {
+            return Ok(Self::Given(camera.get().0.clone()));
+        }
+        view.extract().map(Self::Named).map_err(|_| Error::new_err("a view is the name of a photo, or a Camera"))
+    }
+}
+
+impl Scene {
+    /// Works on the scene while Python is free. Python must not be held while waiting for the scene: who has the scene may wait for Python.
+    fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut Opened) -> fastlgs::Result<T> + Send) -> PyResult<T> {
+        py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner))).map_err(raised)
+    }
+}
+
+impl Opened {
+    fn camera(&self, which: &Which) -> fastlgs::Result<fastlgs_core::Camera> {
+        let cameras = &self.session.cameras;
+        Ok(match which {
+            Which::Given(camera) => camera.clone(),
+            Which::Named(name) => cameras[self.session.folder.view_index(cameras, name)?].clone(),
+            Which::First => {
+                let first = cameras.first().cloned();
+                first.ok_or_else(|| fastlgs::Error::Invalid("the scene has no views".to_owned()))?
+            }
+        })
+    }
+
+    /// What a view tells about objects; rendered unless it is the one that was asked last.
+    fn look(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<()> {
+        if self.shown.as_ref().is_none_or(|(shown, _)| shown != camera) {
+            self.shown = Some((camera.clone(), self.session.field(camera, None)?));
+        }
+        Ok(())
+    }
+}
+
+/// Values of rows as an array of that many columns.
+fn table<'py, T: numpy::Element>(py: Python<'py>, values: Vec<T>, shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
+    Ok(PyArray1::from_vec(py, values).reshape(shape.to_vec())?.into_any())
+}
+
+#[pymethods]
+impl Scene {
+    /// Opens a trained scene folder.
+    #[new]
+    #[pyo3(signature = (path, *, device = "auto", clip_text = None))]
+    fn new(py: Python<'_>, path: PathBuf, device: &str, clip_text: Option<PathBuf>) -> PyResult<Self> {
+        let open = || -> fastlgs::Result<Opened> {
+            let mut session = Session::open(&path, device)?;
+            session.clip_text = clip_text;
+            let grid = session.grid()?;
+            Ok(Opened { session, grid, shown: None })
+        };
+        Ok(Self { opened: Mutex::new(py.detach(open).map_err(raised)?) })
+    }
+
+    /// The folder.
+    #[getter]
+    fn path(&self, py: Python<'_>) -> PyResult<PathBuf> {
+        self.with(py, |opened| Ok(opened.session.folder.root.clone()))
+    }
+
+    /// The device's name.
+    #[getter]
+    fn device(&self, py: Python<'_>) -> PyResult<String> {
+        self.with(py, |opened| Ok(opened.session.engine.name()))
+    }
+
+    /// Names of all views, sorted.
+    #[getter]
+    fn views(&self, py: Python<'_>) -> PyResult<Vec<String>> {
+        self.with(py, |opened| Ok(opened.session.cameras.iter().map(|c| c.name.clone()).collect()))
+    }
+
+    /// Names of the views that were kept out of training.
+    #[getter]
+    fn held_out(&self, py: Python<'_>) -> PyResult<Vec<String>> {
+        self.with(py, |Opened { session, .. }| Ok(session.manifest.held_out(&session.cameras).into_iter().map(|c| c.name).collect()))
+    }
+
+    /// The camera of a view.
+    fn camera(&self, py: Python<'_>, view: &Bound<'_, PyAny>) -> PyResult<Camera> {
+        let which = Which::of(Some(view))?;
+        self.with(py, |opened| opened.camera(&which)).map(Camera)
+    }
+
+    /// Asks for a text, for what a pixel of the view shows, or for what a picture (uint8, (height, width, 3)) shows.
+    #[pyo3(signature = (text = None, *, view = None, point = None, image = None, negatives = Vec::new(), false_alarms = None, top_k = None))]
+    fn query(
+        &self,
+        py: Python<'_>,
+        text: Option<String>,
+        view: Option<&Bound<'_, PyAny>>,
+        point: Option<(u32, u32)>,
+        image: Option<PyReadonlyArray3<'_, u8>>,
+        negatives: Vec<String>,
+        false_alarms: Option<f32>,
+        top_k: Option<usize>,
+    ) -> PyResult<Answer> {
+        let ask = match (text, point, image) {
+            (Some(text), None, None) => Ask::Text(text),
+            (None, Some((x, y)), None) => Ask::Point(x, y),
+            (None, None, Some(image)) => Ask::Image("image".to_owned(), picture(&image)?),
+            _ => return Err(Error::new_err("ask in one way: a text, a point or an image")),
+        };
+        let usual = QueryConfig::default();
+        let config = QueryConfig { false_alarms: false_alarms.unwrap_or(usual.false_alarms), top_k: top_k.unwrap_or(usual.top_k) };
+        if !(0.0..=1.0).contains(&config.false_alarms) || config.top_k == 0 {
+            return Err(Error::new_err("false_alarms is a share from 0 to 1, and top_k is 1 at least"));
+        }
+        let which = Which::of(view)?;
+        let (camera, report, mask, relevancy) = self.with(py, |opened| {
+            let camera = opened.camera(&which)?;
+            opened.look(&camera)?;
+            let Opened { session, grid, shown } = opened;
+            let Some((_, field)) = shown else { unreachable!("rendered above") };
+            let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates: CANDIDATES };
+            let (answer, mut report) = question.put(session, grid, field, &camera, 0.0)?;
+            let relevancy = field.relevancy(grid, &answer.found.ranked);
+            let (mask, ids) = (answer.mask, answer.found.targets.iter().map(|t| t.id).collect::<Vec<_>>());
+            if report.found && report.pixels < VISIBLE {
+                report.seen_best = session.seen_best(grid, &ids)?;
+            }
+            Ok((camera, report, mask, relevancy))
+        })?;
+        let shape = [camera.height as usize, camera.width as usize];
+        let mask = PyArray1::from_vec(py, mask).reshape(shape)?.unbind();
+        let relevancy: Py<PyArray2<f32>> = PyArray1::from_vec(py, relevancy).reshape(shape)?.unbind();
+        Ok(Answer { report, mask, relevancy })
+    }
+
+    /// All objects and parts: id, parent (0 for none), support, views, area (largest share of a photo), code.
+    #[getter]
+    fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let area = |areas: &[f32]| areas.iter().fold(0.0f32, |most, area| most.max(*area));
+        let told = |o: &Object| json!({ "id": o.id, "parent": o.parent, "support": o.support, "views": o.views, "area": area(&o.areas), "code": o.code.to_array() });
+        to_python(py, &self.with(py, |opened| Ok(opened.grid.objects.iter().map(told).collect::<Vec<_>>()))?)
+    }
+
+    /// Embeddings of an object's views, (views, numbers).
+    fn embeddings<'py>(&self, py: Python<'py>, id: u16) -> PyResult<Bound<'py, PyAny>> {
+        let embeddings = self.with(py, |opened| {
+            let known = opened.grid.objects.len();
+            let object = usize::from(id).checked_sub(1).and_then(|k| opened.grid.objects.get(k));
+            let unknown = || fastlgs::Error::Invalid(format!("there is no object {id}; there are {known}"));
+            Ok(object.ok_or_else(unknown)?.embeddings.clone())
+        })?;
+        let columns = embeddings.first().map_or(0, Vec::len);
+        table(py, embeddings.concat(), &[embeddings.len(), columns])
+    }
+
+    /// A picture: `color` uint8 (h, w, 3), `depth` float32 (h, w) in units of the scene, `feature` float32 (h, w, 3), `objects` uint16 (h, w).
+    #[pyo3(signature = (view = None, what = "color"))]
+    fn render<'py>(&self, py: Python<'py>, view: Option<&Bound<'py, PyAny>>, what: &str) -> PyResult<Bound<'py, PyAny>> {
+        let which = Which::of(view)?;
+        let size = |camera: &fastlgs_core::Camera| [camera.height as usize, camera.width as usize];
+        let planes = |first: usize| {
+            self.with(py, |opened| {
+                let camera = opened.camera(&which)?;
+                let frame = opened.session.render(&camera)?;
+                let pixels = size(&camera).iter().product::<usize>();
+                let planes = frame.channels(first, first + 3);
+                let values: Vec<f32> = (0..pixels).flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]]).collect();
+                Ok((size(&camera), values))
+            })
+        };
+        match what {
+            "color" => {
+                let ([h, w], values) = planes(0)?;
+                let bytes: Vec<u8> = values.into_iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
+                table(py, bytes, &[h, w, 3])
+            }
+            "feature" => {
+                let ([h, w], values) = planes(3)?;
+                table(py, values, &[h, w, 3])
+            }
+            "depth" => {
+                let (size, values) = self.with(py, |opened| {
+                    let camera = opened.camera(&which)?;
+                    Ok((size(&camera), opened.session.render_depth(&camera)?))
+                })?;
+                table(py, values, &size)
+            }
+            "objects" => {
+                let (size, owners) = self.with(py, |opened| {
+                    let camera = opened.camera(&which)?;
+                    opened.look(&camera)?;
+                    let owners = opened.shown.as_ref().map(|(_, field)| field.owners(&opened.grid).labels);
+                    Ok((size(&camera), owners.unwrap_or_default()))
+                })?;
+                table(py, owners, &size)
+            }
+            other => Err(Error::new_err(format!("'{other}' is none of color, depth, feature and objects"))),
+        }
+    }
+
+    /// All Gaussians as arrays: means and scales (n, 3) in units of the scene, rotations (n, 4) as (w, x, y, z), opacities (n), sh (n, k, 3),
+    /// features (n, 3) and object_ids (n).
+    #[getter]
+    fn gaussians<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let scene = self.with(py, |opened| Ok(opened.session.gaussians.clone()))?;
+        let n = scene.len();
+        let rows = |values: &[Vec3]| -> Vec<f32> { values.iter().flat_map(|v| v.to_array()).collect() };
+        let scales: Vec<f32> = scene.log_scales.iter().flat_map(|s| s.exp().to_array()).collect();
+        let unit = |q: &[f32; 4]| {
+            let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
+            q.map(|v| v / length)
+        };
+        let rest = rest_len(scene.sh_degree);
+        let sh = (0..n).flat_map(|i| std::iter::once(scene.sh_dc[i]).chain(scene.sh_rest[i * rest..(i + 1) * rest].iter().copied()));
+        let opacities: Vec<f32> = scene.opacity_logits.iter().map(|o| 1.0 / (1.0 + (-o).exp())).collect();
+        let arrays = PyDict::new(py);
+        arrays.set_item("means", table(py, rows(&scene.means), &[n, 3])?)?;
+        arrays.set_item("scales", table(py, scales, &[n, 3])?)?;
+        arrays.set_item("rotations", table(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?)?;
+        arrays.set_item("opacities", table(py, opacities, &[n])?)?;
+        arrays.set_item("sh", table(py, sh.flat_map(|c| c.to_array()).collect(), &[n, 1 + rest, 3])?)?;
+        arrays.set_item("features", table(py, rows(&scene.features), &[n, 3])?)?;
+        arrays.set_item("object_ids", table(py, scene.object_ids, &[n])?)?;
+        Ok(arrays)
+    }
+
+    /// Places of the Gaussians of some objects and their parts: uint32, rising.
+    fn select<'py>(&self, py: Python<'py>, ids: Vec<u16>) -> PyResult<Bound<'py, PyArray1<u32>>> {
+        let places = self.with(py, |opened| Ok(selection::gaussians(&opened.session.gaussians, &opened.grid, &ids)))?;
+        Ok(PyArray1::from_vec(py, places.into_iter().map(|place| place as u32).collect()))
+    }
+
+    /// Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz or .glb; all of them without `ids`.
+    #[pyo3(signature = (path, ids = None, *, rest = false))]
+    fn export(&self, py: Python<'_>, path: PathBuf, ids: Option<Vec<u16>>, rest: bool) -> PyResult<()> {
+        self.with(py, |Opened { session: Session { gaussians, cameras, .. }, grid, .. }| match &ids {
+            None => selection::write(&path, gaussians, cameras),
+            Some(ids) => selection::export(&path, gaussians, cameras, &selection::gaussians(gaussians, grid, ids), !rest),
+        })
+    }
+
+    fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
+        self.with(py, |Opened { session, grid, .. }| {
+            let root = session.folder.root.display();
+            Ok(format!("Scene('{root}', {} Gaussians, {} objects)", session.gaussians.len(), grid.objects.len()))
+        })
+    }
+}
+
+/// A picture of Python's.
+fn picture(image: &PyReadonlyArray3<'_, u8>) -> PyResult<RgbImage> {
+    let view = image.as_array();
+    let (height, width, channels) = view.dim();
+    if channels != 3 || width == 0 || height == 0 {
+        return Err(Error::new_err(format!("a picture is uint8 of (height, width, 3), not of ({height}, {width}, {channels})")));
+    }
+    Ok(RgbImage::from_fn(width as u32, height as u32, |x, y| image::Rgb(std::array::from_fn(|k| view[(y as usize, x as usize, k)]))))
+}

@@ -1,0 +1,115 @@
+//! Runs a stage on a thread of its own, while Python's main thread hears of its progress and of Ctrl-C.
+
+use crate::raised;
+use fastlgs::Run;
+use fastlgs::progress::{Message, Sink};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::Duration;
+
+/// How long Ctrl-C may wait to be noticed.
+const PATIENCE: Duration = Duration::from_millis(50);
+
+/// What a stage told, as far as Python hears of it.
+enum Event {
+    Stage { stage: &'static str, done: u64, total: u64, note: String },
+    Trained { step: fastlgs::progress::TrainStep, total: u32 },
+    Warning(String),
+}
+
+impl Event {
+    fn to_python<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let event = PyDict::new(py);
+        match self {
+            Self::Stage { stage, done, total, note } => {
+                event.set_item("stage", stage)?;
+                event.set_item("done", done)?;
+                event.set_item("total", total)?;
+                event.set_item("note", note)?;
+            }
+            Self::Trained { step, total } => {
+                event.set_item("stage", "train")?;
+                event.set_item("done", step.iteration)?;
+                event.set_item("total", total)?;
+                event.set_item("loss", step.loss)?;
+                event.set_item("psnr", step.psnr)?;
+                event.set_item("gaussians", step.gaussians)?;
+            }
+            Self::Warning(text) => event.set_item("warning", text)?,
+        }
+        Ok(event)
+    }
+}
+
+/// Passes on what it hears, and ends the stage where that is asked for.
+struct Listener<'a> {
+    events: std::sync::Mutex<Sender<Event>>,
+    cancelled: &'a AtomicBool,
+}
+
+impl Sink for Listener<'_> {
+    fn tell(&self, message: Message<'_>) {
+        let event = match message {
+            Message::Started { stage, total } => Event::Stage { stage, done: 0, total, note: String::new() },
+            Message::Advanced { stage, done, total, note } => Event::Stage { stage, done, total, note: note.to_owned() },
+            Message::Trained { step, total, .. } => Event::Trained { step, total },
+            Message::Warning(text) => Event::Warning(text.to_owned()),
+            _ => return,
+        };
+        // Nobody may be listening any more.
+        let _ = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner).send(event);
+    }
+
+    fn cancelled(&self) -> bool {
+        self.cancelled.load(Ordering::Relaxed)
+    }
+}
+
+/// The next thing that is told. A receiver may be waited on from one place at a time, which `&mut` says.
+fn wait(heard: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
+    heard.recv_timeout(PATIENCE)
+}
+
+/// Runs `work`, with Python free to do something else; `progress` is called with a dictionary for each thing that is told.
+///
+/// # Errors
+/// Those of the stage; what `progress` raises, and `KeyboardInterrupt`, both of which end the stage first.
+pub fn run<T: Send>(
+    py: Python<'_>,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    work: impl FnOnce(&Run) -> fastlgs::Result<T> + Send,
+) -> PyResult<T> {
+    let cancelled = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        let (events, mut heard) = channel();
+        let cancelled = &cancelled;
+        let thread = scope.spawn(move || {
+            let listener = Listener { events: std::sync::Mutex::new(events), cancelled };
+            work(&Run { device, seed, progress: &listener })
+        });
+        let mut interruption = None;
+        loop {
+            let event = py.detach(|| wait(&mut heard));
+            let told = match &event {
+                Ok(event) => progress.as_ref().map_or(Ok(()), |f| f.call1(py, (event.to_python(py)?,)).map(drop)),
+                Err(RecvTimeoutError::Timeout) => Ok(()),
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            // The first interruption ends the stage; what comes after it is the stage ending.
+            if let (Err(error), None) = (told.and_then(|()| py.check_signals()), &interruption) {
+                interruption = Some(error);
+                cancelled.store(true, Ordering::Relaxed);
+            }
+        }
+        let result = py.detach(|| thread.join());
+        match (interruption, result) {
+            (Some(error), _) => Err(error),
+            (None, Ok(result)) => result.map_err(raised),
+            (None, Err(panic)) => std::panic::resume_unwind(panic),
+        }
+    })
+}

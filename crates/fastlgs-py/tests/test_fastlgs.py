@@ -1,0 +1,139 @@
+"""The whole way from Python: a generated scene is preprocessed, trained and asked."""
+
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+
+import fastlgs
+
+
+@pytest.fixture(scope="session")
+def events():
+    return []
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory, events):
+    photos, folder = tmp_path_factory.mktemp("photos"), tmp_path_factory.mktemp("scene")
+    written = fastlgs.synth("room", photos, views=16, size=(160, 120))
+    assert written["views"] == 16
+    made = fastlgs.preprocess(photos, folder, segmenter="import", progress=events.append, device="cpu")
+    assert made["training_photos"] == 14 and made["masks"] > 0
+    trained = fastlgs.train(folder, iterations=400, budget=4000, progress=events.append, device="cpu")
+    assert 0 < trained["gaussians"] <= 4000
+    return fastlgs.Scene(folder, device="cpu")
+
+
+def test_progress_is_told(scene, events):
+    stages = {event.get("stage") for event in events}
+    assert {"photos", "masks", "train", "votes", "objects"} <= stages
+    steps = [event["done"] for event in events if event.get("stage") == "train" and "psnr" in event]
+    assert steps == sorted(steps) and steps[-1] == 400
+
+
+def test_questions_are_answered(scene):
+    view = scene.held_out[0]
+    cat = scene.query("cat", view=view, false_alarms=1.0)
+    width, height = scene.camera(view).size
+    assert cat.found and bool(cat) and cat.view == view
+    assert cat.mask.shape == cat.relevancy.shape == (height, width) and cat.mask.dtype == bool
+    assert cat.report["pixels"] == cat.mask.sum()
+    assert scene.query("cat", view=view, false_alarms=0.0).found is False
+    # What a pixel shows is the object that is drawn there.
+    drawn = scene.render(view, "objects")
+    y, x = np.argwhere(drawn > 0)[0]
+    pointed = scene.query(point=(int(x), int(y)), view=view)
+    assert pointed.found and pointed.mask[y, x]
+    # A picture of the thing itself, cut out of the render.
+    shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
+    assert shown.text == "image"
+
+
+def test_arrays_are_those_of_the_scene(scene):
+    g = scene.gaussians
+    n = len(g["means"])
+    shapes = {"means": (n, 3), "scales": (n, 3), "rotations": (n, 4), "opacities": (n,), "features": (n, 3), "object_ids": (n,)}
+    assert {name: g[name].shape for name in shapes} == shapes and g["sh"].shape[::2] == (n, 3)
+    assert (g["scales"] > 0).all() and ((g["opacities"] > 0) & (g["opacities"] < 1)).all()
+    np.testing.assert_allclose(np.linalg.norm(g["rotations"], axis=1), 1, atol=1e-5)
+    leaf = next(o["id"] for o in scene.objects if o["id"] not in {p["parent"] for p in scene.objects})
+    np.testing.assert_array_equal(scene.select([leaf]), np.flatnonzero(g["object_ids"] == leaf))
+    embeddings = scene.embeddings(leaf)
+    assert embeddings.ndim == 2 and len(embeddings) > 0
+
+
+def test_cameras_of_either_convention_agree(scene):
+    view = scene.views[0]
+    known = scene.camera(view)
+    pose = np.linalg.inv(known.world_to_camera) @ np.diag([1.0, -1, -1, 1])
+    fx, fy, cx, cy = known.intrinsics
+    same = fastlgs.Camera.from_nerfstudio(pose[:3], fx, fy, *known.size, cx=cx, cy=cy)
+    np.testing.assert_allclose(same.world_to_camera, known.world_to_camera, atol=1e-4)
+    a, b = scene.render(known), scene.render(same)
+    assert a.dtype == np.uint8 and np.abs(a.astype(int) - b).mean() < 0.5
+    photo_like = scene.render(known.resized(80, 60), "depth")
+    assert photo_like.shape == (60, 80) and (photo_like > 0).all()
+
+
+def test_selections_are_exported(scene, tmp_path):
+    first = scene.objects[0]["id"]
+    scene.export(tmp_path / "one.ply", [first])
+    scene.export(tmp_path / "rest.ply", [first], rest=True)
+    assert (tmp_path / "one.ply").stat().st_size > 0 and (tmp_path / "rest.ply").stat().st_size > 0
+
+
+def test_mistakes_are_named(scene, tmp_path):
+    for call, words in [
+        (lambda: fastlgs.Scene(tmp_path / "nowhere"), "nowhere"),
+        (lambda: fastlgs.preprocess(tmp_path, tmp_path / "out", max_sides=3), "max_sides"),
+        (lambda: fastlgs.preprocess(tmp_path, tmp_path / "out", max_side="large"), "max_side"),
+        (lambda: fastlgs.make(tmp_path, tmp_path / "out", effort="heroic"), "heroic"),
+        (lambda: scene.query(), "one way"),
+        (lambda: scene.query(" "), "empty"),
+        (lambda: scene.query("cat", view="nowhere.png"), "nowhere.png"),
+        (lambda: scene.render(what="smell"), "smell"),
+        (lambda: scene.embeddings(9999), "9999"),
+        (lambda: scene.export(tmp_path / "scene.xyz"), "scene.xyz"),
+        (lambda: fastlgs.Camera(0, 10, 1, 1, np.eye(4)), "0x10"),
+    ]:
+        with pytest.raises(fastlgs.Error, match=words):
+            call()
+
+
+def test_ctrl_c_and_a_callback_that_raises_end_a_stage(scene, tmp_path):
+    folder = scene.path
+    interrupt = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        fastlgs.train(folder, iterations=200_000, device="cpu")
+
+    class Enough(Exception):
+        pass
+
+    def stop(event):
+        if event.get("stage") == "train":
+            raise Enough
+
+    with pytest.raises(Enough):
+        fastlgs.train(folder, iterations=200_000, progress=stop, device="cpu")
+    # The earlier result is whole.
+    assert fastlgs.Scene(folder, device="cpu").views == scene.views
+
+
+def test_other_threads_go_on(scene):
+    counts = []
+    done = threading.Event()
+
+    def count():
+        while not done.is_set():
+            counts.append(1)
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    answers = [scene.query("cat", view=view) for view in scene.views]
+    done.set()
+    thread.join()
+    assert len(answers) == len(scene.views) and len(counts) > 100
