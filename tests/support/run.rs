@@ -1,6 +1,8 @@
 //! Runs the binary, on the machine's adapter unless a test names another device. Not every test needs all of this.
 #![allow(dead_code)]
 
+use fastlgs_core::label_map::LabelMap;
+use fastlgs_core::metrics;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -66,6 +68,32 @@ pub fn room() -> Option<&'static Room> {
         Some(Room { photos: folder.join("photos"), scene: folder.join("room") })
     };
     ROOM.get_or_init(make).as_ref()
+}
+
+/// The room, and a folder of a test program's own.
+pub struct Fixture {
+    pub dir: tempfile::TempDir,
+    pub photos: PathBuf,
+    pub scene: PathBuf,
+}
+
+/// The generated room that all test programs share, and a folder of these tests' own.
+pub fn fixture() -> Option<&'static Fixture> {
+    static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
+    let make = || {
+        let room = room()?;
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        Some(Fixture { dir, photos: room.photos.clone(), scene: room.scene.clone() })
+    };
+    FIXTURE.get_or_init(make).as_ref()
+}
+
+/// IoU of an answer's mask with the coffee's exact one in view 008.
+pub fn coffee_iou(f: &Fixture, answer: &Value) -> f64 {
+    let mask = LabelMap::load(Path::new(answer["mask"].as_str().expect("a path"))).expect("the mask is a grey PNG");
+    let truth = LabelMap::load(&f.photos.join("masks/008.png.png")).expect("exact masks");
+    let found: Vec<bool> = mask.labels.iter().map(|m| *m > 0).collect();
+    metrics::iou(&found, &truth.mask(2))
 }
 
 pub fn json(args: &[&str]) -> Value {

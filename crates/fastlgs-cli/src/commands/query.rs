@@ -1,5 +1,7 @@
 //! `fastlgs query`: what a text, a picture or a point names, as masks and as Gaussians (paper, querying features).
 
+mod dialogue;
+
 use super::library;
 use crate::outcome::Outcome;
 use crate::{report, ui};
@@ -14,7 +16,7 @@ use fastlgs_grid::Grid;
 use fastlgs_grid::query::{Field, QueryConfig};
 use fastlgs_raster::Frame;
 use serde_json::json;
-use std::io::{BufRead, Write};
+use std::io::{BufRead, IsTerminal, Write};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -27,7 +29,7 @@ pub struct Args {
     #[arg(required_unless_present = "scenes_below")]
     scene: Option<PathBuf>,
     /// What to look for; several texts are answered one after the other. "wheel of the bicycle" asks for a part. `-` reads
-    /// texts from standard input and answers each line at once with a line of JSON.
+    /// texts from standard input and answers each line at once with a line of JSON; on a terminal it is a dialogue.
     #[arg(required_unless_present_any = ["image", "point", "scenes_below"])]
     text: Vec<String>,
     /// A picture of what to look for.
@@ -145,6 +147,8 @@ struct Asker<'a> {
     config: QueryConfig,
     shown: Option<Shown>,
     tiles: Vec<Tile>,
+    /// Where pictures go.
+    output: Option<PathBuf>,
 }
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
@@ -182,8 +186,12 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         scene.text_query("warm up")?;
     }
     scene.warm_up()?;
-    let mut asker = Asker { args, scene, grid, cameras, config, shown: None, tiles: Vec::new() };
-    if lines { asker.answer_lines() } else { asker.answer_arguments(common) }
+    let mut asker = Asker { args, scene, grid, cameras, config, shown: None, tiles: Vec::new(), output: args.output.clone() };
+    match lines {
+        true if std::io::stdin().is_terminal() && std::io::stdout().is_terminal() => asker.converse(),
+        true => asker.answer_lines(),
+        false => asker.answer_arguments(common),
+    }
 }
 
 impl Asker<'_> {
@@ -225,7 +233,7 @@ impl Asker<'_> {
 
     /// Writes the contact sheet of all answers: where one view was asked in rows of [`IN_A_ROW`], else a row for each view.
     fn sheet(&self) -> Result<Option<PathBuf>> {
-        let Some(path) = self.args.output.as_ref().map(|folder| folder.join("sheet.png")) else { return Ok(None) };
+        let Some(path) = self.output.as_ref().map(|folder| folder.join("sheet.png")) else { return Ok(None) };
         let columns = if self.cameras.len() == 1 { IN_A_ROW } else { self.tiles.len() / self.cameras.len() };
         image_io::save_png(&path, sheet::sheet(&self.tiles, columns))?;
         Ok(Some(path))
@@ -258,7 +266,7 @@ impl Asker<'_> {
         let started = Instant::now();
         let field = self.scene.field(&self.cameras[place], self.args.tau_ac)?;
         let ms = started.elapsed().as_secs_f64() * 1e3;
-        let color = self.args.output.as_ref().map(|_| self.scene.render(&self.cameras[place])).transpose()?;
+        let color = self.output.as_ref().map(|_| self.scene.render(&self.cameras[place])).transpose()?;
         if let Some(frame) = &color {
             self.tiles.extend(sheet::of_view(&self.scene, &self.grid, &self.cameras[place], frame, &field));
         }
@@ -276,7 +284,7 @@ impl Asker<'_> {
         let (answer, mut report) = question.put(scene, grid, field, camera, render_ms)?;
         let targets = &answer.found.targets;
         let mut tile = None;
-        if let (Some(folder), Some(color)) = (&args.output, color) {
+        if let (Some(folder), Some(color)) = (&self.output, color) {
             let picture = answer.write(folder, color, args.heatmap, &mut report)?;
             tile = Some(Tile { picture, title: report.text.clone(), note: in_short(&report) });
         }

@@ -1,0 +1,103 @@
+//! `fastlgs query SCENE -` on a terminal: texts and answers in turn.
+
+use super::{Asker, told};
+use crate::outcome::Outcome;
+use anyhow::{Result, bail};
+use fastlgs::session::ask::Ask;
+use std::io::Write;
+use std::path::PathBuf;
+
+/// A line of a dialogue.
+#[derive(Debug, PartialEq)]
+enum Said<'a> {
+    Nothing,
+    Text(&'a str),
+    View(&'a str),
+    Views,
+    Save,
+    Help,
+    Quit,
+}
+
+impl<'a> Said<'a> {
+    fn of(line: &'a str) -> Self {
+        let line = line.trim();
+        match line.split_once(' ') {
+            Some(("view", name)) if !name.trim().is_empty() => Self::View(name.trim()),
+            _ => match line {
+                "" => Self::Nothing,
+                "views" => Self::Views,
+                "save" => Self::Save,
+                "help" | "?" => Self::Help,
+                "quit" | "exit" => Self::Quit,
+                text => Self::Text(text),
+            },
+        }
+    }
+}
+
+const HELP: &str = "a text asks for it; view NAME looks from there; views lists all; save writes the last answer's pictures; quit ends";
+
+impl Asker<'_> {
+    /// Questions and answers on a terminal.
+    pub(super) fn converse(&mut self) -> Result<Outcome> {
+        println!("{HELP}");
+        let mut last = None;
+        loop {
+            print!("{}> ", self.cameras[0].name);
+            std::io::stdout().flush()?;
+            let mut line = String::new();
+            if std::io::stdin().read_line(&mut line)? == 0 {
+                println!();
+                return Ok(Outcome::Done);
+            }
+            let said = match Said::of(&line) {
+                Said::Quit => return Ok(Outcome::Done),
+                Said::Nothing => continue,
+                Said::Help => Ok(HELP.to_owned()),
+                Said::Views => Ok(self.scene.cameras.iter().map(|c| c.name.as_str()).collect::<Vec<_>>().join("  ")),
+                Said::View(name) => self.look_from(name).map(|()| String::new()),
+                Said::Save => self.save(last.as_deref()),
+                Said::Text(text) => {
+                    last = Some(text.to_owned());
+                    self.answer(&Ask::Text(text.to_owned()), 0).map(|report| told(&report))
+                }
+            };
+            match said {
+                Ok(words) if words.is_empty() => {}
+                Ok(words) => println!("{words}"),
+                Err(error) => println!("{error:#}"),
+            }
+        }
+    }
+
+    fn look_from(&mut self, name: &str) -> Result<()> {
+        let index = self.scene.folder.view_index(&self.scene.cameras, name)?;
+        self.cameras = vec![self.scene.cameras[index].clone()];
+        self.shown = None;
+        Ok(())
+    }
+
+    /// Writes the pictures of the last answer, to the folder `answers` unless another was named.
+    fn save(&mut self, last: Option<&str>) -> Result<String> {
+        let Some(text) = last else { bail!("nothing was asked yet") };
+        let named = self.output.get_or_insert_with(|| PathBuf::from("answers")).clone();
+        (self.shown, self.tiles) = (None, Vec::new());
+        let report = self.answer(&Ask::Text(text.to_owned()), 0)?;
+        let sheet = self.sheet()?.unwrap_or(named);
+        self.output.clone_from(&self.args.output);
+        Ok(format!("{}\nall of it on one sheet: {}", told(&report), sheet.display()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_of_a_dialogue_is_a_text_unless_it_is_a_command() {
+        let said = ["", "red cup", " view 003.png ", "view", "views", "save", "?", "exit"].map(Said::of);
+        let view = Said::View("003.png");
+        assert_eq!(said, [Said::Nothing, Said::Text("red cup"), view, Said::Text("view"), Said::Views, Said::Save, Said::Help, Said::Quit]);
+    }
+}
