@@ -5,6 +5,7 @@ mod console;
 mod outcome;
 mod report;
 mod ui;
+mod words;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use outcome::Outcome;
@@ -89,15 +90,15 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
     let run = &common.run(&console);
     match command {
         Command::Make(config) => commands::make::run(&config, common, run),
-        Command::Preprocess(config) => report::give(common, &fastlgs::preprocess(&config, run)?),
+        Command::Preprocess(config) => report::tell(common, &fastlgs::preprocess(&config, run)?, words::preprocess),
         Command::Train(args) => commands::train::run(&args, common, &console),
         Command::Batch(args) => commands::batch::run(&args, common, run),
-        Command::Render(config) => report::give(common, &fastlgs::render(&config, run)?),
+        Command::Render(config) => report::tell(common, &fastlgs::render(&config, run)?, words::render),
         Command::Query(args) => commands::query::run(&args, common, run),
         Command::Teach(lesson) => report::give(common, &fastlgs::teach::teach(&lesson, run)?),
         Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),
-        Command::Eval(config) => report::give(common, &fastlgs::eval(&config, run)?),
+        Command::Eval(config) => report::tell(common, &fastlgs::eval(&config, run)?, words::eval),
         Command::Bench(args) => report::give(common, &fastlgs_bench::run(&args, run)?),
         Command::Export(config) => report::give(common, &fastlgs::export(&config, run)?),
         Command::Synth(config) => report::give(common, &fastlgs::synth(&config, run)?),

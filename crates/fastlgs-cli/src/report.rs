@@ -7,6 +7,17 @@ use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
 
+/// Writes a report where `--json` says, else what `words` say of it to standard output.
+pub fn tell<R: Serialize>(common: &Common, report: &R, words: impl FnOnce(&R) -> String) -> Result<Outcome> {
+    if common.json.is_some() {
+        return give(common, report);
+    }
+    if !common.quiet {
+        println!("{}", words(report));
+    }
+    Ok(Outcome::Done)
+}
+
 /// Writes a report where `--json` says, else as `name value` lines to standard output.
 pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
     let value = &serde_json::to_value(report)?;

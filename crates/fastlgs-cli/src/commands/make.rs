@@ -1,6 +1,7 @@
 //! `fastlgs make`: from photos to a scene that answers, and what to do with it.
 
 use crate::outcome::Outcome;
+use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::Run;
@@ -8,13 +9,7 @@ use fastlgs::make::{self, Config, State};
 
 pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let made = fastlgs::make(config, run)?;
-    if common.json.is_some() {
-        return report::give(common, &made);
-    }
-    if !common.quiet {
-        println!("{}", words(&made, &config.preprocess.output.display().to_string()));
-    }
-    Ok(Outcome::Done)
+    report::tell(common, &made, |made| words(made, &config.preprocess.output.display().to_string()))
 }
 
 fn words(made: &make::Report, scene: &str) -> String {
@@ -32,7 +27,8 @@ fn words(made: &make::Report, scene: &str) -> String {
     let scene = if plain { scene.to_owned() } else { format!("'{}'", scene.replace('\'', "'\\''")) };
     format!(
         "{scene}: {how}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nask it:      fastlgs query {scene} \"a thing\"\nlook at it:  fastlgs serve {scene}",
-        train.gaussians, train.objects
+        thousands(train.gaussians),
+        thousands(train.objects)
     )
 }
 

@@ -4,6 +4,7 @@ mod dialogue;
 
 use super::library;
 use crate::outcome::Outcome;
+use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs::session::answer::{CANDIDATES, ObjectReport, Question, Report};
@@ -116,13 +117,6 @@ fn told(report: &Report) -> String {
 fn in_short(report: &Report) -> String {
     let verdict = if report.found { "found" } else { "not found" };
     format!("{verdict}, {:.2}, {} pixels", report.score, thousands(report.pixels))
-}
-
-/// 19580 as 19,580.
-fn thousands(number: usize) -> String {
-    let digits = number.to_string();
-    let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or_default()).collect();
-    groups.join(",")
 }
 
 /// Tiles of a view in a row of a contact sheet.

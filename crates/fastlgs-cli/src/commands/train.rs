@@ -3,7 +3,7 @@
 use super::bind::{DEFAULT_BIND, parse_bind};
 use crate::console::Console;
 use crate::outcome::Outcome;
-use crate::{report, ui};
+use crate::{report, ui, words};
 use anyhow::Result;
 use fastlgs::progress::{Message, Sink};
 use fastlgs::train;
@@ -38,7 +38,7 @@ impl Sink for Both<'_> {
 
 pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcome> {
     let Some(bind) = args.serve else {
-        return report::give(common, &train::train(&args.config, &common.run(console))?);
+        return report::tell(common, &train::train(&args.config, &common.run(console))?, words::train);
     };
     let config = &args.config;
     let live = Live::new(config.iterations(), config.antialias, config.background.color);
@@ -46,7 +46,7 @@ pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcom
     // Standard output is the report's.
     eprintln!("watch it at {}", server.url);
     let report = train::train(config, &common.run(&Both(console, &server)))?;
-    report::give(common, &report)?;
+    report::tell(common, &report, words::train)?;
     server.open_scene(&common.device, None)?;
     server.wait()?;
     Ok(Outcome::Done)
