@@ -7,6 +7,7 @@ pub mod codes;
 pub mod consensus;
 pub mod election;
 pub mod evidence;
+pub mod field;
 pub mod grid;
 pub mod library;
 pub mod mapping;

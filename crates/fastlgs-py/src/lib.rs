@@ -51,9 +51,8 @@ fn preprocess<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let config = options::with(&fastlgs::preprocess::Config { photos, output, ..Default::default() }, options)?;
-    let found = stage::run(py, progress, device, seed, move |run| fastlgs::preprocess(&config, run))?;
-    options::to_python(py, &found)
+    let known = fastlgs::preprocess::Config { photos, output, ..Default::default() };
+    stage::with_options(py, &known, options, progress, device, seed, fastlgs::preprocess)
 }
 
 /// Gaussians with colour and objects for the scene folder `scene`.
@@ -67,9 +66,8 @@ fn train<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let config = options::with(&fastlgs::train::Config { scene, ..Default::default() }, options)?;
-    let trained = stage::run(py, progress, device, seed, move |run| fastlgs::train(&config, run))?;
-    options::to_python(py, &trained)
+    let known = fastlgs::train::Config { scene, ..Default::default() };
+    stage::with_options(py, &known, options, progress, device, seed, fastlgs::train)
 }
 
 /// A generated scene with exact poses, depths and masks, in the folder `output`.
@@ -84,9 +82,8 @@ fn synth<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let config = options::with(&fastlgs::synth::Config { kind, output, ..Default::default() }, options)?;
-    let written = stage::run(py, progress, device, seed, move |run| fastlgs::synth(&config, run))?;
-    options::to_python(py, &written)
+    let known = fastlgs::synth::Config { kind, output, ..Default::default() };
+    stage::with_options(py, &known, options, progress, device, seed, fastlgs::synth)
 }
 
 #[pymodule]

@@ -1,10 +1,12 @@
 //! Runs a stage on a thread of its own, while Python's main thread hears of its progress and of Ctrl-C.
 
-use crate::raised;
+use crate::{options, raised};
 use fastlgs::Run;
 use fastlgs::progress::{Message, Sink};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
@@ -112,4 +114,21 @@ pub fn run<T: Send>(
             (None, Err(panic)) => std::panic::resume_unwind(panic),
         }
     })
+}
+
+/// Runs a stage with some values of its configuration replaced; its report as Python's.
+///
+/// # Errors
+/// Options that do not fit, and those of [`run`].
+pub fn with_options<'py, C: Serialize + DeserializeOwned + Send, R: Serialize + Send>(
+    py: Python<'py>,
+    known: &C,
+    options: Option<&Bound<'py, PyDict>>,
+    progress: Option<Py<PyAny>>,
+    device: &str,
+    seed: u64,
+    stage: fn(&C, &Run) -> fastlgs::Result<R>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let config = options::with(known, options)?;
+    options::to_python(py, &run(py, progress, device, seed, move |run| stage(&config, run))?)
 }

@@ -9,7 +9,7 @@ use axum::http::StatusCode;
 use fastlgs::Session;
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::Field;
+use fastlgs_grid::field::Field;
 use std::path::PathBuf;
 use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};

@@ -14,7 +14,8 @@ use fastlgs::session::{ViewChoice, parse_point, parse_size, selection};
 use fastlgs::{Run, Session};
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::{Field, QueryConfig};
+use fastlgs_grid::field::Field;
+use fastlgs_grid::query::QueryConfig;
 use fastlgs_raster::Frame;
 use serde_json::json;
 use std::io::{BufRead, IsTerminal, Write};
@@ -246,6 +247,8 @@ impl Asker<'_> {
                 let answer = self.answer(&Ask::Text(text.to_owned()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
                 let answer = answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
                 writeln!(out, "{answer}")?;
+                // Lines make no sheet.
+                self.tiles.clear();
             }
             out.flush()?;
         }

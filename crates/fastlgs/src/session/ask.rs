@@ -6,7 +6,8 @@ use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::{self, Field, Found, Hit, QueryConfig};
+use fastlgs_grid::field::Field;
+use fastlgs_grid::query::{self, Found, Hit, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
 use image::RgbImage;
 

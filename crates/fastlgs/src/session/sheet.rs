@@ -4,7 +4,7 @@ use super::Session;
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::Grid;
-use fastlgs_grid::query::Field;
+use fastlgs_grid::field::Field;
 use fastlgs_raster::Frame;
 use image::imageops::{FilterType, overlay, resize};
 use image::{Rgb, RgbImage};

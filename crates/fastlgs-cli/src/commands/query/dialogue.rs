@@ -44,6 +44,8 @@ impl Asker<'_> {
         println!("{HELP}");
         let mut last = None;
         loop {
+            // Only what is saved makes a sheet.
+            self.tiles.clear();
             print!("{}> ", self.cameras[0].name);
             std::io::stdout().flush()?;
             let mut line = String::new();
@@ -82,7 +84,7 @@ impl Asker<'_> {
     fn save(&mut self, last: Option<&str>) -> Result<String> {
         let Some(text) = last else { bail!("nothing was asked yet") };
         let named = self.output.get_or_insert_with(|| PathBuf::from("answers")).clone();
-        (self.shown, self.tiles) = (None, Vec::new());
+        self.shown = None;
         let report = self.answer(&Ask::Text(text.to_owned()), 0)?;
         let sheet = self.sheet()?.unwrap_or(named);
         self.output.clone_from(&self.args.output);
