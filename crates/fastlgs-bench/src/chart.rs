@@ -8,7 +8,7 @@ use anyhow::{Result, bail};
 use fastlgs::Run;
 use fastlgs_core::SceneFolder;
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs bench chart scenes/fox scenes/bonsai -o out")]
@@ -30,15 +30,15 @@ pub struct Args {
 }
 
 /// A way from masks to a field.
-struct Way {
-    name: &'static str,
-    how: How,
+pub struct Way {
+    pub name: &'static str,
+    pub how: How,
     /// How long it takes: 0 seconds, 1 minutes, 2 much longer.
     cost: u8,
 }
 
 /// What a way runs.
-enum How {
+pub enum How {
     /// `train` with options on the scene's Gaussians, whose geometry and colour stay.
     Remap(&'static [&'static str]),
     /// Descent on the paper's codes alone, for so many iterations.
@@ -70,16 +70,12 @@ const WAYS: [Way; 21] = [
     Way { name: "preset quick", how: How::Train(&["--preset", "quick"]), cost: 2 },
     Way { name: "preset standard", how: How::Train(&["--preset", "standard"]), cost: 2 },
     Way { name: "preset paper", how: How::Train(&["--preset", "paper"]), cost: 2 },
-    Way {
-        name: "preset paper in paper's way",
-        how: How::Train(&["--preset", "paper", "--mapping", "paper", "--feature-mode", "train"]),
-        cost: 2,
-    },
+    Way { name: "preset like-paper", how: How::Train(&["--preset", "like-paper"]), cost: 2 },
 ];
 
 impl How {
     /// The command and its arguments; SCENE stands for the scene.
-    fn command(&self) -> Vec<&'static str> {
+    pub fn command(&self) -> Vec<&'static str> {
         const START: [&str; 3] = ["SCENE", "--init-ply", "SCENE/scene.ply"];
         match self {
             Self::Remap(args) => [&["train"], &START[..], &["--iterations", "0"], args].concat(),
@@ -115,12 +111,8 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             SceneFolder::open(scene)?.manifest()?.seconds.iter().filter(|s| s.0.starts_with("preprocess.")).map(|s| s.1).sum();
         for way in &ways {
             let trial = Trial::new(scene, &work, run)?;
-            let command = way.how.command();
-            let mut row = if let How::Baseline(_) = way.how { baseline(&trial, &command, run)? } else { trained(&trial, &command)? };
-            row["scene"] = json!(trial::name(scene));
-            row["way"] = json!(way.name);
+            let mut row = way.row(&trial, &way.how.command(), scene, run)?;
             row["preprocess_seconds"] = json!(before);
-            row["command"] = json!(format!("fastlgs {}", command.join(" ").replace("SCENE", &scene.display().to_string())));
             rows.push(row);
             progress.advance()?;
         }
@@ -137,6 +129,21 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         plot::save(&args.output, file, &Scatter { axes, spots: &spots })?;
     }
     Ok(value)
+}
+
+impl Way {
+    pub const fn new(name: &'static str, how: How) -> Self {
+        Self { name, how, cost: 0 }
+    }
+
+    /// Runs `command` on a copy of `scene`; its figures.
+    pub fn row(&self, trial: &Trial, command: &[&str], scene: &Path, run: &Run) -> Result<Value> {
+        let mut row = if let How::Baseline(_) = self.how { baseline(trial, command, run)? } else { trained(trial, command)? };
+        row["scene"] = json!(trial::name(scene));
+        row["way"] = json!(self.name);
+        row["command"] = json!(format!("fastlgs {}", command.join(" ").replace("SCENE", &scene.display().to_string())));
+        Ok(row)
+    }
 }
 
 /// Trains and evaluates.

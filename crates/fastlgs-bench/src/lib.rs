@@ -7,6 +7,7 @@ mod command;
 mod disturb;
 mod growth;
 mod names;
+mod paper;
 mod plot;
 mod report;
 mod size;
@@ -40,6 +41,8 @@ enum What {
     Size(size::Args),
     /// What remains of accuracy when the input is disturbed, and on scenes that methods fail at.
     Stability(stability::Args),
+    /// The paper's ablations, with its own figures beside ours.
+    Paper(paper::Args),
     /// Seconds and memory of global mapping as photos, masks and Gaussians grow.
     Growth(growth::Args),
     /// What texts give on scenes that nothing was chosen on, and how much more where they were seen.
@@ -61,6 +64,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         What::Chart(args) => chart::run(args, run),
         What::Size(args) => size::run(args, run),
         What::Stability(args) => stability::run(args, run),
+        What::Paper(args) => paper::run(args, run),
         What::Growth(args) => growth::run(args, run),
         What::Names(args) => names::run(args, run),
         What::Report(args) => report::run(args, run),

@@ -8,17 +8,20 @@ use std::collections::BTreeSet;
 const DIMENSION: u32 = 3;
 /// Scale of the paper's distances: codes in (0, 1) are compared on (0, 255).
 pub const SCALE: f32 = 255.0;
-/// Largest distance (on the 0..255 scale) at which a rendered feature belongs to a code (the paper's tau_ac).
-pub const TAU_AC: f32 = 5.0;
 
 /// Cells of the smallest cubic lattice that holds `count`, dealt out in seeded random order, so that objects found one after
 /// the other, which are often neighbours in the picture, do not get neighbouring codes; and the lattice's side.
 fn cells(count: usize, seed: u64) -> (Vec<IVec3>, i32) {
-    let side = (1i32..).find(|s| s.pow(DIMENSION) as usize >= count).unwrap_or(1);
+    let side = side(count);
     let mut cells: Vec<IVec3> = (0..side.pow(DIMENSION)).map(|k| IVec3::new(k % side, k / side % side, k / side / side)).collect();
     Rng::new(seed, "codes").shuffle(&mut cells);
     cells.truncate(count);
     (cells, side)
+}
+
+/// Cells along each side of the smallest cubic lattice that holds so many.
+fn side(count: usize) -> i32 {
+    (1i32..).find(|s| s.pow(DIMENSION) as usize >= count).unwrap_or(1)
 }
 
 fn centres(cells: &[IVec3], side: i32) -> Vec<Vec3> {
@@ -29,6 +32,11 @@ fn centres(cells: &[IVec3], side: i32) -> Vec<Vec3> {
 pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     let (cells, side) = cells(count, seed);
     centres(&cells, side)
+}
+
+/// How far apart the codes of so many objects lie, on the 0..255 scale.
+pub fn spacing(count: usize) -> f32 {
+    SCALE / side(count) as f32
 }
 
 /// Rounds in which objects change their codes.
@@ -105,6 +113,9 @@ mod tests {
         }
         assert_eq!(lattice(20, 7), lattice(20, 7));
     }
+
+    /// The paper's tau_ac.
+    const TAU_AC: f32 = 5.0;
 
     /// Share of the pairs whose blends come within tau_ac of a third code.
     fn colliding(codes: &[Vec3], pairs: &BTreeSet<(u16, u16)>) -> f64 {

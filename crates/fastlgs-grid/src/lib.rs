@@ -5,6 +5,7 @@
 pub mod calibration;
 pub mod codes;
 pub mod consensus;
+pub mod decision;
 pub mod election;
 pub mod evidence;
 pub mod field;

@@ -1,6 +1,7 @@
 //! Cross-view grid mapping (paper, Algorithm 1): which masks of different photos show the same object.
 
 use crate::{Error, Result};
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// One mask of one photo.
@@ -65,42 +66,72 @@ pub struct Mapped {
 
 /// Algorithm 1. `masks` are sorted by view.
 ///
-/// Photos are taken in sequence; masks of the first photo are objects of their own. A mask is compared not with every
-/// earlier one but with each object's representatives, of which none is more than 0.98 like another one. An object that
-/// is seen for the hundredth time adds none, so that the work grows with the photos, not with their square.
+/// Photos are taken in sequence; masks of the first photo are objects of their own. Key points decide first, and a photo may show several masks
+/// of an object that they find. Similarity is for what is left, and one to one, the most alike first: an object that the photo shows already is
+/// no candidate, so that two things of one look stay two. A mask is compared not with every earlier one but with each object's representatives, of
+/// which none is more than 0.98 like another one. An object that is seen for the hundredth time adds none, so that the work grows with the photos,
+/// not with their square.
 ///
 /// # Errors
 /// More than 65,535 objects: a Gaussian's id has 16 bits.
 pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Result<Mapped> {
     let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
     let mut representatives: Vec<usize> = Vec::new();
-    // Those of the photo at hand are not yet to be compared with.
-    let mut fresh: Vec<usize> = Vec::new();
-    for (j, mask) in masks.iter().enumerate() {
-        if fresh.first().is_some_and(|k| masks[*k].view < mask.view) {
-            representatives.append(&mut fresh);
-        }
-        let earlier = masks.partition_point(|m| m.view < mask.view);
-        let most_corresponding = pairs.range((j, 0)..(j, earlier)).map(|(&(_, k), &n)| (n, std::cmp::Reverse(k))).max();
-        let by_key_points = most_corresponding.filter(|(n, _)| config.key_points && *n >= config.tau).map(|(_, k)| k.0);
-        mapped.comparisons += representatives.len();
-        let sims = representatives.iter().map(|&k| (similarity(mask, &masks[k], config.alpha), k));
-        let most_alike = sims.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
-        let same = by_key_points.or(most_alike.filter(|(sim, _)| *sim >= config.theta).map(|(_, k)| k));
-        let object = match same {
-            Some(k) => mapped.object_of[k],
-            None => {
-                mapped.count = mapped.count.checked_add(1).ok_or(Error::TooManyObjects)?;
-                mapped.count
+    for photo in masks.chunk_by(|a, b| a.view == b.view) {
+        let first = mapped.object_of.len();
+        let by_key_points: Vec<Option<u16>> =
+            (first..first + photo.len()).map(|j| most_corresponding(j, first, pairs, &mapped, config)).collect();
+        mapped.comparisons += photo.len() * representatives.len();
+        let alike: Vec<BTreeMap<u16, f32>> =
+            photo.par_iter().map(|mask| similarities(mask, &representatives, masks, &mapped, config)).collect();
+        let mut object_of = by_key_points;
+        for (_, mask, object) in most_alike_first(&alike, config.theta) {
+            if object_of[mask].is_none() && !object_of.contains(&Some(object)) {
+                object_of[mask] = Some(object);
             }
-        };
-        // One of the same object that is as good as the mask itself makes it superfluous.
-        if most_alike.is_none_or(|(sim, k)| sim < ALIKE || mapped.object_of[k] != object) {
-            fresh.push(j);
         }
-        mapped.object_of.push(object);
+        for (k, object) in object_of.into_iter().enumerate() {
+            let object = match object {
+                Some(object) => object,
+                None => {
+                    mapped.count = mapped.count.checked_add(1).ok_or(Error::TooManyObjects)?;
+                    mapped.count
+                }
+            };
+            // One of the same object that is as good as the mask itself makes it superfluous.
+            if alike[k].get(&object).is_none_or(|sim| *sim < ALIKE) {
+                representatives.push(first + k);
+            }
+            mapped.object_of.push(object);
+        }
     }
     Ok(mapped)
+}
+
+/// The object of the mask of an earlier photo, one before `first`, that shares most key points with mask `j`; none below tau.
+fn most_corresponding(j: usize, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> Option<u16> {
+    let most = pairs.range((j, 0)..(j, first)).map(|(&(_, k), &n)| (n, std::cmp::Reverse(k))).max()?;
+    Some(mapped.object_of[most.1.0]).filter(|_| config.key_points && most.0 >= config.tau)
+}
+
+/// How much a mask is like each object: like its most similar representative.
+fn similarities(mask: &Mask, representatives: &[usize], masks: &[Mask], mapped: &Mapped, config: &PaperConfig) -> BTreeMap<u16, f32> {
+    let mut best = BTreeMap::new();
+    for &k in representatives {
+        let sim = best.entry(mapped.object_of[k]).or_insert(f32::MIN);
+        *sim = sim.max(similarity(mask, &masks[k], config.alpha));
+    }
+    best
+}
+
+/// Pairs (similarity, mask, object) from theta on.
+fn most_alike_first(alike: &[BTreeMap<u16, f32>], theta: f32) -> Vec<(f32, usize, u16)> {
+    let of_mask = |(mask, objects): (usize, &BTreeMap<u16, f32>)| {
+        objects.iter().map(|(object, sim)| (*sim, mask, *object)).filter(|p| p.0 >= theta).collect::<Vec<_>>()
+    };
+    let mut pairs: Vec<(f32, usize, u16)> = alike.iter().enumerate().flat_map(of_mask).collect();
+    pairs.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    pairs
 }
 
 #[cfg(test)]

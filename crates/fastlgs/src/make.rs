@@ -1,6 +1,7 @@
 //! The main job in one go: from photos to a scene that answers. What was done is not done again.
 
 use crate::error::Context;
+use crate::eyes::SamPreset;
 use crate::{Result, Run, preprocess, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
@@ -52,7 +53,11 @@ const NOTE: &str = "made";
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
 pub fn make(config: &Config, run: &Run) -> Result<Report> {
     let train = train::Config { scene: config.preprocess.output.clone(), preset: config.effort, ..Default::default() };
-    let (state, train) = scene(&config.preprocess, &train, [run, run])?;
+    let mut preprocess = config.preprocess.clone();
+    if config.effort == train::Preset::LikePaper {
+        preprocess.eyes.sam_preset = SamPreset::LangSplat;
+    }
+    let (state, train) = scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
     Ok(Report { state, photos: [manifest.training(&cameras).len(), manifest.held_out(&cameras).len()], train })

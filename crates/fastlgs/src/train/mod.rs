@@ -41,6 +41,7 @@ pub(crate) fn forget(folder: &SceneFolder) {
 /// Options that contradict each other, a scene that was not preprocessed, a device that fails, or a cancelled run, after which the
 /// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
 pub fn train(config: &Config, run: &Run) -> Result<Report> {
+    let config = &config.resolved();
     let by_descent = config.feature_mode == FeatureMode::Train;
     if by_descent && config.mapping == Mapping::Global {
         bail!(
@@ -54,7 +55,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let mut cameras = if config.init_ply.is_some() { folder.cameras()? } else { given.clone() };
     let mut training = manifest.training(&cameras);
     let known = match config.mapping {
-        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(), run)?),
+        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(&manifest.encoder), run)?),
         Mapping::Keep => Some(objects::kept(&folder, &training)?),
         Mapping::Global => None,
     };
@@ -182,11 +183,11 @@ fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread
             Strategy::Classic => fastlgs_raster::Strategy::Classic,
             Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
         },
-        channels: match (config.freeze, by_descent, config.feature_moves_geometry) {
-            (true, ..) => Channels::Feature,
-            (_, false, _) => Channels::Color,
-            (_, true, false) => Channels::Both,
-            (_, true, true) => Channels::Coupled,
+        channels: match (config.freeze, by_descent) {
+            (true, _) => Channels::Feature,
+            (false, false) => Channels::Color,
+            // As the paper's authors train.
+            (false, true) => Channels::Coupled,
         },
         sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { preset_degree }),
         first_degree: first.sh_degree,

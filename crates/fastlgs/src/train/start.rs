@@ -66,7 +66,7 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, backg
     let color = color.collect();
     let code = |grid: &Grid, id: u16| match grid.objects.get(usize::from(id).wrapping_sub(1)) {
         Some(object) => pack(object.code.to_array().map(|v| (v * 255.0).round() as u8), true),
-        None => pack([0; 3], false),
+        None => pack([0; 3], true),
     };
     let feature = match codes {
         None => Vec::new(),

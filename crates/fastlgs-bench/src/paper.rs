@@ -1,0 +1,133 @@
+//! `fastlgs bench paper`: the paper's ablations, with its own figures beside ours.
+
+use crate::chart::{How, Way};
+use crate::table;
+use crate::trial::{self, Trial};
+use anyhow::Result;
+use fastlgs::{Run, Session};
+use fastlgs_core::fs;
+use fastlgs_grid::query::Hit;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+#[derive(clap::Args)]
+#[command(after_help = "Example: fastlgs bench paper scenes/table scenes/fox -o out --device cpu")]
+pub struct Args {
+    /// Trained scenes whose photos have labels/ beside them.
+    #[arg(required = true)]
+    scenes: Vec<PathBuf>,
+    /// Iterations of the rows that train the scene anew; without any, they take the preset quick's.
+    #[arg(long)]
+    iterations: Option<u32>,
+    /// Folder for paper.md, .csv and .json.
+    #[arg(short, long)]
+    output: PathBuf,
+}
+
+/// Pictures of the paper's last row of speed.
+const SIZE: (u32, u32) = (1440, 1080);
+
+/// The paper's tables of ablations, each row as we make it again. The first two tables keep the scene's Gaussians.
+const WAYS: [Way; 11] = [
+    Way::new("matching: embeddings", How::Remap(&["--mapping", "paper", "--cues", "none"])),
+    Way::new("matching: + key points", How::Remap(&["--mapping", "paper", "--cues", "keypoints"])),
+    Way::new("matching: + colour", How::Remap(&["--mapping", "paper"])),
+    Way::new("field: embeddings", How::Baseline("raw")),
+    Way::new("field: codes of embeddings", How::Baseline("langsplat")),
+    Way::new("codes: 1 number", How::Baseline("code1")),
+    Way::new("codes: 2 numbers", How::Baseline("code2")),
+    Way::new("codes: 3 numbers", How::Baseline("code3")),
+    Way::new("codes: 4 numbers", How::Baseline("code4")),
+    Way::new("all: as the paper", How::Train(&["--preset", "like-paper"])),
+    Way::new("all: by default", How::Train(&[])),
+];
+
+/// What the paper says of its data, on a TITAN RTX.
+const SAID: &str = "
+What the paper says, of other scenes (SPIn-NeRF's and its own), CLIP, SAM, and a TITAN RTX:
+
+| | mIoU | mAcc | seconds a query | MB |
+| --- | --- | --- | --- | --- |
+| matching: embeddings | 0.752 | 0.832 | | |
+| matching: + key points | 0.875 | 0.918 | | |
+| matching: + colour | 0.921 | 0.975 | | |
+| field: embeddings (NeRF) | 0.833 | | 20.1 | |
+| field: embeddings (Gaussians) | out of memory | | | |
+| field: grid | 0.951 | | 0.98 | |
+| 1440x1080 | | | 0.52 | 200 |
+";
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let work = trial::workshop(&args.output)?;
+    let progress = run.work("ways", (args.scenes.len() * WAYS.len()) as u64);
+    let steps = args.iterations.map(|n| n.to_string());
+    let length: Vec<&str> = match &steps {
+        Some(steps) => vec!["--iterations", steps],
+        None => vec!["--iterations", "2000"],
+    };
+    let mut rows = Vec::new();
+    for scene in &args.scenes {
+        for way in &WAYS {
+            let trial = Trial::new(scene, &work, run)?;
+            let mut command = way.how.command();
+            if let How::Train(_) = way.how {
+                command.extend(&length);
+            }
+            let mut row = way.row(&trial, &command, scene, run)?;
+            if !matches!(way.how, How::Baseline(_)) {
+                row["large_ms"] = json!(large_query(&trial.scene().root, run)?);
+            }
+            rows.push(row);
+            progress.advance()?;
+        }
+    }
+    std::fs::remove_dir_all(&work)?;
+    let value = table::write(&args.output, "paper", &COLUMNS, &rows)?;
+    let path = args.output.join("paper.md");
+    let ours = table::text(&rows, &COLUMNS, true);
+    fs::write_atomic(&path, |out| std::io::Write::write_all(out, format!("{ours}{SAID}").as_bytes()))?;
+    Ok(value)
+}
+
+/// Milliseconds to the mask of the object of most views in a new view of 1440x1080.
+fn large_query(scene: &Path, run: &Run) -> Result<f64> {
+    let mut session = Session::open(scene, run.device)?;
+    session.warm_up()?;
+    let grid = session.grid()?;
+    let target: Vec<Hit> = grid.objects.iter().max_by_key(|o| o.views).map(|o| Hit { id: o.id, score: 1.0 }).into_iter().collect();
+    let camera = session.cameras[0].resized(SIZE.0, SIZE.1);
+    let started = Instant::now();
+    session.field(&camera, None)?.mask(&grid, &target);
+    Ok(started.elapsed().as_secs_f64() * 1e3)
+}
+
+const COLUMNS: [&str; 13] = [
+    "scene",
+    "way",
+    "seconds",
+    "query_ms",
+    "large_ms",
+    "oracle_miou",
+    "miou",
+    "loc_acc",
+    "psnr",
+    "objects",
+    "gaussians",
+    "bytes",
+    "command",
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_of_one_table_are_told_apart() {
+        let mut names: Vec<&str> = WAYS.iter().map(|w| w.name).collect();
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), WAYS.len());
+        assert!(WAYS.iter().all(|w| w.how.command().contains(&"SCENE")));
+    }
+}
