@@ -39,6 +39,9 @@ Called again, it keeps what is there, goes on where it was broken off, or makes 
     Render(fastlgs::render::Config),
     /// Finds what a text names: mask, heat map, JSON.
     Query(commands::query::Args),
+    /// Takes a thing out of a scene and fills its place.
+    #[command(after_help = "Example: fastlgs remove scenes/room \"coffee mug\" -o scenes/tidy")]
+    Remove(fastlgs::remove::Config),
     /// Teaches a name by showing a thing; every scene of the same encoder then answers to it.
     #[command(after_help = "Example: fastlgs teach \"my mug\" scenes/desk --view 0003.jpg --point 210,144")]
     Teach(fastlgs::teach::Lesson),
@@ -95,6 +98,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         Command::Batch(args) => commands::batch::run(&args, common, run),
         Command::Render(config) => report::tell(common, &fastlgs::render(&config, run)?, words::render),
         Command::Query(args) => commands::query::run(&args, common, run),
+        Command::Remove(config) => report::tell(common, &fastlgs::remove(&config, run)?, words::remove),
         Command::Teach(lesson) => report::give(common, &fastlgs::teach::teach(&lesson, run)?),
         Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),

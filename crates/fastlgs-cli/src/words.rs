@@ -39,6 +39,14 @@ pub fn preprocess(r: &fastlgs::preprocess::Report) -> String {
     ])
 }
 
+pub fn remove(r: &fastlgs::remove::Report) -> String {
+    table(&[
+        ("scene", format!("{}, with {} objects and parts", r.output.display(), thousands(r.left))),
+        ("removed", format!("{} Gaussians", thousands(r.removed))),
+        ("behind it", format!("{:.0} % were seen by other photos; {} Gaussians fill the rest", 100.0 * r.seen, thousands(r.filled))),
+    ])
+}
+
 pub fn train(r: &fastlgs::train::Report) -> String {
     let held_out = decibels(r.psnr_held_out);
     let colour = if held_out.is_empty() {

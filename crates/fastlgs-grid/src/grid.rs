@@ -108,6 +108,21 @@ impl Grid {
         (0..=self.objects.len() as u16).map(inside).collect()
     }
 
+    /// The grid without some objects and all that lies in them, and the new number of each old one 0..=K; 0 for those that are gone.
+    pub fn without(&self, removed: &[u16]) -> (Self, Vec<u16>) {
+        let gone = self.members(removed);
+        let mut left = 0;
+        let number = |gone: &bool| {
+            left += u16::from(!gone);
+            if *gone { 0 } else { left }
+        };
+        let ids: Vec<u16> = std::iter::once(0).chain(gone[1..].iter().map(number)).collect();
+        let renumbered =
+            |o: &Object| Object { id: ids[usize::from(o.id)], parent: ids.get(usize::from(o.parent)).copied().unwrap_or(0), ..o.clone() };
+        let objects = self.objects.iter().filter(|o| ids[usize::from(o.id)] > 0).map(renumbered).collect();
+        (Self { objects }, ids)
+    }
+
     /// Code of an object; zero for object 0 and unknown ones.
     pub fn code_of(&self, id: u16) -> Vec3 {
         self.objects.get(usize::from(id).wrapping_sub(1)).map_or(Vec3::ZERO, |o| o.code)

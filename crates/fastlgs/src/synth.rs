@@ -32,6 +32,9 @@ pub struct Config {
     /// Write masks as lists in COCO's layout, of whole things and their parts, which overlap, instead of label maps of three levels.
     #[cfg_attr(feature = "clap", arg(long))]
     pub mask_lists: bool,
+    /// Leave the thing of this name out: what stands behind it, to measure removal against.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "NAME"))]
+    pub without: Option<String>,
     /// Every N-th view is labelled, to be held out.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
     pub holdout: usize,
@@ -44,6 +47,7 @@ impl Default for Config {
             output: PathBuf::new(),
             views: None,
             size: (320, 240),
+            without: None,
             pictures: None,
             mask_lists: false,
             holdout: 8,
@@ -82,7 +86,11 @@ pub fn synth(config: &Config, run: &Run) -> Result<Report> {
         bail!("--views {views}: at least 4 are needed");
     }
     let pictures = config.pictures.clone().unwrap_or_else(models::pictures_dir);
-    let world = kind.world(&pictures, views, config.size, run.seed)?;
+    let mut world = kind.world(&pictures, views, config.size, run.seed)?;
+    if let Some(name) = config.without.as_ref().filter(|name| !world.remove(name)) {
+        let names: Vec<&str> = world.things.iter().map(|t| t.name.as_str()).collect();
+        bail!("--without: '{name}' is none of {}", names.join(", "));
+    }
     let work = run.work("synth", views as u64);
     let masks = if config.mask_lists { Masks::Lists } else { Masks::Levels };
     synth::write(&config.output, &world, config.holdout, masks, || drop(work.advance()))?;

@@ -103,6 +103,17 @@ impl World {
         }
     }
 
+    /// Takes a thing and its parts away: the truth of what lay behind them. Numbers of things stay. Whether there was one of that name.
+    pub fn remove(&mut self, name: &str) -> bool {
+        let Some(number) = (1..).zip(&self.things).find(|(_, thing)| thing.name == name).map(|(number, _)| number) else { return false };
+        let things = &self.things;
+        let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|parent| *parent > 0);
+        let gone = |id: u16| std::iter::successors(Some(id).filter(|id| *id > 0), above).any(|id| id == number);
+        self.solids.retain(|solid| !gone(solid.thing));
+        self.tree = Hierarchy::new(&self.solids);
+        true
+    }
+
     /// Nearest hit of a ray.
     fn trace(&self, origin: Vec3, direction: Vec3, bounces: u32) -> Hit {
         let Some((index, hit)) = self.tree.nearest(&self.solids, origin, direction) else { return self.backdrop.hit(origin, direction) };

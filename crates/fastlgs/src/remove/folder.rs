@@ -1,0 +1,87 @@
+//! The scene folder that is left when a thing was removed.
+
+use crate::error::Context;
+use crate::{Result, Session};
+use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
+use fastlgs_grid::Grid;
+use fastlgs_grid::evidence::{self, Pairs};
+use image::{GrayImage, Luma, Rgb};
+use std::path::Path;
+
+/// What is not taken over: it speaks of the photos as they were.
+const LEFT_BEHIND: [&str; 4] = ["cache", "checkpoints", "objects", "embeddings.safetensors"];
+
+/// Share of a mask's pixels that must be hidden for it to be one of the thing.
+const OF_THE_THING: f64 = 0.5;
+
+/// A view, the pixels that the thing may have coloured, and the colours that take their place, `[3][h][w]`.
+type Filled = (Camera, Vec<bool>, Vec<f32>);
+
+/// Writes the scene that `session` holds now to `output`: photos to train on show it without the thing; in photos that are held out, which still
+/// show the thing, those pixels do not count.
+pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
+    let name = output.file_name().with_context(|| format!("{}: it has no name", output.display()))?;
+    // Beside its place, so that it can be renamed; a folder that is not finished never bears its name.
+    let unfinished = output.with_file_name(format!(".{}.unfinished", name.to_string_lossy()));
+    let _ = std::fs::remove_dir_all(&unfinished);
+    copy(&session.folder.root, &unfinished).map_err(Error::io(&unfinished))?;
+    let folder = SceneFolder::new(&unfinished);
+    let mut manifest = session.manifest.clone();
+    let held_out = manifest.held_out(&session.cameras);
+    for (camera, hidden, color) in pictures {
+        let (w, n) = (camera.width, hidden.len());
+        if held_out.iter().any(|c| c.name == camera.name) {
+            let path = folder.ignore_path(&camera.name);
+            let before = path.is_file().then(|| image_io::load_gray(&path)).transpose()?;
+            let counts = |x: u32, y: u32| before.as_ref().map_or(255, |b| b.get_pixel(x, y)[0]);
+            let mask = GrayImage::from_fn(w, camera.height, |x, y| Luma([if hidden[(y * w + x) as usize] { 0 } else { counts(x, y) }]));
+            image_io::save_png(&path, mask)?;
+            continue;
+        }
+        let mut photo = folder.photo(&camera.name)?;
+        for (p, pixel) in photo.pixels_mut().enumerate().filter(|(p, _)| hidden[*p]) {
+            *pixel = Rgb(std::array::from_fn(|c| (255.0 * color[c * n + p].clamp(0.0, 1.0) + 0.5) as u8));
+        }
+        image_io::save_png(&folder.photo_path(&camera.name), photo)?;
+        if folder.masks_path(&camera.name).is_file() {
+            let mut masks = folder.masks(camera)?;
+            let (width, height) = (masks.width, masks.height);
+            masks.masks.retain(|mask| {
+                let own = mask.runs.places(width, height).filter(|p| hidden[*p]).count();
+                (own as f64) < OF_THE_THING * mask.runs.area() as f64
+            });
+            masks.save(&folder.masks_path(&camera.name))?;
+        }
+    }
+    // Numbers of masks are others now.
+    evidence::save_pairs(&folder, &Pairs::new())?;
+    grid.save(&folder)?;
+    ply::write(&folder.ply_path(), &session.gaussians)?;
+    let compact = folder.compact_path();
+    if compact.is_file() {
+        std::fs::remove_file(&compact).map_err(Error::io(&compact))?;
+    }
+    let removed = manifest.notes.entry("removed".to_owned()).or_insert_with(|| serde_json::json!([]));
+    removed.as_array_mut().into_iter().for_each(|list| list.push(what.into()));
+    if let Some(train) = manifest.notes.get_mut("train") {
+        (train["gaussians"], train["objects"]) = (session.gaussians.len().into(), grid.objects.len().into());
+    }
+    folder.save_manifest(&manifest)?;
+    Ok(std::fs::rename(&unfinished, output).map_err(Error::io(output))?)
+}
+
+fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
+    std::fs::create_dir_all(to)?;
+    for entry in std::fs::read_dir(from)? {
+        let entry = entry?;
+        let name = entry.file_name();
+        if LEFT_BEHIND.iter().any(|left| name == *left) {
+            continue;
+        }
+        match entry.file_type()?.is_dir() {
+            true => copy(&entry.path(), &to.join(name))?,
+            false => drop(std::fs::copy(entry.path(), to.join(name))?),
+        }
+    }
+    Ok(())
+}

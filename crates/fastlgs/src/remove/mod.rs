@@ -1,0 +1,193 @@
+//! A thing is taken out of a scene, and what lay behind it is put in its place (paper, applications: object removal with inpainting).
+//!
+//! What other photos saw past the thing is there once its Gaussians are gone. What no photo saw is filled in one view after the other, the
+//! largest gap first: inverse depth and colour are continued into the gap, and each of its pixels becomes a Gaussian, which the next view sees.
+//! So the filling is one surface and not one opinion a view.
+
+mod behind;
+mod folder;
+mod inpaint;
+
+use crate::error::{Context, bail};
+use crate::session::ask::Ask;
+use crate::session::selection;
+use crate::{Result, Run, Session};
+use fastlgs_core::{Camera, metrics};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{Hit, QueryConfig};
+use fastlgs_raster::Channels;
+use glam::Vec2;
+pub use inpaint::{Inpainter, Membrane};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+
+/// What is removed.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+#[cfg_attr(feature = "clap", derive(clap::Args))]
+pub struct Config {
+    /// Trained scene folder.
+    pub scene: PathBuf,
+    /// What is removed, in words.
+    #[cfg_attr(feature = "clap", arg(required_unless_present = "object"))]
+    pub text: Option<String>,
+    /// The object with this number instead; `query` tells numbers.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "ID", conflicts_with = "text"))]
+    pub object: Option<u16>,
+    /// Scene folder to write.
+    #[cfg_attr(feature = "clap", arg(short, long))]
+    pub output: PathBuf,
+}
+
+/// What was removed, and what took its place.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Report {
+    /// The scene that it was in.
+    pub scene: PathBuf,
+    /// The scene without it.
+    pub output: PathBuf,
+    /// Numbers of the objects that were removed, in the first scene.
+    pub objects: Vec<u16>,
+    /// Gaussians that were removed.
+    pub removed: usize,
+    /// Gaussians that were made where no photo saw anything.
+    pub filled: usize,
+    /// Share of the thing's pixels, over all photos, behind which other photos saw something.
+    pub seen: f64,
+    /// Objects that are left.
+    pub left: usize,
+}
+
+/// By how many pixels masks are widened: five times a window of 5x5 (paper).
+const WIDENED: [u32; 2] = [10; 2];
+/// Opacity of the Gaussians that fill a gap.
+const SOLID: f32 = 0.95;
+/// Their radius in distances of pixels: so wide, neighbours leave no gaps.
+const RADIUS: f32 = 0.7;
+/// Share of a view's pixels below which a gap is left alone.
+const SMALL: f64 = 1e-5;
+/// Transmittance from which nothing is where a pixel looks.
+const EMPTY: f32 = 0.5;
+
+/// Removes a thing from a scene; the result is a scene like any other, which does not know it.
+///
+/// # Errors
+/// A text that names nothing in the scene, an object that it does not have, a folder that exists already, or a device that fails.
+pub fn remove(config: &Config, run: &Run) -> Result<Report> {
+    if config.output.exists() {
+        bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
+    }
+    let mut session = Session::open(&config.scene, run.device)?;
+    let grid = session.grid()?;
+    let targets = targets(config, &mut session, &grid)?;
+    let mut hidden = Vec::new();
+    for camera in session.cameras.clone() {
+        let mask = session.field(&camera, None)?.mask(&grid, &targets);
+        let widened = metrics::dilate(&mask, camera.width, camera.height, WIDENED);
+        hidden.push((camera, widened));
+    }
+    let views = session.manifest.training(&session.cameras);
+    let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
+    let shown: Vec<(Camera, Vec<bool>)> = hidden.iter().filter(|(camera, _)| trained_on(camera)).cloned().collect();
+    let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
+    let mut stays = behind::seen(&session, &shown)?;
+    selection::gaussians(&session.gaussians, &grid, &objects).into_iter().for_each(|i| stays[i] = false);
+    let left: Vec<usize> = (0..stays.len()).filter(|i| stays[*i]).collect();
+    if left.is_empty() {
+        bail!("{}: nothing of the scene would be left", config.scene.display());
+    }
+    let removed = stays.len() - left.len();
+    let rest = session.gaussians.select(&left);
+    session.show(rest)?;
+
+    let mut gaps = Vec::new();
+    for (camera, hidden) in &shown {
+        gaps.push(gap(&mut session, camera, hidden)?);
+    }
+    let count = |pixels: &mut dyn Iterator<Item = usize>| pixels.sum::<usize>() as f64;
+    let seen = 1.0 - count(&mut gaps.iter().map(|g| set(g))) / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
+    let filled = fill(&mut session, &grid, &shown, &gaps, &Membrane, run)?;
+
+    let mut pictures = Vec::new();
+    for (camera, hidden) in hidden {
+        let color = session.render(&camera)?.channels(0, 3).to_vec();
+        pictures.push((camera, hidden, color));
+    }
+    let (left_over, ids) = grid.without(&objects);
+    for id in &mut session.gaussians.object_ids {
+        *id = ids[usize::from(*id)];
+    }
+    let what = config.text.clone().unwrap_or_else(|| format!("object {}", objects[0]));
+    folder::write(&config.output, &session, &left_over, &pictures, &what)?;
+    Ok(Report { scene: config.scene.clone(), output: config.output.clone(), objects, removed, filled, seen, left: left_over.objects.len() })
+}
+
+fn set(pixels: &[bool]) -> usize {
+    pixels.iter().filter(|p| **p).count()
+}
+
+/// The objects that are meant.
+fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hit>> {
+    let root = config.scene.display();
+    if let Some(id) = config.object {
+        if id == 0 || usize::from(id) > grid.objects.len() {
+            bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len());
+        }
+        return Ok(vec![Hit { id, score: 1.0 }]);
+    }
+    let text = config.text.clone().unwrap_or_default();
+    let camera = session.cameras.first().cloned().with_context(|| format!("{root}: the scene has no views"))?;
+    let field = session.field(&camera, None)?;
+    let found = Ask::Text(text.clone()).meaning(session, &[])?.find(grid, &field, &camera, &QueryConfig::default())?;
+    if found.targets.is_empty() {
+        bail!("{root}: '{text}' is not found; name the object by its number with --object ('fastlgs query --point X,Y' tells it)");
+    }
+    Ok(found.targets)
+}
+
+/// The hidden pixels of a view where nothing is left.
+fn gap(session: &mut Session, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
+    let frame = session.engine.render(session.view(camera), Channels::Color)?;
+    Ok(hidden.iter().zip(frame.channels(6, 7)).map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY).collect())
+}
+
+/// Makes Gaussians where nothing is left that was photographed, and adds them to the scene; returns how many.
+fn fill(
+    session: &mut Session,
+    grid: &Grid,
+    views: &[(Camera, Vec<bool>)],
+    gaps: &[Vec<bool>],
+    inpainter: &dyn Inpainter,
+    run: &Run,
+) -> Result<usize> {
+    let before = session.gaussians.len();
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    order.sort_by_key(|k| std::cmp::Reverse(set(&gaps[*k])));
+    let work = run.work("gaps", order.len() as u64);
+    for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
+        work.advance()?;
+        // What is left of it when others are filled.
+        let gap = gap(session, camera, hidden)?;
+        let (n, width) = (gap.len(), camera.width as usize);
+        if set(&gap) as f64 <= SMALL * n as f64 || set(&gap) == n {
+            continue;
+        }
+        let depth = session.render_depth(camera)?;
+        let inverse = depth.iter().map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 });
+        let mut planes: Vec<f32> = session.render(camera)?.channels(0, 3).iter().copied().chain(inverse).collect();
+        inpainter.fill(&mut planes, &gap, width);
+        let ids = inpaint::continued(&session.field(camera, None)?.owners(grid).labels, &gap, width);
+        let to_world = camera.world_to_camera.inverse();
+        let mut scene = session.gaussians.clone();
+        for p in (0..n).filter(|p| gap[*p] && planes[3 * n + p] > 0.0) {
+            let depth = 1.0 / planes[3 * n + p];
+            let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
+            let place = to_world.transform_point3(camera.ray(pixel) * depth);
+            scene.push_sphere(place, RADIUS * depth / camera.fx, SOLID, std::array::from_fn(|c| planes[c * n + p].clamp(0.0, 1.0)));
+            let last = scene.len() - 1;
+            (scene.object_ids[last], scene.features[last]) = (ids[p], grid.code_of(ids[p]));
+        }
+        session.show(scene)?;
+    }
+    Ok(session.gaussians.len() - before)
+}
