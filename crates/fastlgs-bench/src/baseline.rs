@@ -13,14 +13,13 @@ use fastlgs_core::{Camera, LabelMap, Level, metrics};
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_grid::{Grid, codes};
+use fastlgs_grid::Grid;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, View, lift};
 use fastlgs_vision::Encoder;
 use glam::Vec3;
 use ndarray::{Array2, Axis};
 use serde_json::{Value, json};
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -31,9 +30,8 @@ pub struct Args {
     scene: PathBuf,
     /// `raw`: the mean embedding of the masks that each Gaussian is seen in, without a grid (the paper's ablation). `lerf`: embeddings of
     /// tiles at three scales, the most relevant scale of each pixel. `langsplat`: embeddings of whole and part masks through a
-    /// scene-wise autoencoder with three numbers. `code1` to `code4`: the grid with codes of this dimension, decided by the nearest one; `separated`:
-    /// with codes of three numbers of which no blend of two neighbours comes near a third.
-    #[arg(long, value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4", "separated"])]
+    /// scene-wise autoencoder with three numbers. `code1` to `code4`: the grid with codes of this dimension, decided by the nearest one.
+    #[arg(long, value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4"])]
     method: String,
 }
 
@@ -58,7 +56,6 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         "raw" => PerPixel::raw(&scene, run)?,
         "lerf" => PerPixel::lerf(&scene, run)?,
         "langsplat" => PerPixel::langsplat(&scene, run)?,
-        "separated" => PerPixel::of_codes(&scene, separated(&scene, &grid, run.seed)?),
         code => PerPixel::of_codes(&scene, lattice(grid.objects.len(), code[4..].parse().context("a dimension")?, run.seed)),
     };
     let seconds = started.elapsed().as_secs_f64();
@@ -232,16 +229,6 @@ fn lattice(count: usize, dimension: u32, seed: u64) -> Vectors {
     let mut cells: Vec<usize> = (0..side.pow(dimension)).collect();
     Rng::new(seed, "codes of any dimension").shuffle(&mut cells);
     Vectors::from_shape_fn((count, dimension as usize), |(k, axis)| ((cells[k] / side.pow(axis as u32) % side) as f32 + 0.5) / side as f32)
-}
-
-/// Codes that take into account which objects touch in the training views.
-fn separated(scene: &Session, grid: &Grid, seed: u64) -> Result<Vectors> {
-    let mut contacts = BTreeSet::new();
-    for camera in scene.manifest.training(&scene.cameras) {
-        contacts.extend(scene.folder.objects(&camera.name)?.contacts());
-    }
-    let codes = codes::separated(grid.objects.len(), &contacts, seed);
-    Ok(Vectors::from_shape_fn((codes.len(), 3), |(k, axis)| codes[k][axis]))
 }
 
 /// A label map, and the vectors of its labels.

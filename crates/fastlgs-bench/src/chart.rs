@@ -49,7 +49,7 @@ pub enum How {
     Baseline(&'static str),
 }
 
-const WAYS: [Way; 21] = [
+const WAYS: [Way; 20] = [
     Way { name: "embeddings", how: How::Remap(&["--mapping", "paper", "--cues", "none"]), cost: 0 },
     Way { name: "+ key points", how: How::Remap(&["--mapping", "paper", "--cues", "keypoints"]), cost: 0 },
     Way { name: "+ colour (paper)", how: How::Remap(&["--mapping", "paper"]), cost: 0 },
@@ -57,7 +57,6 @@ const WAYS: [Way; 21] = [
     Way { name: "code of 1 number", how: How::Baseline("code1"), cost: 0 },
     Way { name: "code of 2 numbers", how: How::Baseline("code2"), cost: 0 },
     Way { name: "code of 3 numbers", how: How::Baseline("code3"), cost: 0 },
-    Way { name: "code of 3 separated", how: How::Baseline("separated"), cost: 0 },
     Way { name: "code of 4 numbers", how: How::Baseline("code4"), cost: 0 },
     Way { name: "no grid", how: How::Baseline("raw"), cost: 0 },
     Way { name: "like LangSplat", how: How::Baseline("langsplat"), cost: 1 },

@@ -15,7 +15,7 @@ use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// Constants of global mapping.
 pub struct Config {
@@ -34,7 +34,6 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
     let pairs = evidence::load_pairs(folder, &masks)?;
     let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
-    let mut contacts = BTreeSet::new();
     for (view, camera) in training.iter().enumerate() {
         let labels = masks::whole(folder, camera)?;
         let mut table = vec![0u16; usize::from(labels.max()) + 1];
@@ -45,9 +44,8 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         }
         let map = LabelMap { labels: labels.labels.iter().map(|l| table[usize::from(*l)]).collect(), ..labels };
         map.save(&folder.objects_path(&camera.name))?;
-        contacts.extend(map.contacts());
     }
-    Ok(Grid::build(&masks, &object_of, codes::separated(usize::from(count), &contacts, run.seed)))
+    Ok(Grid::build(&masks, &object_of, codes::lattice(usize::from(count), run.seed)))
 }
 
 /// The objects that an earlier run found, whose maps must be there for all training views.
