@@ -45,6 +45,16 @@ fn quick_suite() {
     assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| number(r, "seconds") > 0.0));
     written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
 
+    let few = ["--ways", "matching: embeddings,matching: + colour,all: as the paper"];
+    let paper = ["bench", "paper", "--iterations", "500", "--device", "cpu", "-o", text(out)];
+    let paper = json(&[&paper[..], if run::all() { &[] } else { &few }].concat());
+    let row = |way: &str| paper["rows"].as_array().expect("rows").iter().find(|r| r["way"] == way).expect("a way").clone();
+    let oracle = |way: &str| number(&row(way), "oracle_miou");
+    let (embeddings, matching, all) = (oracle("matching: embeddings"), oracle("matching: + colour"), oracle("all: as the paper"));
+    println!("paper: embeddings {embeddings:.3}, with key points and colour {matching:.3}, trained with the scene {all:.3}");
+    assert!(matching > embeddings && matching > 0.8 && all > 0.7 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
+    written(out, &["paper.md", "paper.csv", "paper.json"]);
+
     let size = bench("size", &[]);
     let verdict = &size["auto"][0];
     println!("size: {verdict}");

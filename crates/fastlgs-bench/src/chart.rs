@@ -90,19 +90,9 @@ impl How {
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let most = if args.long { 2 } else { u8::from(!args.quick) };
-    if let Some(unknown) = args.ways.iter().find(|name| !WAYS.iter().any(|w| w.name == **name)) {
-        bail!("--ways: '{unknown}' is none of {}", WAYS.map(|w| w.name).join("; "));
-    }
-    let wanted = |way: &Way| args.ways.is_empty() || args.ways.iter().any(|name| name == way.name);
-    let ways: Vec<&Way> = WAYS.iter().filter(|w| w.cost <= most && wanted(w)).collect();
+    let ways: Vec<&Way> = wanted(&WAYS, &args.ways)?.into_iter().filter(|w| w.cost <= most).collect();
     let work = trial::workshop(&args.output)?;
-    let mut scenes = args.scenes.clone();
-    if scenes.is_empty() {
-        let (views, size) = trial::QUICK;
-        let scene = trial::generated(run, &work, "table", views, size)?;
-        call(run, run.seed, "train", &[trial::text(&scene), "--iterations", "1000"])?;
-        scenes.push(scene);
-    }
+    let scenes = trial::or_generated(&args.scenes, &work, run)?;
     let progress = run.work("ways", (scenes.len() * ways.len()) as u64);
     let mut rows = Vec::new();
     for scene in &scenes {
@@ -128,6 +118,14 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         plot::save(&args.output, file, &Scatter { axes, spots: &spots })?;
     }
     Ok(value)
+}
+
+/// The ways of these names; without any, all.
+pub fn wanted<'a>(ways: &'a [Way], names: &[String]) -> Result<Vec<&'a Way>> {
+    if let Some(unknown) = names.iter().find(|name| !ways.iter().any(|way| way.name == **name)) {
+        bail!("--ways: '{unknown}' is none of {}", ways.iter().map(|way| way.name).collect::<Vec<_>>().join("; "));
+    }
+    Ok(ways.iter().filter(|way| names.is_empty() || names.iter().any(|name| name == way.name)).collect())
 }
 
 impl Way {

@@ -1,6 +1,6 @@
 //! `fastlgs bench paper`: the paper's ablations, with its own figures beside ours.
 
-use crate::chart::{How, Way};
+use crate::chart::{How, Way, wanted};
 use crate::table;
 use crate::trial::{self, Trial};
 use anyhow::Result;
@@ -14,12 +14,14 @@ use std::time::Instant;
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs bench paper scenes/table scenes/fox -o out --device cpu")]
 pub struct Args {
-    /// Trained scenes whose photos have labels/ beside them.
-    #[arg(required = true)]
+    /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
     scenes: Vec<PathBuf>,
-    /// Iterations of the rows that train the scene anew; without any, they take the preset quick's.
-    #[arg(long)]
-    iterations: Option<u32>,
+    /// Iterations of the rows that train the scene anew.
+    #[arg(long, default_value_t = 2000)]
+    iterations: u32,
+    /// Rows that are made, as the table calls them, separated by commas; all by default.
+    #[arg(long, value_delimiter = ',', value_name = "NAMES")]
+    ways: Vec<String>,
     /// Folder for paper.md, .csv and .json.
     #[arg(short, long)]
     output: PathBuf,
@@ -59,20 +61,18 @@ What the paper says, of other scenes (SPIn-NeRF's and its own), CLIP, SAM, and a
 ";
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let ways = wanted(&WAYS, &args.ways)?;
     let work = trial::workshop(&args.output)?;
-    let progress = run.work("ways", (args.scenes.len() * WAYS.len()) as u64);
-    let steps = args.iterations.map(|n| n.to_string());
-    let length: Vec<&str> = match &steps {
-        Some(steps) => vec!["--iterations", steps],
-        None => vec!["--iterations", "2000"],
-    };
+    let scenes = trial::or_generated(&args.scenes, &work, run)?;
+    let progress = run.work("ways", (scenes.len() * ways.len()) as u64);
+    let iterations = args.iterations.to_string();
     let mut rows = Vec::new();
-    for scene in &args.scenes {
-        for way in &WAYS {
+    for scene in &scenes {
+        for way in &ways {
             let trial = Trial::new(scene, &work, run)?;
             let mut command = way.how.command();
             if let How::Train(_) = way.how {
-                command.extend(&length);
+                command.extend(["--iterations", &iterations]);
             }
             let mut row = way.row(&trial, &command, scene, run)?;
             if !matches!(way.how, How::Baseline(_)) {

@@ -33,6 +33,17 @@ pub fn generated(run: &Run, work: &Path, kind: &str, views: usize, size: &str) -
     Ok(scene)
 }
 
+/// The scenes, or where there are none a generated and trained table.
+pub fn or_generated(scenes: &[PathBuf], work: &Path, run: &Run) -> Result<Vec<PathBuf>> {
+    if !scenes.is_empty() {
+        return Ok(scenes.to_vec());
+    }
+    let (views, size) = QUICK;
+    let scene = generated(run, work, "table", views, size)?;
+    call(run, run.seed, "train", &[text(&scene), "--iterations", "1000"])?;
+    Ok(vec![scene])
+}
+
 /// The last part of a path.
 pub fn name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
