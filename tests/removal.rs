@@ -115,6 +115,9 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
     assert!(objects(&tidy) < objects(&f.scene));
     json(&["eval", text(&tidy)]);
     json(&["export", text(&tidy), text(&at("tidy.spz"))]);
+    let small = at("small/");
+    json(&["export", text(&f.scene), text(&small)]);
+    fails(&["remove", text(&small), "--object", &id, "-o", text(&at("x"))], &["photos are not there"]);
     fails(&["remove", text(&f.scene), "--object", &id, "-o", text(&tidy)], &["tidy", "already"]);
     fails(&["remove", text(&f.scene), "--object", "999", "-o", text(&at("x"))], &["none is 999"]);
     fails(&["remove", text(&f.scene), "submarine", "-o", text(&at("x"))], &["'submarine' is not found", "--object"]);

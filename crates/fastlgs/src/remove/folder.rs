@@ -24,8 +24,18 @@ pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled],
     // Beside its place, so that it can be renamed; a folder that is not finished never bears its name.
     let unfinished = output.with_file_name(format!(".{}.unfinished", name.to_string_lossy()));
     let _ = std::fs::remove_dir_all(&unfinished);
-    copy(&session.folder.root, &unfinished).map_err(Error::io(&unfinished))?;
-    let folder = SceneFolder::new(&unfinished);
+    let written = fill(&unfinished, session, grid, pictures, what);
+    if written.is_err() {
+        let _ = std::fs::remove_dir_all(&unfinished);
+    }
+    written?;
+    Ok(std::fs::rename(&unfinished, output).map_err(Error::io(output))?)
+}
+
+/// Writes the folder under the name that it has until it is finished.
+fn fill(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
+    copy(&session.folder.root, unfinished).map_err(Error::io(unfinished))?;
+    let folder = SceneFolder::new(unfinished);
     let mut manifest = session.manifest.clone();
     let held_out = manifest.held_out(&session.cameras);
     for (camera, hidden, color) in pictures {
@@ -66,8 +76,7 @@ pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled],
     if let Some(train) = manifest.notes.get_mut("train") {
         (train["gaussians"], train["objects"]) = (session.gaussians.len().into(), grid.objects.len().into());
     }
-    folder.save_manifest(&manifest)?;
-    Ok(std::fs::rename(&unfinished, output).map_err(Error::io(output))?)
+    Ok(folder.save_manifest(&manifest)?)
 }
 
 fn copy(from: &Path, to: &Path) -> std::io::Result<()> {

@@ -78,6 +78,9 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
         bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
     }
     let mut session = Session::open(&config.scene, run.device)?;
+    if session.cameras.iter().any(|camera| !session.folder.photo_path(&camera.name).is_file()) {
+        bail!("{}: its photos are not there; remove the thing from the scene that was trained, not from an export", config.scene.display());
+    }
     let grid = session.grid()?;
     let targets = targets(config, &mut session, &grid)?;
     let mut hidden = Vec::new();
