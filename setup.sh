@@ -12,8 +12,8 @@ as_root() {
     else fail "root rights are needed for: $* (run this script as root, or install sudo)"; fi
 }
 
-# Vulkan on the CPU, OpenCV's SIFT with its headers, Python for the one-time weight conversion.
-packages="mesa-vulkan-drivers libvulkan1 libopencv-features2d-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
+# Vulkan on the CPU, OpenCV's SIFT and inpainting with their headers, Python for the one-time weight conversion.
+packages="mesa-vulkan-drivers libvulkan1 libopencv-features2d-dev libopencv-photo-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
 if [ "${1:-}" = --tests ]; then
     packages="$packages chromium chromium-driver"
     # Where rustup cannot reach its server, Debian's compiler with its library's source builds for wasm32.

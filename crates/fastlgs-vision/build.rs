@@ -1,12 +1,12 @@
-//! With the feature `opencv`: compiles the function that calls OpenCV's SIFT, and links the system's OpenCV.
+//! With the feature `opencv`: compiles the functions that call OpenCV, and links the system's OpenCV.
 
 fn main() {
-    println!("cargo::rerun-if-changed=src/opencv_sift.cpp");
+    println!("cargo::rerun-if-changed=src/opencv");
     if std::env::var_os("CARGO_FEATURE_OPENCV").is_none() {
         return;
     }
     let mut build = cc::Build::new();
-    build.cpp(true).std("c++14").warnings(false).file("src/opencv_sift.cpp");
+    build.cpp(true).std("c++14").warnings(false).files(["src/opencv/sift.cpp", "src/opencv/inpaint.cpp"]);
     // Where pkg-config does not know it (Debian's single modules), the usual place will do.
     match pkg_config::Config::new().cargo_metadata(false).probe("opencv4") {
         Ok(library) => {
@@ -15,13 +15,13 @@ fn main() {
         }
         Err(_) => drop(build.include("/usr/include/opencv4")),
     }
-    if let Err(error) = build.try_compile("fastlgs_opencv_sift") {
+    if let Err(error) = build.try_compile("fastlgs_opencv") {
         let mend =
-            "install OpenCV 4.4 or newer with its headers (on Debian: libopencv-features2d-dev), or build without the feature 'opencv'";
+            "install OpenCV 4.4 or newer (on Debian: libopencv-features2d-dev, libopencv-photo-dev), or build without the feature 'opencv'";
         println!("cargo::error={error}; {mend}");
         return;
     }
-    for module in ["features2d", "core"] {
+    for module in ["features2d", "photo", "core"] {
         println!("cargo::rustc-link-lib=opencv_{module}");
     }
 }

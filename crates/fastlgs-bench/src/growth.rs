@@ -1,10 +1,13 @@
-//! `fastlgs bench growth`: what global mapping costs as photos, masks and Gaussians grow, on a generated plain of tiles whose masks are exact.
+//! `fastlgs bench growth`: what global mapping and the paper's cost as photos, masks and Gaussians grow, on a generated plain of tiles whose masks
+//! are exact.
 
 use crate::speed::peak_process_bytes;
 use anyhow::{Context, Result};
 use fastlgs::Run;
 use fastlgs::objects::{self, Config};
+use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, LabelMap, MaskList, SceneFolder};
+use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use glam::{Mat3, Vec2, Vec3};
 use rayon::prelude::*;
 use serde_json::{Value, json};
@@ -22,7 +25,7 @@ pub struct Args {
     /// Gaussians.
     #[arg(long, default_value_t = 60_000)]
     gaussians: usize,
-    /// Also map with half the photos, half the masks and half the Gaussians, and tell the exponents.
+    /// Also map with half the photos, half the masks and half the Gaussians, and tell the exponents of global mapping.
     #[arg(long)]
     exponents: bool,
 }
@@ -67,10 +70,16 @@ fn measured([photos, masks, gaussians]: [usize; 3], run: &Run) -> Result<Value> 
     let config = Config { objects: fastlgs_grid::objects::Config::default(), antialias: false };
     let started = Instant::now();
     let mapped = objects::map(&mut scene, &folder, &cameras, &config, run)?;
+    let seconds = started.elapsed().as_secs_f64();
+    let seen = embedded(&cameras, tiles);
+    let started = Instant::now();
+    let matched = mapping::paper(&seen, &mapping::Correspondences::new(), &PaperConfig::default())?;
     Ok(json!({
         "photos": photos, "masks_per_photo": found as f64 / photos as f64, "gaussians": scene.len(),
-        "seconds": started.elapsed().as_secs_f64(),
+        "seconds": seconds,
         "nodes": mapped.summary.nodes, "objects": mapped.chosen.nodes.len(), "things": 3 * tiles * tiles,
+        "paper_masks": seen.len(), "paper_seconds": started.elapsed().as_secs_f64(), "paper_objects": matched.count,
+        "paper_comparisons": matched.comparisons,
     }))
 }
 
@@ -95,21 +104,55 @@ fn camera(k: usize, count: usize) -> Camera {
     Camera::look_at(&format!("{k:04}.png"), eye, Vec3::new(at.x, 0.0, at.y), Vec3::Y, SIZE.0, SIZE.1, 0.95)
 }
 
+/// Numbers of an embedding and of a colour histogram, as CLIP's ViT-B/16 and the paper's have them.
+const EMBEDDING: usize = 512;
+/// How much an embedding wavers from view to view: cosines of one tile are about 0.98.
+const WAVERING: f32 = 0.14;
+
+/// The halves of tiles that views show, as Algorithm 1 takes them: each half looks its own way.
+fn embedded(cameras: &[Camera], tiles: u32) -> Vec<Mask> {
+    let one = |(view, camera): (usize, &Camera)| {
+        let mut areas = std::collections::BTreeMap::new();
+        halves_of(camera, tiles).into_iter().flatten().for_each(|half| *areas.entry(half).or_insert(0.0) += 1.0);
+        let pixels = (camera.width * camera.height) as f32;
+        let mask = |(half, area): (u16, f32)| {
+            let mut look = Rng::new(u64::from(half), "look");
+            let mut wavering = Rng::new((view as u64) << 16 | u64::from(half), "wavering");
+            let mut embedding: Vec<f32> = (0..EMBEDDING).map(|_| look.normal() + WAVERING * wavering.normal()).collect();
+            let length = embedding.iter().map(|v| v * v).sum::<f32>().sqrt();
+            embedding.iter_mut().for_each(|v| *v /= length);
+            let mut histogram: Vec<f32> = (0..EMBEDDING).map(|_| look.normal().powi(2)).collect();
+            let sum: f32 = histogram.iter().sum();
+            histogram.iter_mut().for_each(|v| *v /= sum);
+            Mask { view, label: half, area: area / pixels, embedding, histogram }
+        };
+        areas.into_iter().map(mask).collect::<Vec<_>>()
+    };
+    cameras.par_iter().enumerate().flat_map_iter(one).collect()
+}
+
 /// The tiles that a view shows, and their halves.
 fn masks_of(camera: &Camera, tiles: u32) -> MaskList {
+    let mut levels = [(); 3].map(|()| LabelMap::new(camera.width, camera.height));
+    for (p, half) in halves_of(camera, tiles).into_iter().enumerate() {
+        let Some(half) = half else { continue };
+        (levels[0].labels[p], levels[1].labels[p]) = (half.div_ceil(2), half);
+    }
+    MaskList::of_levels(&levels)
+}
+
+/// Which half of a tile each pixel shows, counted from 1; tile t has the halves 2 t - 1 and 2 t.
+fn halves_of(camera: &Camera, tiles: u32) -> Vec<Option<u16>> {
     let to_world = Mat3::from_mat4(camera.world_to_camera).transpose();
     let eye = camera.centre();
-    let mut levels = [(); 3].map(|()| LabelMap::new(camera.width, camera.height));
-    for p in 0..levels[0].labels.len() {
-        let pixel = Vec2::new((p as u32 % camera.width) as f32 + 0.5, (p as u32 / camera.width) as f32 + 0.5);
+    let half = |p: u32| {
+        let pixel = Vec2::new((p % camera.width) as f32 + 0.5, (p / camera.width) as f32 + 0.5);
         let ray = to_world * camera.ray(pixel);
         let at = eye - ray * (eye.y / ray.y);
         let place = (Vec2::new(at.x, at.z) + HALF) * tiles as f32 / (2.0 * HALF);
-        if ray.y < 0.0 && place.min_element() >= 0.0 && place.max_element() < tiles as f32 {
-            let tile = place.y as u32 * tiles + place.x as u32;
-            levels[0].labels[p] = tile as u16 + 1;
-            levels[1].labels[p] = (2 * tile + u32::from(place.x.fract() > 0.5)) as u16 + 1;
-        }
-    }
-    MaskList::of_levels(&levels)
+        let tile = place.y as u32 * tiles + place.x as u32;
+        let shown = ray.y < 0.0 && place.min_element() >= 0.0 && place.max_element() < tiles as f32;
+        shown.then(|| (2 * tile + u32::from(place.x.fract() > 0.5)) as u16 + 1)
+    };
+    (0..camera.width * camera.height).map(half).collect()
 }

@@ -16,6 +16,7 @@ mod stability;
 mod table;
 mod trial;
 mod vision;
+mod ways;
 
 use anyhow::Result;
 use fastlgs::Run;

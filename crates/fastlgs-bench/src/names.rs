@@ -69,7 +69,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mean = |column: &str| rows.iter().map(|row| table::number(row, column)).sum::<f64>() / rows.len() as f64;
     let (left_out, seen) = (mean("miou_left_out"), mean("miou_seen"));
     if let Some(folder) = &args.output {
-        table::write(folder, "names", &COLUMNS, &rows)?;
+        table::write(folder, "names", &COLUMNS, &rows, "")?;
     }
     Ok(json!({ "rows": rows, "miou_left_out": left_out, "miou_seen": seen, "gap": seen - left_out }))
 }

@@ -1,11 +1,10 @@
 //! `fastlgs bench paper`: the paper's ablations, with its own figures beside ours.
 
-use crate::chart::{How, Way, wanted};
 use crate::table;
 use crate::trial::{self, Trial};
+use crate::ways::{How, Way, wanted};
 use anyhow::Result;
 use fastlgs::{Run, Session};
-use fastlgs_core::fs;
 use fastlgs_grid::query::Hit;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -83,11 +82,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         }
     }
     std::fs::remove_dir_all(&work)?;
-    let value = table::write(&args.output, "paper", &COLUMNS, &rows)?;
-    let path = args.output.join("paper.md");
-    let ours = table::text(&rows, &COLUMNS, true);
-    fs::write_atomic(&path, |out| std::io::Write::write_all(out, format!("{ours}{SAID}").as_bytes()))?;
-    Ok(value)
+    table::write(&args.output, "paper", &COLUMNS, &rows, SAID)
 }
 
 /// Milliseconds to the mask of the object of most views in a new view of 1440x1080.

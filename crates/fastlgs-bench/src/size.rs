@@ -107,7 +107,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         let axes = Axes { title, x: "megabytes of everything that a query needs", y: label };
         plot::save(&args.output, &format!("size-{}", what.replace('_', "-")), &Scatter { axes, spots: &spots })?;
     }
-    let mut value = table::write(&args.output, "size", &COLUMNS, &rows)?;
+    let mut value = table::write(&args.output, "size", &COLUMNS, &rows, "")?;
     value["auto"] = json!(verdicts);
     fastlgs_core::fs::write_json(&args.output.join("size.json"), &value)?;
     Ok(value)

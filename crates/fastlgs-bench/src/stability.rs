@@ -204,7 +204,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     std::fs::remove_dir_all(&work)?;
     let verdicts = |what: &str| rows.iter().filter(|r| r["verdict"] == what).count();
     let (holds, fails) = (verdicts("holds"), verdicts("fails"));
-    let mut value = table::write(&args.output, "stability", &COLUMNS, &rows)?;
+    let mut value = table::write(&args.output, "stability", &COLUMNS, &rows, "")?;
     (value["holds"], value["fails"]) = (json!(holds), json!(fails));
     Ok(value)
 }

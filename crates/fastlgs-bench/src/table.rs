@@ -5,10 +5,11 @@ use fastlgs_core::fs;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Writes `NAME.json`, `NAME.csv` and `NAME.md`, with these columns of the rows, into `folder`; returns what the JSON holds.
-pub fn write(folder: &Path, name: &str, columns: &[&str], rows: &[Value]) -> Result<Value> {
-    for (ending, framed) in [("md", true), ("csv", false)] {
-        let text = text(rows, columns, framed);
+/// Writes `NAME.json`, `NAME.csv` and `NAME.md`, with these columns of the rows, into `folder`; returns what the JSON holds. `remarks` stand below
+/// the table for people.
+pub fn write(folder: &Path, name: &str, columns: &[&str], rows: &[Value], remarks: &str) -> Result<Value> {
+    for (ending, framed, remarks) in [("md", true, remarks), ("csv", false, "")] {
+        let text = text(rows, columns, framed) + remarks;
         fs::write_atomic(&folder.join(format!("{name}.{ending}")), |out| std::io::Write::write_all(out, text.as_bytes()))?;
     }
     let value = json!({ "rows": rows, "chart": folder.join(format!("{name}.svg")) });
@@ -17,7 +18,7 @@ pub fn write(folder: &Path, name: &str, columns: &[&str], rows: &[Value]) -> Res
 }
 
 /// The rows as Markdown (`framed`) or CSV.
-pub fn text(rows: &[Value], columns: &[&str], framed: bool) -> String {
+fn text(rows: &[Value], columns: &[&str], framed: bool) -> String {
     let line = |cells: Vec<String>| if framed { format!("| {} |\n", cells.join(" | ")) } else { format!("{}\n", cells.join(",")) };
     let cell = |row: &Value, name: &str| match &row[name] {
         Value::String(text) if framed => text.clone(),

@@ -151,22 +151,6 @@ impl Gaussians {
         }
     }
 
-    /// Appends all of `others`, whose colour must be of the same degree.
-    ///
-    /// # Panics
-    /// If it is not.
-    pub fn append(&mut self, others: &Self) {
-        assert_eq!(self.sh_degree, others.sh_degree, "colour of one degree");
-        self.means.extend(&others.means);
-        self.log_scales.extend(&others.log_scales);
-        self.rotations.extend(&others.rotations);
-        self.opacity_logits.extend(&others.opacity_logits);
-        self.sh_dc.extend(&others.sh_dc);
-        self.sh_rest.extend(&others.sh_rest);
-        self.features.extend(&others.features);
-        self.object_ids.extend(&others.object_ids);
-    }
-
     /// Rotation of Gaussian `i` as a unit quaternion.
     pub fn rotation(&self, i: usize) -> Quat {
         let [w, x, y, z] = self.rotations[i];

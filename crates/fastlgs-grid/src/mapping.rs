@@ -1,8 +1,10 @@
 //! Cross-view grid mapping (paper, Algorithm 1): which masks of different photos show the same object.
 
 use crate::{Error, Result};
+use fastlgs_core::vectorised;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 /// One mask of one photo.
 #[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
@@ -41,13 +43,34 @@ impl Default for PaperConfig {
 /// Key-point pairs between masks: (later mask, earlier mask) -> number. Masks are indices into the mask list.
 pub type Correspondences = BTreeMap<(usize, usize), u32>;
 
-/// sim = alpha * Bhattacharyya coefficient of C + (1 - alpha) * cosine of L.
-///
-/// The paper's prose swaps the two names; its formulas are meant like this.
-pub fn similarity(a: &Mask, b: &Mask, alpha: f32) -> f32 {
-    let color: f32 = a.histogram.iter().zip(&b.histogram).map(|(x, y)| (x * y).sqrt()).sum();
-    let cosine: f32 = a.embedding.iter().zip(&b.embedding).map(|(x, y)| x * y).sum();
-    alpha * color + (1.0 - alpha) * cosine
+impl Mask {
+    /// One vector for embedding and colours, whose inner products are the paper's similarities:
+    /// sim = alpha * Bhattacharyya coefficient of C + (1 - alpha) * cosine of L. (The paper's prose swaps the two names; its formulas are meant
+    /// like this.)
+    fn look(&self, alpha: f32) -> Vec<f32> {
+        let color = self.histogram.iter().map(|share| (alpha * share).sqrt());
+        color.chain(self.embedding.iter().map(|value| (1.0 - alpha).sqrt() * value)).collect()
+    }
+}
+
+vectorised! {
+    /// Inner products of a vector with others of its length.
+    fn products(with: &[f32], others: &[Vec<f32>], out: &mut [f32]) = products_body
+}
+
+#[inline(always)]
+fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [f32]) {
+    const LANES: usize = 16;
+    for (other, out) in others.iter().zip(out) {
+        let ((a, a_rest), (b, b_rest)) = (with.as_chunks::<LANES>(), other.as_chunks::<LANES>());
+        let mut sums = [0.0f32; LANES];
+        for (a, b) in a.iter().zip(b) {
+            for k in 0..LANES {
+                sums[k] = if FMA { a[k].mul_add(b[k], sums[k]) } else { sums[k] + a[k] * b[k] };
+            }
+        }
+        *out = sums.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum::<f32>();
+    }
 }
 
 /// Masks of an object that are more alike than this stand for each other.
@@ -77,13 +100,13 @@ pub struct Mapped {
 pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Result<Mapped> {
     let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
     let mut representatives: Vec<usize> = Vec::new();
+    let looks: Vec<Vec<f32>> = masks.par_iter().map(|mask| mask.look(config.alpha)).collect();
     for photo in masks.chunk_by(|a, b| a.view == b.view) {
         let first = mapped.object_of.len();
         let by_key_points: Vec<Option<u16>> =
             (first..first + photo.len()).map(|j| most_corresponding(j, first, pairs, &mapped, config)).collect();
         mapped.comparisons += photo.len() * representatives.len();
-        let alike: Vec<BTreeMap<u16, f32>> =
-            photo.par_iter().map(|mask| similarities(mask, &representatives, masks, &mapped, config)).collect();
+        let alike = similarities(&looks, first..first + photo.len(), &representatives, &mapped);
         let mut object_of = by_key_points;
         for (_, mask, object) in most_alike_first(&alike, config.theta) {
             if object_of[mask].is_none() && !object_of.contains(&Some(object)) {
@@ -114,14 +137,24 @@ fn most_corresponding(j: usize, first: usize, pairs: &Correspondences, mapped: &
     Some(mapped.object_of[most.1.0]).filter(|_| config.key_points && most.0 >= config.tau)
 }
 
-/// How much a mask is like each object: like its most similar representative.
-fn similarities(mask: &Mask, representatives: &[usize], masks: &[Mask], mapped: &Mapped, config: &PaperConfig) -> BTreeMap<u16, f32> {
-    let mut best = BTreeMap::new();
-    for &k in representatives {
-        let sim = best.entry(mapped.object_of[k]).or_insert(f32::MIN);
-        *sim = sim.max(similarity(mask, &masks[k], config.alpha));
-    }
-    best
+/// How much each mask of a photo is like each object: like its most similar representative.
+fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usize], mapped: &Mapped) -> Vec<BTreeMap<u16, f32>> {
+    // The photo's own vectors stay at hand while each of the many representatives comes by once.
+    let with = |k: &usize| {
+        let mut row = vec![0.0; photo.len()];
+        products(&looks[*k], &looks[photo.clone()], &mut row);
+        row
+    };
+    let rows: Vec<Vec<f32>> = representatives.par_iter().map(with).collect();
+    let best = |mask: usize| {
+        let mut best = BTreeMap::new();
+        for (k, row) in representatives.iter().zip(&rows) {
+            let sim = best.entry(mapped.object_of[*k]).or_insert(f32::MIN);
+            *sim = sim.max(row[mask]);
+        }
+        best
+    };
+    (0..photo.len()).into_par_iter().map(best).collect()
 }
 
 /// Pairs (similarity, mask, object) from theta on.
@@ -160,7 +193,9 @@ mod tests {
         assert_eq!((found.object_of, found.count), (vec![1, 2, 1, 2, 3, 4], 4));
         assert_eq!(map(PaperConfig { tau: 3, ..PaperConfig::default() }).object_of[5], 1, "tau is an option");
         assert_eq!(map(PaperConfig { key_points: false, ..PaperConfig::default() }).object_of, [1, 2, 3, 2, 4, 5], "so are key points");
-        assert!((similarity(&masks[1], &masks[3], 0.3) - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
+        let mut similarity = [0.0];
+        products(&masks[1].look(0.3), &[masks[3].look(0.3)], &mut similarity);
+        assert!((similarity[0] - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
     }
 
     /// `views` photos of 40 things, of which each shows ten; how a thing looks wavers from photo to photo.

@@ -44,7 +44,7 @@ pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
 
 #[cfg(feature = "opencv")]
 fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
-    let (positions, descriptors) = crate::opencv_sift::detect(photo, MAX_KEYPOINTS)?;
+    let (positions, descriptors) = crate::opencv::sift::detect(photo, MAX_KEYPOINTS)?;
     Ok(Keypoints { positions, descriptors })
 }
 

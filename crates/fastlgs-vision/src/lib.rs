@@ -14,13 +14,14 @@ pub mod encoder;
 pub mod exposure;
 pub mod histogram;
 pub mod import;
+pub mod inpaint;
 pub mod keypoints;
 pub mod masks;
 pub mod matching;
 pub mod models;
 pub mod names;
 #[cfg(feature = "opencv")]
-mod opencv_sift;
+mod opencv;
 pub mod photo_quality;
 pub mod places;
 pub mod pose_check;

@@ -106,10 +106,7 @@ impl World {
     /// Takes a thing and its parts away: the truth of what lay behind them. Numbers of things stay. Whether there was one of that name.
     pub fn remove(&mut self, name: &str) -> bool {
         let Some(number) = (1..).zip(&self.things).find(|(_, thing)| thing.name == name).map(|(number, _)| number) else { return false };
-        let things = &self.things;
-        let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|parent| *parent > 0);
-        let gone = |id: u16| std::iter::successors(Some(id).filter(|id| *id > 0), above).any(|id| id == number);
-        self.solids.retain(|solid| !gone(solid.thing));
+        self.solids.retain(|solid| !chain(&self.things, solid.thing).any(|id| id == number));
         self.tree = Hierarchy::new(&self.solids);
         true
     }
@@ -160,6 +157,12 @@ impl Backdrop {
         let shade = 0.75 + 0.25 * exit.normal.y.abs();
         Hit { thing: 0, t: exit.t, color: surface.color(point, point, exit.normal) * shade }
     }
+}
+
+/// A thing and all that contain it, from small to large.
+fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
+    let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0);
+    std::iter::successors(Some(id).filter(|id| *id > 0), above)
 }
 
 /// Light from above and from the side; nothing is black.

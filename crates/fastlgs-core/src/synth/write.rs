@@ -1,6 +1,6 @@
 //! A generated scene as a folder of photos.
 
-use super::{Thing, World};
+use super::{Thing, World, chain};
 use crate::mask_list::{Mask, RunLengths};
 use crate::{Camera, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
 use serde_json::json;
@@ -52,12 +52,6 @@ pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: 
         "fl_x": first.fx, "fl_y": first.fy, "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height, "frames": frames,
     });
     fs::write_json(&out.join("transforms.json"), &transforms)
-}
-
-/// A thing and all that contain it, from small to large.
-fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
-    let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0);
-    std::iter::successors(Some(id).filter(|id| *id > 0), above)
 }
 
 /// What a thing belongs to at a level: 0 whole things, 1 their parts, 2 parts of parts.

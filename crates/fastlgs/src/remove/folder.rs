@@ -24,7 +24,7 @@ pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled],
     // Beside its place, so that it can be renamed; a folder that is not finished never bears its name.
     let unfinished = output.with_file_name(format!(".{}.unfinished", name.to_string_lossy()));
     let _ = std::fs::remove_dir_all(&unfinished);
-    let written = fill(&unfinished, session, grid, pictures, what);
+    let written = assemble(&unfinished, session, grid, pictures, what);
     if written.is_err() {
         let _ = std::fs::remove_dir_all(&unfinished);
     }
@@ -33,7 +33,7 @@ pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled],
 }
 
 /// Writes the folder under the name that it has until it is finished.
-fn fill(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
+fn assemble(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
     copy(&session.folder.root, unfinished).map_err(Error::io(unfinished))?;
     let folder = SceneFolder::new(unfinished);
     let mut manifest = session.manifest.clone();

@@ -1,12 +1,12 @@
 //! A thing is taken out of a scene, and what lay behind it is put in its place (paper, applications: object removal with inpainting).
 //!
 //! What other photos saw past the thing is there once its Gaussians are gone. What no photo saw is filled in one view after the other, the
-//! largest gap first: inverse depth and colour are continued into the gap, and each of its pixels becomes a Gaussian, which the next view sees.
+//! largest gap first: inverse depth is continued into the gap, colour by an inpainter, and each of its pixels becomes a Gaussian, which the next view sees.
 //! So the filling is one surface and not one opinion a view.
 
 mod behind;
 mod folder;
-mod inpaint;
+mod membrane;
 
 use crate::error::{Context, bail};
 use crate::session::ask::Ask;
@@ -16,13 +16,14 @@ use fastlgs_core::{Camera, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::{Hit, QueryConfig};
 use fastlgs_raster::Channels;
+use fastlgs_vision::inpaint::{self, Inpainter};
 use glam::Vec2;
-pub use inpaint::{Inpainter, Membrane};
+use membrane::Membrane;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
 /// What is removed.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
@@ -37,6 +38,15 @@ pub struct Config {
     /// Scene folder to write.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
+    /// What colours places that no photo saw: membrane (the smoothest), opencv (Telea's), or an ONNX file like LaMa's.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "NAME|FILE", default_value_t = Self::default().inpainter))]
+    pub inpainter: String,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { scene: PathBuf::new(), text: None, object: None, output: PathBuf::new(), inpainter: "membrane".to_owned() }
+    }
 }
 
 /// What was removed, and what took its place.
@@ -77,6 +87,8 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     if config.output.exists() {
         bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
     }
+    let inpainter: Box<dyn Inpainter> =
+        if config.inpainter == "membrane" { Box::new(Membrane) } else { inpaint::named(&config.inpainter).context("--inpainter")? };
     let mut session = Session::open(&config.scene, run.device)?;
     if session.cameras.iter().any(|camera| !session.folder.photo_path(&camera.name).is_file()) {
         bail!("{}: its photos are not there; remove the thing from the scene that was trained, not from an export", config.scene.display());
@@ -109,7 +121,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     }
     let count = |pixels: &mut dyn Iterator<Item = usize>| pixels.sum::<usize>() as f64;
     let seen = 1.0 - count(&mut gaps.iter().map(|g| set(g))) / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
-    let filled = fill(&mut session, &grid, &shown, &gaps, &Membrane, run)?;
+    let filled = fill(&mut session, &grid, &shown, &gaps, &*inpainter, run)?;
 
     let mut pictures = Vec::new();
     for (camera, hidden) in hidden {
@@ -176,17 +188,18 @@ fn fill(
             continue;
         }
         let depth = session.render_depth(camera)?;
-        let inverse = depth.iter().map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 });
-        let mut planes: Vec<f32> = session.render(camera)?.channels(0, 3).iter().copied().chain(inverse).collect();
-        inpainter.fill(&mut planes, &gap, width);
-        let ids = inpaint::continued(&session.field(camera, None)?.owners(grid).labels, &gap, width);
+        let mut inverse: Vec<f32> = depth.iter().map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 }).collect();
+        Membrane::span(&mut inverse, &gap, width);
+        let mut colors = session.render(camera)?.channels(0, 3).to_vec();
+        inpainter.fill(&mut colors, &gap, camera.width)?;
+        let ids = membrane::continued(&session.field(camera, None)?.owners(grid).labels, &gap, width);
         let to_world = camera.world_to_camera.inverse();
         let mut scene = session.gaussians.clone();
-        for p in (0..n).filter(|p| gap[*p] && planes[3 * n + p] > 0.0) {
-            let depth = 1.0 / planes[3 * n + p];
+        for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {
+            let depth = 1.0 / inverse[p];
             let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
             let place = to_world.transform_point3(camera.ray(pixel) * depth);
-            scene.push_sphere(place, RADIUS * depth / camera.fx, SOLID, std::array::from_fn(|c| planes[c * n + p].clamp(0.0, 1.0)));
+            scene.push_sphere(place, RADIUS * depth / camera.fx, SOLID, std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)));
             let last = scene.len() - 1;
             (scene.object_ids[last], scene.features[last]) = (ids[p], grid.code_of(ids[p]));
         }

@@ -1,10 +1,6 @@
-//! Colours for pixels of which nothing is known.
+//! Values for pixels of which nothing is known, from those around them.
 
-/// Fills holes of pictures.
-pub trait Inpainter {
-    /// Gives the pixels of `hole` values that continue those around them, in each plane of `[planes][height][width]`.
-    fn fill(&self, planes: &mut [f32], hole: &[bool], width: usize);
-}
+use fastlgs_vision::inpaint::Inpainter;
 
 /// The smoothest filling: a membrane over the hole, held by its rim (Laplace's equation). It continues planes of inverse depth exactly, and
 /// invents no texture.
@@ -15,11 +11,19 @@ const OVER: f32 = 1.9;
 const STEPS: usize = 400;
 
 impl Inpainter for Membrane {
-    fn fill(&self, planes: &mut [f32], hole: &[bool], width: usize) {
+    fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> fastlgs_vision::Result<()> {
+        Self::span(colors, hole, width as usize);
+        Ok(())
+    }
+}
+
+impl Membrane {
+    /// Fills `hole` in each plane of `[planes][height][width]`.
+    pub fn span(planes: &mut [f32], hole: &[bool], width: usize) {
         let inside: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
         let around: Vec<Vec<usize>> = inside.iter().map(|p| neighbours(*p, width, hole.len())).collect();
         for plane in planes.chunks_exact_mut(hole.len()) {
-            start(plane, hole, &inside, &around);
+            inwards(plane, hole, width, |known| known.iter().sum::<f32>() / known.len() as f32);
             for _ in 0..STEPS {
                 for (p, near) in inside.iter().zip(&around) {
                     let mean = near.iter().map(|q| plane[*q]).sum::<f32>() / near.len() as f32;
@@ -30,39 +34,29 @@ impl Inpainter for Membrane {
     }
 }
 
-/// Ring by ring, the mean of what is known beside each pixel.
-fn start(plane: &mut [f32], hole: &[bool], inside: &[usize], around: &[Vec<usize>]) {
-    let mut open = hole.to_vec();
-    loop {
-        let beside = |(p, near): (&usize, &Vec<usize>)| {
-            let known: Vec<f32> = near.iter().filter(|q| !open[**q]).map(|q| plane[*q]).collect();
-            (open[*p] && !known.is_empty()).then(|| (*p, known.iter().sum::<f32>() / known.len() as f32))
-        };
-        let ring: Vec<(usize, f32)> = inside.iter().zip(around).filter_map(beside).collect();
-        if ring.is_empty() {
-            break;
-        }
-        for (p, value) in ring {
-            plane[p] = value;
-            open[p] = false;
-        }
-    }
-}
-
 /// Labels of a picture, with those of `hole` continued from the pixels around it.
 pub fn continued(labels: &[u16], hole: &[bool], width: usize) -> Vec<u16> {
-    let (mut labels, mut open) = (labels.to_vec(), hole.to_vec());
+    let mut labels = labels.to_vec();
+    inwards(&mut labels, hole, width, |known| known[0]);
+    labels
+}
+
+/// Gives the pixels of `hole` values, ring by ring, each from the known ones beside it.
+fn inwards<T: Copy>(values: &mut [T], hole: &[bool], width: usize, value: impl Fn(&[T]) -> T) {
+    let mut open = hole.to_vec();
     let mut rest: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
     while !rest.is_empty() {
-        let beside = |p: &usize| neighbours(*p, width, hole.len()).into_iter().find(|q| !open[*q]).map(|q| (*p, labels[q]));
-        let ring: Vec<(usize, u16)> = rest.iter().filter_map(beside).collect();
+        let beside = |p: &usize| {
+            let known: Vec<T> = neighbours(*p, width, hole.len()).into_iter().filter(|q| !open[*q]).map(|q| values[q]).collect();
+            (!known.is_empty()).then(|| (*p, value(&known)))
+        };
+        let ring: Vec<(usize, T)> = rest.iter().filter_map(beside).collect();
         if ring.is_empty() {
             break;
         }
-        ring.into_iter().for_each(|(p, label)| (labels[p], open[p]) = (label, false));
+        ring.into_iter().for_each(|(p, value)| (values[p], open[p]) = (value, false));
         rest.retain(|p| open[*p]);
     }
-    labels
 }
 
 /// The up to four pixels beside a pixel.
@@ -83,7 +77,7 @@ mod tests {
         let hole: Vec<bool> = (0..width * height).map(|p| (8..32).contains(&(p % width)) && (6..25).contains(&(p / width))).collect();
         let mut planes: Vec<f32> =
             (0..2 * width * height).map(|p| if hole[p % hole.len()] { 9.0 } else { value(p % hole.len()) }).collect();
-        Membrane.fill(&mut planes, &hole, width);
+        Membrane::span(&mut planes, &hole, width);
         for (p, found) in planes.iter().enumerate() {
             assert!((found - value(p % hole.len())).abs() < 1e-3, "pixel {p}: {found}");
         }

@@ -1,9 +1,10 @@
-//! SIFT by the system's OpenCV (`opencv_sift.cpp`).
+//! SIFT (`sift.cpp`).
 
-use crate::{Error, Result};
+use super::{checked, side};
+use crate::Result;
 use glam::Vec2;
 use image::GrayImage;
-use std::ffi::{CStr, c_char, c_int};
+use std::ffi::{c_char, c_int};
 
 unsafe extern "C" {
     fn fastlgs_opencv_sift(
@@ -30,12 +31,10 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
     let capacity = 2 * most;
     let mut positions = vec![[0.0f32; 2]; capacity];
     let mut descriptors = vec![[0u8; 128]; capacity];
-    let mut reason = [0 as c_char; 256];
-    let size = |n: u32| c_int::try_from(n).map_err(|_| Error::Invalid(format!("SIFT: a side of {n} pixels is too long")));
-    let (width, height) = (size(photo.width())?, size(photo.height())?);
+    let (width, height) = (side(photo.width())?, side(photo.height())?);
     // SAFETY: the picture holds width x height bytes, which are only read; positions, descriptors and reason have the room that is named, and the
     // function writes no more than that, the reason with its final zero.
-    let count = unsafe {
+    let count = checked("SIFT", |reason, reason_size| unsafe {
         fastlgs_opencv_sift(
             photo.as_raw().as_ptr(),
             width,
@@ -44,15 +43,10 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
             capacity as c_int,
             positions.as_mut_ptr().cast(),
             descriptors.as_mut_ptr().cast(),
-            reason.as_mut_ptr(),
-            reason.len(),
+            reason,
+            reason_size,
         )
-    };
-    let Ok(count) = usize::try_from(count) else {
-        // SAFETY: the function ended the text with a zero; the buffer began as zeros.
-        let words = unsafe { CStr::from_ptr(reason.as_ptr()) };
-        return Err(Error::Invalid(format!("SIFT failed: {}", words.to_string_lossy())));
-    };
+    })?;
     descriptors.truncate(count);
     // OpenCV counts from the middle of the first pixel.
     let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.5, y + 0.5)).collect();
