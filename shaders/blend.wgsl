@@ -96,7 +96,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #each Q
         most = max(most, q$Q.transmittance);
 #end
-        if all(most < vec4<f32>(TRANSMITTANCE_MIN)) {
+        if all(most < vec4<f32>(view.finished)) {
             break;
         }
     }

@@ -87,7 +87,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             add(&q$K, px - s0.x, py + $K.0 - s0.y, s0, s1, id);
 #end
         }
-        if all(max(q0.transmittance, q1.transmittance) < vec4<f32>(TRANSMITTANCE_MIN)) {
+        if all(max(q0.transmittance, q1.transmittance) < vec4<f32>(view.finished)) {
             break;
         }
     }

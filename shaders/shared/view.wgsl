@@ -24,9 +24,10 @@ struct View {
     antialias: u32,
     // 1: the first feature channel carries the depth (for depth images).
     depth_as_feature: u32,
+    // A tile is finished once less than this passes through each of its pixels.
+    finished: f32,
     unused0: u32,
     unused1: u32,
-    unused2: u32,
 }
 
 // Tile edge in pixels. Pictures on the device are padded to whole tiles; what is outside the picture is zero.
@@ -34,8 +35,6 @@ const TILE: u32 = 8u;
 // A Gaussian is not drawn where it would add less than one grey level.
 const ALPHA_MIN: f32 = 0.00392156862745098;
 const ALPHA_MAX: f32 = 0.99;
-// A tile is finished once less than this passes through each of its pixels.
-const TRANSMITTANCE_MIN: f32 = 0.0001;
 // Variance (px^2) added to each projected Gaussian so that none falls between pixels (3DGS).
 const DILATION: f32 = 0.3;
 const NEAR: f32 = 0.05;

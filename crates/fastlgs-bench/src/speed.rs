@@ -173,15 +173,15 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
         let frame = engine.render(*view, Channels::Both)?;
         pairs += f64::from(frame.pairs) / views.len() as f64;
         walked += frame.channels(7, 8).iter().map(|w| f64::from(*w)).sum::<f64>() / (pixels * views.len()) as f64;
-        engine.step(*view, id, &full, &step)?;
-        engine.step(*view, id, &options(Channels::Color), &step)?;
-        engine.step(*view, id, &options(Channels::Feature), &frozen)?;
+        engine.step(view.trained(), id, &full, &step)?;
+        engine.step(view.trained(), id, &options(Channels::Color), &step)?;
+        engine.step(view.trained(), id, &options(Channels::Feature), &frozen)?;
     }
     engine.losses()?;
     let mut timed = |channels: Channels, step: &Step| -> Result<f64> {
         let started = Instant::now();
         for k in 0..steps as usize {
-            engine.step(views[k % views.len()], k % views.len(), &options(channels), step)?;
+            engine.step(views[k % views.len()].trained(), k % views.len(), &options(channels), step)?;
         }
         engine.losses()?;
         Ok(started.elapsed().as_secs_f64() / f64::from(steps))
@@ -200,7 +200,7 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
         for _ in 0..ROUNDS {
             let mut round: BTreeMap<&str, f64> = BTreeMap::new();
             for (id, view) in views.iter().enumerate() {
-                engine.step(*view, id, &full, &step)?;
+                engine.step(view.trained(), id, &full, &step)?;
                 for (name, seconds) in engine.take_profile()? {
                     *round.entry(name).or_default() += 1e3 * seconds / views.len() as f64;
                 }

@@ -31,8 +31,7 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
     let view = View { sh_degree: 0, ..*view };
     let lists = lists_of(scene, &view);
     let of_tile = |sums: &mut Vec<f32>, tile: usize| {
-        let [start, end] = lists.ranges[tile].map(|p| p as usize);
-        let job = Job::new(&view, tile, &lists.gaussians[start..end], &lists.splats);
+        let job = Job::new(&view, tile, &lists);
         let mut shown = blend::shown(&view, &job);
         let (names, masks) = masks_of(labels, &job);
         blend::by_mask(&job, &masks, &mut shown, sums);
@@ -56,17 +55,15 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
 /// The labels that a tile's pixels have, and where each of them lies. Pixels of the padding repeat the border.
 fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
     let (mut names, mut masks): (Vec<u16>, Vec<Tile>) = Default::default();
-    for j in 0..Tile::default().len() {
-        for i in 0..Tile::default()[0].len() {
-            let (x, y) = (job.x as u32 + i as u32 % TILE, job.y as u32 + 2 * j as u32 + i as u32 / TILE);
-            let label = labels.at(x.min(labels.width - 1), y.min(labels.height - 1));
-            let place = names.iter().position(|n| *n == label).unwrap_or_else(|| {
-                names.push(label);
-                masks.push(Tile::default());
-                names.len() - 1
-            });
-            masks[place][j][i] = 1.0;
-        }
+    for p in 0..blend::EMPTY.len() {
+        let (x, y) = (job.x as u32 + p as u32 % TILE, job.y as u32 + p as u32 / TILE);
+        let label = labels.at(x.min(labels.width - 1), y.min(labels.height - 1));
+        let place = names.iter().position(|n| *n == label).unwrap_or_else(|| {
+            names.push(label);
+            masks.push(blend::EMPTY);
+            names.len() - 1
+        });
+        masks[place][p] = 1.0;
     }
     (names, masks)
 }
@@ -94,7 +91,7 @@ pub fn largest_weights(scene: &Gaussians, view: &View) -> Vec<f32> {
                 let weight = cpu::alpha(splat, dx, dy) * *transmittance;
                 *transmittance -= weight;
                 largest = largest.max(weight);
-                open |= *transmittance >= cpu::TRANSMITTANCE_MIN;
+                open |= *transmittance >= view.finished;
             }
             out.push((gaussian, largest));
             if !open {

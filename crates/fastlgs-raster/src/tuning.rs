@@ -138,7 +138,7 @@ fn measure(engine: &mut dyn Engine) -> Result<f64> {
     let mut fastest = f64::INFINITY;
     for round in 0..=STEPS {
         let started = Instant::now();
-        engine.step(view, 0, &options, &still)?;
+        engine.step(view.trained(), 0, &options, &still)?;
         engine.losses()?;
         // The first compiles the kernels.
         if round > 0 {

@@ -7,6 +7,11 @@ use fastlgs_core::gaussians::BASE_CHANNELS;
 /// Tile edge in pixels.
 pub const TILE: u32 = 8;
 
+/// Transmittance below which a picture needs nothing of what lies behind.
+const TRANSMITTANCE_MIN: f32 = 0.0001;
+/// The same for a training step: half a grey level of a white background.
+const TRANSMITTANCE_TRAINED: f32 = 1.0 / 512.0;
+
 /// Camera and sizes of one frame.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -45,8 +50,10 @@ pub struct View {
     pub antialias: u32,
     /// 1: the first feature channel carries the depth.
     pub depth_as_feature: u32,
+    /// Transmittance below which a pixel needs no more Gaussians.
+    pub finished: f32,
     /// Padding to 16 bytes.
-    pub unused: [u32; 3],
+    pub unused: [u32; 2],
 }
 
 impl View {
@@ -70,8 +77,15 @@ impl View {
             sh_degree,
             antialias: 0,
             depth_as_feature: 0,
-            unused: [0; 3],
+            finished: TRANSMITTANCE_MIN,
+            unused: [0; 2],
         }
+    }
+
+    /// The same for a step of training, which need not see the last half of a grey level.
+    #[must_use]
+    pub fn trained(self) -> Self {
+        Self { finished: TRANSMITTANCE_TRAINED, ..self }
     }
 
     /// Pixels of the frame.

@@ -1,4 +1,4 @@
-use super::{Splat, TRANSMITTANCE_MIN, alpha};
+use super::{Splat, alpha};
 use crate::View;
 use crate::channels::Channels;
 use crate::view::TILE;
@@ -50,7 +50,7 @@ pub fn blend(
                     }
                 }
                 walked += batch.len();
-                if pixels.iter().all(|p| p.1 < TRANSMITTANCE_MIN) {
+                if pixels.iter().all(|p| p.1 < view.finished) {
                     break;
                 }
             }

@@ -1,4 +1,4 @@
-use super::{BATCH, Splat, TRANSMITTANCE_MIN, alpha, pixels_of, shown};
+use super::{BATCH, Splat, alpha, pixels_of, shown};
 use crate::View;
 use fastlgs_core::shares::{KEPT, pack};
 use rayon::prelude::*;
@@ -45,7 +45,7 @@ pub fn blend_ids(
                     }
                 }
                 // The invocations of a tile stop on their own; what they walk beyond that weighs next to nothing.
-                if pixels.iter().all(|p| p.1 < TRANSMITTANCE_MIN) {
+                if pixels.iter().all(|p| p.1 < view.finished) {
                     break;
                 }
             }

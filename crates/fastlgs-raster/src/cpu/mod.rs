@@ -71,7 +71,6 @@ pub type Splat = [[f32; 4]; 3];
 
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
-pub(crate) const TRANSMITTANCE_MIN: f32 = 0.0001;
 pub(crate) const DILATION: f32 = 0.3;
 pub(crate) const NEAR: f32 = 0.05;
 

@@ -1,17 +1,40 @@
-//! Blending and its gradients, a tile at a time, two of its rows in one vector of sixteen.
+//! Blending and its gradients, a tile at a time: one of its rows in a vector of eight, or two in one of sixteen.
 
-use super::simd::{exp2, madd, vectorised};
-use crate::cpu::{ALPHA_MIN, BATCH, Splat, TRANSMITTANCE_MIN};
+use super::Lists;
+use super::simd::{SUMS, Vector, dispatched};
+use crate::cpu::{ALPHA_MIN, BATCH, Splat};
 use crate::view::View;
 
 /// Pixels along a tile's edge.
 const EDGE: usize = crate::view::TILE as usize;
 
-/// Pixels of two rows: what AVX-512 handles at once.
-const LANES: usize = 2 * EDGE;
-
 /// A value for each pixel of a tile, row by row.
-pub type Tile = [[f32; LANES]; EDGE / 2];
+pub type Tile = [f32; EDGE * EDGE];
+
+/// Zeros.
+pub const EMPTY: Tile = [0.0; EDGE * EDGE];
+
+/// Offsets of a tile's pixels from its upper left corner.
+const COLUMNS: Tile = {
+    let mut out = EMPTY;
+    let mut p = 0;
+    while p < out.len() {
+        out[p] = (p % EDGE) as f32 + 0.5;
+        p += 1;
+    }
+    out
+};
+
+/// The same along y.
+const ROWS: Tile = {
+    let mut out = EMPTY;
+    let mut p = 0;
+    while p < out.len() {
+        out[p] = (p / EDGE) as f32 + 0.5;
+        p += 1;
+    }
+    out
+};
 
 /// What the forward pass makes of a tile.
 #[derive(Clone)]
@@ -32,65 +55,87 @@ pub struct Job<'a> {
     pub y: f32,
     /// Gaussians front to back.
     pub gaussians: &'a [u32],
-    /// All splats.
-    pub splats: &'a [Splat],
+    lists: &'a Lists,
+    /// Transmittance below which a pixel needs no more of them.
+    finished: f32,
 }
 
 impl<'a> Job<'a> {
     /// The job of tile number `tile`.
-    pub fn new(view: &View, tile: usize, gaussians: &'a [u32], splats: &'a [Splat]) -> Self {
+    pub fn new(view: &View, tile: usize, lists: &'a Lists) -> Self {
         let (column, row) = (tile % view.tiles[0] as usize, tile / view.tiles[0] as usize);
-        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, gaussians, splats }
+        let [start, end] = lists.ranges[tile].map(|p| p as usize);
+        let gaussians = &lists.gaussians[start..end];
+        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, gaussians, lists, finished: view.finished }
     }
 }
 
 /// 1 for the pixels of the picture, 0 for those of the padding.
 pub fn shown(view: &View, job: &Job) -> Tile {
     let [w, h] = view.size.map(|s| s as f32);
-    let at = |j: usize, i: usize| (job.x + (i % EDGE) as f32, job.y + (2 * j + i / EDGE) as f32);
-    std::array::from_fn(|j| std::array::from_fn(|i| if at(j, i).0 < w && at(j, i).1 < h { 1.0 } else { 0.0 }))
+    std::array::from_fn(|p| if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h { 1.0 } else { 0.0 })
 }
 
-/// Pairs of rows of the tile in which a splat can reach the least alpha: where its exponent's maximum over x allows it.
-#[inline(always)]
-fn rows_of(splat: &Splat, y: f32) -> std::ops::Range<usize> {
-    let [[_, my, qx, qy], [qz, log_opacity, ..], _] = *splat;
-    // Over x the exponent is at most (qz - qy^2 / 4 qx) dy^2 + log2(opacity).
-    let bend = qz - 0.25 * qy * qy / qx;
-    let reach = ((-8.0 - log_opacity) / bend).max(0.0).sqrt() + 0.01;
-    let first = (my - reach - y - 0.5).ceil().clamp(0.0, EDGE as f32);
-    let end = ((my + reach - y - 0.5).floor() + 1.0).clamp(first, EDGE as f32);
-    first as usize / 2..(end as usize).div_ceil(2)
+/// A splat as it lies to a tile.
+struct Placed<'a, V> {
+    splat: &'a Splat,
+    /// Offsets of a vector's pixels along x; all vectors of the tile have the same.
+    dx: V,
+    /// From the mean to the tile's upper edge.
+    down: f32,
+    /// First pixels of the vectors in which it can reach the least alpha.
+    pixels: std::iter::StepBy<std::ops::Range<usize>>,
 }
 
-/// Offsets of the pixels of two rows from a splat's mean.
-#[inline(always)]
-fn offsets(x: f32) -> [f32; LANES] {
-    std::array::from_fn(|i| x + (i % EDGE) as f32 + 0.5)
-}
-
-/// The same along y, `y` being the first of the two rows.
-#[inline(always)]
-fn row_offsets(y: f32) -> [f32; LANES] {
-    std::array::from_fn(|i| y + (i / EDGE) as f32 + 0.5)
-}
-
-/// Alphas of a splat along two rows.
-#[inline(always)]
-fn alphas<const FMA: bool>(splat: &Splat, dx: &[f32; LANES], dy: &[f32; LANES]) -> [f32; LANES] {
-    let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *splat;
-    let mut out = [0.0; LANES];
-    for i in 0..LANES {
-        let c0 = madd::<FMA>(qz * dy[i], dy[i], log_opacity);
-        let alpha = exp2::<FMA>(madd::<FMA>(dx[i], madd::<FMA>(qx, dx[i], qy * dy[i]), c0));
-        out[i] = if alpha >= ALPHA_MIN { alpha } else { 0.0 };
+impl<'a, V: Vector> Placed<'a, V> {
+    #[inline(always)]
+    fn new(job: &Job<'a>, gaussian: u32) -> Self {
+        let (splat, reach) = (&job.lists.splats[gaussian as usize], job.lists.reach[gaussian as usize]);
+        let down = job.y - splat[0][1];
+        let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
+        let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
+        let per_vector = V::LANES / EDGE;
+        let pixels = (rows.start / per_vector * V::LANES..rows.end.div_ceil(per_vector) * V::LANES).step_by(V::LANES);
+        Self { splat, dx: V::load(&COLUMNS).add(V::splat(job.x - splat[0][0])), down, pixels }
     }
-    out
+
+    /// Offsets along y of the vector that begins at pixel `p`.
+    #[inline(always)]
+    fn dy(&self, p: usize) -> V {
+        V::load(&ROWS[p..]).add(V::splat(self.down))
+    }
+
+    /// Alphas of that vector.
+    #[inline(always)]
+    fn alphas(&self, dy: V) -> V {
+        let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *self.splat;
+        let c0 = V::splat(qz).mul(dy).madd(dy, V::splat(log_opacity));
+        let exponent = self.dx.madd(V::splat(qx).madd(self.dx, V::splat(qy).mul(dy)), c0);
+        exponent.exp2().from_least_on(V::splat(ALPHA_MIN))
+    }
+
+    /// Colour and feature.
+    #[inline(always)]
+    fn values(&self) -> [V; 6] {
+        let [_, [_, _, r, g], [b, f0, f1, f2]] = *self.splat;
+        // `map` is not inlined here.
+        [V::splat(r), V::splat(g), V::splat(b), V::splat(f0), V::splat(f1), V::splat(f2)]
+    }
 }
 
+/// Whether no pixel of the tile needs more.
 #[inline(always)]
-fn values_of(splat: &Splat) -> [f32; 6] {
-    [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]]
+fn finished(job: &Job<'_>, transmittance: &Tile) -> bool {
+    transmittance.iter().all(|t| *t < job.finished)
+}
+
+/// What a vector of pixels takes of the light: the weights of a Gaussian with these alphas.
+#[inline(always)]
+fn taken<V: Vector>(alpha: V, transmittance: &mut [f32]) -> V {
+    let light = V::load(transmittance);
+    let w = alpha.mul(light);
+    light.sub(w).store(transmittance);
+    w
 }
 
 /// Channels of a step: colour 0..3, feature 3..6.
@@ -99,107 +144,91 @@ fn channels<const COLOR: bool, const FEATURE: bool>() -> std::ops::Range<usize> 
     (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 })
 }
 
-vectorised! {
+dispatched! {
     /// Blends the list of a tile; `out.transmittance` must hold 1 for pixels of the picture and 0 for others.
     fn forward<const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) = forward_body
 }
 
 #[inline(always)]
-fn forward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) {
+fn forward_body<V: Vector, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) {
     for batch in job.gaussians.chunks(BATCH) {
         for &g in batch {
-            let splat = &job.splats[g as usize];
-            let values = values_of(splat);
-            let dx = offsets(job.x - splat[0][0]);
-            for j in rows_of(splat, job.y) {
-                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
-                let transmittance = &mut out.transmittance[j];
-                let mut w = [0.0; LANES];
-                for i in 0..LANES {
-                    w[i] = alpha[i] * transmittance[i];
-                    transmittance[i] -= w[i];
-                }
+            let placed = Placed::<V>::new(job, g);
+            let values = placed.values();
+            for p in placed.pixels.clone() {
+                let w = taken(placed.alphas(placed.dy(p)), &mut out.transmittance[p..]);
                 for c in channels::<COLOR, FEATURE>() {
-                    let sums = &mut out.sums[c][j];
-                    for i in 0..LANES {
-                        sums[i] = madd::<FMA>(w[i], values[c], sums[i]);
-                    }
+                    let sums = &mut out.sums[c][p..];
+                    w.madd(values[c], V::load(sums)).store(sums);
                 }
             }
         }
         out.walked += batch.len() as u32;
-        if out.transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+        if finished(job, &out.transmittance) {
             break;
         }
     }
 }
 
-vectorised! {
+dispatched! {
     /// Blending weights of a tile's Gaussians, summed by their ids: those that occur, in the order of the list.
     /// `transmittance` must hold 1 for pixels of the picture and 0 for others.
     fn by_id(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) = by_id_body
 }
 
 #[inline(always)]
-fn by_id_body<const FMA: bool>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) {
+fn by_id_body<V: Vector>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) {
     sums.clear();
     for batch in job.gaussians.chunks(BATCH) {
         for &g in batch {
-            let (splat, id) = (&job.splats[g as usize], ids[g as usize]);
+            let id = ids[g as usize];
             let place = sums.iter().position(|s| s.0 == id).unwrap_or_else(|| {
-                sums.push((id, Tile::default()));
+                sums.push((id, EMPTY));
                 sums.len() - 1
             });
-            let dx = offsets(job.x - splat[0][0]);
-            for j in rows_of(splat, job.y) {
-                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
-                let (transmittance, sum) = (&mut transmittance[j], &mut sums[place].1[j]);
-                for i in 0..LANES {
-                    let w = alpha[i] * transmittance[i];
-                    transmittance[i] -= w;
-                    sum[i] += w;
-                }
+            let placed = Placed::<V>::new(job, g);
+            for p in placed.pixels.clone() {
+                let w = taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]);
+                let sum = &mut sums[place].1[p..];
+                w.add(V::load(sum)).store(sum);
             }
         }
-        if transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+        if finished(job, transmittance) {
             break;
         }
     }
 }
 
-vectorised! {
+dispatched! {
     /// Blending weights of each Gaussian of a tile, summed over the pixels of each of `masks` (1 inside, 0 outside):
     /// `[Gaussian of the list][mask]`, as far as the list is walked.
     fn by_mask(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) = by_mask_body
 }
 
 #[inline(always)]
-fn by_mask_body<const FMA: bool>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) {
+fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) {
     sums.clear();
     for batch in job.gaussians.chunks(BATCH) {
         for &g in batch {
-            let splat = &job.splats[g as usize];
             let first = sums.len();
-            sums.resize(first + masks.len(), 0.0);
-            let dx = offsets(job.x - splat[0][0]);
-            for j in rows_of(splat, job.y) {
-                let alpha = alphas::<FMA>(splat, &dx, &row_offsets(job.y + (2 * j) as f32 - splat[0][1]));
-                let transmittance = &mut transmittance[j];
-                let mut w = [0.0; LANES];
-                for i in 0..LANES {
-                    w[i] = alpha[i] * transmittance[i];
-                    transmittance[i] -= w[i];
-                }
-                for (sum, mask) in sums[first..].iter_mut().zip(masks) {
-                    let mut inside = [0.0; LANES];
-                    for i in 0..LANES {
-                        inside[i] = w[i] * mask[j][i];
-                    }
-                    *sum += inside.iter().sum::<f32>();
-                }
+            let placed = Placed::<V>::new(job, g);
+            let mut weights = EMPTY;
+            for p in placed.pixels.clone() {
+                taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]).store(&mut weights[p..]);
             }
+            // Twelve masks at a time, as sums are added up.
+            for masks in masks.chunks(SUMS) {
+                let mut inside = [V::splat(0.0); SUMS];
+                for (sum, mask) in inside.iter_mut().zip(masks) {
+                    for p in placed.pixels.clone() {
+                        *sum = V::load(&weights[p..]).madd(V::load(&mask[p..]), *sum);
+                    }
+                }
+                sums.extend(&V::sums(&inside)[..masks.len()]);
+            }
+            debug_assert_eq!(sums.len(), first + masks.len());
         }
-        if transmittance.iter().flatten().all(|t| *t < TRANSMITTANCE_MIN) {
+        if finished(job, transmittance) {
             break;
         }
     }
@@ -217,73 +246,51 @@ pub struct Given {
     pub walked: u32,
 }
 
-vectorised! {
+dispatched! {
     /// Gradient slots of a tile's pairs, in the order of its list.
-    fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; 12]])
+    fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; SUMS]])
         = backward_body
 }
 
 #[inline(always)]
-fn backward_body<const FMA: bool, const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
+fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
     job: &Job<'_>,
     given: &mut Given,
-    slots: &mut [[f32; 12]],
+    slots: &mut [[f32; SUMS]],
 ) {
     let walked = given.walked as usize;
+    let (zero, one) = (V::splat(0.0), V::splat(1.0));
     for (&g, slot) in job.gaussians[..walked].iter().zip(&mut *slots) {
-        let splat = &job.splats[g as usize];
-        let values = values_of(splat);
-        let dx = offsets(job.x - splat[0][0]);
-        let (mut p_sum, mut py_sum, mut pyy_sum) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
-        let mut sums = [[0.0; LANES]; 6];
-        for j in rows_of(splat, job.y) {
-            let dy = row_offsets(job.y + (2 * j) as f32 - splat[0][1]);
-            let alpha = alphas::<FMA>(splat, &dx, &dy);
-            let mut w = [0.0; LANES];
-            for i in 0..LANES {
-                w[i] = alpha[i] * given.transmittance[j][i];
-                given.transmittance[j][i] -= w[i];
-            }
+        let placed = Placed::<V>::new(job, g);
+        let values = placed.values();
+        let [mut p_sum, mut py_sum, mut pyy_sum] = [zero; 3];
+        let mut sums = [zero; 6];
+        for at in placed.pixels.clone() {
+            let dy = placed.dy(at);
+            let alpha = placed.alphas(dy);
+            let w = taken(alpha, &mut given.transmittance[at..]);
+            let gradient = |c: usize| V::load(&given.gradient[c][at..]);
             for c in channels::<COLOR, FEATURE>() {
-                for i in 0..LANES {
-                    sums[c][i] = madd::<FMA>(w[i], given.gradient[c][j][i], sums[c][i]);
-                }
+                sums[c] = w.madd(gradient(c), sums[c]);
             }
             if COLOR {
-                let mut c_dot_g = [0.0; LANES];
+                let mut c_dot_g = zero;
                 for c in 0..if MOVES { 6 } else { 3 } {
-                    for i in 0..LANES {
-                        c_dot_g[i] = madd::<FMA>(values[c], given.gradient[c][j][i], c_dot_g[i]);
-                    }
+                    c_dot_g = values[c].madd(gradient(c), c_dot_g);
                 }
-                for i in 0..LANES {
-                    let w_c_dot_g = w[i] * c_dot_g[i];
-                    let r_dot_g = given.r_dot_g[j][i] - w_c_dot_g;
-                    given.r_dot_g[j][i] = r_dot_g;
-                    let p = w_c_dot_g - r_dot_g * (alpha[i] / (1.0 - alpha[i]));
-                    p_sum[i] += p;
-                    py_sum[i] = madd::<FMA>(p, dy[i], py_sum[i]);
-                    pyy_sum[i] = madd::<FMA>(p * dy[i], dy[i], pyy_sum[i]);
-                }
+                let behind = &mut given.r_dot_g[at..];
+                let w_c_dot_g = w.mul(c_dot_g);
+                let r_dot_g = V::load(behind).sub(w_c_dot_g);
+                r_dot_g.store(behind);
+                let p = w_c_dot_g.sub(r_dot_g.mul(alpha.div(one.sub(alpha))));
+                p_sum = p_sum.add(p);
+                py_sum = p.madd(dy, py_sum);
+                pyy_sum = p.mul(dy).madd(dy, pyy_sum);
             }
         }
-        let total = |values: &[f32; LANES]| values.iter().sum::<f32>();
-        let by = |values: &[f32; LANES], factor: &[f32; LANES]| std::array::from_fn::<f32, LANES, _>(|i| values[i] * factor[i]);
-        let px = by(&p_sum, &dx);
-        *slot = [
-            total(&px),
-            total(&py_sum),
-            total(&by(&px, &dx)),
-            total(&by(&py_sum, &dx)),
-            total(&pyy_sum),
-            total(&p_sum),
-            total(&sums[0]),
-            total(&sums[1]),
-            total(&sums[2]),
-            total(&sums[3]),
-            total(&sums[4]),
-            total(&sums[5]),
-        ];
+        let (px, pxy) = (p_sum.mul(placed.dx), py_sum.mul(placed.dx));
+        let [r, g, b, f0, f1, f2] = sums;
+        *slot = V::sums(&[px, py_sum, px.mul(placed.dx), pxy, pyy_sum, p_sum, r, g, b, f0, f1, f2]);
     }
-    slots[walked..].fill([0.0; 12]);
+    slots[walked..].fill([0.0; SUMS]);
 }

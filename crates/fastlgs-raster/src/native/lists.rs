@@ -16,8 +16,13 @@ pub(crate) struct Lists {
     pub places: Vec<u32>,
     /// See `places`.
     pub first: Vec<u32>,
+    /// Pixels up and down from each Gaussian's mean within which it reaches the least alpha.
+    pub reach: Vec<f32>,
     footprints: Vec<Footprint>,
 }
+
+/// Added to the reach: alphas are rounded.
+const ROUNDING: f32 = 0.01;
 
 /// Gaussians are listed in so many parts, whatever the number of threads.
 const PARTS: usize = 16;
@@ -39,6 +44,7 @@ impl Lists {
         }
         let mut lists = Self {
             splats: projected.iter().map(|p| p.splat).collect(),
+            reach: projected.iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect(),
             footprints: projected.iter().map(|p| p.footprint).collect(),
             ranges: vec![[0; 2]; view.tile_count() as usize],
             gaussians: Vec::new(),

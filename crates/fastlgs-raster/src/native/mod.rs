@@ -45,11 +45,11 @@ impl<const C: usize> Picture<C> {
 
     /// The pixels of a tile.
     fn tile(&self, channel: usize, job: &Job) -> Tile {
-        const EDGE: usize = TILE as usize;
-        std::array::from_fn(|j| {
-            let rows = [0, 1].map(|k| &self.row(channel, job.y as usize + 2 * j + k)[job.x as usize..][..EDGE]);
-            std::array::from_fn(|i| rows[i / EDGE][i % EDGE])
-        })
+        let mut tile = blend::EMPTY;
+        for (y, row) in tile.chunks_exact_mut(TILE as usize).enumerate() {
+            row.copy_from_slice(&self.row(channel, job.y as usize + y)[job.x as usize..][..TILE as usize]);
+        }
+        tile
     }
 }
 
@@ -144,24 +144,21 @@ impl CpuEngine {
         bands.enumerate().for_each(|(row, (band, walked))| {
             for column in 0..tiles_x {
                 let tile = row * tiles_x + column;
-                let [start, end] = lists.ranges[tile].map(|p| p as usize);
-                let job = Job::new(view, tile, &lists.gaussians[start..end], &lists.splats);
+                let job = Job::new(view, tile, lists);
                 let shown = blend::shown(view, &job);
-                let mut out = Blended { sums: [Tile::default(); 6], transmittance: shown, walked: 0 };
+                let mut out = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
                 blend::forward::<COLOR, FEATURE>(&job, &mut out);
                 walked[column] = out.walked;
                 const EDGE: usize = TILE as usize;
                 for y in 0..EDGE {
-                    // Two rows lie in one vector.
-                    let (j, half) = (y / 2, y % 2 * EDGE);
+                    let own = y * EDGE..(y + 1) * EDGE;
                     let at = |c: usize| (y * 8 + c) * width + column * EDGE;
                     for c in (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 }) {
-                        for i in 0..EDGE {
-                            let k = half + i;
-                            band[at(c) + i] = shown[j][k] * (out.sums[c][j][k] + out.transmittance[j][k] * background[c]);
+                        for (i, p) in own.clone().enumerate() {
+                            band[at(c) + i] = shown[p] * (out.sums[c][p] + out.transmittance[p] * background[c]);
                         }
                     }
-                    band[at(6)..][..EDGE].copy_from_slice(&out.transmittance[j][half..half + EDGE]);
+                    band[at(6)..][..EDGE].copy_from_slice(&out.transmittance[own]);
                     band[at(7)..][..EDGE].fill(out.walked as f32);
                 }
             }
@@ -185,13 +182,13 @@ impl CpuEngine {
             let first = lists.ranges[row * tiles_x][0] as usize;
             for tile in row * tiles_x..(row + 1) * tiles_x {
                 let [start, end] = lists.ranges[tile].map(|p| p as usize);
-                let job = Job::new(view, tile, &lists.gaussians[start..end], &lists.splats);
+                let job = Job::new(view, tile, lists);
                 let trained = |c: usize| if c < 3 { COLOR } else { FEATURE };
-                let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { Tile::default() });
-                let mut r_dot_g = Tile::default();
+                let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { blend::EMPTY });
+                let mut r_dot_g = blend::EMPTY;
                 for c in 0..if MOVES { 6 } else { 3 } {
                     let light = frame.tile(c, &job);
-                    for (b, (l, g)) in r_dot_g.iter_mut().flatten().zip(light.iter().flatten().zip(g[c].iter().flatten())) {
+                    for (b, (l, g)) in r_dot_g.iter_mut().zip(light.iter().zip(&g[c])) {
                         *b += l * g;
                     }
                 }
@@ -296,12 +293,11 @@ impl Engine for CpuEngine {
         const EDGE: usize = TILE as usize;
         pixels.par_chunks_mut(EDGE * width as usize).enumerate().for_each_init(Vec::new, |sums, (row, band)| {
             for tile in row * view.tiles[0] as usize..(row + 1) * view.tiles[0] as usize {
-                let [start, end] = lists.ranges[tile].map(|p| p as usize);
-                let job = Job::new(&view, tile, &lists.gaussians[start..end], &lists.splats);
+                let job = Job::new(&view, tile, &lists);
                 blend::by_id(&job, ids, &mut blend::shown(&view, &job), sums);
                 for (y, line) in band.chunks_exact_mut(width as usize).enumerate() {
                     for (x, pixel) in line[job.x as usize..].iter_mut().take(EDGE).enumerate() {
-                        let at = |tile: &Tile| tile[y / 2][y % 2 * EDGE + x];
+                        let at = |tile: &Tile| tile[y * EDGE + x];
                         *pixel = heaviest(sums.iter().map(|(id, tile)| (*id, at(tile))));
                     }
                 }

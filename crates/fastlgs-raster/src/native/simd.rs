@@ -1,6 +1,9 @@
-//! Arithmetic of the vectorised bodies ([`fastlgs_core::simd`]).
+//! Arithmetic of the vectorised bodies: [`fastlgs_core::simd`] where the compiler finds the vectors by itself, and [`Vector`] where it does not.
 
 pub(super) use fastlgs_core::vectorised;
+
+#[cfg(target_arch = "x86_64")]
+pub(super) use x86::{Avx2, Avx512};
 
 /// a * b + c.
 #[inline(always)]
@@ -8,31 +11,352 @@ pub fn madd<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// 2^x for x between -126 and 126, within 2e-7 of it; smaller x are taken for -126.
-#[inline(always)]
-pub fn exp2<const FMA: bool>(x: f32) -> f32 {
-    // Adding 1.5 * 2^23 rounds to the nearest integer, which then stands in the lowest bits.
-    const ROUND: f32 = 12_582_912.0;
-    let x = if x > -126.0 { x } else { -126.0 };
-    let shifted = x + ROUND;
-    let f = x - (shifted - ROUND);
-    let mut p = 1.540_353e-4;
-    for c in [1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 2.402_265e-1, 6.931_472e-1, 1.0] {
-        p = madd::<FMA>(p, f, c);
+/// Sums that a pair leaves behind.
+pub const SUMS: usize = 12;
+
+/// One register of floats.
+///
+/// In a body with many sums the compiler packs sums instead of pixels into registers, and shuffles more than it adds: so registers have a type.
+pub trait Vector: Copy {
+    /// Floats in it.
+    const LANES: usize;
+
+    /// The same value everywhere.
+    fn splat(value: f32) -> Self;
+    /// The first values of a slice.
+    fn load(from: &[f32]) -> Self;
+    /// Writes the first values of a slice.
+    fn store(self, to: &mut [f32]);
+    /// self + b.
+    fn add(self, b: Self) -> Self;
+    /// self - b.
+    fn sub(self, b: Self) -> Self;
+    /// self * b.
+    fn mul(self, b: Self) -> Self;
+    /// self / b.
+    fn div(self, b: Self) -> Self;
+    /// self * b + c.
+    fn madd(self, b: Self, c: Self) -> Self;
+    /// The larger of both.
+    fn max(self, b: Self) -> Self;
+    /// self, and 0 where it is below `least`.
+    fn from_least_on(self, least: Self) -> Self;
+    /// self * 2^k, where `k`'s lowest bits hold a whole number.
+    fn times_power_of_two(self, k: Self) -> Self;
+    /// The sum of each vector's floats.
+    fn sums(all: &[Self; SUMS]) -> [f32; SUMS];
+
+    /// 2^x for x up to 126, within 2e-7 of it; x below -126 are taken for -126.
+    #[inline(always)]
+    fn exp2(self) -> Self {
+        // Adding 1.5 * 2^23 rounds to the nearest integer, which then stands in the lowest bits.
+        let round = Self::splat(12_582_912.0);
+        let x = self.max(Self::splat(-126.0));
+        let shifted = x.add(round);
+        let f = x.sub(shifted.sub(round));
+        let mut p = Self::splat(1.540_353e-4);
+        for c in [1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 2.402_265e-1, 6.931_472e-1, 1.0] {
+            p = p.madd(f, Self::splat(c));
+        }
+        p.times_power_of_two(shifted)
     }
-    f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
+
+/// Eight floats that the compiler may keep in whatever registers there are.
+#[derive(Clone, Copy)]
+pub struct Portable([f32; 8]);
+
+impl Portable {
+    #[inline(always)]
+    fn with(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
+        Self(std::array::from_fn(|i| f(self.0[i], b.0[i])))
+    }
+}
+
+impl Vector for Portable {
+    const LANES: usize = 8;
+
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        Self([value; 8])
+    }
+
+    #[inline(always)]
+    fn load(from: &[f32]) -> Self {
+        Self(*from.first_chunk().expect("as long as a vector"))
+    }
+
+    #[inline(always)]
+    fn store(self, to: &mut [f32]) {
+        *to.first_chunk_mut().expect("as long as a vector") = self.0;
+    }
+
+    #[inline(always)]
+    fn add(self, b: Self) -> Self {
+        self.with(b, |a, b| a + b)
+    }
+
+    #[inline(always)]
+    fn sub(self, b: Self) -> Self {
+        self.with(b, |a, b| a - b)
+    }
+
+    #[inline(always)]
+    fn mul(self, b: Self) -> Self {
+        self.with(b, |a, b| a * b)
+    }
+
+    #[inline(always)]
+    fn div(self, b: Self) -> Self {
+        self.with(b, |a, b| a / b)
+    }
+
+    #[inline(always)]
+    fn madd(self, b: Self, c: Self) -> Self {
+        Self(std::array::from_fn(|i| madd::<{ cfg!(target_arch = "aarch64") }>(self.0[i], b.0[i], c.0[i])))
+    }
+
+    #[inline(always)]
+    fn max(self, b: Self) -> Self {
+        self.with(b, |a, b| if a > b { a } else { b })
+    }
+
+    #[inline(always)]
+    fn from_least_on(self, least: Self) -> Self {
+        self.with(least, |a, least| if a >= least { a } else { 0.0 })
+    }
+
+    #[inline(always)]
+    fn times_power_of_two(self, k: Self) -> Self {
+        self.with(k, |a, k| f32::from_bits(a.to_bits().wrapping_add(k.to_bits() << 23)))
+    }
+
+    #[inline(always)]
+    fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
+        std::array::from_fn(|k| {
+            let v = &all[k].0;
+            let half = [v[0] + v[4], v[1] + v[5], v[2] + v[6], v[3] + v[7]];
+            (half[0] + half[2]) + (half[1] + half[3])
+        })
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    //! Registers of x86-64. Each function of a type may only be called where the processor has what the type is named after, which is what
+    //! [`super::dispatched`] looks for; slices that are too short are refused.
+
+    use super::{SUMS, Vector};
+    use std::arch::x86_64::*;
+
+    /// Eight floats: AVX2 and FMA.
+    #[derive(Clone, Copy)]
+    pub struct Avx2(__m256);
+
+    /// Sixteen floats: AVX-512 F and DQ.
+    #[derive(Clone, Copy)]
+    pub struct Avx512(__m512);
+
+    /// Implements a method by an expression of intrinsics.
+    macro_rules! by_intrinsics {
+        ($(fn $name:ident($($arg:ident),*) = $body:expr;)*) => {
+            $(
+                #[inline(always)]
+                fn $name(self $(, $arg: Self)*) -> Self {
+                    let a = self.0;
+                    $(let $arg = $arg.0;)*
+                    // SAFETY: see the module.
+                    Self(unsafe { $body(a $(, $arg)*) })
+                }
+            )*
+        };
+    }
+
+    impl Vector for Avx2 {
+        const LANES: usize = 8;
+
+        by_intrinsics! {
+            fn add(b) = _mm256_add_ps;
+            fn sub(b) = _mm256_sub_ps;
+            fn mul(b) = _mm256_mul_ps;
+            fn div(b) = _mm256_div_ps;
+            fn madd(b, c) = _mm256_fmadd_ps;
+            fn max(b) = _mm256_max_ps;
+            fn from_least_on(least) = |a, least| _mm256_and_ps(a, _mm256_cmp_ps::<_CMP_GE_OQ>(a, least));
+            fn times_power_of_two(k) = |a, k| {
+                let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(k));
+                _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a), exponent))
+            };
+        }
+
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: see the module.
+            Self(unsafe { _mm256_set1_ps(value) })
+        }
+
+        #[inline(always)]
+        fn load(from: &[f32]) -> Self {
+            assert!(from.len() >= Self::LANES, "as long as a vector");
+            // SAFETY: see the module.
+            Self(unsafe { _mm256_loadu_ps(from.as_ptr()) })
+        }
+
+        #[inline(always)]
+        fn store(self, to: &mut [f32]) {
+            assert!(to.len() >= Self::LANES, "as long as a vector");
+            // SAFETY: see the module.
+            unsafe { _mm256_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+
+        #[inline(always)]
+        fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
+            let mut out = [0.0; SUMS];
+            // SAFETY: see the module; `out` has eight and four floats.
+            unsafe {
+                // Halves of two vectors are added side by side, then quarters of four, then eighths of eight.
+                let halves = |i: usize, j: usize| {
+                    let (a, b) = (all[i].0, all[j].0);
+                    _mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b))
+                };
+                let quarters = |a, b| _mm256_add_ps(_mm256_shuffle_ps::<0x44>(a, b), _mm256_shuffle_ps::<0xee>(a, b));
+                let [low, high] = [quarters(halves(0, 4), halves(1, 5)), quarters(halves(2, 6), halves(3, 7))];
+                _mm256_storeu_ps(out.as_mut_ptr(), _mm256_hadd_ps(low, high));
+                let half = |i: usize| _mm_add_ps(_mm256_castps256_ps128(all[i].0), _mm256_extractf128_ps::<1>(all[i].0));
+                let last = _mm_hadd_ps(_mm_hadd_ps(half(8), half(9)), _mm_hadd_ps(half(10), half(11)));
+                _mm_storeu_ps(out[8..].as_mut_ptr(), last);
+            }
+            out
+        }
+    }
+
+    impl Vector for Avx512 {
+        const LANES: usize = 16;
+
+        by_intrinsics! {
+            fn add(b) = _mm512_add_ps;
+            fn sub(b) = _mm512_sub_ps;
+            fn mul(b) = _mm512_mul_ps;
+            fn div(b) = _mm512_div_ps;
+            fn madd(b, c) = _mm512_fmadd_ps;
+            fn max(b) = _mm512_max_ps;
+            fn from_least_on(least) = |a, least| _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, least), a);
+            fn times_power_of_two(k) = |a, k| {
+                let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(k));
+                _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(a), exponent))
+            };
+        }
+
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: see the module.
+            Self(unsafe { _mm512_set1_ps(value) })
+        }
+
+        #[inline(always)]
+        fn load(from: &[f32]) -> Self {
+            assert!(from.len() >= Self::LANES, "as long as a vector");
+            // SAFETY: see the module.
+            Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+
+        #[inline(always)]
+        fn store(self, to: &mut [f32]) {
+            assert!(to.len() >= Self::LANES, "as long as a vector");
+            // SAFETY: see the module.
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+
+        #[inline(always)]
+        fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
+            let mut halves = [Avx2::splat(0.0); SUMS];
+            for (half, v) in halves.iter_mut().zip(all) {
+                // SAFETY: see the module.
+                half.0 = unsafe { _mm256_add_ps(_mm512_castps512_ps256(v.0), _mm512_extractf32x8_ps::<1>(v.0)) };
+            }
+            Avx2::sums(&halves)
+        }
+    }
+}
+
+/// `dispatched! { fn name<const ...>(args) = body }`: `name` runs `body::<V, ...>` with the widest [`Vector`] that the processor has. The body is an
+/// `#[inline(always)]` function.
+macro_rules! dispatched {
+    ($(#[$doc:meta])* fn $name:ident $(<$(const $p:ident: bool),+>)? ($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
+        $(#[$doc])*
+        pub fn $name $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+                fn avx512 $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
+                    $body::<$crate::native::simd::Avx512 $($(, $p)+)?>($($arg),*);
+                }
+                #[target_feature(enable = "avx2,fma")]
+                fn avx2 $(<$(const $p: bool),+>)? ($($arg: $ty),*) {
+                    $body::<$crate::native::simd::Avx2 $($(, $p)+)?>($($arg),*);
+                }
+                if is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
+                    // SAFETY: the features were found a line above; avx512dq implies avx512f.
+                    return unsafe { avx512 $(::<$($p),+>)? ($($arg),*) };
+                }
+                if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                    // SAFETY: the features were found a line above.
+                    return unsafe { avx2 $(::<$($p),+>)? ($($arg),*) };
+                }
+            }
+            $body::<$crate::native::simd::Portable $($(, $p)+)?>($($arg),*);
+        }
+    };
+}
+pub(super) use dispatched;
 
 #[cfg(test)]
 mod tests {
-    #[test]
-    fn exp2_is_close() {
-        for k in -1260..=0 {
-            let x = k as f32 * 0.1;
-            for value in [super::exp2::<false>(x), super::exp2::<true>(x)] {
-                assert!((value - x.exp2()).abs() <= 3e-7 * x.exp2(), "{x}: {value}");
+    use super::*;
+
+    dispatched! {
+        /// The widest vectors.
+        fn widest(check: &mut u32) = check_body
+    }
+
+    /// A vector's arithmetic against that of its floats.
+    #[inline(always)]
+    fn check_body<V: Vector>(checked: &mut u32) {
+        let read = |v: V| {
+            let mut out = [0.0; 16];
+            v.store(&mut out);
+            out
+        };
+        let values: Vec<f32> = (0..400).map(|k| 0.37 * k as f32 - 60.0).collect();
+        for start in 0..values.len() - 32 {
+            let (a, b) = (&values[start..], &values[start + 16..]);
+            let (x, y) = (V::load(a), V::load(b));
+            let all = [read(x.add(y)), read(x.sub(y)), read(x.mul(y)), read(x.div(y)), read(x.max(y)), read(x.madd(y, V::splat(3.0)))];
+            let (least, powers) = (read(x.from_least_on(V::splat(a[3]))), read(x.exp2()));
+            for i in 0..V::LANES {
+                let expected = [a[i] + b[i], a[i] - b[i], a[i] * b[i], a[i] / b[i], a[i].max(b[i]), a[i] * b[i] + 3.0];
+                for (found, expected) in all.iter().zip(expected) {
+                    assert!((found[i] - expected).abs() <= 1e-6 * expected.abs().max(100.0), "{} and {}: {}", a[i], b[i], found[i]);
+                }
+                assert_eq!(least[i], if a[i] >= a[3] { a[i] } else { 0.0 });
+                assert!((powers[i] - a[i].exp2()).abs() <= 3e-7 * a[i].exp2(), "2^{}: {}", a[i], powers[i]);
+            }
+            let rows: [V; SUMS] = std::array::from_fn(|k| V::load(&values[start + k..]));
+            for (k, sum) in V::sums(&rows).into_iter().enumerate() {
+                let expected: f32 = values[start + k..][..V::LANES].iter().sum();
+                assert!((sum - expected).abs() < 1e-3, "sum {k}: {sum} instead of {expected}");
             }
         }
-        assert!(super::exp2::<false>(-1e9) < 1e-37);
+        assert!(read(V::splat(-1e9).exp2())[0] < 1e-37);
+        *checked += V::LANES as u32;
+    }
+
+    #[test]
+    fn vectors_do_what_their_floats_do() {
+        let mut checked = 0;
+        check_body::<Portable>(&mut checked);
+        widest(&mut checked);
+        println!("checked: portable, and vectors of {}", checked - 8);
+        assert!(checked >= 16);
     }
 }

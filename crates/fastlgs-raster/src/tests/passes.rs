@@ -220,7 +220,7 @@ fn blending_and_its_gradients() {
                 assert_close(&format!("frame, {what}"), seen, expected, 1e-3, 0.001);
             } else {
                 // Blocks that are finished before their tile leave out no more than passes through them then.
-                let left_out = seen.iter().zip(expected).filter(|(a, b)| (*a - *b).abs() > 2.0 * cpu::TRANSMITTANCE_MIN).count();
+                let left_out = seen.iter().zip(expected).filter(|(a, b)| (*a - *b).abs() > 2.0 * view.finished).count();
                 assert!(left_out * 1000 <= seen.len(), "frame, {what}: {left_out} values differ");
             }
             let frame = &twin[5];

@@ -171,7 +171,7 @@ impl Trainer {
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len());
-        self.engine.step(self.view(&camera, degree), id, &options, &step)?;
+        self.engine.step(self.view(&camera, degree).trained(), id, &options, &step)?;
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
         }
