@@ -1,8 +1,8 @@
 //! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
 
 use crate::cpu;
-use crate::native::Lists;
 use crate::native::blend::{self, Job, Tile};
+use crate::native::{self, Lists};
 use crate::view::{TILE, View};
 use fastlgs_core::{Gaussians, LabelMap};
 use rayon::prelude::*;
@@ -35,8 +35,8 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
         let mut shown = blend::shown(&view, &job);
         let (names, masks) = masks_of(labels, &job);
         blend::by_mask(&job, &masks, &mut shown, sums);
-        let rows = job.gaussians.iter().zip(sums.chunks_exact(names.len()));
-        let votes = rows.flat_map(|(&gaussian, row)| names.iter().zip(row).map(move |(&label, &weight)| Vote { gaussian, label, weight }));
+        let rows = job.gaussians().zip(sums.chunks_exact(names.len()));
+        let votes = rows.flat_map(|(gaussian, row)| names.iter().zip(row).map(move |(&label, &weight)| Vote { gaussian, label, weight }));
         votes.filter(|v| v.weight > 0.0).collect::<Vec<_>>()
     };
     let tiles: Vec<Vec<Vote>> = (0..view.tile_count() as usize).into_par_iter().map_init(Vec::new, of_tile).collect();
@@ -70,9 +70,7 @@ fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
 
 /// Tile lists of a view; what depends on the viewing direction is left out.
 fn lists_of(scene: &Gaussians, view: &View) -> Lists {
-    let params = scene.to_channels();
-    let n = scene.len();
-    Lists::new(view, |i, c| params[c * n + i])
+    Lists::new(view, &native::transposed(&scene.to_channels(), scene.len()))
 }
 
 /// Largest blending weight alpha * transmittance of each Gaussian over all pixels of a view.
@@ -80,10 +78,10 @@ pub fn largest_weights(scene: &Gaussians, view: &View) -> Vec<f32> {
     let view = View { sh_degree: 0, ..*view };
     let lists = lists_of(scene, &view);
     let of_tile = |tile: u32| {
-        let [start, end] = lists.ranges[tile as usize].map(|p| p as usize);
+        let job = Job::new(&view, tile as usize, &lists);
         let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, cpu::shown(x, y, &view))).collect();
-        let mut out = Vec::with_capacity(end - start);
-        for &gaussian in &lists.gaussians[start..end] {
+        let mut out = Vec::new();
+        for gaussian in job.gaussians() {
             let splat = &lists.splats[gaussian as usize];
             let (mut largest, mut open) = (0.0f32, false);
             for (x, y, transmittance) in &mut pixels {

@@ -6,6 +6,7 @@ use crate::view::TILE;
 pub type Footprint = [[f32; 4]; 2];
 
 /// Tiles of a row of tiles that the ellipse touches.
+#[inline(always)]
 pub fn span(f: &Footprint, row: u32, tiles_x: u32) -> std::ops::Range<u32> {
     let [[mean_x, mean_y, lean, spread], [height2, apex, ..]] = *f;
     let half_height = height2.sqrt();
@@ -21,5 +22,6 @@ pub fn span(f: &Footprint, row: u32, tiles_x: u32) -> std::ops::Range<u32> {
     let (size, limit) = (TILE as f32, tiles_x as f32);
     let first = (((left + 0.5) / size).ceil() - 1.0).clamp(0.0, limit);
     let end = (((right - 0.5) / size).floor() + 1.0).clamp(0.0, limit);
-    first as u32..first.max(end) as u32
+    // Signed: processors convert nothing else at once.
+    first as i32 as u32..first.max(end) as i32 as u32
 }

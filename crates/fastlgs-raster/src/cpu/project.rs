@@ -12,7 +12,6 @@ pub(crate) struct Projected {
     pub splat: Splat,
     pub depth: u32,
     pub footprint: Footprint,
-    pub touched: u32,
 }
 
 /// Key of a Gaussian that is not drawn: it sorts last.
@@ -24,13 +23,17 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
     for i in 0..page {
         let g = first + i;
         (depths[g], touched[g]) = (NOT_DRAWN, 0);
-        if let Some(p) = project_one(view, |c| params[c * stride(page) + i]) {
-            (splats[g], depths[g], footprints[g], touched[g]) = (p.splat, p.depth, p.footprint, p.touched);
+        let Some(p) = project_one(view, |c| params[c * stride(page) + i]) else { continue };
+        let [top, bottom] = [p.footprint[1][2], p.footprint[1][3]].map(|row| row as u32);
+        let tiles = (top..bottom).map(|row| span(&p.footprint, row, view.tiles[0]).len() as u32).sum();
+        if tiles > 0 {
+            (splats[g], depths[g], footprints[g], touched[g]) = (p.splat, p.depth, p.footprint, tiles);
         }
     }
 }
 
-/// Projects the Gaussian whose channels `param` gives; nothing where it is not drawn.
+/// Projects the Gaussian whose channels `param` gives; nothing where it is not drawn, other than for touching no tile.
+#[inline(always)]
 pub(crate) fn project_one(view: &View, param: impl Fn(usize) -> f32) -> Option<Projected> {
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));
     let mean = param3(0);
@@ -60,10 +63,6 @@ pub(crate) fn project_one(view: &View, param: impl Fn(usize) -> f32) -> Option<P
     let first_row = (((center.y - half_height + 0.5) / size).ceil() - 1.0).clamp(0.0, rows);
     let end_row = (((center.y + half_height - 0.5) / size).floor() + 1.0).clamp(0.0, rows);
     let footprint = [[center.x, center.y, cxy / cyy, det / (cyy * cyy)], [reach2 * cyy, (reach2 / cxx).sqrt() * cxy, first_row, end_row]];
-    let touched = (first_row as u32..end_row as u32).map(|row| span(&footprint, row, view.tiles[0]).len() as u32).sum();
-    if touched == 0 {
-        return None;
-    }
     let color = color_of(view, mean, &param).max(Vec3::ZERO);
     let f = if view.depth_as_feature == 1 { Vec3::new(t.z, 0.0, 0.0) } else { param3(14) };
     let log2e = std::f32::consts::LOG2_E;
@@ -73,10 +72,11 @@ pub(crate) fn project_one(view: &View, param: impl Fn(usize) -> f32) -> Option<P
         [-0.5 * log2e * qc, opacity.min(ALPHA_MAX).log2(), color.x, color.y],
         [color.z, f.x, f.y, f.z],
     ];
-    Some(Projected { splat, depth: (t.z.to_bits() >> 7).min(NOT_DRAWN - 1), footprint, touched })
+    Some(Projected { splat, depth: (t.z.to_bits() >> 7).min(NOT_DRAWN - 1), footprint })
 }
 
 /// Colour before it is cut off at zero.
+#[inline(always)]
 fn color_of(view: &View, mean: Vec3, param: impl Fn(usize) -> f32) -> Vec3 {
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));
     let mut color = Vec3::splat(0.5) + SH_C0 * param3(11);

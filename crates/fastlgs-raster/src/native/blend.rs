@@ -1,6 +1,6 @@
 //! Blending and its gradients, a tile at a time: one of its rows in a vector of eight, or two in one of sixteen.
 
-use super::Lists;
+use super::lists::{Band, Lists};
 use super::simd::{SUMS, Vector, dispatched};
 use crate::cpu::{ALPHA_MIN, BATCH, Splat};
 use crate::view::View;
@@ -53,8 +53,9 @@ pub struct Job<'a> {
     pub x: f32,
     /// Upper left pixel.
     pub y: f32,
-    /// Gaussians front to back.
-    pub gaussians: &'a [u32],
+    /// Places of the tile's Gaussians in its band, front to back.
+    list: &'a [u32],
+    band: &'a Band,
     lists: &'a Lists,
     /// Transmittance below which a pixel needs no more of them.
     finished: f32,
@@ -64,9 +65,13 @@ impl<'a> Job<'a> {
     /// The job of tile number `tile`.
     pub fn new(view: &View, tile: usize, lists: &'a Lists) -> Self {
         let (column, row) = (tile % view.tiles[0] as usize, tile / view.tiles[0] as usize);
-        let [start, end] = lists.ranges[tile].map(|p| p as usize);
-        let gaussians = &lists.gaussians[start..end];
-        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, gaussians, lists, finished: view.finished }
+        let band = &lists.bands[row];
+        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, list: band.tile(column), band, lists, finished: view.finished }
+    }
+
+    /// The Gaussians front to back.
+    pub fn gaussians(&self) -> impl Iterator<Item = u32> {
+        self.list.iter().map(|place| self.band.gaussians[*place as usize])
     }
 }
 
@@ -89,8 +94,8 @@ struct Placed<'a, V> {
 
 impl<'a, V: Vector> Placed<'a, V> {
     #[inline(always)]
-    fn new(job: &Job<'a>, gaussian: u32) -> Self {
-        let (splat, reach) = (&job.lists.splats[gaussian as usize], job.lists.reach[gaussian as usize]);
+    fn new(job: &Job<'a>, gaussian: usize) -> Self {
+        let (splat, reach) = (&job.lists.splats[gaussian], job.lists.reach[gaussian]);
         let down = job.y - splat[0][1];
         let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
         let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
@@ -151,9 +156,9 @@ dispatched! {
 
 #[inline(always)]
 fn forward_body<V: Vector, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) {
-    for batch in job.gaussians.chunks(BATCH) {
-        for &g in batch {
-            let placed = Placed::<V>::new(job, g);
+    for batch in job.list.chunks(BATCH) {
+        for &place in batch {
+            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let values = placed.values();
             for p in placed.pixels.clone() {
                 let w = taken(placed.alphas(placed.dy(p)), &mut out.transmittance[p..]);
@@ -179,9 +184,10 @@ dispatched! {
 #[inline(always)]
 fn by_id_body<V: Vector>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) {
     sums.clear();
-    for batch in job.gaussians.chunks(BATCH) {
-        for &g in batch {
-            let id = ids[g as usize];
+    for batch in job.list.chunks(BATCH) {
+        for &place in batch {
+            let g = job.band.gaussians[place as usize] as usize;
+            let id = ids[g];
             let place = sums.iter().position(|s| s.0 == id).unwrap_or_else(|| {
                 sums.push((id, EMPTY));
                 sums.len() - 1
@@ -208,10 +214,10 @@ dispatched! {
 #[inline(always)]
 fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) {
     sums.clear();
-    for batch in job.gaussians.chunks(BATCH) {
-        for &g in batch {
+    for batch in job.list.chunks(BATCH) {
+        for &place in batch {
             let first = sums.len();
-            let placed = Placed::<V>::new(job, g);
+            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let mut weights = EMPTY;
             for p in placed.pixels.clone() {
                 taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]).store(&mut weights[p..]);
@@ -247,7 +253,7 @@ pub struct Given {
 }
 
 dispatched! {
-    /// Gradient slots of a tile's pairs, in the order of its list.
+    /// Adds a tile's gradients to those of its band's Gaussians.
     fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; SUMS]])
         = backward_body
 }
@@ -258,10 +264,9 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
     given: &mut Given,
     slots: &mut [[f32; SUMS]],
 ) {
-    let walked = given.walked as usize;
     let (zero, one) = (V::splat(0.0), V::splat(1.0));
-    for (&g, slot) in job.gaussians[..walked].iter().zip(&mut *slots) {
-        let placed = Placed::<V>::new(job, g);
+    for &place in &job.list[..given.walked as usize] {
+        let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
         let values = placed.values();
         let [mut p_sum, mut py_sum, mut pyy_sum] = [zero; 3];
         let mut sums = [zero; 6];
@@ -290,7 +295,7 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
         }
         let (px, pxy) = (p_sum.mul(placed.dx), py_sum.mul(placed.dx));
         let [r, g, b, f0, f1, f2] = sums;
-        *slot = V::sums(&[px, py_sum, px.mul(placed.dx), pxy, pyy_sum, p_sum, r, g, b, f0, f1, f2]);
+        let sums = V::sums(&[px, py_sum, px.mul(placed.dx), pxy, pyy_sum, p_sum, r, g, b, f0, f1, f2]);
+        slots[place as usize].iter_mut().zip(sums).for_each(|(slot, sum)| *slot += sum);
     }
-    slots[walked..].fill([0.0; SUMS]);
 }

@@ -1,24 +1,38 @@
 //! Projection, depth order and tile lists.
 
+use super::simd::vectorised;
 use crate::cpu::{self, Footprint, NOT_DRAWN, Projected, Splat, span};
 use crate::view::View;
 use rayon::prelude::*;
 
-/// What blending walks through. Pairs are numbered by tile and, within a tile, front to back.
+/// What blending walks through.
 pub(crate) struct Lists {
     /// Projected Gaussians.
     pub splats: Vec<Splat>,
-    /// First pair and the one after the last, of each tile.
-    pub ranges: Vec<[u32; 2]>,
-    /// Gaussian of each pair.
-    pub gaussians: Vec<u32>,
-    /// Places of each Gaussian's pairs: those of Gaussian g are `places[first[g]..first[g + 1]]`.
+    /// Pixels up and down from each Gaussian's mean within which it reaches the least alpha.
+    pub reach: Vec<f32>,
+    /// Rows of tiles.
+    pub bands: Vec<Band>,
+    /// Where each Gaussian stands in the bands, if their Gaussians are counted on from band to band: `places[first[g]..first[g + 1]]`.
     pub places: Vec<u32>,
     /// See `places`.
     pub first: Vec<u32>,
-    /// Pixels up and down from each Gaussian's mean within which it reaches the least alpha.
-    pub reach: Vec<f32>,
-    footprints: Vec<Footprint>,
+}
+
+/// A row of tiles. What a Gaussian adds up in its tiles stays at hand while the row is walked.
+pub(crate) struct Band {
+    /// The Gaussians that touch it, front to back.
+    pub gaussians: Vec<u32>,
+    /// Lists of its tiles, one after the other: places in `gaussians`, front to back.
+    pairs: Vec<u32>,
+    /// Where each tile's list ends.
+    ends: Vec<u32>,
+}
+
+/// A Gaussian in a row of tiles: the columns that it touches.
+struct Touch {
+    gaussian: u32,
+    columns: std::ops::Range<u32>,
 }
 
 /// Added to the reach: alphas are rounded.
@@ -27,88 +41,136 @@ const ROUNDING: f32 = 0.01;
 /// Gaussians are listed in so many parts, whatever the number of threads.
 const PARTS: usize = 16;
 
-/// Projects the Gaussians, whose channels `param(i, channel)` gives.
-fn project(view: &View, param: impl Fn(usize, usize) -> f32 + Sync) -> Vec<Projected> {
-    let nothing = Projected { splat: [[0.0; 4]; 3], depth: NOT_DRAWN, footprint: [[0.0; 4]; 2], touched: 0 };
-    (0..view.gaussians as usize).into_par_iter().map(|i| cpu::project_one(view, |c| param(i, c)).unwrap_or(nothing)).collect()
-}
-
 impl Lists {
-    /// Lists of a view over the Gaussians whose channels `param(i, channel)` gives.
-    pub fn new(view: &View, param: impl Fn(usize, usize) -> f32 + Sync) -> Self {
-        let projected = project(view, param);
-        let order = in_depth_order(&projected);
-        let mut first = vec![0; projected.len() + 1];
-        for (i, p) in projected.iter().enumerate() {
-            first[i + 1] = first[i] + p.touched;
-        }
-        let mut lists = Self {
-            splats: projected.iter().map(|p| p.splat).collect(),
-            reach: projected.iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect(),
-            footprints: projected.iter().map(|p| p.footprint).collect(),
-            ranges: vec![[0; 2]; view.tile_count() as usize],
-            gaussians: Vec::new(),
-            places: vec![0; first[projected.len()] as usize],
-            first,
-        };
-        lists.fill(view, &order);
-        lists
+    /// Lists of a view over Gaussians, `[n][channels]`.
+    pub fn new(view: &View, params: &[f32]) -> Self {
+        let projected = project(view, params);
+        let bands = bands(view, &projected);
+        let (first, places) = places(&bands, projected.len());
+        let reach = projected.iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect();
+        Self { splats: splats(&projected), reach, bands, places, first }
     }
 
     /// Projects again where only what does not move geometry has changed.
-    pub fn refresh(&mut self, view: &View, param: impl Fn(usize, usize) -> f32 + Sync) {
-        self.splats = project(view, param).into_iter().map(|p| p.splat).collect();
+    pub fn refresh(&mut self, view: &View, params: &[f32]) {
+        self.splats = splats(&project(view, params));
     }
 
-    /// Counting sort by tile of the tiles that each Gaussian touches, which keeps the order of depths within a tile.
-    fn fill(&mut self, view: &View, order: &[u32]) {
-        let (tiles_x, tiles) = (view.tiles[0], self.ranges.len());
-        let footprints = &self.footprints;
-        let touched = |gaussians: &[u32]| {
-            let (mut found, mut counts) = (Vec::new(), vec![0u32; tiles]);
-            for &g in gaussians {
-                let footprint = &footprints[g as usize];
-                for row in footprint[1][2] as u32..(footprint[1][3] as u32).min(view.tiles[1]) {
-                    for tile in span(footprint, row, tiles_x).map(|x| row * tiles_x + x) {
-                        counts[tile as usize] += 1;
-                        found.push(tile);
-                    }
-                }
-            }
-            (found, counts)
-        };
-        let parts = order.par_chunks(order.len().div_ceil(PARTS).max(1));
-        let (found, mut next): (Vec<Vec<u32>>, Vec<Vec<u32>>) = parts.map(touched).unzip();
-        let mut end = 0;
-        for (tile, range) in self.ranges.iter_mut().enumerate() {
-            range[0] = end;
-            for counts in &mut next {
-                end += std::mem::replace(&mut counts[tile], end);
-            }
-            range[1] = end;
+    /// Pairs of a tile and a Gaussian.
+    pub fn pairs(&self) -> usize {
+        self.bands.iter().map(|band| band.pairs.len()).sum()
+    }
+}
+
+impl Band {
+    /// From what touches the row, front to back: a counting sort by column, which keeps that order.
+    fn new<'a>(columns: u32, touches: impl Iterator<Item = &'a Touch> + Clone) -> Self {
+        let mut next = vec![0; columns as usize + 1];
+        for column in touches.clone().flat_map(|t| t.columns.clone()) {
+            next[column as usize + 1] += 1;
         }
-        self.gaussians = vec![0; end as usize];
-        let mut tiles = found.iter().zip(&mut next).flat_map(|(found, next)| {
-            found.iter().map(move |tile| {
-                let place = next[*tile as usize];
-                next[*tile as usize] += 1;
-                place
-            })
-        });
-        for &g in order {
-            let own = self.first[g as usize] as usize..self.first[g as usize + 1] as usize;
-            for (slot, place) in self.places[own].iter_mut().zip(&mut tiles) {
-                *slot = place;
-                self.gaussians[place as usize] = g;
+        for column in 0..columns as usize {
+            next[column + 1] += next[column];
+        }
+        let mut pairs = vec![0; next[columns as usize] as usize];
+        for (place, touch) in touches.clone().enumerate() {
+            for next in &mut next[touch.columns.start as usize..touch.columns.end as usize] {
+                pairs[*next as usize] = place as u32;
+                *next += 1;
             }
+        }
+        next.pop();
+        Self { gaussians: touches.map(|t| t.gaussian).collect(), pairs, ends: next }
+    }
+
+    /// The list of a tile.
+    pub fn tile(&self, column: usize) -> &[u32] {
+        let start = if column == 0 { 0 } else { self.ends[column - 1] };
+        &self.pairs[start as usize..self.ends[column] as usize]
+    }
+}
+
+/// Gaussians that are projected in one piece.
+const BLOCK: usize = 256;
+
+/// Projects Gaussians, `[n][channels]`.
+fn project(view: &View, params: &[f32]) -> Vec<Projected> {
+    let nothing = Projected { splat: [[0.0; 4]; 3], depth: NOT_DRAWN, footprint: [[0.0; 4]; 2] };
+    let mut projected = vec![nothing; view.gaussians as usize];
+    let width = (params.len() / projected.len().max(1)).max(1);
+    projected.par_chunks_mut(BLOCK).zip(params.par_chunks(BLOCK * width)).for_each(|(out, params)| project_block(view, width, params, out));
+    projected
+}
+
+vectorised! {
+    /// Projects some Gaussians; `out` holds what is not drawn.
+    fn project_block(view: &View, width: usize, params: &[f32], out: &mut [Projected]) = project_block_body
+}
+
+#[inline(always)]
+fn project_block_body<const FMA: bool>(view: &View, width: usize, params: &[f32], out: &mut [Projected]) {
+    for (params, out) in params.chunks_exact(width).zip(out) {
+        if let Some(drawn) = cpu::project_one(view, |c| params[c]) {
+            *out = drawn;
         }
     }
+}
+
+fn splats(projected: &[Projected]) -> Vec<Splat> {
+    projected.iter().map(|p| p.splat).collect()
 }
 
 /// Drawn Gaussians by ascending depth; those of the same depth by their number.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
     let mut keys: Vec<u64> =
-        projected.iter().enumerate().filter(|(_, p)| p.touched > 0).map(|(i, p)| u64::from(p.depth) << 32 | i as u64).collect();
+        projected.iter().enumerate().filter(|(_, p)| p.depth != NOT_DRAWN).map(|(i, p)| u64::from(p.depth) << 32 | i as u64).collect();
     keys.par_sort_unstable();
     keys.into_iter().map(|k| k as u32).collect()
+}
+
+/// The rows of tiles, each with its Gaussians in order of depth.
+fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
+    let order = in_depth_order(projected);
+    let touched = |gaussians: &[u32]| {
+        let mut rows: Vec<Vec<Touch>> = (0..view.tiles[1]).map(|_| Vec::new()).collect();
+        touches(view, projected, gaussians, &mut rows);
+        rows
+    };
+    let parts: Vec<Vec<Vec<Touch>>> = order.par_chunks(order.len().div_ceil(PARTS).max(1)).map(touched).collect();
+    let band = |row: usize| Band::new(view.tiles[0], parts.iter().flat_map(|rows| &rows[row]));
+    (0..view.tiles[1] as usize).into_par_iter().map(band).collect()
+}
+
+vectorised! {
+    /// Adds to each row of tiles what touches it, in the order of `gaussians`.
+    fn touches(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) = touches_body
+}
+
+#[inline(always)]
+fn touches_body<const FMA: bool>(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) {
+    for &gaussian in gaussians {
+        let footprint: &Footprint = &projected[gaussian as usize].footprint;
+        for row in footprint[1][2] as u32..(footprint[1][3] as u32).min(view.tiles[1]) {
+            let columns = span(footprint, row, view.tiles[0]);
+            if !columns.is_empty() {
+                rows[row as usize].push(Touch { gaussian, columns });
+            }
+        }
+    }
+}
+
+/// Where each Gaussian's places begin, and the places; see [`Lists::places`].
+fn places(bands: &[Band], count: usize) -> (Vec<u32>, Vec<u32>) {
+    let all = || bands.iter().flat_map(|band| &band.gaussians).map(|g| *g as usize);
+    let mut first = vec![0; count + 1];
+    all().for_each(|g| first[g + 1] += 1);
+    for g in 0..count {
+        first[g + 1] += first[g];
+    }
+    let (mut next, mut places) = (first.clone(), vec![0; first[count] as usize]);
+    for (place, g) in all().enumerate() {
+        places[next[g] as usize] = place as u32;
+        next[g] += 1;
+    }
+    (first, places)
 }

@@ -19,6 +19,7 @@ use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{KEPT, pack};
 pub(crate) use lists::Lists;
 use rayon::prelude::*;
+use simd::SUMS;
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
@@ -69,7 +70,8 @@ pub struct CpuEngine {
     gradient: Picture<6>,
     scratch: loss::Scratch,
     walked: Vec<u32>,
-    slots: Vec<[f32; 12]>,
+    /// Sums over the tiles of a row, for each place of [`Lists::places`].
+    slots: Vec<[f32; SUMS]>,
     lists: Option<Lists>,
     /// Lists of views whose geometry is frozen.
     cached: HashMap<usize, Lists>,
@@ -78,7 +80,7 @@ pub struct CpuEngine {
 }
 
 /// `[n][channels]` from `[channels][n]`, or with the roles changed the other way round.
-fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
+pub(crate) fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
     let channels = columns.len() / n.max(1);
     (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
 }
@@ -116,14 +118,12 @@ impl CpuEngine {
             return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {}", view.gaussians, self.n)));
         }
         self.timed("lists", |s| {
-            let (params, width) = (&s.params, channels_of(s.sh_degree));
-            let param = |i: usize, c: usize| params[i * width + c];
             s.lists = match frozen.and_then(|id| s.cached.remove(&id)) {
                 Some(mut lists) => {
-                    lists.refresh(view, param);
+                    lists.refresh(view, &s.params);
                     Some(lists)
                 }
-                None => Some(Lists::new(view, param)),
+                None => Some(Lists::new(view, &s.params)),
             };
         });
         self.timed("blend", |s| match channels {
@@ -167,21 +167,20 @@ impl CpuEngine {
 
     fn blend_backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(&mut self, view: &View) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
-        self.slots.resize(lists.gaussians.len(), [0.0; 12]);
+        self.slots.resize(lists.places.len(), [0.0; SUMS]);
         let tiles_x = view.tiles[0] as usize;
         // Each row of tiles owns a stretch of the slots.
         let mut bands = Vec::new();
         let mut rest = &mut self.slots[..];
-        for row in lists.ranges.chunks_exact(tiles_x) {
-            let (band, after) = rest.split_at_mut((row[tiles_x - 1][1] - row[0][0]) as usize);
-            bands.push(band);
+        for band in &lists.bands {
+            let (own, after) = rest.split_at_mut(band.gaussians.len());
+            bands.push(own);
             rest = after;
         }
         let (frame, gradient, walked) = (&self.frame, &self.gradient, &self.walked);
-        bands.into_par_iter().enumerate().for_each(|(row, band)| {
-            let first = lists.ranges[row * tiles_x][0] as usize;
+        bands.into_par_iter().enumerate().for_each(|(row, slots)| {
+            slots.fill([0.0; SUMS]);
             for tile in row * tiles_x..(row + 1) * tiles_x {
-                let [start, end] = lists.ranges[tile].map(|p| p as usize);
                 let job = Job::new(view, tile, lists);
                 let trained = |c: usize| if c < 3 { COLOR } else { FEATURE };
                 let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { blend::EMPTY });
@@ -193,7 +192,7 @@ impl CpuEngine {
                     }
                 }
                 let mut given = Given { gradient: g, r_dot_g, transmittance: blend::shown(view, &job), walked: walked[tile] };
-                blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, &mut band[start - first..end - first]);
+                blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, slots);
             }
         });
     }
@@ -212,7 +211,7 @@ impl CpuEngine {
             for (k, (params, gradients)) in params.chunks_exact(width).zip(gradients.chunks_exact_mut(width)).enumerate() {
                 let i = block * adam::BLOCK + k;
                 let places = &lists.places[lists.first[i] as usize..lists.first[i + 1] as usize];
-                let mut slot = [0.0; 12];
+                let mut slot = [0.0; SUMS];
                 for place in places {
                     slot.iter_mut().zip(&slots[*place as usize]).for_each(|(sum, value)| *sum += value);
                 }
@@ -280,14 +279,13 @@ impl Engine for CpuEngine {
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
         self.forward(&view, channels, None)?;
-        let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len()) as u32;
+        let pairs = self.lists.as_ref().map_or(0, Lists::pairs) as u32;
         Ok(Frame::gathered(&View { pairs, ..view }, channels, |channel, y| self.frame.row(channel, y as usize)))
     }
 
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
         check_ids(&view, ids, self.n)?;
-        let (params, channels) = (&self.params, channels_of(self.sh_degree));
-        let lists = Lists::new(&view, |i, c| params[i * channels + c]);
+        let lists = Lists::new(&view, &self.params);
         let [width, height] = view.size;
         let mut pixels = vec![[0; KEPT]; view.pixels()];
         const EDGE: usize = TILE as usize;
@@ -352,14 +350,14 @@ impl Engine for CpuEngine {
 
     fn memory(&self) -> Memory {
         let bytes = |words: usize| 4 * words as u64;
-        let pairs = self.lists.as_ref().map_or(0, |l| l.gaussians.len());
+        let words = |lists: &Lists| lists.pairs() + 2 * lists.places.len();
         Memory {
             state: bytes(3 * self.params.len()),
-            lists: bytes(2 * pairs + 12 * self.slots.len()),
-            gaussians: bytes(self.gradients.len() + 23 * self.n),
+            lists: bytes(self.lists.as_ref().map_or(0, words) + SUMS * self.slots.len()),
+            gaussians: bytes(self.gradients.len() + 14 * self.n),
             frame: bytes(self.frame.data.len() + self.gradient.data.len() + self.scratch.words()),
             views: self.targets.values().map(|t| bytes(t.color.len())).sum::<u64>()
-                + self.cached.values().map(|l| bytes(2 * l.gaussians.len() + 23 * self.n)).sum::<u64>(),
+                + self.cached.values().map(|l| bytes(words(l) + 14 * self.n)).sum::<u64>(),
         }
     }
 
