@@ -54,7 +54,6 @@ fn sum_of(slots: &[f32], floats: usize, pairs: std::ops::Range<usize>) -> [f32; 
 
 /// Carries one Gaussian's summed slot to its trained values (docs/gradients.md, sections 2 to 6, whose symbols the names follow), which `put(channel, gradient)` receives. Returns the length
 /// of the projected mean's gradient in half-image units for Gaussians that are drawn.
-#[inline(always)]
 pub(crate) fn backward_one(
     view: &View,
     channels: Channels,
