@@ -1,4 +1,4 @@
-//! Puts the WGSL passes together, validates every permutation with naga, and writes `shaders.rs`: for each pass a type with its
+//! Puts the WGSL passes together, validates every permutation with naga, translates it for Vulkan, Metal and Direct3D 12, and writes `shaders.rs`: for each pass a type with its
 //! sources, its uniform, and its buffers by name.
 //!
 //! The shaders are WGSL with these lines beside, each alone on its line (`#` first, after spaces):
@@ -127,11 +127,12 @@ struct Bound {
 /// Parses and validates; returns what is bound, in order.
 fn validate(name: &str, source: &str) -> Vec<Bound> {
     let module = naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
-    naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
+    let info = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
         .subgroup_stages(naga::valid::ShaderStages::COMPUTE)
         .subgroup_operations(naga::valid::SubgroupOperationSet::all())
         .validate(&module)
         .unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
+    translate(name, &module, &info);
     let mut bound: Vec<Bound> = module
         .global_variables
         .iter()
@@ -155,6 +156,24 @@ fn validate(name: &str, source: &str) -> Vec<Bound> {
     assert!(bound.iter().enumerate().all(|(k, b)| b.place == k as u32), "{name}: bindings are 0, 1, 2, ...");
     assert_eq!(bound[0].kind, "Binding::Uniform", "{name}: binding 0 is the uniform");
     bound
+}
+
+/// Says it in the languages of all platforms, most of which are not at hand: that one of them cannot say it must not be found there.
+fn translate(name: &str, module: &naga::Module, info: &naga::valid::ModuleInfo) {
+    use naga::back::{hlsl, msl, spv};
+    let failed = |to: &str, e: &dyn std::fmt::Display| -> ! { panic!("shaders/{name}.wgsl cannot be translated to {to}: {e}") };
+    let options = spv::Options { lang_version: (1, 3), ..spv::Options::default() };
+    spv::write_vec(module, info, &options, None).unwrap_or_else(|e| failed("SPIR-V", &e));
+
+    let options = msl::Options { lang_version: (2, 4), ..msl::Options::default() };
+    let metal = msl::write_string(module, info, &options, &msl::PipelineOptions::default()).unwrap_or_else(|e| failed("Metal", &e));
+    metal.1.entry_point_names.iter().filter_map(|entry| entry.as_ref().err()).for_each(|e| failed("Metal", e));
+
+    // Waves, as Direct3D calls subgroups, came with 6.0.
+    let options = hlsl::Options { shader_model: hlsl::ShaderModel::V6_0, ..hlsl::Options::default() };
+    let (mut out, pipeline) = (String::new(), hlsl::PipelineOptions::default());
+    let direct3d = hlsl::Writer::new(&mut out, &options, &pipeline).write(module, info, None).unwrap_or_else(|e| failed("HLSL", &e));
+    direct3d.entry_point_names.iter().filter_map(|entry| entry.as_ref().err()).for_each(|e| failed("HLSL", e));
 }
 
 /// A pass as Rust: a type with its shader, and its buffers by name.
