@@ -167,13 +167,17 @@ fn translate(name: &str, module: &naga::Module, info: &naga::valid::ModuleInfo) 
 
     let options = msl::Options { lang_version: (2, 4), ..msl::Options::default() };
     let metal = msl::write_string(module, info, &options, &msl::PipelineOptions::default()).unwrap_or_else(|e| failed("Metal", &e));
-    metal.1.entry_point_names.iter().filter_map(|entry| entry.as_ref().err()).for_each(|e| failed("Metal", e));
+    if let Some(e) = metal.1.entry_point_names.iter().find_map(|entry| entry.as_ref().err()) {
+        failed("Metal", e);
+    }
 
     // Waves, as Direct3D calls subgroups, came with 6.0.
     let options = hlsl::Options { shader_model: hlsl::ShaderModel::V6_0, ..hlsl::Options::default() };
     let (mut out, pipeline) = (String::new(), hlsl::PipelineOptions::default());
     let direct3d = hlsl::Writer::new(&mut out, &options, &pipeline).write(module, info, None).unwrap_or_else(|e| failed("HLSL", &e));
-    direct3d.entry_point_names.iter().filter_map(|entry| entry.as_ref().err()).for_each(|e| failed("HLSL", e));
+    if let Some(e) = direct3d.entry_point_names.iter().find_map(|entry| entry.as_ref().err()) {
+        failed("HLSL", e);
+    }
 }
 
 /// A pass as Rust: a type with its shader, and its buffers by name.

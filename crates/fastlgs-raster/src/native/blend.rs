@@ -116,7 +116,7 @@ impl<'a, V: Vector> Placed<'a, V> {
         let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *self.splat;
         let c0 = V::splat(qz).mul(dy).madd(dy, V::splat(log_opacity));
         let exponent = self.dx.madd(V::splat(qx).madd(self.dx, V::splat(qy).mul(dy)), c0);
-        exponent.exp2().from_least_on(V::splat(ALPHA_MIN))
+        exponent.exp2().at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Colour and feature.

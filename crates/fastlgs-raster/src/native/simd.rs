@@ -40,7 +40,7 @@ pub trait Vector: Copy {
     /// The larger of both.
     fn max(self, b: Self) -> Self;
     /// self, and 0 where it is below `least`.
-    fn from_least_on(self, least: Self) -> Self;
+    fn at_least_or_zero(self, least: Self) -> Self;
     /// self * 2^k, where `k`'s lowest bits hold a whole number.
     fn times_power_of_two(self, k: Self) -> Self;
     /// The sum of each vector's floats.
@@ -122,7 +122,7 @@ impl Vector for Portable {
     }
 
     #[inline(always)]
-    fn from_least_on(self, least: Self) -> Self {
+    fn at_least_or_zero(self, least: Self) -> Self {
         self.with(least, |a, least| if a >= least { a } else { 0.0 })
     }
 
@@ -182,7 +182,7 @@ mod x86 {
             fn div(b) = _mm256_div_ps;
             fn madd(b, c) = _mm256_fmadd_ps;
             fn max(b) = _mm256_max_ps;
-            fn from_least_on(least) = |a, least| _mm256_and_ps(a, _mm256_cmp_ps::<_CMP_GE_OQ>(a, least));
+            fn at_least_or_zero(least) = |a, least| _mm256_and_ps(a, _mm256_cmp_ps::<_CMP_GE_OQ>(a, least));
             fn times_power_of_two(k) = |a, k| {
                 let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(k));
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a), exponent))
@@ -240,7 +240,7 @@ mod x86 {
             fn div(b) = _mm512_div_ps;
             fn madd(b, c) = _mm512_fmadd_ps;
             fn max(b) = _mm512_max_ps;
-            fn from_least_on(least) = |a, least| _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, least), a);
+            fn at_least_or_zero(least) = |a, least| _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, least), a);
             fn times_power_of_two(k) = |a, k| {
                 let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(k));
                 _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(a), exponent))
@@ -332,7 +332,7 @@ mod tests {
             let (a, b) = (&values[start..], &values[start + 16..]);
             let (x, y) = (V::load(a), V::load(b));
             let all = [read(x.add(y)), read(x.sub(y)), read(x.mul(y)), read(x.div(y)), read(x.max(y)), read(x.madd(y, V::splat(3.0)))];
-            let (least, powers) = (read(x.from_least_on(V::splat(a[3]))), read(x.exp2()));
+            let (least, powers) = (read(x.at_least_or_zero(V::splat(a[3]))), read(x.exp2()));
             for i in 0..V::LANES {
                 let expected = [a[i] + b[i], a[i] - b[i], a[i] * b[i], a[i] / b[i], a[i].max(b[i]), a[i] * b[i] + 3.0];
                 for (found, expected) in all.iter().zip(expected) {
