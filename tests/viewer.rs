@@ -442,6 +442,79 @@ fn a_text_lights_up_its_object_in_the_browser() {
     assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), "pictures");
 }
 
+/// A plain file server; killed with this value.
+struct Files(Child);
+
+impl Files {
+    /// Gives out a folder; returns the address, too.
+    fn of(folder: &Path) -> (Self, String) {
+        let port = std::net::TcpListener::bind("127.0.0.1:0").and_then(|l| l.local_addr()).expect("a free port").port();
+        let mut command = Command::new("python3");
+        command.args(["-m", "http.server", &port.to_string(), "--bind", "127.0.0.1", "-d", text(folder)]);
+        let files = Self(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("python3 starts"));
+        let began = Instant::now();
+        while TcpStream::connect(("127.0.0.1", port)).is_err() {
+            assert!(began.elapsed() < Duration::from_secs(20), "the file server does not answer");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        (files, format!("http://127.0.0.1:{port}"))
+    }
+}
+
+impl Drop for Files {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn a_shared_folder_answers_without_a_program() {
+    if !chromium() {
+        return;
+    }
+    let Some(scene) = room() else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let page = dir.path().join("my page");
+    let share = |words: &str| json(&["export", text(scene), text(&page), "--html", "--words", words, "--device", "cpu"]);
+    assert_eq!(share("40")["words"], 40);
+    // What was shared before is replaced.
+    let report = share(if run::all() { "20000" } else { "3000" });
+    println!("shared: {report}");
+    assert!(report["words"].as_u64() >= Some(3000) && report["found"].as_u64() > Some(0), "{report}");
+    assert!(report["bytes"].as_u64() < Some(6_000_000), "{report}");
+    // Somebody else's folder is not.
+    let other = dir.path().join("other");
+    std::fs::create_dir(&other).and_then(|()| std::fs::write(other.join("letter.txt"), "dear")).expect("a folder");
+    run::fails(&["export", text(scene), text(&other), "--html"], &["something else is there"]);
+    assert!(other.join("letter.txt").is_file());
+
+    // Below another address, as pages of a project are.
+    let (_files, url) = Files::of(dir.path());
+    let browser = Browser::open(window().0, window().1, &["--enable-unsafe-swiftshader"]);
+    browser.go(&format!("{url}/my%20page/"));
+    browser.wait_for("document.body.dataset.ready");
+    assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), "webgl2", "nobody else renders pictures");
+    let plain = snapshot(&browser);
+    let answer = json(&["query", text(scene), "cat", "--device", "cpu"]);
+    let ids: BTreeSet<u64> = answer["objects"].as_array().expect("objects").iter().filter_map(|o| o["id"].as_u64()).collect();
+    let said = type_text(&browser, "cat");
+    let selected = browser.run("return [...fastlgs.state.selected];");
+    assert_eq!(selected.as_array().expect("ids").iter().filter_map(Value::as_u64).collect::<BTreeSet<_>>(), ids, "{said}: {answer}");
+    assert!(psnr(&plain, &snapshot(&browser)) < 25.0, "the cat is lit");
+    assert!(type_text(&browser, "bicycle").contains("not found"));
+    browser.keys("/");
+    browser.run("document.getElementById('text').value = '';");
+    browser.keys("striped catt\u{e007}");
+    browser.wait_for("!document.getElementById('problem').hidden");
+    let said = browser.run("return document.getElementById('problem').textContent;");
+    assert!(said.as_str().is_some_and(|said| said.contains("\"striped catt\" is none of them") && said.contains("near it:")), "{said}");
+    browser.keys("\u{e00c}");
+    browser.wait_for("document.querySelector('#list img').naturalWidth > 0");
+    assert_eq!(browser.run("return document.getElementById('exports').hidden && document.getElementById('compare').hidden;"), true);
+    assert_eq!(browser.errors(), Vec::<String>::new(), "nothing on the console");
+}
+
 #[test]
 fn the_fox_lights_up_in_the_browser() {
     let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");

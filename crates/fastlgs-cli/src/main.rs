@@ -54,11 +54,11 @@ Called again, it keeps what is there, goes on where it was broken off, or makes 
     Eval(fastlgs::eval::Config),
     /// Measures speed.
     Bench(fastlgs_bench::Args),
-    /// Writes a trained scene as PLY or SPZ, or as a small folder for queries.
+    /// Writes a trained scene as PLY, SPZ or glTF, as a small folder for queries, or as a page for any web server.
     #[command(
-        after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox\n          fastlgs export scenes/fox cameras.json"
+        after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox\n          fastlgs export scenes/fox cameras.json\n          fastlgs export scenes/fox page/fox --html"
     )]
-    Export(fastlgs::export::Config),
+    Export(commands::export::Args),
     /// Makes a scene with exact poses, depths and masks.
     #[command(after_help = "Example: fastlgs synth table -o photos/table --views 40 --size 320x240")]
     Synth(fastlgs::synth::Config),
@@ -99,13 +99,13 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         Command::Render(config) => report::tell(common, &fastlgs::render(&config, run)?, words::render),
         Command::Query(args) => commands::query::run(&args, common, run),
         Command::Remove(config) => report::tell(common, &fastlgs::remove(&config, run)?, words::remove),
-        Command::Teach(lesson) => report::give(common, &fastlgs::teach::teach(&lesson, run)?),
+        Command::Teach(lesson) => report::tell(common, &fastlgs::teach::teach(&lesson, run)?, words::teach),
         Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),
         Command::Eval(config) => report::tell(common, &fastlgs::eval(&config, run)?, words::eval),
         Command::Bench(args) => report::give(common, &fastlgs_bench::run(&args, run)?),
-        Command::Export(config) => report::give(common, &fastlgs::export(&config, run)?),
-        Command::Synth(config) => report::give(common, &fastlgs::synth(&config, run)?),
+        Command::Export(args) => commands::export::run(&args, common, run),
+        Command::Synth(config) => report::tell(common, &fastlgs::synth(&config, run)?, words::synth),
         Command::Models(args) => commands::models::run(&args, common, run),
         Command::Info(args) => commands::info::run(&args, common),
         Command::Completions(args) => commands::shell::completions(&args, Cli::command()),

@@ -1,9 +1,10 @@
 //! Reports of the stages in words: a short table with units. `--json` has everything.
 
 use fastlgs::eval::Outcome;
+use fastlgs_serve::share;
 
 /// Lines of a name and what there is to say; lines without anything to say are left out.
-fn table(lines: &[(&str, String)]) -> String {
+pub fn table(lines: &[(&str, String)]) -> String {
     let said = || lines.iter().filter(|(_, words)| !words.is_empty());
     let width = said().map(|(name, _)| name.len()).max().unwrap_or(0);
     said().map(|(name, words)| format!("{name:width$}  {words}")).collect::<Vec<_>>().join("\n")
@@ -14,6 +15,11 @@ pub fn thousands(number: usize) -> String {
     let digits = number.to_string();
     let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or_default()).collect();
     groups.join(",")
+}
+
+/// Bytes in millions.
+pub fn megabytes(bytes: u64) -> String {
+    format!("{:.1} MB", bytes as f64 / 1e6)
 }
 
 fn decibels(psnr: Option<f64>) -> String {
@@ -83,6 +89,49 @@ pub fn render(r: &fastlgs::render::Report) -> String {
     let views = r.render_ms.len();
     lines.push(format!("{views} view{} of {}, {mean:.0} ms each ({})", if views == 1 { "" } else { "s" }, r.size, r.adapter));
     lines.join("\n")
+}
+
+pub fn export(r: &fastlgs::export::Report) -> String {
+    let r = match r {
+        fastlgs::export::Report::Path { output, frames, .. } => return format!("{}: a camera path of {frames} views", output.display()),
+        fastlgs::export::Report::Scene(scene) => scene,
+    };
+    let quality = match (r.psnr_held_out.before, r.psnr_held_out.after) {
+        (Some(before), Some(after)) => format!("{after:.2} dB on photos that were kept aside, {before:.2} before"),
+        _ => format!("pictures are within {:.1} dB of the scene's own", r.psnr_against_original),
+    };
+    table(&[
+        ("written", format!("{}, {}", r.output.display(), megabytes(r.bytes))),
+        ("scene", format!("{}, of which queries need {}", r.scene.display(), megabytes(r.bytes_before))),
+        ("Gaussians", format!("{}, colour of degree {}", thousands(r.gaussians), r.sh_degree)),
+        ("colour", quality),
+    ])
+}
+
+pub fn share(r: &share::Report) -> String {
+    let folder = r.output.display();
+    let said = table(&[
+        ("written", format!("{folder}, {}, for any web server", megabytes(r.bytes))),
+        ("Gaussians", thousands(r.gaussians)),
+        ("words", format!("{} are answered; {} of them name something in the scene", thousands(r.words), thousands(r.found))),
+    ]);
+    format!("{said}\n\ntry it:  python3 -m http.server -d {folder}")
+}
+
+pub fn synth(r: &fastlgs::synth::Report) -> String {
+    let photos = r.photos.display();
+    format!(
+        "{photos}: {} photos of {} of '{}', with exact poses, depths, masks and labels\nin it: {}",
+        r.views,
+        r.size,
+        r.kind,
+        r.objects.join(", ")
+    )
+}
+
+pub fn teach(r: &fastlgs::teach::Report) -> String {
+    let shown = r.object.map_or_else(|| "a picture".to_owned(), |id| format!("object {id}"));
+    format!("\"{}\" is {shown} from now on, by {} views; {} examples of it are kept in {}", r.name, r.views, r.examples, r.kept.display())
 }
 
 pub fn eval(r: &fastlgs::eval::Report) -> String {

@@ -40,9 +40,11 @@ pub struct Hit {
 pub struct Evidence {
     /// What objects are ranked by: the higher, the likelier this one is meant.
     pub rank: f32,
+    /// What the rank is without the object's size: how like the text it is.
+    pub likeness: f32,
     /// Share of absent names that no object of a scene is as like as this one is like the text.
     pub score: f32,
-    /// Standard error of the rank, from view to view.
+    /// Standard error of rank and likeness, from view to view.
     pub error: f32,
 }
 
@@ -72,9 +74,9 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let usual = median(&around, bare, *total).min(anything / shares.iter().sum::<f32>().max(LEAST));
     let of_object = |(k, object): (usize, &Object)| {
         let cosine = cosines[k].filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e)));
-        let Some(cosine) = cosine else { return Evidence { rank: f32::NEG_INFINITY, score: 0.0, error: 0.0 } };
+        let Some(cosine) = cosine else { return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 } };
         if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
-            return Evidence { rank: f32::INFINITY, score: 1.0, error: 0.0 };
+            return Evidence { rank: f32::INFINITY, likeness: f32::INFINITY, score: 1.0, error: 0.0 };
         }
         let all_over = if shares[k] > 0.0 { sums[k] / shares[k] } else { around[k] };
         let likeness = calibration.trust() * cosine + (1.0 - calibration.trust()) * all_over;
@@ -82,6 +84,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
         Evidence {
             rank: excess.ln() + calibration.size_exponent() * (shares[k] / total).max(LEAST).ln(),
+            likeness: excess.ln(),
             score: calibration.confidence(calibration.temperature * margins[k]),
             error: variance.sqrt() / excess,
         }
@@ -191,7 +194,8 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 }
 
 /// The target objects; empty means "not found". The likeliest one, and those elsewhere that are found and cannot be told from it: by no more than
-/// the errors of both.
+/// the errors of both, and not by their size either. A large thing may be meant rather than a small one that is more like the text, but does not
+/// become another of its kind by being large.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
@@ -204,7 +208,8 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
             break;
         }
         let nested = |other: &Hit| grid.chain(hit.id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == hit.id);
-        if hit.score >= config.min_score() && !chosen.iter().any(nested) {
+        let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
+        if alike && hit.score >= config.min_score() && !chosen.iter().any(nested) {
             chosen.push(*hit);
         }
     }

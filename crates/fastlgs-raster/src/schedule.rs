@@ -91,8 +91,8 @@ impl Default for TrainConfig {
             first_degree: 0,
             lambda: 0.2,
             feature_weight: 1.0,
-            refine_until: 0.5,
-            coarse_until: 0.2,
+            refine_until: 0.4,
+            coarse_until: 0.4,
             antialias: false,
             background: [0.0; 3],
             learn_background: false,
@@ -112,8 +112,8 @@ const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
 const LOOKS: u32 = 16;
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
-/// Shares of the iterations after which unimportant Gaussians are removed under an automatic budget.
-const PRUNE_AT: [f32; 2] = [0.55, 0.75];
+/// Shares of the iterations after the end of growth at which unimportant Gaussians are removed under an automatic budget.
+const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
 /// Share of the iterations for which MCMC moves Gaussians, as its authors do: 25,000 of 30,000.
 const MCMC_UNTIL: f32 = 0.83;
 /// Shares of the iterations after which cameras are aligned: once shapes stand, and so that what is left can follow.
@@ -202,7 +202,7 @@ impl TrainConfig {
     /// Whether unimportant Gaussians are removed then.
     pub(crate) fn prunes(&self, iteration: u32) -> bool {
         let automatic = matches!(self.budget, Budget::Auto(_)) && self.channels.color();
-        automatic && PRUNE_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
+        automatic && PRUNE_AFTER.iter().any(|share| iteration == self.step_at(self.refine_until + share).max(1))
     }
 
     /// Whether the cameras of the training views are aligned to the scene then.
@@ -217,7 +217,7 @@ impl TrainConfig {
         match self.strategy {
             _ if !self.channels.color() => [0.0; 2],
             Strategy::Mcmc => [OPACITY_WEIGHT * each, SCALE_WEIGHT * each],
-            Strategy::Classic if iteration < self.step_at(PRUNE_AT[0]) => [OPACITY_WEIGHT * each, 0.0],
+            Strategy::Classic if iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]) => [OPACITY_WEIGHT * each, 0.0],
             Strategy::Classic => [0.0; 2],
         }
     }
@@ -236,24 +236,24 @@ mod tests {
     fn the_schedule_of_a_run() {
         let config = TrainConfig { iterations: 8000, sh_degree: 3, budget: Budget::Auto(1000), ..TrainConfig::default() };
         assert_eq!([0, 999, 1000, 2500, 7999].map(|i| config.degree(i)), [0, 0, 1, 2, 3]);
-        assert!(config.coarse(1599) && !config.coarse(1600));
-        assert!(config.refines(400) && !config.refines(300) && config.refines(4000) && !config.refines(4100));
+        assert!(config.coarse(3199) && !config.coarse(3200));
+        assert!(config.refines(400) && !config.refines(300) && config.refines(3200) && !config.refines(3300));
         let rounds = |iterations: u32| {
             let config = TrainConfig { iterations, ..config.clone() };
             (0..=iterations).filter(|i| config.refines(*i)).count()
         };
-        assert_eq!([1000, 2000, 7000, 30_000].map(rounds), [17, 17, 32, 136]);
+        assert_eq!([1000, 2000, 7000, 30_000].map(rounds), [15, 17, 25, 106]);
         assert!(config.looks(500) && !config.looks(400));
         assert!(!config.resets_opacity(3000), "too late to recover");
         let long = TrainConfig { iterations: 30_000, ..config.clone() };
-        assert!(long.resets_opacity(3000) && long.resets_opacity(12_000) && !long.resets_opacity(15_000));
-        assert!(config.prunes(4400) && config.prunes(6000) && !config.prunes(6001));
+        assert!(long.resets_opacity(3000) && long.resets_opacity(9000) && !long.resets_opacity(12_000));
+        assert!(config.prunes(3600) && config.prunes(5200) && !config.prunes(5201));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
-        assert_eq!([4399, 4400].map(|i| config.regularisers(i, 1)), [[OPACITY_WEIGHT, 0.0], [0.0; 2]]);
+        assert_eq!([3599, 3600].map(|i| config.regularisers(i, 1)), [[OPACITY_WEIGHT, 0.0], [0.0; 2]]);
         let continued = TrainConfig { first_degree: 2, ..config.clone() };
         assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
-        assert!(!frozen.refines(400) && !frozen.prunes(4400));
+        assert!(!frozen.refines(400) && !frozen.prunes(3600));
     }
 }

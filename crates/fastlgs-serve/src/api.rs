@@ -47,23 +47,7 @@ pub async fn scene(State(app): App) -> Answer {
             let live = app.live.as_ref().ok_or_else(Failure::busy)?;
             json!({ "stage": "training", "antialias": live.antialias, "background": live.background, "objects": 0 })
         }
-        Some(bell) => {
-            let ready = |desk: &mut Desk| {
-                Ok(json!({
-                    "stage": "ready",
-                    "antialias": desk.scene.trained.antialias,
-                    "background": desk.scene.trained.background,
-                    "objects": desk.grid.objects.len(),
-                    "gaussians": desk.gaussians(),
-                    "min_score": QueryConfig::default().min_score(),
-                    "support_share": query::SUPPORT_SHARE,
-                    "segmenter": desk.scene.manifest.segmenter,
-                    "encoder": desk.scene.manifest.encoder,
-                    "adapter": desk.scene.engine.name(),
-                }))
-            };
-            bell.ask(ready).await?
-        }
+        Some(bell) => bell.ask(|desk| Ok(desk.about())).await?,
     };
     if let (Value::Object(all), Value::Object(more)) = (&mut value, more) {
         all.extend(more);
@@ -89,30 +73,7 @@ pub async fn splats(State(app): App) -> Answer<Response> {
 
 /// `GET /api/objects`: all objects and parts, by id.
 pub async fn objects(State(app): App) -> Answer {
-    let list = |desk: &mut Desk| {
-        desk.choose(&Choice::default())?;
-        // One pass: the Gaussians of each object, those of what lies in it included.
-        let mut own: Vec<Vec<usize>> = vec![Vec::new(); desk.grid.objects.len() + 1];
-        for (i, id) in desk.scene.gaussians.object_ids.iter().enumerate() {
-            for above in desk.grid.chain(*id) {
-                own[usize::from(above)].push(i);
-            }
-        }
-        let row = |o: &fastlgs_grid::grid::Object| {
-            let own = &own[usize::from(o.id)];
-            json!({
-                "id": o.id,
-                "parent": o.parent,
-                "support": o.support,
-                "views": o.views,
-                "gaussians": own.len(),
-                "bbox3d": selection::robust_box(&desk.scene.gaussians, own),
-                "color": turbo::id_color(o.id),
-            })
-        };
-        Ok(Json(Value::Array(desk.grid.objects.iter().map(row).collect())))
-    };
-    app.ready()?.ask(list).await
+    app.ready()?.ask(|desk| Ok(Json(desk.objects()?))).await
 }
 
 /// `GET /api/objects/{id}/thumbnail.png`

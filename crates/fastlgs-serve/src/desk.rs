@@ -7,10 +7,15 @@ use anyhow::{Context, Result, anyhow};
 use axum::body::Bytes;
 use axum::http::StatusCode;
 use fastlgs::Session;
-use fastlgs_core::{Camera, Gaussians};
+use fastlgs::session::selection;
+use fastlgs_core::{Camera, Gaussians, turbo};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
-use std::path::PathBuf;
+use fastlgs_grid::grid::Object;
+use fastlgs_grid::query::{self, QueryConfig};
+use image::RgbImage;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 
@@ -50,21 +55,27 @@ type Work = Box<dyn FnOnce(&mut Desk) + Send>;
 pub struct Bell(mpsc::Sender<Work>);
 
 impl Desk {
+    /// Opens a scene.
+    pub fn new(root: &Path, device: &str, clip_text: Option<PathBuf>) -> Result<Self> {
+        let mut scene = Session::open(root, device)?;
+        scene.clip_text = clip_text;
+        let grid = scene.grid()?;
+        Ok(Self { scene, grid, thumbnails: Thumbnails::default(), seen: None, choice: Choice::default(), all: None, splats: None })
+    }
+
     /// Opens a scene on a thread of its own; returns once it can be asked.
     pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<Bell> {
         let (bell, mut work) = mpsc::channel::<Work>(WAITING);
         let (opened, wait) = std::sync::mpsc::channel();
         std::thread::Builder::new().name("scene".into()).spawn(move || {
-            let open = || -> Result<Desk> {
-                let mut scene = Session::open(&root, &device)?;
-                scene.clip_text = clip_text;
-                let grid = scene.grid()?;
-                scene.warm_up()?;
+            let open = || -> Result<Self> {
+                let mut desk = Self::new(&root, &device, clip_text)?;
+                desk.scene.warm_up()?;
                 // The first question should not wait for the encoder. Without it the page still shows the scene.
-                if let Err(error) = scene.text_query("warm up") {
+                if let Err(error) = desk.scene.text_query("warm up") {
                     tracing::warn!("texts cannot be asked for: {error:#}");
                 }
-                Ok(Desk { scene, grid, thumbnails: Thumbnails::default(), seen: None, choice: Choice::default(), all: None, splats: None })
+                Ok(desk)
             };
             match open() {
                 Ok(mut desk) => {
@@ -121,6 +132,53 @@ impl Desk {
         }
         self.choice = choice.clone();
         Ok(true)
+    }
+
+    /// What the page needs to know of a scene that can be asked.
+    pub fn about(&self) -> Value {
+        json!({
+            "stage": "ready",
+            "antialias": self.scene.trained.antialias,
+            "background": self.scene.trained.background,
+            "objects": self.grid.objects.len(),
+            "gaussians": self.gaussians(),
+            "min_score": QueryConfig::default().min_score(),
+            "support_share": query::SUPPORT_SHARE,
+            "segmenter": self.scene.manifest.segmenter,
+            "encoder": self.scene.manifest.encoder,
+            "adapter": self.scene.engine.name(),
+        })
+    }
+
+    /// All objects and parts, by id.
+    pub fn objects(&mut self) -> Result<Value> {
+        self.choose(&Choice::default())?;
+        // One pass: the Gaussians of each object, those of what lies in it included.
+        let mut own: Vec<Vec<usize>> = vec![Vec::new(); self.grid.objects.len() + 1];
+        for (i, id) in self.scene.gaussians.object_ids.iter().enumerate() {
+            for above in self.grid.chain(*id) {
+                own[usize::from(above)].push(i);
+            }
+        }
+        let row = |o: &Object| {
+            let own = &own[usize::from(o.id)];
+            json!({
+                "id": o.id,
+                "parent": o.parent,
+                "support": o.support,
+                "views": o.views,
+                "gaussians": own.len(),
+                "bbox3d": selection::robust_box(&self.scene.gaussians, own),
+                "color": turbo::id_color(o.id),
+            })
+        };
+        Ok(Value::Array(self.grid.objects.iter().map(row).collect()))
+    }
+
+    /// The picture of an object; nothing for one that no view shows.
+    pub fn picture(&mut self, id: u16) -> Result<Option<RgbImage>> {
+        self.choose(&Choice::default())?;
+        self.thumbnails.picture(&mut self.scene, &self.grid, id)
     }
 
     /// The PNG of an object; nothing for one that no view shows.

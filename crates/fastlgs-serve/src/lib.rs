@@ -6,6 +6,7 @@ mod failure;
 mod guard;
 mod live;
 mod page;
+pub mod share;
 mod shared;
 mod splats;
 mod thumbnails;

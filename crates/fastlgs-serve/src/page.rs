@@ -7,7 +7,7 @@ use axum::routing::get;
 use std::sync::Arc;
 
 /// Address, kind, and content.
-const FILES: [(&str, &str, &str); 18] = [
+const FILES: [(&str, &str, &str); 19] = [
     ("/", HTML, include_str!("../web/index.html")),
     ("/style.css", "text/css; charset=utf-8", include_str!("../web/style.css")),
     ("/app.js", SCRIPT, include_str!("../web/app.js")),
@@ -15,6 +15,7 @@ const FILES: [(&str, &str, &str); 18] = [
     ("/objects.js", SCRIPT, include_str!("../web/objects.js")),
     ("/training.js", SCRIPT, include_str!("../web/training.js")),
     ("/server.js", SCRIPT, include_str!("../web/server.js")),
+    ("/save.js", SCRIPT, include_str!("../web/save.js")),
     ("/camera.js", SCRIPT, include_str!("../web/camera.js")),
     ("/renderer.js", SCRIPT, include_str!("../web/renderer.js")),
     ("/webgpu.js", SCRIPT, include_str!("../web/webgpu.js")),
@@ -31,6 +32,16 @@ const FILES: [(&str, &str, &str); 18] = [
 const HTML: &str = "text/html; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
+
+/// The page as files, by name: for a folder that no program stands behind.
+pub fn files() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let of = |(address, _, content): (&'static str, &str, &'static str)| match address {
+        "/" => Some(("index.html", content)),
+        "/server.js" => Some(("server.js", include_str!("../web/files.js"))),
+        _ => address.strip_prefix('/').filter(|name| !name.contains('/')).map(|name| (name, content)),
+    };
+    FILES.into_iter().filter_map(of)
+}
 
 /// One route a file.
 pub fn routes() -> Router<Arc<Shared>> {

@@ -32,15 +32,19 @@ impl Shared {
 
     /// All views as the page wants them.
     pub fn views(&self) -> Result<Vec<Value>> {
-        let manifest = self.folder.manifest()?;
-        let distances = self.focus.get();
-        let view = |(k, camera): (usize, &Camera)| {
-            let mut value = serde_json::to_value(camera)?;
-            value["held_out"] = json!(manifest.is_held_out(k, &camera.name));
-            value["photo"] = json!(self.folder.photo_path(&camera.name).is_file());
-            value["focus"] = json!(distances.and_then(|d| d.get(k)).copied().unwrap_or(1.0));
-            Ok(value)
-        };
-        self.cameras.iter().enumerate().map(view).collect()
+        views(&self.folder, &self.cameras, self.focus.get().map_or(&[], Vec::as_slice))
     }
+}
+
+/// All views as the page wants them. `focus` is how far what each looks at is, where that is known.
+pub fn views(folder: &SceneFolder, cameras: &[Camera], focus: &[f32]) -> Result<Vec<Value>> {
+    let manifest = folder.manifest()?;
+    let view = |(k, camera): (usize, &Camera)| {
+        let mut value = serde_json::to_value(camera)?;
+        value["held_out"] = json!(manifest.is_held_out(k, &camera.name));
+        value["photo"] = json!(folder.photo_path(&camera.name).is_file());
+        value["focus"] = json!(focus.get(k).copied().unwrap_or(1.0));
+        Ok(value)
+    };
+    cameras.iter().enumerate().map(view).collect()
 }

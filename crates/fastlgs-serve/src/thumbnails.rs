@@ -36,24 +36,29 @@ struct Best {
 impl Thumbnails {
     /// The PNG of an object; nothing for one that no view shows.
     pub fn png(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
+        if !self.made.contains_key(&id) {
+            let Some(picture) = self.picture(scene, grid, id)? else { return Ok(None) };
+            self.made.insert(id, image_io::encode_png(picture)?);
+        }
+        Ok(self.made.get(&id).cloned())
+    }
+
+    /// The picture of an object; nothing for one that no view shows.
+    pub fn picture(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<RgbImage>> {
         if self.best.is_empty() {
             self.search(scene, grid)?;
         }
         let Some(Best { view, bounds: [left, top, right, bottom], .. }) = self.best.get(usize::from(id)).copied().flatten() else {
             return Ok(None);
         };
-        if !self.made.contains_key(&id) {
-            let picture = &self.views[view];
-            let margin = (MARGIN * (right - left).max(bottom - top) as f32).ceil() as u32 + 2;
-            let (left, top) = (left.saturating_sub(margin), top.saturating_sub(margin));
-            let (right, bottom) = ((right + margin).min(picture.width()), (bottom + margin).min(picture.height()));
-            let (w, h) = (right - left, bottom - top);
-            let scale = SIDE as f32 / w.max(h) as f32;
-            let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
-            let small = resize(&*crop_imm(picture, left, top, w, h), size(w), size(h), FilterType::Triangle);
-            self.made.insert(id, image_io::encode_png(small)?);
-        }
-        Ok(self.made.get(&id).cloned())
+        let picture = &self.views[view];
+        let margin = (MARGIN * (right - left).max(bottom - top) as f32).ceil() as u32 + 2;
+        let (left, top) = (left.saturating_sub(margin), top.saturating_sub(margin));
+        let (right, bottom) = ((right + margin).min(picture.width()), (bottom + margin).min(picture.height()));
+        let (w, h) = (right - left, bottom - top);
+        let scale = SIDE as f32 / w.max(h) as f32;
+        let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
+        Ok(Some(resize(&*crop_imm(picture, left, top, w, h), size(w), size(h), FilterType::Triangle)))
     }
 
     /// Looks through some views for the place where each object is largest.

@@ -1,9 +1,10 @@
 // The page: what is asked, selected, hidden and shown, and the controls for it.
 
-import { Objects } from "/objects.js";
-import { Stage } from "/stage.js";
-import { follow, recall } from "/training.js";
-import { getBlob, getJson, postJson, save } from "/server.js";
+import { Objects } from "./objects.js";
+import { Stage } from "./stage.js";
+import { follow, recall } from "./training.js";
+import { save } from "./save.js";
+import { getBlob, getJson, postJson } from "./server.js";
 
 const $ = (id) => document.getElementById(id);
 const LISTED = 24; // objects before "more"
@@ -81,9 +82,11 @@ const find = guarded(async (text) => {
   const ms = Math.round(answer.ms.total);
   if (answer.found) {
     const parts = answer.objects.length === 1 ? `#${answer.objects[0].id}` : `${answer.objects.length} objects`;
-    say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}, ${answer.pixels.toLocaleString("en")} pixels here (${ms} ms)`);
+    // A folder of files knows what a word means, and not what is seen from here.
+    const pixels = answer.pixels === undefined ? "" : `, ${answer.pixels.toLocaleString("en")} pixels here`;
+    say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}${pixels} (${ms} ms)`);
   } else {
-    say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score} is needed (${ms} ms)`, true);
+    say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
   }
   select(answer.objects.map((o) => o.id));
 });
@@ -214,7 +217,8 @@ async function ready() {
   scene = Object.assign(stage.scene, await getJson("/api/scene"));
   objects = new Objects(await getJson("/api/objects"), scene.support_share);
   $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
-    + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, answered by ${scene.adapter}`;
+    + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, `
+    + (scene.shared ? `${scene.shared.words.toLocaleString("en")} words are known` : `answered by ${scene.adapter}`);
   $("text").disabled = false;
   update();
 }
@@ -223,6 +227,9 @@ async function main() {
   scene = await getJson("/api/scene");
   document.title = `${scene.name} - FastLGS`;
   $("name").textContent = scene.name;
+  // Without a program behind the page nothing is exported, and photos stay at home.
+  $("exports").hidden = Boolean(scene.shared);
+  $("compare").hidden = $("photo-label").hidden = !scene.views.some((view) => view.photo);
   stage = new Stage(scene, { stage: $("stage"), canvas: $("canvas"), cameras: $("cameras"), photo: $("photo"), divider: $("divider") }, failed);
   await stage.open(new URLSearchParams(location.search).get("renderer"));
   $("views").replaceChildren(...scene.views.map((view) => new Option(`${view.name}${view.held_out ? " (held out)" : ""}`)));

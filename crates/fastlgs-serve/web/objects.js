@@ -1,6 +1,6 @@
 // Objects as the page knows them: what contains what, and their buttons with pictures.
 
-import { getBlob } from "/server.js";
+import { getBlob } from "./server.js";
 
 export class Objects {
   constructor(list, supportShare) {

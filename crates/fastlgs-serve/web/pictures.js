@@ -1,6 +1,6 @@
 // Shows pictures that the server renders, where the browser can draw nothing itself.
 
-import { postBlob, postJson } from "/server.js";
+import { postBlob, postJson } from "./server.js";
 
 // Longer side of the pictures, in pixels: what a server without a GPU still draws quickly.
 const SIDE = 640;

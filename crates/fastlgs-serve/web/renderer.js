@@ -1,8 +1,8 @@
 // What all ways of drawing share: the Gaussians' bytes, the uniform of splat.wgsl, and which way is taken.
 
-import { openWebGpu } from "/webgpu.js";
-import { openWebGl2 } from "/webgl2.js";
-import { openPictures } from "/pictures.js";
+import { openWebGpu } from "./webgpu.js";
+import { openWebGl2 } from "./webgl2.js";
+import { openPictures } from "./pictures.js";
 
 export const ROW = 2048; // texels of a row; splat.wgsl has the same number
 export const OBJECT_ROWS = 512; // 256 of states, 256 of colours
@@ -38,13 +38,13 @@ export function packFrame({ camera, width, height, scene, splats, mode, dim }) {
 const WAYS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openPictures]];
 
 // The first way that this browser can go, or the one that is wished for. A browser without a GPU draws slower than the server, so
-// it gets pictures unless something else is wished for.
-export async function openRenderer(canvas, wish, evenSlow) {
+// it gets pictures unless something else is wished for, or unless it is `alone`: no server renders any.
+export async function openRenderer(canvas, wish, alone) {
   const reasons = [];
   for (const [name, open] of WAYS) {
-    if (wish && wish !== name) continue;
+    if ((wish && wish !== name) || (alone && name === "pictures")) continue;
     try {
-      return Object.assign(await open(canvas, evenSlow || Boolean(wish)), { name, reasons });
+      return Object.assign(await open(canvas, alone || Boolean(wish)), { name, reasons });
     } catch (error) {
       reasons.push(`${name}: ${error.message}`);
     }

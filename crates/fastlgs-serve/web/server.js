@@ -36,12 +36,3 @@ export const getBytes = async (path) => (await request(path)).arrayBuffer();
 export const getBlob = async (path) => (await request(path)).blob();
 export const postJson = async (path, body) => (await request(path, posted(body))).json();
 export const postBlob = async (path, body) => (await request(path, posted(body))).blob();
-
-// Gives a blob to the user as a file.
-export function save(blob, name) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = name;
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
-}

@@ -1,8 +1,8 @@
 // The picture: canvas, camera, hands on it, and what lies over it (cameras of the photos, the photo itself).
 
-import { Camera, frustum } from "/camera.js";
-import { OBJECT_ROWS, openRenderer, parseSplats } from "/renderer.js";
-import { getBlob, getBytes } from "/server.js";
+import { Camera, frustum } from "./camera.js";
+import { OBJECT_ROWS, openRenderer, parseSplats } from "./renderer.js";
+import { getBlob, getBytes } from "./server.js";
 
 // More pixels than this, along the longer side, are not drawn: software rasterisers would crawl.
 const MOST_PIXELS = 1280;
@@ -20,10 +20,11 @@ export class Stage {
   }
 
   async open(wish) {
-    // The server renders no pictures of a scene in training.
-    this.renderer = await openRenderer(this.elements.canvas, wish, this.scene.stage === "training");
+    // Nobody renders pictures of a scene in training, or of one in a folder of files.
+    const alone = this.scene.stage === "training" || Boolean(this.scene.shared);
+    this.renderer = await openRenderer(this.elements.canvas, wish, alone);
     this.renderer.lost.then(() => this.failed(new Error("the browser lost its graphics device; reload the page")));
-    this.sorter = new Worker("/sorter.js");
+    this.sorter = new Worker("./sorter.js");
     this.sorter.onmessage = ({ data }) => this.sorted(data);
     new ResizeObserver(() => this.resize()).observe(this.elements.stage);
     this.listen();

@@ -1,6 +1,6 @@
 // A scene that grows: its curves, and new Gaussians when the server has made a picture of it.
 
-import { getJson } from "/server.js";
+import { getJson } from "./server.js";
 
 const EVERY_MS = 1000;
 

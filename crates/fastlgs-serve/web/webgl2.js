@@ -1,6 +1,6 @@
 // Draws by WebGL2, with the shaders that the build translated from splat.wgsl. Their names of things are naga's.
 
-import { OBJECT_ROWS, ROW, packFrame } from "/renderer.js";
+import { OBJECT_ROWS, ROW, packFrame } from "./renderer.js";
 
 // Whether the browser would draw without a GPU. Asked of another canvas, as a canvas keeps its first context for good.
 function isSlow() {
@@ -11,7 +11,7 @@ function isSlow() {
 
 export async function openWebGl2(canvas, evenSlow) {
   if (!evenSlow && isSlow()) throw new Error("only a software rasteriser");
-  const sources = await Promise.all(["/corner.glsl", "/pixel.glsl"].map(async (path) => (await fetch(path)).text()));
+  const sources = await Promise.all(["corner.glsl", "pixel.glsl"].map(async (path) => (await fetch(path)).text()));
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, preserveDrawingBuffer: true });
   if (!gl) throw new Error("no WebGL2");
   const program = gl.createProgram();

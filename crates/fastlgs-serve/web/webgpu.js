@@ -1,6 +1,6 @@
 // Draws by WebGPU.
 
-import { OBJECT_ROWS, ROW, packFrame } from "/renderer.js";
+import { OBJECT_ROWS, ROW, packFrame } from "./renderer.js";
 
 export async function openWebGpu(canvas, evenSlow) {
   const adapter = await navigator.gpu?.requestAdapter();
@@ -9,7 +9,7 @@ export async function openWebGpu(canvas, evenSlow) {
   const device = await adapter.requestDevice();
   const format = navigator.gpu.getPreferredCanvasFormat();
   const shader = async (path) => device.createShaderModule({ code: await (await fetch(path)).text() });
-  const [module, present] = await Promise.all([shader("/splat.wgsl"), shader("/present.wgsl")]);
+  const [module, present] = await Promise.all([shader("splat.wgsl"), shader("present.wgsl")]);
   const layout = device.createBindGroupLayout({
     entries: [
       { binding: 0, visibility: GPUShaderStage.VERTEX | GPUShaderStage.FRAGMENT, buffer: {} },

@@ -39,6 +39,7 @@ pub mod sweep;
 pub mod text;
 pub mod tracks;
 pub mod triangulate;
+pub mod video;
 
 #[cfg(test)]
 #[path = "../../../tests/support/onnx.rs"]

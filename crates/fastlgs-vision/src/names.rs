@@ -2,9 +2,10 @@
 
 use crate::encoder::{TextEncoder, normalise};
 use crate::places::{NAMES, offline_dir};
-use crate::{MiniLm, Result};
+use crate::{Error, MiniLm, Result};
 use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
+use std::collections::BTreeSet;
 
 /// Names of a class that describe it: the later ones are rarer, at last Latin.
 const SYNONYMS: usize = 3;
@@ -28,6 +29,25 @@ pub fn embeddings() -> Result<Vec<Vec<f32>>> {
         tracing::debug!("the names are not kept: {e}");
     }
     Ok(embeddings)
+}
+
+/// Common English words, about as frequent ones first as MiniLM's vocabulary has them, and what the classifier's things are called: at most
+/// `most` words, each once.
+///
+/// # Errors
+/// When the offline models are not installed.
+pub fn common(most: usize) -> Result<Vec<String>> {
+    let folder = offline_dir();
+    let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
+    let path = folder.join("tokenizer.json");
+    let tokenizer = tokenizers::Tokenizer::from_file(&path).map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;
+    let mut pieces: Vec<(u32, String)> = tokenizer.get_vocab(false).into_iter().map(|(piece, place)| (place, piece)).collect();
+    pieces.sort();
+    let is_word = |piece: &String| piece.len() > 2 && piece.bytes().all(|b| b.is_ascii_lowercase());
+    let things = lists.into_iter().flat_map(|list| list.into_iter().take(SYNONYMS)).map(|name| name.to_lowercase());
+    let mut seen = BTreeSet::new();
+    let words = things.chain(pieces.into_iter().map(|p| p.1).filter(is_word)).filter(|word| seen.insert(word.clone()));
+    Ok(words.take(most).collect())
 }
 
 /// For each class the mean embedding of its first names.

@@ -1,7 +1,7 @@
 //! Photos that harm a scene more than they help: blurred ones, and those that repeat their neighbour.
 
-use image::RgbImage;
 use image::imageops::{FilterType, grayscale, resize};
+use image::{GrayImage, RgbImage};
 
 /// A photo this much less sharp than the middle one is called blurred.
 const BLURRED: f32 = 0.2;
@@ -15,7 +15,8 @@ const THUMB: u32 = 32;
 /// What a photo looks like, in a few numbers.
 #[derive(Clone)]
 pub struct Impression {
-    sharpness: f32,
+    /// How strong edges are against the picture's contrast; depends on what is shown and how large.
+    pub sharpness: f32,
     thumb: Vec<u8>,
 }
 
@@ -23,7 +24,11 @@ impl Impression {
     /// Looks at a photo. Sharpness is the mean square of the Laplacian over that of the grey values' spread, so that plain
     /// and dark photos are not called blurred.
     pub fn of(photo: &RgbImage) -> Self {
-        let gray = grayscale(photo);
+        Self::of_gray(&grayscale(photo))
+    }
+
+    /// The same of a photo without colours.
+    pub fn of_gray(gray: &GrayImage) -> Self {
         let (w, h) = gray.dimensions();
         let at = |x: u32, y: u32| f32::from(gray.get_pixel(x, y)[0]);
         let (mut edges, mut sum, mut squares, mut count) = (0.0f64, 0.0f64, 0.0f64, 1e-6f64);
@@ -35,7 +40,7 @@ impl Impression {
             count += 1.0;
         }
         let spread = squares / count - (sum / count).powi(2);
-        let thumb = resize(&gray, THUMB, THUMB, FilterType::Triangle).into_raw();
+        let thumb = resize(gray, THUMB, THUMB, FilterType::Triangle).into_raw();
         Self { sharpness: (edges / count / spread.max(1.0)) as f32, thumb }
     }
 }

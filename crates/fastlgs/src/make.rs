@@ -1,14 +1,14 @@
-//! The main job in one go: from photos to a scene that answers. What was done is not done again.
+//! The main job in one go: from photos or a video to a scene that answers. What was done is not done again.
 
 use crate::error::Context;
 use crate::eyes::SamPreset;
+use crate::preprocess::fingerprint;
 use crate::{Result, Run, preprocess, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::time::UNIX_EPOCH;
 
 /// What is made, and how thoroughly.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -95,8 +95,11 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     Ok((State::Made, report))
 }
 
-/// What tells whether a folder's files are still the same: names, sizes and times of all of them.
+/// What tells whether a video, or a folder's files, are still the same: names, sizes and times of all of them.
 fn files(folder: &Path) -> Result<Value> {
+    if folder.is_file() {
+        return fingerprint(folder);
+    }
     let refused = |error| fastlgs_core::Error::io(folder)(error);
     let mut found = serde_json::Map::new();
     for entry in std::fs::read_dir(folder).map_err(refused)? {
@@ -111,8 +114,7 @@ fn files(folder: &Path) -> Result<Value> {
             }
             files(&entry.path())?
         } else {
-            let changed = about.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map(|time| time.as_secs());
-            json!([about.len(), changed])
+            fingerprint(&entry.path())?
         };
         found.insert(name, value);
     }

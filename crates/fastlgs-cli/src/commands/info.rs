@@ -1,10 +1,12 @@
 //! `fastlgs info`: devices, or what is in a scene.
 
 use crate::outcome::Outcome;
-use crate::{report, ui};
+use crate::{report, ui, words};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
-use std::path::PathBuf;
+use fastlgs_vision::{keypoints, models};
+use serde_json::json;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs info scenes/fox")]
@@ -14,31 +16,63 @@ pub struct Args {
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    let value = match &args.scene {
-        None => serde_json::json!({
-            "version": env!("CARGO_PKG_VERSION"),
-            "adapters": fastlgs_raster::adapters(),
-            "auto": fastlgs_raster::choice("auto"),
-            "cores": std::thread::available_parallelism().map_or(1, usize::from),
-            "sift": fastlgs_vision::keypoints::backend(),
-            "offline_models": fastlgs_vision::models::offline_installed(),
-        }),
-        Some(root) => {
-            let folder = SceneFolder::open(root)?;
-            let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
-            let objects = fastlgs_grid::Grid::load(&folder).map(|g| g.objects.len()).ok();
-            let held_out = manifest.held_out(&cameras).len();
-            let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
-            serde_json::json!({
-                "scene": root,
-                "views": cameras.len(),
-                "held_out": held_out,
-                "objects": objects,
-                "gaussians": folder.gaussians().map(|g| g.len()).ok(),
-                "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
-                "made_by": manifest,
-            })
-        }
-    };
-    report::give(common, &value)
+    match &args.scene {
+        None => machine(common),
+        Some(root) => scene(root, common),
+    }
+}
+
+/// What there is to work with.
+fn machine(common: &ui::Common) -> Result<Outcome> {
+    let (version, adapters, auto) = (env!("CARGO_PKG_VERSION"), fastlgs_raster::adapters(), fastlgs_raster::choice("auto"));
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let (sift, installed) = (keypoints::backend(), models::offline_installed());
+    let value = json!({
+        "version": version,
+        "adapters": adapters,
+        "auto": auto,
+        "cores": cores,
+        "sift": sift,
+        "offline_models": installed,
+    });
+    report::tell(common, &value, |_| {
+        words::table(&[
+            ("fastlgs", format!("{version}, key points by {sift}")),
+            ("cpu", format!("{cores} cores")),
+            ("adapters", if adapters.is_empty() { "none".to_owned() } else { adapters.join(", ") }),
+            ("takes", format!("{} ({})", auto.device, auto.why)),
+            ("encoders", if installed { "installed" } else { "missing: fastlgs models install-offline" }.to_owned()),
+        ])
+    })
+}
+
+/// What is in a scene.
+fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
+    let folder = SceneFolder::open(root)?;
+    let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
+    let objects = fastlgs_grid::Grid::load(&folder).map(|g| g.objects.len()).ok();
+    let gaussians = folder.gaussians().map(|g| g.len()).ok();
+    let held_out = manifest.held_out(&cameras).len();
+    let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
+    let value = json!({
+        "scene": root,
+        "views": cameras.len(),
+        "held_out": held_out,
+        "objects": objects,
+        "gaussians": gaussians,
+        "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
+        "made_by": manifest,
+    });
+    let counted = |count: Option<usize>| count.map_or_else(|| "none yet: fastlgs train".to_owned(), words::thousands);
+    report::tell(common, &value, |_| {
+        words::table(&[
+            ("scene", format!("{}, made by fastlgs {}, seed {}", root.display(), manifest.version, manifest.seed)),
+            ("photos", format!("{} from {}, {held_out} of them kept aside", cameras.len(), manifest.photos.display())),
+            ("eyes", format!("masks: {}, embeddings: {}", manifest.segmenter, manifest.encoder)),
+            ("Gaussians", counted(gaussians)),
+            ("objects", counted(objects)),
+            ("queries", format!("need {}", words::megabytes(fastlgs::session::bytes(root)))),
+            ("warnings", manifest.warnings.join("\n          ")),
+        ])
+    })
 }

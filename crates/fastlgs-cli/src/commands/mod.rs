@@ -2,6 +2,7 @@
 
 pub mod batch;
 mod bind;
+pub mod export;
 pub mod info;
 mod library;
 pub mod make;

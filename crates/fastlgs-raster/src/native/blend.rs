@@ -216,7 +216,6 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
     sums.clear();
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
-            let first = sums.len();
             let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let mut weights = EMPTY;
             for p in placed.pixels.clone() {
@@ -232,7 +231,6 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
                 }
                 sums.extend(&V::sums(&inside)[..masks.len()]);
             }
-            debug_assert_eq!(sums.len(), first + masks.len());
         }
         if finished(job, transmittance) {
             break;
@@ -297,5 +295,55 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
         let [r, g, b, f0, f1, f2] = sums;
         let sums = V::sums(&[px, py_sum, px.mul(placed.dx), pxy, pyy_sum, p_sum, r, g, b, f0, f1, f2]);
         slots[place as usize].iter_mut().zip(sums).for_each(|(slot, sum)| *slot += sum);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::simd::Portable;
+    use super::super::transposed;
+    use super::*;
+    use crate::density::State;
+    use crate::tests::{camera, cloud};
+
+    /// All that the bodies leave behind, with vectors of one width.
+    fn by<V: Vector>(view: &View, lists: &Lists, ids: &[u16], masks: &[Tile]) -> Vec<f32> {
+        let mut out = Vec::new();
+        for tile in 0..(view.tiles[0] * view.tiles[1]) as usize {
+            let job = Job::new(view, tile, lists);
+            let shown = shown(view, &job);
+            let mut blended = Blended { sums: [EMPTY; 6], transmittance: shown, walked: 0 };
+            forward_body::<V, true, true>(&job, &mut blended);
+            let mut given = Given { gradient: blended.sums, r_dot_g: blended.transmittance, transmittance: shown, walked: blended.walked };
+            let mut slots = vec![[0.0; SUMS]; job.band.gaussians.len()];
+            backward_body::<V, true, true, true>(&job, &mut given, &mut slots);
+            let (mut shares, mut inside) = (Vec::new(), Vec::new());
+            by_id_body::<V>(&job, ids, &mut shown.clone(), &mut shares);
+            by_mask_body::<V>(&job, masks, &mut shown.clone(), &mut inside);
+            out.extend(blended.sums.concat());
+            out.extend(blended.transmittance);
+            out.extend(slots.concat());
+            shares.sort_by_key(|share| share.0);
+            out.extend(shares.iter().flat_map(|share| share.1));
+            out.extend(inside);
+        }
+        out
+    }
+
+    #[test]
+    fn vectors_of_sixteen_give_what_those_of_eight_do() {
+        let scene = cloud(3000, 4, 1, true);
+        let state = State::of(&scene);
+        // Neither side is a multiple of a tile's.
+        let view = View::new(&camera(93, 61), scene.len(), 1);
+        let lists = Lists::new(&view, &transposed(&state.params, scene.len()));
+        let ids: Vec<u16> = (0..scene.len() as u16).map(|k| k % 7).collect();
+        let masks: Vec<Tile> = (0..SUMS + 1).map(|k| std::array::from_fn(|p| f32::from(u8::from(p % (k + 2) == 0)))).collect();
+        let (eight, sixteen) = (by::<Portable<8>>(&view, &lists, &ids, &masks), by::<Portable<16>>(&view, &lists, &ids, &masks));
+        assert_eq!(eight.len(), sixteen.len());
+        assert!(eight.iter().filter(|v| **v != 0.0).count() > eight.len() / 4);
+        for (a, b) in eight.iter().zip(&sixteen) {
+            assert!((a - b).abs() <= 1e-4 * a.abs().max(1.0), "{a} and {b}");
+        }
     }
 }

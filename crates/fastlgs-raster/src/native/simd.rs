@@ -62,23 +62,23 @@ pub trait Vector: Copy {
     }
 }
 
-/// Eight floats that the compiler may keep in whatever registers there are.
+/// Floats that the compiler may keep in whatever registers there are.
 #[derive(Clone, Copy)]
-pub struct Portable([f32; 8]);
+pub struct Portable<const N: usize>([f32; N]);
 
-impl Portable {
+impl<const N: usize> Portable<N> {
     #[inline(always)]
     fn with(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
         Self(std::array::from_fn(|i| f(self.0[i], b.0[i])))
     }
 }
 
-impl Vector for Portable {
-    const LANES: usize = 8;
+impl<const N: usize> Vector for Portable<N> {
+    const LANES: usize = N;
 
     #[inline(always)]
     fn splat(value: f32) -> Self {
-        Self([value; 8])
+        Self([value; N])
     }
 
     #[inline(always)]
@@ -134,9 +134,12 @@ impl Vector for Portable {
     #[inline(always)]
     fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
         std::array::from_fn(|k| {
-            let v = &all[k].0;
-            let half = [v[0] + v[4], v[1] + v[5], v[2] + v[6], v[3] + v[7]];
-            (half[0] + half[2]) + (half[1] + half[3])
+            let (mut v, mut n) = (all[k].0, N);
+            while n > 1 {
+                n /= 2;
+                (0..n).for_each(|i| v[i] += v[i + n]);
+            }
+            v[0]
         })
     }
 }
@@ -304,7 +307,7 @@ macro_rules! dispatched {
                     return unsafe { avx2 $(::<$($p),+>)? ($($arg),*) };
                 }
             }
-            $body::<$crate::native::simd::Portable $($(, $p)+)?>($($arg),*);
+            $body::<$crate::native::simd::Portable<8> $($(, $p)+)?>($($arg),*);
         }
     };
 }
@@ -354,9 +357,10 @@ mod tests {
     #[test]
     fn vectors_do_what_their_floats_do() {
         let mut checked = 0;
-        check_body::<Portable>(&mut checked);
+        check_body::<Portable<8>>(&mut checked);
+        check_body::<Portable<16>>(&mut checked);
         widest(&mut checked);
-        println!("checked: portable, and vectors of {}", checked - 8);
-        assert!(checked >= 16);
+        println!("checked: portable ones of 8 and 16, and vectors of {}", checked - 24);
+        assert!(checked >= 32);
     }
 }

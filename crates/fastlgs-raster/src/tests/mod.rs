@@ -23,12 +23,12 @@ pub(crate) fn gpu() -> Option<Gpu> {
     }
 }
 
-fn camera(width: u32, height: u32) -> Camera {
+pub(crate) fn camera(width: u32, height: u32) -> Camera {
     Camera::look_at("test", Vec3::new(0.3, 0.5, -4.0), Vec3::ZERO, Vec3::Y, width, height, 0.9)
 }
 
 /// A cloud around the origin; `nasty` adds Gaussians that must not be drawn or are hard to draw.
-fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussians {
+pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussians {
     let mut rng = Rng::new(seed, "cloud");
     // The more there are, the smaller they are, as in trained scenes.
     let shrink = (n as f32 / 20_000.0).max(1.0).ln();

@@ -5,6 +5,7 @@ mod masks;
 mod matches;
 mod photos;
 mod poses;
+mod video;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
@@ -15,11 +16,13 @@ use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
 use fastlgs_grid::evidence;
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::video::is_video;
 use fastlgs_vision::{brightness, import, sweep, tracks};
 use photos::Known;
 pub use photos::{Photo, load_photo};
 use std::collections::BTreeMap;
 use std::time::Instant;
+pub(crate) use video::fingerprint;
 
 /// Photos to masks, embeddings, key points, poses and points, all in the scene folder `config.output`.
 ///
@@ -36,6 +39,13 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     };
     if config.max_side < 64 {
         bail!("--max-side {} is too small: 64 pixels are the least", config.max_side);
+    }
+    let of_video =
+        |video| Ok::<_, crate::Error>(Config { photos: video::photos(video, &SceneFolder::new(&config.output), run)?, ..config.clone() });
+    let of_video = Some(&config.photos).filter(|photos| is_video(photos)).map(|video| of_video(video)).transpose()?;
+    let config = of_video.as_ref().unwrap_or(config);
+    if of_video.is_some() {
+        lap("frames");
     }
     if config.photos.join("images").is_dir() && !dataset::has_poses(&config.photos) {
         poses::find(&config.photos, config.sfm, run)?;

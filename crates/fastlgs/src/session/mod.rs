@@ -154,6 +154,22 @@ impl Session {
         self.texts()?.query(text)
     }
 
+    /// Prepares many texts at once.
+    ///
+    /// # Errors
+    /// As [`Self::text_query`], but names that were taught with another encoder are taken as words.
+    pub fn text_queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
+        self.texts()?.queries(texts)
+    }
+
+    /// Names that the user has taught with this scene's encoder.
+    ///
+    /// # Errors
+    /// As [`Self::text_query`].
+    pub fn taught_names(&self) -> Result<Vec<String>> {
+        Ok(self.texts()?.taught())
+    }
+
     /// Whether the user has taught a name.
     pub fn is_taught(&self, text: &str) -> bool {
         self.texts().is_ok_and(|texts| texts.is_taught(text))

@@ -54,20 +54,44 @@ impl Texts {
         if text.trim().is_empty() {
             bail!("the text is empty; say what to look for");
         }
-        if let Some(examples) = self.names.of(text) {
-            let own = examples.iter().filter(|e| e.encoder == self.identity);
-            let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
-            if meant.is_empty() {
-                bail!(
+        if self.is_taught(text) {
+            return self.of_examples(text).with_context(|| {
+                format!(
                     "'{text}' was taught with another encoder than that of this scene: teach it here as well, or forget it: fastlgs names remove '{text}'"
-                );
-            }
-            return Ok(TextQuery::of_examples(meant, self.calibrations.pictures));
+                )
+            });
         }
+        Ok(self.worded(text, self.encoder.embed(&[text])?.remove(0)))
+    }
+
+    /// Prepares many texts; a name that was taught with another encoder only is a text like others.
+    ///
+    /// # Errors
+    /// When inference fails.
+    pub fn queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
+        let embeddings = self.encoder.embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let query = |(text, embedding): (&String, Vec<f32>)| self.of_examples(text).unwrap_or_else(|| self.worded(text, embedding));
+        Ok(texts.iter().zip(embeddings).map(query).collect())
+    }
+
+    /// Names that were taught with this encoder.
+    pub fn taught(&self) -> Vec<String> {
+        self.names.rows().into_iter().map(|row| row.name).filter(|name| self.of_examples(name).is_some()).collect()
+    }
+
+    /// What was taught under a name with this encoder; nothing where nothing was.
+    fn of_examples(&self, name: &str) -> Option<TextQuery> {
+        let own = self.names.of(name)?.iter().filter(|e| e.encoder == self.identity);
+        let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
+        (!meant.is_empty()).then(|| TextQuery::of_examples(meant, self.calibrations.pictures))
+    }
+
+    /// A text with its embedding.
+    fn worded(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
         let advantage = self.encoder.advantage(text);
         // Only the offline encoder gives one, for what it measures by itself.
         let calibration = if advantage > 0.0 { Calibration::OFFLINE_COLORED } else { self.calibrations.texts };
         let anything = calibration.anything + advantage;
-        Ok(TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(self.encoder.embed(&[text])?, calibration) })
+        TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(vec![embedding], calibration) }
     }
 }

@@ -17,7 +17,7 @@ use std::path::PathBuf;
 #[serde(rename_all = "kebab-case")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Preset {
-    /// 2,000 iterations.
+    /// 3,000 iterations.
     Quick,
     /// 7,000 iterations.
     #[default]
@@ -32,7 +32,7 @@ impl Preset {
     /// Iterations, highest SH degree, and most Gaussians with an automatic budget.
     pub(super) fn values(self) -> (u32, u32, usize) {
         match self {
-            Self::Quick => (2_000, 2, 200_000),
+            Self::Quick => (3_000, 2, 200_000),
             Self::Standard => (7_000, 2, 300_000),
             Self::Paper | Self::LikePaper => (30_000, 3, 1_000_000),
         }

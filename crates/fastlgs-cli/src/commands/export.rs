@@ -1,0 +1,34 @@
+//! `fastlgs export`: a scene for other programs, for queries elsewhere, or for a web server.
+
+use crate::outcome::Outcome;
+use crate::{report, ui, words};
+use anyhow::{Result, bail};
+use fastlgs::Run;
+use fastlgs::export::Config;
+use fastlgs_serve::share;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: Config,
+    /// Write a folder with the page of `serve`, for any web server: it answers common words and all that was taught, and has no photos.
+    #[arg(long)]
+    html: bool,
+    /// With --html, how many common words are answered.
+    #[arg(long, default_value_t = share::WORDS, requires = "html")]
+    words: usize,
+}
+
+pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
+    let config = &args.config;
+    if !args.html {
+        return report::tell(common, &fastlgs::export(config, run)?, words::export);
+    }
+    let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    if ["ply", "spz", "glb", "json"].contains(&ending) {
+        bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
+    }
+    let share =
+        share::Config { scene: config.scene.clone(), output: config.output.clone(), sh_degree: config.sh_degree, words: args.words };
+    report::tell(common, &share::share(&share, run)?, words::share)
+}

@@ -1,0 +1,183 @@
+//! A scene as a folder of files that any web server can give out: the page, what it shows, and what common words mean in it.
+
+use crate::desk::Desk;
+use crate::shared::views;
+use crate::{focus, page, splats};
+use anyhow::{Context, Result, bail};
+use fastlgs::Run;
+use fastlgs_core::camera::mean_up;
+use fastlgs_core::fs::{write_atomic, write_json};
+use fastlgs_grid::Grid;
+use fastlgs_grid::query::{self, Hit, QueryConfig};
+use fastlgs_grid::relevancy::TextQuery;
+use fastlgs_vision::names;
+use image::codecs::jpeg::JpegEncoder;
+use rayon::prelude::*;
+use serde::Serialize;
+use serde_json::json;
+use std::collections::BTreeSet;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// Common words that are answered, unless another number is asked for.
+pub const WORDS: usize = 20_000;
+/// Words that are embedded at once.
+const BATCH: usize = 256;
+/// Objects that are told for each word; `web/files.js` has the same number.
+const CANDIDATES: usize = 8;
+/// Of the pictures of objects.
+const JPEG_QUALITY: u8 = 80;
+
+/// What is shared, and where.
+#[derive(Clone, Debug)]
+pub struct Config {
+    /// Trained scene folder.
+    pub scene: PathBuf,
+    /// Folder to write.
+    pub output: PathBuf,
+    /// Drop colour's SH coefficients above this degree.
+    pub sh_degree: Option<u32>,
+    /// Common words that are answered.
+    pub words: usize,
+}
+
+/// What was written.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// The scene.
+    pub scene: PathBuf,
+    /// The folder.
+    pub output: PathBuf,
+    /// Its bytes.
+    pub bytes: u64,
+    /// Gaussians.
+    pub gaussians: usize,
+    /// Words that are answered.
+    pub words: usize,
+    /// Those of them that name something in the scene.
+    pub found: usize,
+}
+
+/// Writes the folder; an earlier one is replaced when the new one is whole.
+///
+/// # Errors
+/// A scene that cannot be asked, a folder that holds something else, and a place that cannot be written.
+pub fn share(config: &Config, run: &Run) -> Result<Report> {
+    let root = &config.output;
+    let ours = root.join("data/scene.json").is_file() && root.join("files.txt").is_file();
+    if root.exists() && !ours && root.read_dir().map_or(true, |mut entries| entries.next().is_some()) {
+        bail!("{}: something else is there; name a new folder", root.display());
+    }
+    let mut desk = Desk::new(&config.scene, run.device, None)?;
+    if let Some(degree) = config.sh_degree {
+        let lower = desk.scene.gaussians.clone().with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
+        desk.scene.show(lower)?;
+    }
+    let parent = std::path::absolute(root)?.parent().map(Path::to_owned).context("the folder has no parent")?;
+    std::fs::create_dir_all(&parent).with_context(|| parent.display().to_string())?;
+    // Beside the folder, so that it can be renamed into place.
+    let partial = tempfile::Builder::new().prefix(".share-").tempdir_in(&parent).with_context(|| parent.display().to_string())?;
+    let (words, found) = fill(partial.path(), &mut desk, config, run)?;
+    let partial = partial.keep();
+    readable(&partial)?;
+    if ours {
+        std::fs::remove_dir_all(root).with_context(|| root.display().to_string())?;
+    }
+    std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
+    Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: bytes(root), gaussians: desk.gaussians(), words, found })
+}
+
+/// Temporary folders are their owner's alone; this one is for a web server.
+fn readable(folder: &Path) -> Result<()> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o755))?;
+    }
+    let _ = folder;
+    Ok(())
+}
+
+/// Writes everything; returns how many words are answered, and how many of them name something.
+fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usize, usize)> {
+    let data = root.join("data");
+    let (words, rows, found) = words(desk, config.words, run)?;
+    write_json(&data.join("words.json"), &words)?;
+    write(&data.join("words.bin"), &rows)?;
+    let cameras = &desk.scene.cameras;
+    let focus: Vec<f32> = cameras.iter().map(|camera| focus(&desk.scene.gaussians.means, camera)).collect();
+    let mut views = views(&desk.scene.folder, cameras, &focus)?;
+    // Photos stay at home.
+    views.iter_mut().for_each(|view| view["photo"] = json!(false));
+    let scene = config.scene.canonicalize().unwrap_or_else(|_| config.scene.clone());
+    let mut about = desk.about();
+    about["name"] = json!(scene.file_name().unwrap_or_default().to_string_lossy());
+    about["up"] = json!(mean_up(cameras).to_array());
+    about["views"] = json!(views);
+    about["trained_here"] = json!(false);
+    about["shared"] = json!({ "words": words.len() });
+    write_json(&data.join("scene.json"), &about)?;
+    write(&data.join("splats.bin"), &splats::pack(&desk.scene.gaussians))?;
+    write_json(&data.join("objects.json"), &desk.objects()?)?;
+    for id in 1..=desk.grid.objects.len() as u16 {
+        let Some(picture) = desk.picture(id)? else { continue };
+        let mut jpeg = Vec::new();
+        picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
+        write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
+    }
+    for (name, content) in page::files() {
+        write(&root.join(name), content.as_bytes())?;
+    }
+    write(
+        &root.join("files.txt"),
+        b"A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.\n",
+    )?;
+    Ok((words.len(), found))
+}
+
+/// Bytes of all files in a folder.
+fn bytes(folder: &Path) -> u64 {
+    let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
+    entries.map(|path| if path.is_dir() { bytes(&path) } else { path.metadata().map_or(0, |m| m.len()) }).sum()
+}
+
+fn write(path: &Path, content: &[u8]) -> Result<()> {
+    Ok(write_atomic(path, |file| file.write_all(content))?)
+}
+
+/// The words, a row of the table for each, and how many of them name something.
+fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
+    let taught = desk.scene.taught_names()?.into_iter().map(|name| name.to_lowercase());
+    let words: BTreeSet<String> = names::common(common)?.into_iter().chain(taught).collect();
+    let mut words: Vec<String> = words.into_iter().collect();
+    // Texts of like length waste no padding.
+    words.sort_by_key(|word| (word.split_whitespace().count(), word.len()));
+    let work = run.work("words", words.len().div_ceil(BATCH) as u64);
+    let (grid, config) = (&desk.grid, QueryConfig::default());
+    let mut rows = Vec::new();
+    for batch in words.chunks(BATCH) {
+        let queries = desk.scene.text_queries(batch)?;
+        rows.par_extend(queries.par_iter().map(|query| row(grid, query, &config)));
+        work.advance()?;
+    }
+    let found = rows.iter().filter(|row| row[1] > 0).count();
+    Ok((words, rows.into_flattened(), found))
+}
+
+/// What is kept of a word's answer: the best score, how many objects are meant, and then objects with their scores, those first.
+type Row = [u8; 2 + 3 * CANDIDATES];
+
+fn row(grid: &Grid, query: &TextQuery, config: &QueryConfig) -> Row {
+    let ranked = query::rank(grid, query);
+    let meant = query::select(grid, &ranked, query, config);
+    let byte = |score: f32| (score.clamp(0.0, 1.0) * 255.0).round() as u8;
+    let mut row = [0; 2 + 3 * CANDIDATES];
+    row[0] = byte(query::best_score(&ranked));
+    row[1] = meant.len().min(CANDIDATES) as u8;
+    let others = ranked.iter().filter(|hit| !meant.iter().any(|m| m.id == hit.id));
+    for (place, Hit { id, score }) in row[2..].chunks_exact_mut(3).zip(meant.iter().chain(others)) {
+        place[..2].copy_from_slice(&id.to_le_bytes());
+        place[2] = byte(*score);
+    }
+    row
+}

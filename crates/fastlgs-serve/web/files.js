@@ -1,0 +1,64 @@
+// What server.js is for the program that serves this page, for a folder of files: the scene, and what common words mean in it.
+
+// As src/share.rs writes them: a row a word.
+const CANDIDATES = 8;
+const ROW = 2 + 3 * CANDIDATES;
+// Suggestions for a word that is not known.
+const NEAR = 5;
+
+async function file(path) {
+  const response = await fetch(path).catch(() => null);
+  if (!response?.ok) throw new Error(`${path} is missing beside this page; was the whole folder copied?`);
+  return response;
+}
+
+export const getJson = async (path) => (await file(`data${path.slice(4)}.json`)).json();
+export const getBytes = async (path) => (await file(`data${path.slice(4)}.bin`)).arrayBuffer();
+export const getBlob = async (path) => (await file(`data${path.slice(4).replace(/png$/, "jpg")}`)).blob();
+export const postBlob = async () => { throw new Error("this page is a folder of files, which cannot render pictures"); };
+
+let table;
+
+async function words() {
+  const [list, rows] = await Promise.all([getJson("/api/words"), getBytes("/api/words")]);
+  return { list: new Map(list.map((word, place) => [word, place])), rows: new DataView(rows) };
+}
+
+// Letters that must be changed, added or taken away to make one word of another.
+function distance(a, b) {
+  let row = Array.from({ length: b.length + 1 }, (_, k) => k);
+  for (let i = 1; i <= a.length; i++) {
+    const next = [i];
+    for (let k = 1; k <= b.length; k++) next.push(Math.min(row[k] + 1, next[k - 1] + 1, row[k - 1] + (a[i - 1] === b[k - 1] ? 0 : 1)));
+    row = next;
+  }
+  return row[b.length];
+}
+
+// Known words for one that is not: those that it contains, then those that are written nearly so.
+function near(text, list) {
+  const inside = text.split(/\s+/).filter((word) => word !== text && list.has(word));
+  const written = [...list.keys()].filter((word) => Math.abs(word.length - text.length) < 4).map((word) => [distance(text, word), word]);
+  written.sort((a, b) => a[0] - b[0]);
+  return [...new Set([...inside.reverse(), ...written.map(([, word]) => word)])].slice(0, NEAR);
+}
+
+// Answers a text from the table, in the form of the server's answer.
+export async function postJson(path, { text }) {
+  const began = performance.now();
+  const { list, rows } = await (table ??= words());
+  const plain = text.trim().toLowerCase().replace(/\s+/g, " ").replace(/^(a|an|the) /, "");
+  const place = list.get(plain);
+  if (place === undefined) {
+    const known = `${list.size.toLocaleString("en")} words`;
+    throw new Error(`this page knows what ${known} mean here, and "${plain}" is none of them; near it: ${near(plain, list).join(", ")}`);
+  }
+  const at = ROW * place;
+  const candidates = Array.from({ length: CANDIDATES }, (_, k) => {
+    const from = at + 2 + 3 * k;
+    return { id: rows.getUint16(from, true), score: rows.getUint8(from + 2) / 255 };
+  }).filter(({ id }) => id > 0);
+  const objects = candidates.slice(0, rows.getUint8(at + 1));
+  const score = rows.getUint8(at) / 255;
+  return { candidates, objects, score, found: objects.length > 0, ms: { total: performance.now() - began } };
+}
