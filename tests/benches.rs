@@ -1,6 +1,8 @@
 //! The quick suite of benches on generated scenes: that they run, that their figures add up, and the bounds that are promised. Of the
 //! rows that take longest only some, unless everything is tested.
 
+#[path = "support/browser.rs"]
+mod browser;
 #[path = "support/run.rs"]
 mod run;
 
@@ -91,4 +93,15 @@ fn quick_suite() {
     assert_eq!(report["results"].as_array().map(Vec::len), Some(3));
     let page = std::fs::read_to_string(out.join("report.html")).expect("the report");
     assert!(page.matches("<svg").count() == 5 && page.contains("photos shuffled") && !page.contains("src=\"http"), "self-contained");
+    if browser::installed() {
+        let browser = browser::Browser::open(900, 700, &[]);
+        browser.go(&format!("file://{}", text(&out.join("report.html"))));
+        let drawn = browser.run("return [...document.querySelectorAll('img, svg')].filter((p) => p.getBoundingClientRect().width > 0 && (p.naturalWidth ?? 1) > 0).length;");
+        let all = browser.run("return document.querySelectorAll('img, svg').length;");
+        assert!(all.as_u64() >= Some(5) && drawn == all, "{drawn} of {all} pictures are drawn");
+        assert_eq!(browser.errors(), Vec::<String>::new(), "nothing on the console");
+    } else {
+        assert!(std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(), "chromium and chromedriver are missing");
+        eprintln!("SKIPPED: the report is not opened: needs chromium and chromedriver");
+    }
 }

@@ -5,6 +5,7 @@ mod console;
 mod outcome;
 mod report;
 mod ui;
+mod whole;
 mod words;
 
 use clap::{CommandFactory, Parser, Subcommand};

@@ -6,6 +6,7 @@ mod camera;
 mod options;
 mod scene;
 mod stage;
+mod texts;
 
 use pyo3::create_exception;
 use pyo3::exceptions::PyException;

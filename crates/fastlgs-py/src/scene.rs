@@ -3,6 +3,7 @@
 use crate::answer::Answer;
 use crate::camera::Camera;
 use crate::options::to_python;
+use crate::texts::Texts;
 use crate::{Error, raised};
 use fastlgs::Session;
 use fastlgs::session::answer::{CANDIDATES, Question};
@@ -93,13 +94,16 @@ fn table<'py, T: numpy::Element>(py: Python<'py>, values: Vec<T>, shape: &[usize
 
 #[pymethods]
 impl Scene {
-    /// Opens a trained scene folder.
+    /// Opens a trained scene folder. Texts are embedded by `embed_text`, where it is given: a list of str to float32 (texts, numbers).
     #[new]
-    #[pyo3(signature = (path, *, device = "auto", clip_text = None))]
-    fn new(py: Python<'_>, path: PathBuf, device: &str, clip_text: Option<PathBuf>) -> PyResult<Self> {
+    #[pyo3(signature = (path, *, device = "auto", clip_text = None, embed_text = None))]
+    fn new(py: Python<'_>, path: PathBuf, device: &str, clip_text: Option<PathBuf>, embed_text: Option<Py<PyAny>>) -> PyResult<Self> {
         let open = || -> fastlgs::Result<Opened> {
             let mut session = Session::open(&path, device)?;
             session.clip_text = clip_text;
+            if let Some(embed) = embed_text {
+                session.use_text_encoder(Box::new(Texts(embed)))?;
+            }
             let grid = session.grid()?;
             Ok(Opened { session, grid, shown: None })
         };

@@ -1,6 +1,8 @@
 """The whole way from Python: a generated scene is preprocessed, trained and asked."""
 
+import json
 import os
+import pathlib
 import signal
 import threading
 
@@ -137,3 +139,58 @@ def test_other_threads_go_on(scene):
     done.set()
     thread.join()
     assert len(answers) == len(scene.views) and len(counts) > 100
+
+
+def test_own_masks_and_embeddings(scene, tmp_path):
+    """Masks and embeddings as a segmenter and a CLIP in the caller's process would give them."""
+    photos = tmp_path / "photos"
+    fastlgs.synth("room", photos, views=16, size=(160, 120))
+    largest = sorted(scene.objects, key=lambda o: -o["area"])[:6]
+    things = {f"thing {k}": o["id"] for k, o in enumerate(largest)}
+    drawn = {name: scene.render(name, "objects") for name in scene.views}
+
+    def embed_text(texts):
+        return np.array([[float(text == name) for name in things] + [0.1] for text in texts], dtype=np.float32)
+
+    def own():
+        for view, ids in drawn.items():
+            there = {name: ids == id for name, id in things.items() if (ids == id).sum() > 20}
+            yield view, np.stack(list(there.values())), embed_text(list(there))
+
+    folder = tmp_path / "scene"
+    made = fastlgs.preprocess(photos, folder, masks=own(), device="cpu")
+    assert made["masks"] > made["training_photos"]
+    fastlgs.train(folder, iterations=400, budget=4000, device="cpu")
+    asked = fastlgs.Scene(folder, device="cpu", embed_text=embed_text)
+    right = 0
+    for name, id in things.items():
+        view = max(drawn, key=lambda view: (drawn[view] == id).sum())
+        answer, truth = asked.query(name, view=view), drawn[view] == id
+        iou = (answer.mask & truth).sum() / (answer.mask | truth).sum()
+        right += iou > 0.5
+    assert right >= len(things) - 2, f"{right} of {len(things)}"
+    assert not asked.query("nothing of the kind"), "like none of the things"
+    with pytest.raises(fastlgs.Error, match="no such photo"):
+        fastlgs.write_masks(photos, "none.png", np.zeros((1, 4, 4), dtype=bool))
+    with pytest.raises(fastlgs.Error, match="2 masks need as many rows"):
+        fastlgs.write_masks(photos, "000.png", np.zeros((2, 4, 4), dtype=bool), np.zeros((1, 8)))
+    with pytest.raises(fastlgs.Error, match="float32 of \\(texts, numbers\\)"):
+        fastlgs.Scene(folder, device="cpu", embed_text=lambda texts: "no array").query("thing 0")
+
+
+def test_run_lengths_go_down_columns():
+    from fastlgs.own import run_lengths
+
+    mask = np.array([[1, 0], [1, 1], [0, 0]], dtype=bool)
+    assert run_lengths(mask) == [0, 2, 2, 1, 1]
+    assert run_lengths(np.zeros((2, 2), dtype=bool)) == [4]
+
+
+def test_the_notebook_runs(tmp_path, monkeypatch):
+    notebook = pathlib.Path(__file__).parents[1] / "examples" / "photos_to_answers.ipynb"
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for cell in json.loads(notebook.read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert names["cat"].mask.any() and names["answer"].report

@@ -1,5 +1,5 @@
 from os import PathLike
-from typing import Any, Callable, Dict, List, Literal, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Iterable, List, Literal, Optional, Sequence, Tuple, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,7 +85,15 @@ class Answer:
 class Scene:
     """A trained scene folder, opened on a device. Python goes on while it works; one thing is done at a time."""
 
-    def __init__(self, path: Path, *, device: str = "auto", clip_text: Optional[Path] = None) -> None: ...
+    def __init__(
+        self,
+        path: Path,
+        *,
+        device: str = "auto",
+        clip_text: Optional[Path] = None,
+        embed_text: Optional[Callable[[List[str]], NDArray[np.float32]]] = None,
+    ) -> None:
+        """`embed_text` embeds texts where the masks were embedded by a model of the caller's: a list of str to (texts, numbers)."""
     @property
     def path(self) -> str: ...
     @property
@@ -134,10 +142,31 @@ def make(
 ) -> Dict[str, Any]:
     """From photos to a scene that answers. Options are those of `fastlgs make`, with underscores."""
 
+OwnMasks = Union[
+    Tuple[str, NDArray[np.bool_]],
+    Tuple[str, NDArray[np.bool_], Optional[NDArray[np.float32]]],
+]
+"""The name of a photo, its masks (n, height, width), which may overlap, and their embeddings (n, numbers)."""
+
 def preprocess(
-    photos: Path, output: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any
+    photos: Path,
+    output: Path,
+    *,
+    masks: Optional[Iterable[OwnMasks]] = None,
+    progress: Optional[Progress] = None,
+    device: str = "auto",
+    seed: int = 0,
+    **options: Any,
 ) -> Dict[str, Any]:
-    """Photos to masks, key points, poses and points. Options are those of `fastlgs preprocess`, with underscores."""
+    """Photos to masks, key points, poses and points. Options are those of `fastlgs preprocess`, with underscores.
+
+    `masks`, of all photos, are written beside the photos and taken instead of the offline ones.
+    """
+
+def write_masks(
+    photos: Path, name: str, masks: NDArray[np.bool_], embeddings: Optional[NDArray[np.float32]] = None
+) -> None:
+    """Keeps the masks of one photo, and an embedding for each, where `preprocess` imports them from."""
 
 def train(scene: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any) -> Dict[str, Any]:
     """Gaussians with colour and objects. Options are those of `fastlgs train`, with underscores."""

@@ -19,7 +19,7 @@ use fastlgs_grid::query::Hit;
 use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
-use fastlgs_vision::Encoder;
+use fastlgs_vision::{Encoder, TextEncoder};
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 pub use texts::Texts;
@@ -173,6 +173,15 @@ impl Session {
     /// Whether the user has taught a name.
     pub fn is_taught(&self, text: &str) -> bool {
         self.texts().is_ok_and(|texts| texts.is_taught(text))
+    }
+
+    /// Embeds texts by a tower of the caller's from now on, for scenes whose embeddings were imported.
+    ///
+    /// # Errors
+    /// A tower whose embeddings have another length than the scene's.
+    pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
+        self.texts = OnceCell::from(Texts::of(encoder, &self.folder, &self.manifest)?);
+        Ok(())
     }
 
     /// Forgets the text tower, so that the next text is asked with the names as they are then.

@@ -25,7 +25,11 @@ pub struct Texts {
 impl Texts {
     /// The text tower of the encoder that made the scene's embeddings.
     pub fn load(folder: &SceneFolder, manifest: &Manifest, clip_text: Option<&Path>) -> Result<Self> {
-        let encoder = eyes::text_encoder_of(manifest, clip_text)?;
+        Self::of(eyes::text_encoder_of(manifest, clip_text)?, folder, manifest)
+    }
+
+    /// A text tower of the caller's, which must belong to what made the scene's embeddings.
+    pub fn of(encoder: Box<dyn TextEncoder>, folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
         let canonical = if manifest.encoder == eyes::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
