@@ -93,6 +93,10 @@ fn exports_keep_what_queries_need() {
     assert!(spz_report["psnr_against_original"].as_f64().is_some_and(|db| db > 35.0), "{spz_report}");
     let bytes = |report: &Value| report["bytes"].as_u64().expect("a number");
     assert!(4 * bytes(&spz_report) < bytes(&ply_report), "{spz_report} {ply_report}");
+    let sog_report = json(&["export", text(&f.scene), text(&at("scene.sog"))]);
+    assert!(sog_report["psnr_against_original"].as_f64().is_some_and(|db| db > 35.0), "{sog_report}");
+    println!("SPZ: {spz_report}\nSOG: {sog_report}");
+    assert!(bytes(&sog_report) < bytes(&spz_report), "{sog_report} {spz_report}");
     let small = at("small");
     let report = json(&["export", text(&f.scene), text(&small)]);
     assert!(3 * bytes(&report) < report["bytes_before"].as_u64().expect("a number"), "{report}");

@@ -6,7 +6,7 @@
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Camera, Gaussians, camera_path, dataset, fs, image_io, labels, npy, ply, spz};
+use fastlgs_core::{Camera, Gaussians, camera_path, dataset, fs, image_io, labels, npy, ply, sog, spz};
 use glam::Vec3;
 use image::{GrayImage, Luma, RgbImage};
 use std::collections::BTreeSet;
@@ -124,6 +124,7 @@ fn targets() -> Vec<Target> {
     vec![
         target("ply", "a.ply", nothing, written(|p| ply::write(p, &scene()).expect("a file")), |f| ply::read(&f.join("a.ply")).map(|_| ())),
         target("spz", "a.spz", nothing, written(|p| spz::write(p, &scene()).expect("a file")), |f| spz::read(&f.join("a.spz")).map(|_| ())),
+        target("sog", "a.sog", nothing, written(|p| sog::write(p, &scene()).expect("a file")), |f| sog::read(&f.join("a.sog")).map(|_| ())),
         target("compact", "a.safetensors", nothing, written(|p| compact::write(p, &scene(), &Precision::default()).expect("a file")), |f| {
             compact::read(&f.join("a.safetensors")).map(|_| ())
         }),

@@ -2,7 +2,7 @@
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::gaussians::rest_len;
-use fastlgs_core::{Camera, Gaussians, LabelMap, metrics, ply, spz};
+use fastlgs_core::{Camera, Gaussians, LabelMap, metrics, ply, sog, spz};
 use fastlgs_grid::{Grid, codes, grid::Object};
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
@@ -105,6 +105,18 @@ proptest! {
             prop_assert!((back.log_scales[i] - scene.log_scales[i]).abs().max_element() <= 1.0 / 16.0);
             let turn: Quat = back.rotation(i) * scene.rotation(i).inverse();
             prop_assert!(turn.w.abs() > 0.98, "a rotation turned by {} rad", 2.0 * turn.w.abs().min(1.0).acos());
+        }
+    }
+
+    #[test]
+    fn sog_keeps_what_eyes_see(scene in scene()) {
+        let back = through(|p| sog::write(p, &scene).expect("written"), |p| sog::read(p).expect("read"));
+        prop_assert_eq!(back.len(), scene.len());
+        // They come in another order.
+        for (mean, i) in back.means.iter().zip(0..) {
+            let near = |k: &usize| (*mean - scene.means[*k]).abs().max_element() <= 0.01 * (1.0 + mean.abs().max_element());
+            let same = |k: &usize| (back.log_scales[i] - scene.log_scales[*k]).abs().max_element() <= 0.2 && back.rotation(i).dot(scene.rotation(*k)).abs() > 0.999;
+            prop_assert!((0..scene.len()).filter(near).any(|k| same(&k)), "Gaussian {i}");
         }
     }
 

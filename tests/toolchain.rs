@@ -5,7 +5,8 @@
 #[path = "support/run.rs"]
 mod run;
 
-use fastlgs_core::{Camera, camera_path, ply};
+use fastlgs_core::gaussians::sigmoid;
+use fastlgs_core::{Camera, Gaussians, camera_path, ply, sog, spz};
 use run::{complaint, copy_folder, fails, fastlgs, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -198,13 +199,14 @@ fn selections_and_camera_paths_go_out_and_in() {
     let Some(l) = library() else { return };
     let room = l.scenes.join("room");
     let out = l.dir.path().join("exchange");
-    for ending in ["ply", "spz", "glb"] {
+    for ending in fastlgs::session::selection::ENDINGS {
         let file = out.join(format!("cat.{ending}"));
         let answer = json(&["query", text(&room), "cat", "--export", text(&file), "--device", "cpu"]);
         assert_eq!(answer["found"], true);
         let magic: &[u8] = match ending {
             "ply" => b"ply\n",
             "spz" => &[0x1f, 0x8b],
+            "sog" => b"PK",
             _ => b"glTF",
         };
         assert!(std::fs::read(&file).expect("the selection").starts_with(magic), "{ending}");
@@ -234,6 +236,100 @@ fn selections_and_camera_paths_go_out_and_in() {
     let by_path = fastlgs_core::image_io::load_rgb(&pictures.join("frame_00001.color.png")).expect("a picture");
     let far = own.as_raw().iter().zip(by_path.as_raw()).filter(|(a, b)| a.abs_diff(**b) > 2).count();
     assert!(far * 1000 < own.as_raw().len(), "{far} values differ");
+}
+
+/// Programs of others, installed once by npm; nothing where there is no npm.
+fn others() -> Option<PathBuf> {
+    let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("npm");
+    let npm = |args: &[&str]| Command::new("npm").args(args).current_dir(&root).output();
+    std::fs::create_dir_all(&root).expect("a folder");
+    if npm(&["--version"]).is_err() {
+        eprintln!("SKIPPED: npm is not installed, which brings the programs that our files are tried with");
+        return None;
+    }
+    let bin = root.join("node_modules");
+    if !bin.join("gltf-validator").is_dir() {
+        std::fs::write(root.join("package.json"), "{}").expect("a file");
+        let packages = ["install", "--silent", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10"];
+        let done = npm(&packages).expect("npm starts");
+        assert!(done.status.success(), "npm: {}", String::from_utf8_lossy(&done.stderr));
+    }
+    Some(bin)
+}
+
+#[test]
+fn programs_of_others_read_what_is_exported() {
+    let (Some(l), Some(others)) = (library(), others()) else { return };
+    let room = l.scenes.join("room");
+    let out = l.dir.path().join("others");
+    let node = |args: &[&str]| {
+        let done = Command::new("node").args(args).output().expect("node starts");
+        assert!(done.status.success(), "{args:?}: {}", String::from_utf8_lossy(&done.stderr));
+        done.stdout
+    };
+    let transform = others.join("@playcanvas/splat-transform/bin/cli.mjs");
+    let convert = |from: &Path, to: &Path| drop(node(&[text(&transform), "-q", "-w", "-g", "cpu", text(from), text(to)]));
+    let own = |path: &Path| match path.extension().and_then(|e| e.to_str()) {
+        Some("spz") => spz::read(path).expect("an SPZ file"),
+        Some("sog") => sog::read(path).expect("a SOG file"),
+        _ => ply::read(path).expect("a PLY file"),
+    };
+    // Both ways: what we write they read, and what they write we read, as the same Gaussians. Programs may put them in another order.
+    let same = |ours: Gaussians, theirs: Gaussians, close: f32| {
+        assert_eq!((ours.len(), ours.sh_degree), (theirs.len(), theirs.sh_degree));
+        let sorted = |g: Gaussians| {
+            let mut places: Vec<usize> = (0..g.len()).collect();
+            let key = |i: &usize| g.means[*i].to_array().map(|v| (v * 1e4).round() as i64);
+            places.sort_by_key(key);
+            g.select(&places)
+        };
+        let (ours, theirs) = (sorted(ours), sorted(theirs));
+        let off = (0..ours.len()).filter(|&i| {
+            let apart = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let opacity = sigmoid(ours.opacity_logits[i]) - sigmoid(theirs.opacity_logits[i]);
+            let rest = ours.rest(i).iter().zip(theirs.rest(i)).map(|(a, b)| apart(a.to_array(), b.to_array())).fold(0.0, f32::max);
+            apart(ours.means[i].to_array(), theirs.means[i].to_array()) > close
+                || apart(ours.log_scales[i].to_array(), theirs.log_scales[i].to_array()) > close
+                || apart(ours.sh_dc[i].to_array(), theirs.sh_dc[i].to_array()) > close
+                || rest > close
+                || opacity.abs() > close.max(2e-3)
+                || ours.rotation(i).dot(theirs.rotation(i)).abs() < 1.0 - close
+        });
+        // Equal places may be sorted either way.
+        let off = off.count();
+        assert!(off * 100 <= ours.len(), "{off} of {} Gaussians differ", ours.len());
+    };
+    for ending in ["ply", "spz", "sog"] {
+        let (file, back) = (out.join(format!("room.{ending}")), out.join(format!("{ending}.ply")));
+        json(&["export", text(&room), text(&file), "--device", "cpu"]);
+        convert(&file, &back);
+        same(own(&file), own(&back), 1e-3);
+    }
+    let theirs = out.join("theirs.sog");
+    convert(&out.join("room.ply"), &theirs);
+    let back = out.join("theirs.ply");
+    convert(&theirs, &back);
+    same(own(&theirs), own(&back), 1e-3);
+    println!("SOG: {} bytes by us, {} by splat-transform", bytes(&out.join("room.sog")), bytes(&theirs));
+
+    let glb = out.join("room.glb");
+    json(&["export", text(&room), text(&glb), "--device", "cpu"]);
+    let validate = "const v = require(process.argv[1]); const f = require('fs').readFileSync(process.argv[2]);
+        v.validateBytes(new Uint8Array(f)).then((r) => console.log(JSON.stringify(r)));";
+    let report = node(&["-e", validate, text(&others.join("gltf-validator")), text(&glb)]);
+    let report: Value = serde_json::from_slice(&report).expect("JSON");
+    // The validator does not know the extension, nor that names of its attributes have a colon.
+    let known = |m: &&Value| {
+        let own = m["pointer"].as_str().is_some_and(|p| p.contains("/attributes/KHR_gaussian_splatting:") || p == "/extensionsUsed/0");
+        !(own && ["MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"].iter().any(|code| m["code"] == *code))
+    };
+    let messages: Vec<&Value> = report["issues"]["messages"].as_array().expect("messages").iter().filter(known).collect();
+    assert!(messages.is_empty(), "{messages:?}");
+    assert_eq!(report["info"]["extensionsUsed"], serde_json::json!(["KHR_gaussian_splatting"]));
+}
+
+fn bytes(path: &Path) -> u64 {
+    std::fs::metadata(path).expect("a file").len()
 }
 
 #[test]

@@ -40,7 +40,13 @@ struct Served {
 
 impl Served {
     fn start(args: &[&str]) -> Self {
-        let command = Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(args).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+        Self::start_knowing(&run::data(), args)
+    }
+
+    /// With the names that were taught in a folder.
+    fn start_knowing(names: &Path, args: &[&str]) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_fastlgs"));
+        let command = command.args(args).env("FASTLGS_DATA", names).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
         let mut process = command.expect("the binary starts");
         let out: Box<dyn Read + Send> = match args[0] {
             "serve" => Box::new(process.stdout.take().expect("piped")),
@@ -123,7 +129,8 @@ fn the_interface_answers_as_the_query_command_does() {
     for (path, methods) in document["paths"].as_object().expect("paths") {
         let path = path.replace("{id}", "1").replace("{view}", "008.png").replace("/api/training", "/api/scene");
         let path = if path == "/api/export" { format!("{path}?objects=1&format=glb") } else { path };
-        let body = methods.get("post").map(|_| {
+        // Names are taught in a test of their own.
+        let body = methods.get("post").filter(|_| methods.get("get").is_none()).map(|_| {
             r#"{"text":"cat","what":"heatmap"}"#
                 .replace(r#","what":"heatmap""#, if path.ends_with("render") { r#","what":"heatmap""# } else { "" })
         });
@@ -440,6 +447,156 @@ fn a_text_lights_up_its_object_in_the_browser() {
     browser.go(&served.url);
     browser.wait_for("document.body.dataset.ready");
     assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), "pictures");
+}
+
+#[test]
+fn what_one_sees_is_named_measured_and_passed_on() {
+    if !chromium() {
+        return;
+    }
+    let Some(scene) = room() else { return };
+    let names = tempfile::tempdir().expect("a temporary folder");
+    let served = Served::start_knowing(names.path(), &["serve", text(scene), "--bind", "0", "--device", "cpu"]);
+    let browser = Browser::open(window().0, window().1, &["--enable-unsafe-swiftshader"]);
+    let open = |address: &str| {
+        browser.go(address);
+        browser.wait_for("document.body.dataset.ready");
+    };
+    open(&format!("{}/?renderer=webgl2", served.url));
+    let said = || browser.run("return document.getElementById('answer').textContent;").as_str().expect("text").to_owned();
+    let ids = || browser.run("return [...fastlgs.state.selected];");
+
+    // What a text has found gets a name, by keys alone; the name is known at once, here and to programs.
+    type_text(&browser, "cat");
+    let cat = ids();
+    assert_eq!(cat.as_array().expect("ids").len(), 1, "{cat}");
+    browser.keys("nMruczek\u{e007}");
+    browser.wait_for("document.getElementById('answer').textContent.includes('is called \"mruczek\"')");
+    browser.keys("\u{e00c}");
+    type_text(&browser, "mruczek");
+    assert_eq!(ids(), cat, "{}", said());
+    let names = served.json("/api/names", None);
+    assert!(names.as_array().expect("names").contains(&Value::from("mruczek")), "{names}");
+    let taught = |body: &str, status| served.refusal("/api/names", Some(body), status);
+    assert!(taught(r#"{"name":" ","object":1}"#, 400).contains("empty"));
+    assert!(taught(r#"{"name":"a","object":60000}"#, 404).contains("60000"));
+    assert!(taught(r#"{"name":"a"}"#, 422).contains("object"));
+
+    // What was asked before is offered, the last first, and still after the page was opened again.
+    let offered = || browser.run("return [...document.querySelectorAll('#recent option')].map((o) => o.value).slice(0, 2);");
+    assert_eq!(offered(), serde_json::json!(["mruczek", "cat"]));
+
+    // Who looks away is led to where the answer is seen best.
+    browser.run(
+        "const { camera } = fastlgs.stage, pose = camera.pose();
+         camera.stand(pose.map((v, k) => (k > 2 && k < 6 ? 2 * pose[k - 3] - v : v)));
+         await fastlgs.stage.settle();",
+    );
+    let led = type_text(&browser, "cat");
+    assert!(led.contains("seen best in"), "{led}");
+    let pixels: usize = led.split(" pixels here").next().and_then(|s| s.rsplit(", ").next()).and_then(|n| n.parse().ok()).unwrap_or(9999);
+    assert!(pixels > 100, "{led}");
+    assert_eq!(browser.run("return fastlgs.stage.camera.moved;"), false);
+
+    // A link leads others to the same place, with the same answer.
+    browser.run("fastlgs.stage.camera.turn(0.2, 0.1); fastlgs.stage.camera.zoom(0.9);");
+    browser.keys("2l");
+    browser.wait_for("document.getElementById('answer').textContent.includes('link to this view')");
+    let pose = || -> Vec<f64> {
+        let pose = browser.run("return fastlgs.stage.camera.pose();");
+        pose.as_array().expect("numbers").iter().filter_map(Value::as_f64).collect()
+    };
+    let (address, before) = (browser.run("return location.href;"), pose());
+    let address = address.as_str().expect("an address").to_owned();
+    browser.go("about:blank");
+    open(&address);
+    assert!(before.iter().zip(pose()).all(|(a, b)| (a - b).abs() < 1e-3), "{address}: {before:?}, {:?}", pose());
+    assert_eq!(ids(), cat, "{address}");
+    assert_eq!(browser.run("return document.querySelector('#modes input:checked').value;"), "relevancy", "{address}");
+    assert_eq!(offered(), serde_json::json!(["cat", "mruczek"]));
+    browser.run("location.hash = '#view=nowhere.png';");
+    browser.wait_for("document.getElementById('problem').textContent.includes('\"nowhere.png\"')");
+
+    // Two clicks measure; points lie where the scene's own depth says, whoever draws.
+    browser.keys("\u{e00c}1m");
+    browser.drag([150, 200], [150, 200]);
+    browser.wait_for("fastlgs.stage.measure.points.length === 1");
+    browser.drag([350, 260], [350, 260]);
+    browser.wait_for("document.getElementById('length').textContent.includes(' units')");
+    let apart = || browser.run("const [a, b] = fastlgs.stage.measure.points; return Math.hypot(...a.map((v, k) => v - b[k]));");
+    let units = apart().as_f64().expect("a length");
+    browser.run(
+        "const metres = document.getElementById('metres'); metres.value = '2.5'; metres.dispatchEvent(new Event('change'));
+         await fastlgs.stage.settle();",
+    );
+    assert_eq!(browser.run("return document.getElementById('length').textContent;"), "2.5 m");
+    browser.drag([350, 260], [350, 260]);
+    browser.wait_for("fastlgs.stage.measure.points.length === 1");
+    browser.drag([150, 200], [150, 200]);
+    browser.wait_for("document.getElementById('length').textContent === '2.5 m'");
+    assert!((apart().as_f64().expect("a length") - units).abs() < 1e-6);
+    // Nothing was selected meanwhile, and Escape ends it.
+    assert_eq!(browser.run("return fastlgs.state.selected.size;"), 0);
+    browser.keys("\u{e00c}");
+    assert_eq!(browser.run("return fastlgs.stage.measure.on;"), false);
+    browser.run("fastlgs.stage.lookFrom(0);");
+    let photos = &run::room().expect("the room").photos;
+    let view = browser.run("return fastlgs.stage.camera.view.name;");
+    let truth = photos.join("depth").join(format!("{}.exr", view.as_str().expect("a name")));
+    let (width, height, truth) = fastlgs_core::exr_image::read(&truth).expect("the room's own depth");
+    let places: Vec<[usize; 2]> = (1..8).flat_map(|y| (1..8).map(move |x| [width * x / 8, height * y / 8])).collect();
+    let deep = browser.run(&format!(
+        "const {{ stage }} = fastlgs, lens = stage.camera.lens(stage.width, stage.height), {{ left, top, width }} = lens.picture;
+         const near = [];
+         for (const [x, y] of {}) {{
+           const point = await stage.point(left + (x + 0.5) * width / {width}, top + (y + 0.5) * width / {width});
+           near.push(point && point.reduce((sum, v, k) => sum + (v - stage.camera.eye[k]) * stage.camera.forward[k], 0));
+         }}
+         return near;",
+        serde_json::to_string(&places).expect("JSON")
+    ));
+    let off = |(p, z): (&[usize; 2], &Value)| {
+        let truth = f64::from(truth[0].1[p[1] * width + p[0]]);
+        (z.as_f64().unwrap_or(f64::INFINITY) / truth - 1.0).abs()
+    };
+    let mut errors: Vec<f64> = places.iter().zip(deep.as_array().expect("depths")).map(off).collect();
+    errors.sort_by(f64::total_cmp);
+    println!("measured depths are off by {:.2} % in the middle, {:.1} % in nine of ten", 100.0 * errors[24], 100.0 * errors[44]);
+    assert!(errors[24] < 0.02 && errors[44] < 0.15, "{errors:?}");
+
+    // What goes wrong is said with numbers that people can read.
+    let sentences = browser.run(
+        "const { readable } = await import(new URL('sentence.js', location.href));
+         return ['8388608 bytes, 0.6000000238 of 2000x1500', '0027.jpg and \"20000\" stay; 12345.678'].map(readable);",
+    );
+    assert_eq!(sentences, serde_json::json!(["8,388,608 bytes, 0.6 of 2,000 x 1,500", "0027.jpg and \"20000\" stay; 12,300"]));
+    assert_eq!(browser.errors(), Vec::<String>::new(), "nothing on the console");
+}
+
+#[test]
+fn a_large_scene_is_seen_soon() {
+    const GAUSSIANS: usize = 100_000;
+    if !chromium() {
+        return;
+    }
+    let Some(scene) = room() else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let large = dir.path().join("large");
+    copy_folder(scene, &large);
+    let folder = fastlgs_core::SceneFolder::new(&large);
+    let room = folder.gaussians().expect("the room");
+    let many = room.select(&(0..GAUSSIANS).map(|i| i % room.len()).collect::<Vec<_>>());
+    fastlgs_core::ply::write(&folder.ply_path(), &many).expect("a file");
+    let served = Served::start(&["serve", text(&large), "--bind", "0", "--device", "cpu"]);
+    for (way, flags) in [("pictures", &[][..]), ("webgl2", &["--enable-unsafe-swiftshader"][..])] {
+        let browser = Browser::open(window().0, window().1, flags);
+        browser.go(&format!("{}/?renderer={way}", served.url));
+        browser.wait_for("window.fastlgs?.stage.firstPicture");
+        let ms = browser.run("return fastlgs.stage.firstPicture;").as_f64().expect("milliseconds");
+        println!("{way}: {GAUSSIANS} Gaussians are seen {ms:.0} ms after the page was opened");
+        // Alone it takes much less than the two seconds that are promised; here other tests run beside it.
+        assert!(ms < 4000.0, "{way}: {ms} ms");
+    }
 }
 
 /// A plain file server; killed with this value.

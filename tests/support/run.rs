@@ -21,10 +21,13 @@ pub fn adapter() -> &'static str {
     })
 }
 
+/// Where what a test program teaches is kept: it is none of the user's names.
+pub fn data() -> PathBuf {
+    Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("data-{}", env!("CARGO_CRATE_NAME")))
+}
+
 pub fn fastlgs(args: &[&str]) -> Output {
-    // What tests teach is none of the user's names.
-    let data = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("data-{}", env!("CARGO_CRATE_NAME")));
-    Command::new(PROGRAM).env("FASTLGS_DEVICE", adapter()).env("FASTLGS_DATA", data).args(args).output().expect("the binary starts")
+    Command::new(PROGRAM).env("FASTLGS_DEVICE", adapter()).env("FASTLGS_DATA", data()).args(args).output().expect("the binary starts")
 }
 
 /// Whether everything is to be tested (`./test.sh --all`), or a smaller dose of what takes long.

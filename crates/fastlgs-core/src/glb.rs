@@ -133,7 +133,17 @@ mod tests {
         assert_eq!(word(&data, 20 + length), body.len());
         assert_eq!(document["buffers"][0]["byteLength"], body.len());
 
-        let names = &document["meshes"][0]["primitives"][0]["attributes"];
+        // What the extension's schema wants, as ratified.
+        let primitive = &document["meshes"][0]["primitives"][0];
+        let extension = &primitive["extensions"]["KHR_gaussian_splatting"];
+        assert_eq!((&primitive["mode"], &extension["kernel"]), (&json!(POINTS), &json!("ellipse")));
+        assert!(["srgb_rec709_display", "lin_rec709_display"].iter().any(|space| extension["colorSpace"] == *space));
+        assert!(
+            ["ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"]
+                .iter()
+                .all(|name| { primitive["attributes"][format!("KHR_gaussian_splatting:{name}")].is_u64() })
+        );
+        let names = &primitive["attributes"];
         let values = |name: &str, width: usize| -> Vec<f32> {
             let accessor = &document["accessors"][names[name].as_u64().unwrap() as usize];
             let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];

@@ -27,6 +27,7 @@ pub mod rng;
 pub mod scene_folder;
 pub mod shares;
 pub mod simd;
+pub mod sog;
 pub mod spz;
 pub mod synth;
 pub mod turbo;

@@ -36,9 +36,6 @@ struct Opened {
     shown: Option<(fastlgs_core::Camera, Field)>,
 }
 
-/// Fewest pixels of an answer that a person sees.
-const VISIBLE: usize = 30;
-
 /// Which view is meant.
 #[derive(Clone)]
 enum Which {
@@ -173,10 +170,8 @@ impl Scene {
             let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates: CANDIDATES };
             let (answer, mut report) = question.put(session, grid, field, &camera, 0.0)?;
             let relevancy = field.relevancy(grid, &answer.found.ranked);
-            let (mask, ids) = (answer.mask, answer.found.targets.iter().map(|t| t.id).collect::<Vec<_>>());
-            if report.found && report.pixels < VISIBLE {
-                report.seen_best = session.seen_best(grid, &ids)?;
-            }
+            let mask = answer.mask;
+            report.look_elsewhere(session, grid)?;
             Ok((camera, report, mask, relevancy))
         })?;
         let shape = [camera.height as usize, camera.width as usize];
@@ -282,7 +277,7 @@ impl Scene {
         Ok(PyArray1::from_vec(py, places.into_iter().map(|place| place as u32).collect()))
     }
 
-    /// Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz or .glb; all of them without `ids`.
+    /// Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz, .sog or .glb; all of them without `ids`.
     #[pyo3(signature = (path, ids = None, *, rest = false))]
     fn export(&self, py: Python<'_>, path: PathBuf, ids: Option<Vec<u16>>, rest: bool) -> PyResult<()> {
         self.with(py, |Opened { session: Session { gaussians, cameras, .. }, grid, .. }| match &ids {

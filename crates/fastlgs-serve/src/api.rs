@@ -15,6 +15,7 @@ use fastlgs::session::answer::{CANDIDATES, Question};
 use fastlgs::session::ask::Ask;
 use fastlgs::session::pictures::{heatmap, mask_picture, overlay};
 use fastlgs::session::{parse_size, selection};
+use fastlgs::teach::learn;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::query::{self, QueryConfig};
@@ -83,6 +84,42 @@ pub async fn thumbnail(State(app): App, Path(id): Path<u16>) -> Answer<Response>
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
+/// `GET /api/objects/{id}/view`: where to look at it from.
+pub async fn best_view(State(app): App, Path(id): Path<u16>) -> Answer {
+    let view = app.ready()?.ask(move |desk| Ok(desk.best_view(id)?)).await?;
+    let view = view.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
+    Ok(Json(json!({ "view": view })))
+}
+
+/// What an object is called.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Naming {
+    name: String,
+    object: u16,
+}
+
+/// `GET /api/names`: names that were taught with the scene's encoder.
+pub async fn names(State(app): App) -> Answer {
+    app.ready()?.ask(|desk| Ok(Json(json!(desk.scene.taught_names()?)))).await
+}
+
+/// `POST /api/names`: teaches the name of an object; texts know it from now on.
+pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>) -> Answer {
+    let Json(naming) = request?;
+    let name = checked_text(&naming.name)?.to_owned();
+    let work = move |desk: &mut Desk| {
+        let known = usize::from(naming.object).checked_sub(1).is_some_and(|k| k < desk.grid.objects.len());
+        if !known {
+            return Err(Failure::new(StatusCode::NOT_FOUND, format!("there is no object {}", naming.object)));
+        }
+        let learned = learn(&desk.scene, &name, naming.object)?;
+        desk.scene.forget_texts();
+        Ok(Json(json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples })))
+    };
+    app.ready()?.ask(work).await
+}
+
 /// `GET /api/photos/{view}`: the photo as it was trained on.
 pub async fn photo(State(app): App, Path(view): Path<String>) -> Answer<Response> {
     let known = app.cameras.iter().find(|c| c.name == view).map(|c| app.folder.photo_path(&c.name)).filter(|p| p.is_file());
@@ -107,7 +144,12 @@ fn camera_of(app: &Shared, view: Option<&str>, camera: Option<Camera>, size: Opt
     }
     camera.check().map_err(Failure::bad)?;
     if camera.width.saturating_mul(camera.height) > MOST_PIXELS {
-        return Err(Failure::bad(format!("{}x{} is too large: at most {MOST_PIXELS} pixels", camera.width, camera.height)));
+        return Err(Failure::bad(format!(
+            "{}x{} is too large: at most {} million pixels",
+            camera.width,
+            camera.height,
+            MOST_PIXELS / 1_000_000
+        )));
     }
     Ok(camera)
 }
@@ -172,13 +214,15 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         let candidates = asked.candidates.unwrap_or(CANDIDATES);
         let render_ms = desk.look(&camera)?;
         let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates };
-        let (answer, report) = question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
+        let (answer, mut report) = question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
+        let mask = (want_mask && report.found).then(|| mask_picture(&answer.mask, camera.width, camera.height));
+        let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.ranked));
+        report.look_elsewhere(&mut desk.scene, &desk.grid)?;
         let mut value = serde_json::to_value(&report).map_err(anyhow::Error::from)?;
-        if want_mask && report.found {
-            value["mask"] = data_url(mask_picture(&answer.mask, camera.width, camera.height))?;
+        if let Some(mask) = mask {
+            value["mask"] = data_url(mask)?;
         }
-        if want_heat {
-            let relevancy = answer.field.relevancy(&desk.grid, &answer.found.ranked);
+        if let Some(relevancy) = relevancy {
             let frame = desk.scene.render(&camera)?;
             let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
             value["heatmap"] = data_url(heatmap(&color, &relevancy))?;
@@ -254,7 +298,7 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
 pub struct Export {
     /// Object ids separated by commas.
     objects: String,
-    /// `ply`, `spz` or `glb`.
+    /// `ply`, `spz`, `sog` or `glb`.
     format: String,
     /// False: everything but these objects.
     #[serde(default = "yes")]
@@ -274,8 +318,8 @@ pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejecti
     let ids: Option<Vec<u16>> = wanted.objects.split(',').map(|id| id.trim().parse().ok()).collect();
     let ids = ids.ok_or_else(|| Failure::bad("objects: give ids like 3,17"))?;
     let ending = wanted.format;
-    if !["ply", "spz", "glb"].contains(&ending.as_str()) {
-        return Err(Failure::bad(format!("format: '{ending}' is unknown; there are ply, spz and glb")));
+    if !selection::ENDINGS.contains(&ending.as_str()) {
+        return Err(Failure::bad(format!("format: '{ending}' is unknown; there are {}", selection::ENDINGS.join(", "))));
     }
     let name = format!("{}-{}.{ending}", app.name, if wanted.keep { "selection" } else { "rest" });
     let work = move |desk: &mut Desk| {

@@ -187,6 +187,12 @@ impl Desk {
         self.thumbnails.png(&mut self.scene, &self.grid, id)
     }
 
+    /// The view that shows most of an object; nothing for one that no view shows.
+    pub fn best_view(&mut self, id: u16) -> Result<Option<String>> {
+        self.choose(&Choice::default())?;
+        self.thumbnails.view(&mut self.scene, &self.grid, id)
+    }
+
     /// How many Gaussians there are, hidden ones included.
     pub fn gaussians(&self) -> usize {
         self.all.as_ref().unwrap_or(&self.scene.gaussians).len()

@@ -83,7 +83,7 @@ async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
     };
     match tokio::time::timeout(PATIENT_FOR, listen).await {
         Ok(Some(())) if arrived <= most => Ok(kept),
-        Ok(Some(())) => Err(Failure::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {LARGEST_BODY} bytes"))),
+        Ok(Some(())) => Err(Failure::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {} MiB", LARGEST_BODY >> 20))),
         Ok(None) | Err(_) => Err(Failure::new(StatusCode::REQUEST_TIMEOUT, "the request did not arrive whole")),
     }
 }

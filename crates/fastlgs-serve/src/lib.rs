@@ -123,6 +123,8 @@ fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
         .route("/api/splats", get(api::splats))
         .route("/api/objects", get(api::objects))
         .route("/api/objects/{id}/thumbnail.png", get(api::thumbnail))
+        .route("/api/objects/{id}/view", get(api::best_view))
+        .route("/api/names", get(api::names).post(api::name))
         .route("/api/photos/{view}", get(api::photo))
         .route("/api/query", post(api::query))
         .route("/api/render", post(api::render))

@@ -7,7 +7,7 @@ use axum::routing::get;
 use std::sync::Arc;
 
 /// Address, kind, and content.
-const FILES: [(&str, &str, &str); 19] = [
+const FILES: [(&str, &str, &str); 23] = [
     ("/", HTML, include_str!("../web/index.html")),
     ("/style.css", "text/css; charset=utf-8", include_str!("../web/style.css")),
     ("/app.js", SCRIPT, include_str!("../web/app.js")),
@@ -15,6 +15,10 @@ const FILES: [(&str, &str, &str); 19] = [
     ("/objects.js", SCRIPT, include_str!("../web/objects.js")),
     ("/training.js", SCRIPT, include_str!("../web/training.js")),
     ("/server.js", SCRIPT, include_str!("../web/server.js")),
+    ("/link.js", SCRIPT, include_str!("../web/link.js")),
+    ("/measure.js", SCRIPT, include_str!("../web/measure.js")),
+    ("/recent.js", SCRIPT, include_str!("../web/recent.js")),
+    ("/sentence.js", SCRIPT, include_str!("../web/sentence.js")),
     ("/save.js", SCRIPT, include_str!("../web/save.js")),
     ("/camera.js", SCRIPT, include_str!("../web/camera.js")),
     ("/renderer.js", SCRIPT, include_str!("../web/renderer.js")),

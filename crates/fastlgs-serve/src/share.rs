@@ -103,6 +103,7 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     let data = root.join("data");
     let (words, rows, found) = words(desk, config.words, run)?;
     write_json(&data.join("words.json"), &words)?;
+    write_json(&data.join("names.json"), &desk.scene.taught_names()?)?;
     write(&data.join("words.bin"), &rows)?;
     let cameras = &desk.scene.cameras;
     let focus: Vec<f32> = cameras.iter().map(|camera| focus(&desk.scene.gaussians.means, camera)).collect();
@@ -124,6 +125,9 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
         let mut jpeg = Vec::new();
         picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
         write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
+        if let Some(view) = desk.best_view(id)? {
+            write_json(&data.join(format!("objects/{id}/view.json")), &json!({ "view": view }))?;
+        }
     }
     for (name, content) in page::files() {
         write(&root.join(name), content.as_bytes())?;

@@ -33,6 +33,11 @@ struct Best {
     bounds: [u32; 4],
 }
 
+/// Of so many views one is searched.
+fn step(scene: &Session) -> usize {
+    scene.cameras.len().div_ceil(VIEWS).max(1)
+}
+
 impl Thumbnails {
     /// The PNG of an object; nothing for one that no view shows.
     pub fn png(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
@@ -45,12 +50,7 @@ impl Thumbnails {
 
     /// The picture of an object; nothing for one that no view shows.
     pub fn picture(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<RgbImage>> {
-        if self.best.is_empty() {
-            self.search(scene, grid)?;
-        }
-        let Some(Best { view, bounds: [left, top, right, bottom], .. }) = self.best.get(usize::from(id)).copied().flatten() else {
-            return Ok(None);
-        };
+        let Some(Best { view, bounds: [left, top, right, bottom], .. }) = self.best(scene, grid, id)? else { return Ok(None) };
         let picture = &self.views[view];
         let margin = (MARGIN * (right - left).max(bottom - top) as f32).ceil() as u32 + 2;
         let (left, top) = (left.saturating_sub(margin), top.saturating_sub(margin));
@@ -61,10 +61,22 @@ impl Thumbnails {
         Ok(Some(resize(&*crop_imm(picture, left, top, w, h), size(w), size(h), FilterType::Triangle)))
     }
 
+    /// The view, of those that are searched, that shows most of an object; nothing for one that none shows.
+    pub fn view(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<String>> {
+        let best = self.best(scene, grid, id)?;
+        Ok(best.map(|best| scene.cameras[best.view * step(scene)].name.clone()))
+    }
+
+    fn best(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Best>> {
+        if self.best.is_empty() {
+            self.search(scene, grid)?;
+        }
+        Ok(self.best.get(usize::from(id)).copied().flatten())
+    }
+
     /// Looks through some views for the place where each object is largest.
     fn search(&mut self, scene: &mut Session, grid: &Grid) -> Result<()> {
-        let step = scene.cameras.len().div_ceil(VIEWS).max(1);
-        let cameras: Vec<Camera> = scene.cameras.iter().step_by(step).map(|c| c.shrunk_to(VIEW_SIDE)).collect();
+        let cameras: Vec<Camera> = scene.cameras.iter().step_by(step(scene)).map(|c| c.shrunk_to(VIEW_SIDE)).collect();
         let mut best: Vec<Option<Best>> = vec![None; grid.objects.len() + 1];
         let mut views = Vec::new();
         for (view, camera) in cameras.iter().enumerate() {

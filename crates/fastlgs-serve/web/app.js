@@ -1,6 +1,9 @@
 // The page: what is asked, selected, hidden and shown, and the controls for it.
 
+import { follow as followLink, linkOf } from "./link.js";
 import { Objects } from "./objects.js";
+import { Recent } from "./recent.js";
+import { readable } from "./sentence.js";
 import { Stage } from "./stage.js";
 import { follow, recall } from "./training.js";
 import { save } from "./save.js";
@@ -10,11 +13,11 @@ const $ = (id) => document.getElementById(id);
 const LISTED = 24; // objects before "more"
 const ASKED_SIDE = 640; // pixels of the view that a question is put to
 
-let scene, stage, objects;
-const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED };
+let scene, stage, objects, recent;
+const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, wish: null, listed: LISTED };
 
 function failed(error) {
-  $("problem").textContent = error.message;
+  $("problem").textContent = readable(error.message);
   $("problem").hidden = false;
   clearTimeout(failed.timer);
   failed.timer = setTimeout(() => { $("problem").hidden = true; }, 8000);
@@ -44,6 +47,7 @@ function update() {
   objects.fill($("list"), rows.slice(0, state.listed), options);
   $("more").hidden = rows.length <= state.listed;
   $("selection").hidden = selected.size === 0;
+  $("naming").hidden = selected.size !== 1 || Boolean(scene.shared);
   $("show-all").disabled = hidden.size + only.size === 0;
   if (selected.size === 0) return;
   const [first] = selected;
@@ -70,11 +74,33 @@ function select(ids) {
   update();
 }
 
+// Asks for a text as it is seen from here.
+const ask = (text) => {
+  const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
+  return postJson("/api/query", { text, camera, candidates: objects.list.length });
+};
+
+// The view to go to for an answer that is not seen from here. A folder of files knows where things are, and not what hides them.
+async function elsewhere(answer) {
+  if (!answer.found || answer.seen_best || answer.pixels !== undefined) return answer.seen_best;
+  const [{ id }] = answer.objects;
+  return objects.isInSight(id, stage) ? null : bestView(id);
+}
+
+const bestView = async (id) => (await getJson(`/api/objects/${id}/view`)).view;
+
+const lookFrom = (name) => stage.lookFrom(scene.views.findIndex((view) => view.name === name));
+
 const find = guarded(async (text) => {
   if (!text.trim()) return clear();
   say(`looking for "${text}" ...`);
-  const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
-  const answer = await postJson("/api/query", { text, camera, candidates: objects.list.length });
+  let answer = await ask(text);
+  const best = await elsewhere(answer);
+  if (best) {
+    lookFrom(best);
+    answer = await ask(text);
+  }
+  recent.asked(text);
   state.text = text;
   state.ranked = answer.candidates;
   state.scores = new Map(answer.candidates.map(({ id, score }) => [id, score]));
@@ -84,11 +110,20 @@ const find = guarded(async (text) => {
     const parts = answer.objects.length === 1 ? `#${answer.objects[0].id}` : `${answer.objects.length} objects`;
     // A folder of files knows what a word means, and not what is seen from here.
     const pixels = answer.pixels === undefined ? "" : `, ${answer.pixels.toLocaleString("en")} pixels here`;
-    say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}${pixels} (${ms} ms)`);
+    const gone = best ? `, seen best in ${best}` : "";
+    say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}${pixels}${gone} (${ms} ms)`);
   } else {
     say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
   }
   select(answer.objects.map((o) => o.id));
+});
+
+const nameIt = guarded(async (name) => {
+  const [object] = state.selected;
+  const taught = await postJson("/api/names", { name, object });
+  $("its-name").value = "";
+  recent.taught(await getJson("/api/names"));
+  say(`#${object} is called "${taught.name}" from now on: ${taught.views.toLocaleString("en")} pictures of it are known by that name`);
 });
 
 function clear() {
@@ -121,6 +156,43 @@ const exported = guarded(async (keep) => {
   save(await getBlob(`/api/export?objects=${ids}&format=${format}&keep=${keep}`), `${scene.name}-${keep ? "selection" : "rest"}.${format}`);
 });
 
+function measure(on = !stage.measure.on) {
+  stage.measure.on = on;
+  stage.measure.points = [];
+  $("measure").setAttribute("aria-pressed", on);
+  measured();
+  stage.draw();
+}
+
+function measured() {
+  const length = stage.measure.text();
+  $("length").textContent = length || (stage.measure.on ? "click two points" : "");
+  $("known").hidden = !length;
+}
+
+const link = guarded(async () => {
+  history.replaceState(null, "", linkOf(stage.camera, { text: state.text, mode: stage.mode }));
+  // Browsers hand out their clipboard on the machine itself and over HTTPS.
+  const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
+  say(copied ? "the link to this view is copied" : "the link to this view is in the address bar");
+});
+
+const followed = guarded(async () => {
+  const { text, mode } = followLink(location.hash, stage);
+  if (mode) setMode(mode);
+  state.wish = text;
+  if (objects) await fulfil();
+});
+
+// Asks what the link wants to know.
+async function fulfil() {
+  const text = state.wish;
+  state.wish = null;
+  if (!text) return;
+  $("text").value = text;
+  await find(text);
+}
+
 const actions = {
   isolate: () => {
     state.only = new Set(state.selected);
@@ -136,6 +208,9 @@ const actions = {
     update();
   },
   clear,
+  best: guarded(async () => lookFrom(await bestView([...state.selected][0]))),
+  measure: () => measure(),
+  link,
   export: () => exported(true),
   "export-rest": () => exported(false),
   more: () => {
@@ -167,8 +242,12 @@ const keys = {
   i: actions.isolate,
   x: actions.hide,
   a: actions["show-all"],
+  b: () => state.selected.size > 0 && actions.best(),
+  n: () => $("its-name").focus(),
+  m: actions.measure,
+  l: link,
   s: actions.save,
-  Escape: clear,
+  Escape: () => (stage.measure.on ? measure(false) : clear()),
   "+": () => stage.camera.zoom(0.9),
   "=": () => stage.camera.zoom(0.9),
   "-": () => stage.camera.zoom(1.1),
@@ -176,7 +255,7 @@ const keys = {
 
 function pressed(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return;
-  const typing = event.target.matches("input[type=search], select");
+  const typing = event.target.matches("input[type=search], input[type=number], #its-name, select");
   if (typing) {
     if (event.key === "Escape") $("canvas").focus();
     return;
@@ -199,12 +278,23 @@ function listen() {
     event.preventDefault();
     find($("text").value);
   });
+  $("naming").addEventListener("submit", (event) => {
+    event.preventDefault();
+    nameIt($("its-name").value);
+  });
+  $("metres").addEventListener("change", () => {
+    stage.measure.known(Number($("metres").value));
+    measured();
+    stage.draw();
+  });
+  window.addEventListener("hashchange", followed);
   $("modes").addEventListener("change", (event) => stage.setMode(event.target.value));
   $("views").addEventListener("change", () => stage.lookFrom($("views").selectedIndex));
   $("show-cameras").addEventListener("change", cameras);
   $("compare").addEventListener("input", () => setCompare($("compare").value));
   for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
   document.addEventListener("keydown", pressed);
+  stage.measured = measured;
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
     if (!objects || id === 0) return select([]);
@@ -216,6 +306,7 @@ function listen() {
 async function ready() {
   scene = Object.assign(stage.scene, await getJson("/api/scene"));
   objects = new Objects(await getJson("/api/objects"), scene.support_share);
+  recent.taught(await getJson("/api/names"));
   $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
     + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, `
     + (scene.shared ? `${scene.shared.words.toLocaleString("en")} words are known` : `answered by ${scene.adapter}`);
@@ -233,15 +324,19 @@ async function main() {
   stage = new Stage(scene, { stage: $("stage"), canvas: $("canvas"), cameras: $("cameras"), photo: $("photo"), divider: $("divider") }, failed);
   await stage.open(new URLSearchParams(location.search).get("renderer"));
   $("views").replaceChildren(...scene.views.map((view) => new Option(`${view.name}${view.held_out ? " (held out)" : ""}`)));
+  recent = new Recent(scene.name, $("recent"));
   listen();
   stage.lookFrom(0);
+  if (location.hash) await followed();
   const training = { training: $("training"), text: $("training-text"), loss: $("curve-loss"), psnr: $("curve-psnr") };
   if (scene.stage === "training") {
     $("text").disabled = true;
     await follow(training, () => stage.load());
   }
-  await ready();
+  // The picture first: what the page tells of objects can wait.
   await stage.load();
+  await ready();
+  await fulfil();
   if (scene.trained_here) await recall(training);
   // For programs that drive this page.
   window.fastlgs = { stage, state, find };

@@ -34,6 +34,28 @@ export class Camera {
     return add(this.eye, this.forward, this.distance);
   }
 
+  // Where it stands, what it turns about, and which way is down: nine numbers.
+  pose() {
+    return [...this.eye, ...this.target(), ...this.down];
+  }
+
+  // Takes a pose; whether it is one.
+  stand(pose) {
+    const [eye, target, down] = [pose.slice(0, 3), pose.slice(3, 6), pose.slice(6, 9)];
+    const forward = add(target, eye, -1);
+    const right = cross(down, forward);
+    const apart = Math.hypot(...forward), wide = Math.hypot(...right);
+    if (pose.length !== 9 || !(apart > 1e-6) || !(wide > 1e-6 * apart)) return false;
+    Object.assign(this, { eye, distance: apart, forward: unit(forward), right: unit(right), moved: true });
+    this.down = unit(cross(this.forward, this.right));
+    return true;
+  }
+
+  // Direction in the world of what a place of the canvas shows, one unit deep.
+  ray(x, y, lens) {
+    return add(add(this.forward, this.right, (x - lens.cx) / lens.fx), this.down, (y - lens.cy) / lens.fy);
+  }
+
   turn(yaw, pitch) {
     const target = this.target();
     const both = (v) => turned(turned(v, this.right, pitch), this.up, yaw);

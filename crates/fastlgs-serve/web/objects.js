@@ -22,6 +22,13 @@ export class Objects {
     return chain;
   }
 
+  // Whether the middle of an object lies in the picture.
+  isInSight(id, { camera, width, height }) {
+    const box = this.byId.get(id).bbox3d;
+    const place = box && camera.project(box[0].map((low, k) => (low + box[1][k]) / 2), camera.lens(width, height));
+    return Boolean(place) && place.every((v, k) => v > 0 && v < [width, height][k]);
+  }
+
   parts(id) {
     return this.children.get(id) ?? [];
   }

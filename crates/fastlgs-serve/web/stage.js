@@ -1,6 +1,7 @@
 // The picture: canvas, camera, hands on it, and what lies over it (cameras of the photos, the photo itself).
 
 import { Camera, frustum } from "./camera.js";
+import { Measure, pointAt } from "./measure.js";
 import { OBJECT_ROWS, openRenderer, parseSplats } from "./renderer.js";
 import { getBlob, getBytes } from "./server.js";
 
@@ -15,7 +16,9 @@ export class Stage {
     this.objects = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), text: null, list: [], members: () => [] };
     this.showCameras = false;
     this.compare = 0;
+    this.measure = new Measure(scene.name);
     this.picked = () => {};
+    this.measured = () => {};
     this.looked = () => {};
   }
 
@@ -33,7 +36,7 @@ export class Stage {
 
   // Fetches the Gaussians; also those of a scene that grows.
   async load() {
-    if (this.renderer.name === "pictures") return this.draw();
+    if (this.renderer.name === "pictures") return this.drawNow();
     this.splats = parseSplats(await getBytes("/api/splats"));
     this.renderer.setSplats(this.splats);
     this.renderer.setObjects(this.objectBytes());
@@ -88,7 +91,10 @@ export class Stage {
 
   sorted({ order, number }) {
     // An order of Gaussians that were replaced meanwhile fits no longer.
-    if (number === this.loading) this.renderer.setOrder(order);
+    if (number === this.loading) {
+      this.renderer.setOrder(order);
+      this.ordered = true;
+    }
     if (number !== this.loading || this.sortAgain) return this.sort();
     this.sorting = false;
     this.draw();
@@ -120,7 +126,9 @@ export class Stage {
   drawNow() {
     if (!this.camera.view || !(this.splats || this.renderer.name === "pictures")) return;
     const drawn = this.renderer.draw(this.frame());
-    this.drawCameras();
+    // How long one waits after opening the page, in milliseconds.
+    if (this.ordered || this.renderer.name === "pictures") Promise.resolve(drawn).then(() => (this.firstPicture ??= performance.now()));
+    this.drawOver();
     this.placePhoto();
     return drawn;
   }
@@ -145,24 +153,59 @@ export class Stage {
 
   objectBytes() {
     const bytes = new Uint8Array(4 * 256 * OBJECT_ROWS);
-    const { list, selected, hidden, only, scores, members } = this.objects;
+    const { list, selected, scores, members } = this.objects;
     for (const { id, color } of [{ id: 0, color: [0, 0, 0] }, ...list]) {
       // Relevant, selected or hidden is also what lies in a thing that is.
       const around = members(id);
       const score = Math.max(0, ...around.map((above) => scores.get(above) ?? 0));
-      const any = (set) => around.some((above) => set.has(above));
-      const gone = any(hidden) || (only.size > 0 && !any(only));
-      bytes.set([Math.round(255 * score), any(selected) ? 255 : 0, gone ? 255 : 0, 255], 4 * id);
+      const lit = around.some((above) => selected.has(above));
+      bytes.set([Math.round(255 * score), lit ? 255 : 0, this.isShown(id) ? 0 : 255, 255], 4 * id);
       bytes.set([...color, 255], 4 * (65536 + id));
     }
     return bytes;
   }
 
-  drawCameras() {
+  // Whether an object is shown, with what it lies in.
+  isShown(id) {
+    const { hidden, only, members } = this.objects;
+    const around = members(id);
+    const any = (set) => around.some((above) => set.has(above));
+    return !any(hidden) && (only.size === 0 || any(only));
+  }
+
+  // What lies over the picture: the photos' cameras, and what is measured.
+  drawOver() {
     const context = this.elements.cameras.getContext("2d");
     context.clearRect(0, 0, this.width, this.height);
-    if (!this.showCameras) return;
     const lens = this.camera.lens(this.width, this.height);
+    if (this.showCameras) this.drawCameras(context, lens);
+    if (this.measure.on) this.drawMeasure(context, lens);
+  }
+
+  drawMeasure(context, lens) {
+    const places = this.measure.points.map((point) => this.camera.project(point, lens));
+    if (places.some((place) => !place)) return;
+    const [a, b] = places;
+    Object.assign(context, { strokeStyle: "#fff", fillStyle: "#fff", lineWidth: 2 * this.ratio, font: `${14 * this.ratio}px sans-serif` });
+    for (const [x, y] of places) {
+      context.beginPath();
+      context.arc(x, y, 4 * this.ratio, 0, 2 * Math.PI);
+      context.fill();
+    }
+    if (!b) return;
+    context.beginPath();
+    context.moveTo(...a);
+    context.lineTo(...b);
+    context.stroke();
+    // Dark around the letters, so that they can be read on anything.
+    const middle = [(a[0] + b[0]) / 2 + 8 * this.ratio, (a[1] + b[1]) / 2 - 8 * this.ratio];
+    context.strokeStyle = "#000";
+    context.strokeText(this.measure.text(), ...middle);
+    context.fillText(this.measure.text(), ...middle);
+  }
+
+  drawCameras(context, lens) {
+    context.lineWidth = 1;
     for (const [index, view] of this.scene.views.entries()) {
       if (index === this.index && !this.camera.moved) continue;
       const { apex, corners } = frustum(view, 0.08 * view.focus);
@@ -243,7 +286,24 @@ export class Stage {
     }, { passive: false });
   }
 
+  // The point of the scene at a place of the canvas. Who is given pictures fetches the Gaussians for this.
+  async point(x, y) {
+    const splats = this.splats ?? (this.fetched ??= parseSplats(await getBytes("/api/splats")));
+    return pointAt(splats, this.camera, this.camera.lens(this.width, this.height), x, y, (id) => this.isShown(id));
+  }
+
   async click(x, y) {
+    if (this.measure.on) {
+      try {
+        const point = await this.point(x, y);
+        if (!point) throw new Error("nothing is there that could be measured");
+        this.measure.add(point);
+        this.measured();
+      } catch (error) {
+        this.failed(error);
+      }
+      return this.draw();
+    }
     if (this.showCameras) {
       const lens = this.camera.lens(this.width, this.height);
       const near = (view) => {

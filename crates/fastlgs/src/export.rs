@@ -5,7 +5,7 @@ use crate::session::selection;
 use crate::{Result, Run, Session};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, image_io, ply, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, image_io, ply, sog, spz};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// FILE.ply (3DGS columns), FILE.spz (compressed, without objects), FILE.glb (glTF with KHR_gaussian_splatting), FILE.json (the
+    /// FILE.ply (3DGS columns), FILE.spz or FILE.sog (compressed, without objects), FILE.glb (glTF with KHR_gaussian_splatting), FILE.json (the
     /// views as a camera path of nerfstudio's form), or a folder for everything that queries need.
     pub output: PathBuf,
     /// Drop colour's SH coefficients above this degree.
@@ -93,10 +93,11 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
     let folder = config.output.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || config.output.is_dir();
-    if !folder && !["", "ply", "spz", "glb"].contains(&ending) {
+    let file = !folder && selection::ENDINGS.contains(&ending);
+    if !folder && !file && !ending.is_empty() {
         let path = config.output.display();
         bail!(
-            "{path}: nothing is written as .{ending}; there are .ply, .spz, .glb and .json, and folders, whose names have no ending or end with /"
+            "{path}: nothing is written as .{ending}; there are .ply, .spz, .sog, .glb and .json, and folders, whose names have no ending or end with /"
         );
     }
     let mut scene = Session::open(&config.scene, run.device)?;
@@ -104,21 +105,19 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     let before = pictures(&mut scene, &held_out)?;
     let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
     scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
-    let (written, precision) = match ending {
-        "ply" | "spz" | "glb" if !folder => {
-            selection::write(&config.output, &scene.gaussians, &scene.cameras)?;
-            let written = match ending {
-                "ply" => ply::read(&config.output)?,
-                "spz" => spz::read(&config.output)?,
-                // It holds the same floats as before.
-                _ => scene.gaussians.clone(),
-            };
-            (written, None)
-        }
-        _ => {
-            let (written, precision) = small_folder(&mut scene, &config.output)?;
-            (written, Some(precision.by_group().into_iter().map(|(group, bytes)| (group.to_owned(), bytes)).collect()))
-        }
+    let (written, precision) = if file {
+        selection::write(&config.output, &scene.gaussians, &scene.cameras)?;
+        let written = match ending {
+            "ply" => ply::read(&config.output)?,
+            "spz" => spz::read(&config.output)?,
+            "sog" => sog::read(&config.output)?,
+            // It holds the same floats as before.
+            _ => scene.gaussians.clone(),
+        };
+        (written, None)
+    } else {
+        let (written, precision) = small_folder(&mut scene, &config.output)?;
+        (written, Some(precision.by_group().into_iter().map(|(group, bytes)| (group.to_owned(), bytes)).collect()))
     };
     scene.show(written)?;
     let after = pictures(&mut scene, &held_out)?;

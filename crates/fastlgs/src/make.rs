@@ -9,9 +9,10 @@ use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// What is made, and how thoroughly.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
@@ -19,8 +20,17 @@ pub struct Config {
     #[cfg_attr(feature = "clap", command(flatten))]
     pub preprocess: preprocess::Config,
     /// How long is trained.
-    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = train::Preset::Quick))]
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = Config::default().effort))]
     pub effort: train::Preset,
+    /// Train for as long as all of it fits into so many minutes on this machine, instead of an effort.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "N", conflicts_with = "effort", value_parser = train::parse_minutes))]
+    pub minutes: Option<f64>,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self { preprocess: preprocess::Config::default(), effort: train::Preset::Quick, minutes: None }
+    }
 }
 
 /// Whether there was something to do.
@@ -52,7 +62,8 @@ const NOTE: &str = "made";
 /// # Errors
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
 pub fn make(config: &Config, run: &Run) -> Result<Report> {
-    let train = train::Config { scene: config.preprocess.output.clone(), preset: config.effort, ..Default::default() };
+    let train =
+        train::Config { scene: config.preprocess.output.clone(), preset: config.effort, minutes: config.minutes, ..Default::default() };
     let mut preprocess = config.preprocess.clone();
     if config.effort == train::Preset::LikePaper {
         preprocess.eyes.sam_preset = SamPreset::LangSplat;
@@ -83,6 +94,7 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     }
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
     let begun = known.is_some() && train::is_begun(&folder);
+    let started = Instant::now();
     if !begun {
         train::forget(&folder);
         crate::preprocess(preprocess, runs[0])?;
@@ -91,7 +103,9 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         manifest.notes.insert(NOTE.to_owned(), with()?);
         folder.save_manifest(&manifest)?;
     }
-    let report = crate::train(&train::Config { resume: begun || train.resume, ..train.clone() }, runs[1])?;
+    // Minutes are those of all stages.
+    let minutes = train.minutes.map(|minutes| minutes - started.elapsed().as_secs_f64() / 60.0);
+    let report = crate::train(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, runs[1])?;
     Ok((State::Made, report))
 }
 

@@ -5,6 +5,7 @@ use crate::{report, ui, words};
 use anyhow::{Result, bail};
 use fastlgs::Run;
 use fastlgs::export::Config;
+use fastlgs::session::selection::ENDINGS;
 use fastlgs_serve::share;
 
 #[derive(clap::Args)]
@@ -25,7 +26,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         return report::tell(common, &fastlgs::export(config, run)?, words::export);
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    if ["ply", "spz", "glb", "json"].contains(&ending) {
+    if ending == "json" || ENDINGS.contains(&ending) {
         bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
     }
     let share =

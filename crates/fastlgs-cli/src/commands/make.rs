@@ -21,7 +21,9 @@ fn words(made: &make::Report, scene: &str) -> String {
     let train = &made.train;
     let seconds = train.seconds + train.mapping_seconds;
     let how = match made.state {
-        State::Made => format!("trained and mapped in {seconds:.0} s ({})", train.adapter),
+        State::Made => {
+            format!("{} iterations and the objects took {seconds:.0} s ({})", thousands(train.iterations as usize), train.adapter)
+        }
         State::Kept => "was there already, made from the same photos with the same options".to_owned(),
     };
     let [training, held_out] = made.photos;

@@ -76,7 +76,7 @@ pub struct Args {
     /// How often the kernel of --dilate is applied.
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
     dilate_times: u32,
-    /// Write the selected Gaussians as a scene of their own: FILE.ply, FILE.spz or FILE.glb.
+    /// Write the selected Gaussians as a scene of their own: FILE.ply, FILE.spz, FILE.sog or FILE.glb.
     #[arg(long, value_name = "FILE", alias = "export-ply")]
     export: Option<PathBuf>,
     /// Write the scene without the selected Gaussians, in the same formats.
@@ -129,9 +129,6 @@ struct Shown {
     field: Field,
     color: Option<Frame>,
 }
-
-/// Pixels of an answer from which a person sees it.
-const VISIBLE: usize = 30;
 
 /// What questions are put to, and how.
 struct Asker<'a> {
@@ -292,10 +289,7 @@ impl Asker<'_> {
                 selection::export(path, &scene.gaussians, &scene.cameras, &selected, keep)?;
             }
         }
-        if report.found && report.pixels < VISIBLE {
-            let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
-            report.seen_best = self.scene.seen_best(&self.grid, &ids)?;
-        }
+        report.look_elsewhere(&mut self.scene, &self.grid)?;
         self.tiles.extend(tile);
         Ok(report)
     }

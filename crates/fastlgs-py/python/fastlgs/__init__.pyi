@@ -128,7 +128,7 @@ class Scene:
     def select(self, ids: Sequence[int]) -> NDArray[np.uint32]:
         """Places of the Gaussians of some objects and their parts, rising."""
     def export(self, path: Path, ids: Optional[Sequence[int]] = None, *, rest: bool = False) -> None:
-        """Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz or .glb."""
+        """Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz, .sog or .glb."""
 
 def make(
     photos: Path,
@@ -138,9 +138,10 @@ def make(
     device: str = "auto",
     seed: int = 0,
     effort: Optional[Literal["quick", "standard", "paper"]] = None,
+    minutes: Optional[float] = None,
     **options: Any,
 ) -> Dict[str, Any]:
-    """From photos to a scene that answers. Options are those of `fastlgs make`, with underscores."""
+    """From photos to a scene that answers, with an effort or in about so many minutes. Options are those of `fastlgs make`, with underscores."""
 
 OwnMasks = Union[
     Tuple[str, NDArray[np.bool_]],

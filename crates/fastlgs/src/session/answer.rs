@@ -16,6 +16,8 @@ use std::time::Instant;
 
 /// Objects that a report lists with their scores, chosen or not, unless more are asked for.
 pub const CANDIDATES: usize = 8;
+/// Pixels below which an answer is hardly seen.
+const VISIBLE: usize = 30;
 
 /// What is asked, and how the answer is chosen.
 pub struct Question<'a> {
@@ -86,7 +88,7 @@ pub struct Report {
     pub candidates: Vec<Hit>,
     /// Pixels of the mask.
     pub pixels: usize,
-    /// The view that shows it best, where this one hardly does and another was looked for.
+    /// The view that shows it best, where this one hardly does ([`Self::look_elsewhere`]).
     pub seen_best: Option<String>,
     /// File of the mask, where it was written.
     pub mask: Option<PathBuf>,
@@ -98,6 +100,20 @@ pub struct Report {
     pub adapter: String,
     /// Where the time went.
     pub ms: Milliseconds,
+}
+
+impl Report {
+    /// Names the view that shows the answer best, where this one hardly does.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn look_elsewhere(&mut self, session: &mut Session, grid: &Grid) -> Result<()> {
+        if self.found && self.pixels < VISIBLE {
+            let ids: Vec<u16> = self.objects.iter().map(|o| o.id).collect();
+            self.seen_best = session.seen_best(grid, &ids)?;
+        }
+        Ok(())
+    }
 }
 
 /// One object of an answer.

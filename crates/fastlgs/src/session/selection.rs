@@ -3,7 +3,7 @@
 use crate::Result;
 use crate::error::{Context, bail};
 use fastlgs_core::camera::mean_up;
-use fastlgs_core::{Camera, Gaussians, glb, ply, spz};
+use fastlgs_core::{Camera, Gaussians, glb, ply, sog, spz};
 use fastlgs_grid::Grid;
 use std::path::Path;
 
@@ -29,7 +29,10 @@ pub fn export(path: &Path, scene: &Gaussians, cameras: &[Camera], selected: &[us
     write(path, &selected, cameras).context("the selection cannot be written")
 }
 
-/// Writes Gaussians as the file's ending says: `.ply`, `.spz`, or `.glb`, whose up is that of the cameras.
+/// Files that Gaussians are written to, by their endings.
+pub const ENDINGS: [&str; 4] = ["ply", "spz", "sog", "glb"];
+
+/// Writes Gaussians as the file's ending says ([`ENDINGS`]); up in `.glb` is that of the cameras.
 ///
 /// # Errors
 /// An unknown ending, or the system's refusal.
@@ -37,8 +40,9 @@ pub fn write(path: &Path, gaussians: &Gaussians, cameras: &[Camera]) -> Result<(
     match path.extension().and_then(|e| e.to_str()) {
         Some("ply") => ply::write(path, gaussians)?,
         Some("spz") => spz::write(path, gaussians)?,
+        Some("sog") => sog::write(path, gaussians)?,
         Some("glb") => glb::write(path, gaussians, mean_up(cameras))?,
-        _ => bail!("{}: name it .ply, .spz or .glb", path.display()),
+        _ => bail!("{}: name it .ply, .spz, .sog or .glb", path.display()),
     }
     Ok(())
 }

@@ -166,6 +166,13 @@ fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
     text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
 }
 
+/// Parses a time above zero.
+#[cfg(feature = "clap")]
+pub(crate) fn parse_minutes(text: &str) -> Result<f64, String> {
+    let minutes = text.parse().ok().filter(|n: &f64| n.is_finite() && *n > 0.0);
+    minutes.ok_or_else(|| format!("'{text}' is no number of minutes"))
+}
+
 /// What is trained, and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
@@ -179,6 +186,10 @@ pub struct Config {
     /// Iterations, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub iterations: Option<u32>,
+    /// As many iterations as fit into so many minutes, objects included, on this machine, instead of the preset's; the report says how many, and
+    /// --iterations does the same again elsewhere.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "N", conflicts_with_all = ["iterations", "preset"], value_parser = parse_minutes))]
+    pub minutes: Option<f64>,
     /// Gaussians: `auto` (as many as held-out quality gains from; at most one for 20 pixels of the training photos, and 200,000 with the preset
     /// quick, 300,000 with standard, a million with paper), or exactly how many there may be.
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
@@ -249,6 +260,7 @@ impl Default for Config {
             scene: PathBuf::new(),
             preset: Preset::default(),
             iterations: None,
+            minutes: None,
             budget: None,
             strategy: Strategy::default(),
             sh_degree: None,

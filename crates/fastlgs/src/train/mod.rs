@@ -1,15 +1,18 @@
 //! Colour and semantic field together (paper, training features for Gaussians), and the objects on them.
 
 mod config;
+mod pace;
 mod start;
 
 use crate::error::{Context, bail};
 use crate::progress::{Message, TrainStep};
 use crate::{Result, Run, objects, preprocess};
+#[cfg(feature = "clap")]
+pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{Alignment, Channels, Target, TrainConfig, Trainer};
+use fastlgs_raster::{Alignment, Channels, Choice, Target, TrainConfig, Trainer};
 pub(crate) use start::target;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -65,6 +68,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let targets = training.iter().map(target).collect::<Result<Vec<_>>>()?;
     let held_out = manifest.held_out(&cameras);
     let held_out = held_out.iter().map(|c| start::target(&folder, c, None, &config.background)).collect::<Result<Vec<_>>>()?;
+    let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
         // What most views say: where they disagree, descent from elsewhere ends between their codes.
@@ -76,10 +80,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         );
     }
     let settings = settings(config, &first, start::pixels(&targets), light.spread_stops, run.seed);
-    if settings.iterations >= WORTH_TUNING {
-        fastlgs_raster::tuning::tune(run.device, false)?;
-    }
-    let device = fastlgs_raster::choice(run.device);
+    let device = device(settings.iterations, run)?;
     let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
@@ -169,6 +170,14 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     // Checkpoints serve a broken run only.
     forget(&folder);
     Ok(report)
+}
+
+/// The device for so many iterations.
+fn device(iterations: u32, run: &Run) -> Result<Choice> {
+    if iterations >= WORTH_TUNING {
+        fastlgs_raster::tuning::tune(run.device, false)?;
+    }
+    Ok(fastlgs_raster::choice(run.device))
 }
 
 /// What the trainer is told: options, else what the preset says.

@@ -1,0 +1,365 @@
+//! SOG, the compressed Gaussian format of PlayCanvas (version 2 of its specification,
+//! developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog): an archive of lossless WebP pictures, in which each pixel is a
+//! Gaussian, and `meta.json`, which tells what the pixels mean. Features and object ids have no place in it.
+//!
+//! Positions are logarithmic in 16 bits, rotations the three smallest components in 8 bits each; scales and colours are places in codebooks,
+//! and the SH coefficients of a Gaussian a row of a palette. Axes are those of 3DGS's PLY files.
+
+mod codebook;
+mod palette;
+
+use crate::gaussians::{MAX_SH_DEGREE, logit, rest_len, sigmoid};
+use crate::{Error, Gaussians, Result, fs};
+use codebook::{CODES, codebook, nearest};
+use glam::Vec3;
+use image::codecs::webp::{WebPDecoder, WebPEncoder};
+use image::{ExtendedColorType, ImageDecoder};
+use palette::palette;
+use serde::{Deserialize, Serialize};
+use std::io::{Cursor, Read, Write};
+use std::path::Path;
+use zip::write::SimpleFileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+const VERSION: u32 = 2;
+/// Rows of the palette beside each other in a row of its picture.
+const PALETTE_COLUMNS: usize = 64;
+/// The fourth channel of rotations names the component that is left out, w first.
+const FIRST_TAG: u8 = 252;
+
+#[derive(Serialize, Deserialize)]
+struct Meta {
+    version: u32,
+    #[serde(default)]
+    asset: Asset,
+    count: usize,
+    means: Means,
+    scales: Coded,
+    quats: Files,
+    sh0: Coded,
+    #[serde(rename = "shN", skip_serializing_if = "Option::is_none")]
+    rest: Option<Rest>,
+}
+
+#[derive(Default, Serialize, Deserialize)]
+struct Asset {
+    #[serde(default)]
+    generator: String,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Means {
+    mins: [f32; 3],
+    maxs: [f32; 3],
+    files: [String; 2],
+}
+
+#[derive(Serialize, Deserialize)]
+struct Coded {
+    codebook: Vec<f32>,
+    files: [String; 1],
+}
+
+#[derive(Serialize, Deserialize)]
+struct Files {
+    files: [String; 1],
+}
+
+#[derive(Serialize, Deserialize)]
+struct Rest {
+    count: usize,
+    bands: u32,
+    codebook: Vec<f32>,
+    files: [String; 2],
+}
+
+/// RGBA pixels.
+struct Picture {
+    name: &'static str,
+    width: usize,
+    pixels: Vec<[u8; 4]>,
+}
+
+fn byte(value: f32) -> u8 {
+    (255.0 * value).round().clamp(0.0, 255.0) as u8
+}
+
+/// What spreads positions near the middle and draws those far away together.
+fn log(v: Vec3) -> Vec3 {
+    (v.abs() + 1.0).map(f32::ln) * v.signum()
+}
+
+fn exp(v: Vec3) -> Vec3 {
+    (v.abs().map(f32::exp) - 1.0) * v.signum()
+}
+
+/// Writes the scene atomically. What the format cannot hold (features, object ids) is left out; Gaussians that are near each other in space
+/// come near each other in the file.
+///
+/// # Errors
+/// [`Error::Invalid`] for an empty scene, and the system's refusal.
+pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
+    if scene.is_empty() {
+        return Err(Error::Invalid(format!("{}: there are no Gaussians to write", path.display())));
+    }
+    let scene = &scene.select(&spatial_order(scene));
+    let n = scene.len();
+    // Whole blocks of four pixels, as the specification's own encoder has them.
+    let width = ((n as f64).sqrt() / 4.0).ceil() as usize * 4;
+    let pixels = width * n.div_ceil(width).next_multiple_of(4);
+    let mut pictures = Vec::new();
+    let mut picture = |name: &'static str, of: &dyn Fn(usize) -> [u8; 4]| {
+        let mut own: Vec<[u8; 4]> = (0..n).map(of).collect();
+        own.resize(pixels, [0, 0, 0, 255]);
+        pictures.push(Picture { name, width, pixels: own });
+        name.to_owned()
+    };
+
+    let logs: Vec<Vec3> = scene.means.iter().map(|m| log(*m)).collect();
+    let low = logs.iter().copied().reduce(Vec3::min).unwrap_or_default();
+    let high = logs.iter().copied().reduce(Vec3::max).unwrap_or_default();
+    let range = (high - low).max(Vec3::splat(1e-6));
+    let steps = |i: usize| ((logs[i] - low) / range * 65535.0).round().to_array().map(|v| v as u16);
+    let means_l = picture("means_l.webp", &|i| with_alpha(steps(i).map(|v| v as u8), 255));
+    let means_u = picture("means_u.webp", &|i| with_alpha(steps(i).map(|v| (v >> 8) as u8), 255));
+    let quats = picture("quats.webp", &|i| packed_rotation(scene.rotations[i]));
+    let scale_codes = codebook(scene.log_scales.iter().flat_map(|s| s.to_array()));
+    let scales = picture("scales.webp", &|i| with_alpha(scene.log_scales[i].to_array().map(|s| nearest(&scale_codes, s)), 255));
+    let color_codes = codebook(scene.sh_dc.iter().flat_map(|c| c.to_array()));
+    let color = |i: usize| scene.sh_dc[i].to_array().map(|c| nearest(&color_codes, c));
+    let sh0 = picture("sh0.webp", &|i| with_alpha(color(i), byte(sigmoid(scene.opacity_logits[i]))));
+    let bands = scene.sh_degree;
+    let mut centroids = None;
+    let rest = (bands > 0).then(|| {
+        let rows: Vec<f32> = scene.sh_rest.iter().flat_map(|v| v.to_array()).collect();
+        let palette = palette(&rows, 3 * rest_len(bands));
+        let labels = picture("shN_labels.webp", &|i| {
+            let [low, high] = palette.labels[i].to_le_bytes();
+            [low, high, 0, 255]
+        });
+        let codes = codebook(palette.rows.iter().copied());
+        let coded = palette.rows.chunks_exact(3).map(|v| with_alpha([0, 1, 2].map(|k| nearest(&codes, v[k])), 255));
+        let width = PALETTE_COLUMNS * rest_len(bands);
+        let mut coded: Vec<[u8; 4]> = coded.collect();
+        let count = coded.len() / rest_len(bands);
+        coded.resize(coded.len().next_multiple_of(width), [0, 0, 0, 255]);
+        let name = "shN_centroids.webp";
+        centroids = Some(Picture { name, width, pixels: coded });
+        Rest { count, bands, codebook: codes.to_vec(), files: [name.to_owned(), labels] }
+    });
+    pictures.extend(centroids);
+    let meta = Meta {
+        version: VERSION,
+        asset: Asset { generator: concat!("FastLGS ", env!("CARGO_PKG_VERSION")).to_owned() },
+        count: n,
+        means: Means { mins: low.to_array(), maxs: (low + range).to_array(), files: [means_l, means_u] },
+        scales: Coded { codebook: scale_codes.to_vec(), files: [scales] },
+        quats: Files { files: [quats] },
+        sh0: Coded { codebook: color_codes.to_vec(), files: [sh0] },
+        rest,
+    };
+    archive(path, &meta, &pictures)
+}
+
+fn with_alpha([r, g, b]: [u8; 3], a: u8) -> [u8; 4] {
+    [r, g, b, a]
+}
+
+/// The archive as bytes, written at once.
+fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
+    let damaged = |error: &dyn std::fmt::Display| Error::format(path, format!("cannot be made: {error}"));
+    let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
+    // Pictures are compressed already.
+    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
+    let mut add = |name: &str, data: &[u8]| {
+        archive.start_file(name, options).map_err(|e| damaged(&e))?;
+        archive.write_all(data).map_err(|e| damaged(&e))
+    };
+    add("meta.json", &serde_json::to_vec(meta).map_err(|e| damaged(&e))?)?;
+    for Picture { name, width, pixels } in pictures {
+        let mut data = Vec::new();
+        let height = (pixels.len() / width) as u32;
+        let encoder = WebPEncoder::new_lossless(&mut data);
+        encoder.encode(pixels.as_flattened(), *width as u32, height, ExtendedColorType::Rgba8).map_err(|e| damaged(&e))?;
+        add(name, &data)?;
+    }
+    let data = archive.finish().map_err(|e| damaged(&e))?.into_inner();
+    fs::write_atomic(path, |file| file.write_all(&data))
+}
+
+/// Places of the Gaussians along a curve that fills space (Morton's), so that neighbours in the pictures are alike.
+fn spatial_order(scene: &Gaussians) -> Vec<usize> {
+    let low = scene.means.iter().copied().reduce(Vec3::min).unwrap_or_default();
+    let high = scene.means.iter().copied().reduce(Vec3::max).unwrap_or_default();
+    let size = (high - low).max(Vec3::splat(1e-6));
+    // Every third bit.
+    let spread = |v: u32| (0..10).fold(0u32, |bits, k| bits | (v >> k & 1) << (3 * k));
+    let place = |m: &Vec3| {
+        let [x, y, z] = ((*m - low) / size * 1023.0).to_array().map(|v| spread(v as u32));
+        x | y << 1 | z << 2
+    };
+    let codes: Vec<u32> = scene.means.iter().map(place).collect();
+    let mut order: Vec<usize> = (0..scene.len()).collect();
+    order.sort_by_key(|i| codes[*i]);
+    order
+}
+
+/// The three smallest of (w, x, y, z), between -1 and 1 after a stretch by the square root of 2, and which one is left out.
+fn packed_rotation(q: [f32; 4]) -> [u8; 4] {
+    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
+    let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
+    let scale = std::f32::consts::FRAC_1_SQRT_2 / if q[largest] < 0.0 { -length } else { length };
+    let mut rest = (0..4).filter(|k| *k != largest).map(|k| byte(q[k] * scale + 0.5));
+    let mut next = || rest.next().unwrap_or(0);
+    [next(), next(), next(), FIRST_TAG + largest as u8]
+}
+
+fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
+    let largest = usize::from(tag.checked_sub(FIRST_TAG)?);
+    let rest = [a, b, c].map(|v| (f32::from(v) / 255.0 * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
+    let own = (1.0 - rest.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    let mut out = rest.to_vec();
+    out.insert(largest, own);
+    out.try_into().ok()
+}
+
+/// Reads a scene; features are zero and object ids 0.
+///
+/// # Errors
+/// [`Error::Format`] for files that are no SOG, are cut off, or of another version.
+pub fn read(path: &Path) -> Result<Gaussians> {
+    let bad = |reason: String| Error::format(path, reason);
+    let data = fs::read(path)?;
+    let mut archive = ZipArchive::new(Cursor::new(data)).map_err(|e| bad(format!("not a whole SOG file ({e}); copy it again")))?;
+    let mut member = |name: &str| -> Result<Vec<u8>> {
+        let mut data = Vec::new();
+        let mut file = archive.by_name(name).map_err(|e| bad(format!("{name} is missing in it ({e})")))?;
+        file.read_to_end(&mut data).map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
+        Ok(data)
+    };
+    let meta: Meta = serde_json::from_slice(&member("meta.json")?).map_err(|e| bad(format!("meta.json: {e}")))?;
+    if meta.version != VERSION {
+        return Err(bad(format!("SOG version {}; only version {VERSION} can be read", meta.version)));
+    }
+    let n = meta.count;
+    let mut picture = |name: &str, least: usize| -> Result<Vec<[u8; 4]>> {
+        let data = member(name)?;
+        let damaged = |e: image::ImageError| bad(format!("{name} is damaged ({e}); copy it again"));
+        let decoder = WebPDecoder::new(Cursor::new(data)).map_err(damaged)?;
+        let channels = usize::from(decoder.color_type().channel_count());
+        let (width, height) = decoder.dimensions();
+        // Checked before anything is allocated for it.
+        if (width as usize) * (height as usize) < least {
+            return Err(bad(format!("{name} has {width}x{height} pixels, too few for {n} Gaussians")));
+        }
+        let mut values = vec![0; decoder.total_bytes() as usize];
+        decoder.read_image(&mut values).map_err(damaged)?;
+        let pixel = |p: &[u8]| [p[0], p[1], p[2], if channels == 4 { p[3] } else { 255 }];
+        Ok(values.chunks_exact(channels).map(pixel).collect())
+    };
+    let of = |codes: &[f32], name: &str| {
+        <[f32; CODES]>::try_from(codes).map_err(|_| bad(format!("the codebook of {name} has no {CODES} numbers")))
+    };
+    let look = |codes: [f32; CODES]| move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)]));
+
+    let low = picture(&meta.means.files[0], n)?;
+    let high = picture(&meta.means.files[1], n)?;
+    let (from, to) = (Vec3::from(meta.means.mins), Vec3::from(meta.means.maxs));
+    let mean = |(l, u): (&[u8; 4], &[u8; 4])| {
+        let steps = Vec3::from_array([0, 1, 2].map(|k| f32::from(u16::from_le_bytes([l[k], u[k]]))));
+        exp(from + (to - from) * steps / 65535.0)
+    };
+    let means = low.iter().zip(&high).take(n).map(mean).collect();
+    let rotations = picture(&meta.quats.files[0], n)?.into_iter().take(n).map(rotation).collect::<Option<Vec<_>>>();
+    let rotations = rotations.ok_or_else(|| bad(format!("{} holds no rotations", meta.quats.files[0])))?;
+    let scale = look(of(&meta.scales.codebook, "scales")?);
+    let log_scales = picture(&meta.scales.files[0], n)?.into_iter().take(n).map(scale).collect();
+    let colors = picture(&meta.sh0.files[0], n)?;
+    // Opacities of exactly 0 and 1 have no finite logit.
+    let opacity_logits = colors.iter().take(n).map(|p| logit((f32::from(p[3]) / 255.0).clamp(0.001, 0.999))).collect();
+    let sh_dc = colors.into_iter().take(n).map(look(of(&meta.sh0.codebook, "sh0")?)).collect();
+    let mut sh_rest = Vec::new();
+    let mut sh_degree = 0;
+    if let Some(rest) = &meta.rest {
+        sh_degree = rest.bands;
+        if sh_degree > MAX_SH_DEGREE {
+            return Err(bad(format!("SH degree {sh_degree}; at most {MAX_SH_DEGREE} is known")));
+        }
+        let width = rest_len(sh_degree);
+        let centroids = picture(&rest.files[0], rest.count * width)?;
+        let labels = picture(&rest.files[1], n)?;
+        let value = look(of(&rest.codebook, "shN")?);
+        for label in labels.iter().take(n) {
+            let at = usize::from(u16::from_le_bytes([label[0], label[1]])) * width;
+            let row = centroids.get(at..at + width).ok_or_else(|| bad(format!("{} names rows that the palette lacks", rest.files[1])))?;
+            sh_rest.extend(row.iter().map(|p| value(*p)));
+        }
+    }
+    let (features, object_ids) = (vec![Vec3::ZERO; n], vec![0; n]);
+    Ok(Gaussians { means, log_scales, rotations, opacity_logits, sh_dc, sh_degree, sh_rest, features, object_ids })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Rng;
+
+    fn sample(n: usize) -> Gaussians {
+        let mut rng = Rng::new(1, "sog");
+        let mut g = Gaussians { sh_degree: 2, ..Gaussians::default() };
+        for i in 0..n {
+            let mean = 3.0 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
+            g.push_sphere(mean, rng.range(0.001, 0.5), rng.range(0.1, 0.9), [rng.uniform(), rng.uniform(), rng.uniform()]);
+            g.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
+        }
+        g.sh_rest.iter_mut().for_each(|v| *v = 0.1 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+        g
+    }
+
+    #[test]
+    fn round_trip_is_as_close_as_the_format_allows() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.sog");
+        let before = sample(3000);
+        write(&path, &before).unwrap();
+        let after = read(&path).unwrap();
+        let before = before.select(&spatial_order(&before));
+        assert_eq!((after.len(), after.sh_degree), (3000, 2));
+        for i in 0..before.len() {
+            assert!((after.means[i] - before.means[i]).length() < 2e-3);
+            assert!((after.log_scales[i] - before.log_scales[i]).abs().max_element() <= 0.1);
+            assert!((sigmoid(after.opacity_logits[i]) - sigmoid(before.opacity_logits[i])).abs() < 0.003);
+            assert!((after.sh_dc[i] - before.sh_dc[i]).abs().max_element() < 0.03);
+            assert!(after.rotation(i).dot(before.rotation(i)).abs() > 0.9999);
+        }
+        // Noise is what a palette holds worst.
+        let error = |a: &[Vec3]| a.iter().zip(&before.sh_rest).map(|(a, b)| (*a - *b).length_squared()).sum::<f32>();
+        assert!(error(&after.sh_rest) < 0.8 * error(&vec![Vec3::ZERO; before.sh_rest.len()]));
+        let again = dir.path().join("again.sog");
+        write(&again, &sample(3000)).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap(), "the same scene gives the same bytes");
+        // Without what depends on the direction, and with a single Gaussian.
+        write(&path, &sample(1).with_sh_degree(0)).unwrap();
+        assert_eq!(read(&path).unwrap().len(), 1);
+        assert!(write(&path, &Gaussians::default()).is_err());
+    }
+
+    #[test]
+    fn damage_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.sog");
+        write(&path, &sample(50)).unwrap();
+        let data = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &data[..data.len() / 2]).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("scene.sog"));
+        std::fs::write(&path, b"ply\n").unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("SOG"));
+        // A count that the pictures do not hold.
+        let count = data.windows(10).position(|w| w == b"\"count\":50").unwrap();
+        let mut more = data;
+        more[count..count + 10].copy_from_slice(b"\"count\":99");
+        std::fs::write(&path, &more).unwrap();
+        let said = read(&path).unwrap_err().to_string();
+        assert!(said.contains("damaged") || said.contains("too few"), "{said}");
+    }
+}

@@ -1,0 +1,121 @@
+//! Rows of numbers as one of a few rows that stand for all: k-means.
+
+use rayon::prelude::*;
+
+/// Most rows of a palette. The format takes 65,536; each row costs time with every one of the scene's.
+const MOST: usize = 4096;
+/// Rows for each of the palette's.
+const SHARE: usize = 4;
+/// Rows that the palette is learned from; all others are only assigned to it.
+const LEARNED_FROM: usize = 65_536;
+/// Rounds of Lloyd's algorithm.
+const ROUNDS: usize = 8;
+/// Numbers that are summed beside each other.
+const LANES: usize = 8;
+
+/// A palette, and which of its rows stands for each.
+pub struct Palette {
+    /// Its rows, one after the other.
+    pub rows: Vec<f32>,
+    /// Row of the palette for each row.
+    pub labels: Vec<u16>,
+}
+
+/// The palette of `rows`, each of `width` numbers. The same rows give the same palette.
+pub fn palette(rows: &[f32], width: usize) -> Palette {
+    let n = rows.len() / width;
+    let count = (n / SHARE).clamp(1, MOST);
+    let padded = Rows::new(rows.chunks_exact(width), width);
+    let sample = Rows::new(rows.chunks_exact(width).step_by(n.div_ceil(LEARNED_FROM)), width);
+    let learned = sample.len();
+    let mut centres = Rows::new((0..count).map(|k| &rows[(k * n / count) * width..][..width]), width);
+    for _ in 0..ROUNDS {
+        let labels = centres.nearest(&sample);
+        let mut sums = vec![0.0f64; count * width];
+        let mut counts = vec![0u32; count];
+        for (row, label) in (0..learned).map(|k| sample.row(k)).zip(&labels) {
+            let label = usize::from(*label);
+            counts[label] += 1;
+            sums[label * width..][..width].iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(*v));
+        }
+        for (k, count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
+            let mean = sums[k * width..][..width].iter().map(|s| (s / f64::from(*count)) as f32);
+            centres.row_mut(k).iter_mut().zip(mean).for_each(|(v, mean)| *v = mean);
+        }
+    }
+    let labels = centres.nearest(&padded);
+    Palette { rows: (0..count).flat_map(|k| centres.row(k)[..width].to_vec()).collect(), labels }
+}
+
+/// Rows, filled up with zeros to whole vectors.
+struct Rows {
+    values: Vec<f32>,
+    stride: usize,
+}
+
+impl Rows {
+    fn new<'a>(rows: impl Iterator<Item = &'a [f32]>, width: usize) -> Self {
+        let stride = width.next_multiple_of(LANES);
+        let fill = stride - width;
+        Self { values: rows.flat_map(|row| row.iter().copied().chain(std::iter::repeat_n(0.0, fill))).collect(), stride }
+    }
+
+    fn len(&self) -> usize {
+        self.values.len() / self.stride
+    }
+
+    fn row(&self, k: usize) -> &[f32] {
+        &self.values[k * self.stride..][..self.stride]
+    }
+
+    fn row_mut(&mut self, k: usize) -> &mut [f32] {
+        &mut self.values[k * self.stride..][..self.stride]
+    }
+
+    /// The row of this palette that is nearest to each of others; the first of several.
+    fn nearest(&self, others: &Self) -> Vec<u16> {
+        // |x - c|^2 = |x|^2 - 2 (x c - |c|^2 / 2), of which |x| decides nothing.
+        let halves: Vec<f32> = (0..self.len()).map(|k| 0.5 * dot(self.row(k), self.row(k))).collect();
+        let of = |row: &[f32]| {
+            let (mut best, mut place) = (f32::NEG_INFINITY, 0);
+            for (k, (centre, half)) in self.values.chunks_exact(self.stride).zip(&halves).enumerate() {
+                let near = dot(row, centre) - half;
+                if near > best {
+                    (best, place) = (near, k);
+                }
+            }
+            place as u16
+        };
+        others.values.par_chunks_exact(self.stride).map(of).collect()
+    }
+}
+
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; LANES];
+    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
+        for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
+            *sum += a * b;
+        }
+    }
+    sums.iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::rng::Rng;
+
+    #[test]
+    fn rows_of_a_few_kinds_are_told_apart() {
+        let mut rng = Rng::new(5, "palette");
+        let kinds: Vec<[f32; 9]> = (0..20).map(|_| std::array::from_fn(|_| rng.normal())).collect();
+        let rows: Vec<f32> = (0..800).flat_map(|_| kinds[(20.0 * rng.uniform()) as usize]).collect();
+        let rows: Vec<f32> = rows.into_iter().map(|v| v + 0.001 * rng.normal()).collect();
+        let Palette { rows: palette, labels } = palette(&rows, 9);
+        assert_eq!((palette.len(), labels.len()), (200 * 9, 800));
+        for (row, label) in rows.chunks_exact(9).zip(labels) {
+            let own = &palette[usize::from(label) * 9..][..9];
+            assert!(row.iter().zip(own).all(|(a, b)| (a - b).abs() < 0.01));
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! How many iterations fit into the minutes that somebody has.
+
+use super::config::{Config, Preset};
+use super::{device, settings, start};
+use crate::preprocess::Brightness;
+use crate::{Result, Run, objects};
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::{Camera, SceneFolder};
+use fastlgs_raster::{Target, Trainer};
+use serde_json::json;
+
+/// Iterations of the trial, which is a whole run in small: half resolution, growth, removal and all.
+const TRIAL: u32 = 100;
+/// What an iteration of a long run costs, for each of the trial: scenes grow for longer.
+const GROWTH: f64 = 1.3;
+/// Iterations of any run: fewer make no scene, and more gain nothing.
+const FEWEST: u32 = 500;
+const MOST: u32 = 30_000;
+
+/// Note of the manifest: what was decided, for a run that goes on after it was broken off.
+const NOTE: &str = "minutes";
+
+/// `config` with iterations, and the preset's limits, that fit into its minutes together with the mapping; itself where it has none.
+pub fn fitted(
+    config: &Config,
+    folder: &SceneFolder,
+    manifest: &mut Manifest,
+    training: &[Camera],
+    targets: &[Target],
+    run: &Run,
+) -> Result<Config> {
+    let Some(minutes) = config.minutes else { return Ok(config.clone()) };
+    let decided = manifest.notes.get(NOTE).and_then(|note| serde_json::from_value(note.clone()).ok());
+    let iterations = match decided.filter(|_| config.resume) {
+        Some(iterations) => iterations,
+        None => {
+            let mapping = objects::seconds_of_embedding(folder, training)?;
+            let step = GROWTH * trial(config, folder, manifest, targets, run)?;
+            let fit = (60.0 * minutes - mapping) / step;
+            tracing::info!(minutes, mapping, milliseconds_a_step = 1e3 * step, fit, "what fits");
+            if fit < f64::from(FEWEST) {
+                run.warn(&format!(
+                    "{minutes:.1} minutes are left for training, which are too few for these photos on this machine; it takes about {:.1} with {FEWEST} iterations",
+                    (mapping + step * f64::from(FEWEST)) / 60.0
+                ));
+            }
+            rounded(fit)
+        }
+    };
+    manifest.notes.insert(NOTE.to_owned(), json!(iterations));
+    folder.save_manifest(manifest)?;
+    let preset = [Preset::Quick, Preset::Standard].into_iter().find(|p| p.values().0 >= iterations).unwrap_or(Preset::Paper);
+    Ok(Config { preset, iterations: Some(iterations), ..config.clone() })
+}
+
+/// Whole hundreds, within what makes sense.
+fn rounded(iterations: f64) -> u32 {
+    ((iterations / 100.0).floor() as u32 * 100).clamp(FEWEST, MOST)
+}
+
+/// Seconds that an iteration of the trial takes.
+fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &[Target], run: &Run) -> Result<f64> {
+    let short = Config { iterations: Some(TRIAL), ..config.clone() };
+    let first = start::gaussians(&short, folder, targets, run)?;
+    let light = Brightness::of(manifest);
+    let settings = settings(&short, &first, start::pixels(targets), light.spread_stops, run.seed);
+    let engine = fastlgs_raster::open_engine(&device(MOST, run)?.device)?;
+    let work = run.work("trial", u64::from(TRIAL));
+    let mut trainer = Trainer::new(engine, &first, targets.to_vec(), settings)?;
+    let result = trainer.run(None, |_, _| work.check())?;
+    Ok(1.0 / result.iterations_per_second)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn iterations_are_whole_hundreds_within_reason() {
+        assert_eq!([-3.0, 120.0, 2_399.0, 1e9].map(rounded), [500, 500, 2_300, 30_000]);
+    }
+}
