@@ -41,8 +41,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         let others = |left_out: Option<usize>| samples.iter().enumerate().filter(move |(k, _)| Some(*k) != left_out).map(|s| s.1);
         let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
             let mut scene = Session::open(root, run.device)?;
-            let texts = measured(others(left_out)).with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
-            scene.calibrations = Some(Calibrations { texts, ..Calibrations::of(&scene.manifest) });
+            let own = Calibrations::of(&scene.manifest);
+            let measured = measured(others(left_out), own.texts.anything);
+            let [texts, colored] = measured.with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
+            scene.calibrations = Some(Calibrations { texts, colored, ..own });
             let config = eval::Config { scene: root.clone(), labels: Some(folder.clone()), ..eval::Config::default() };
             let report = eval::eval_session(scene, &config)?;
             work.advance()?;
@@ -91,14 +93,16 @@ fn rejected(report: &eval::Report) -> f64 {
     report.absent_rejected as f64 / report.absent_texts.max(1) as f64
 }
 
-/// What follows from the samples of some scenes.
-fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>) -> Option<Calibration> {
+/// What follows from the samples of some scenes, for texts and for those that name a colour.
+fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>, anything: f32) -> Option<[Calibration; 2]> {
     let mut all = Samples::default();
     for scene in scenes {
         all.right.extend(&scene.right);
         all.wrong.extend(&scene.wrong);
         all.margins.extend(&scene.margins);
         all.absent.extend(&scene.absent);
+        all.colored.extend(&scene.colored);
     }
-    Calibration::measured(&all, Calibration::OFFLINE.anything)
+    let texts = Calibration::measured(&all, anything)?;
+    Some([texts, texts.judged_by(&all.colored)?])
 }

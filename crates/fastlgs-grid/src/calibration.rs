@@ -30,6 +30,8 @@ pub struct Samples {
     pub margins: Vec<f32>,
     /// By how much the best place of a scene does, then.
     pub absent: Vec<f32>,
+    /// The same where what is asked for has a colour or a material in its name.
+    pub colored: Vec<f32>,
 }
 
 impl Samples {
@@ -91,8 +93,13 @@ impl Calibration {
             return None;
         }
         let wrong = moments(&samples.margins).0;
-        let absent = gumbel(&samples.absent.iter().map(|margin| temperature * margin).collect::<Vec<_>>());
-        (absent[1] > 0.0).then_some(Self { temperature, separation, wrong, anything, absent, measured: true })
+        Self { temperature, separation, wrong, anything, absent: [0.0; 2], measured: true }.judged_by(&samples.absent)
+    }
+
+    /// The same with the law that the best places of scenes follow where what is asked for is absent; nothing where there are too few of them.
+    pub fn judged_by(self, best: &[f32]) -> Option<Self> {
+        let absent = gumbel(&best.iter().map(|margin| self.temperature * margin).collect::<Vec<_>>());
+        (absent[1] > 0.0).then_some(Self { absent, ..self })
     }
 
     /// The same, with what follows from samples that lack those of best places, which depend on it.

@@ -52,6 +52,11 @@ impl Growth {
         }
         self.last = Some((gaussians, psnr));
     }
+
+    /// Forgets the last look, with which the next would say nothing.
+    pub fn forget(&mut self) {
+        self.last = None;
+    }
 }
 
 /// What a removal cost, for reports.

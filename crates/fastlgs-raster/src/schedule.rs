@@ -167,9 +167,14 @@ impl TrainConfig {
         (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
-    /// Rounds of density control from the one at `iteration` on.
+    /// Whether the scene may still grow.
+    pub(crate) fn grows(&self, iteration: u32) -> bool {
+        iteration <= self.step_at(self.refine_until)
+    }
+
+    /// Rounds of density control in which the scene may grow, from the one at `iteration` on.
     pub(crate) fn rounds_left(&self, iteration: u32) -> u32 {
-        1 + self.step_at(self.density_until()).saturating_sub(iteration) / self.between_rounds()
+        1 + self.step_at(self.refine_until).saturating_sub(iteration) / self.between_rounds()
     }
 
     /// Share of the iterations after which density control ends: with MCMC, which moves Gaussians as well, later than growth.
@@ -192,7 +197,7 @@ impl TrainConfig {
         matches!(self.budget, Budget::Auto(_)) && iteration.is_multiple_of((self.iterations / LOOKS).max(1))
     }
 
-    /// Whether opacities are reset then: not in the last round, after which they could not recover.
+    /// Whether opacities are reset then: not so late that they could not recover before growth ends.
     pub(crate) fn resets_opacity(&self, iteration: u32) -> bool {
         self.strategy == Strategy::Classic
             && iteration.is_multiple_of(RESET_EVERY)

@@ -23,6 +23,9 @@ pub fn key(parts: &[&[u8]]) -> Key {
     hash.finalize().into()
 }
 
+/// Bytes that may lie idle in any case.
+const IDLE: u64 = 256 << 20;
+
 /// `SCENE/cache/STAGE/FINGERPRINT`.
 pub struct Cache {
     root: PathBuf,
@@ -64,15 +67,19 @@ impl Cache {
         self.counts.lock().expect("no panic while holding the lock").clone()
     }
 
-    /// Removes what this run had no use for, oldest first, until the rest takes no more room than what it used: a trial with another
-    /// segmenter leaves the first one's results.
+    /// Removes what this run had no use for, oldest first, until the rest takes no more room than what it used, or than [`IDLE`]: a trial with
+    /// another segmenter, or with masks of another program, leaves the first one's results.
     pub fn tidy(&self) {
+        self.tidy_to(IDLE);
+    }
+
+    fn tidy_to(&self, least: u64) {
         let used = self.used.lock().expect("no panic while holding the lock");
         let stages = std::fs::read_dir(&self.root).into_iter().flatten().flatten();
         let files = stages.flat_map(|stage| std::fs::read_dir(stage.path()).into_iter().flatten().flatten());
         let known = files.filter_map(|file| Some((file.path(), file.metadata().ok()?)));
         let (in_use, mut idle): (Vec<_>, Vec<_>) = known.partition(|(path, _)| used.contains(path));
-        let room: u64 = in_use.iter().map(|(_, about)| about.len()).sum();
+        let room = in_use.iter().map(|(_, about)| about.len()).sum::<u64>().max(least);
         // The newest first.
         idle.sort_by_key(|(path, about)| (std::cmp::Reverse(about.modified().ok()), path.clone()));
         let mut taken = 0;
@@ -107,7 +114,7 @@ mod tests {
         let rest = |input: &str| {
             let cache = Cache::new(&SceneFolder::new(dir.path()));
             ask(&cache, input);
-            cache.tidy();
+            cache.tidy_to(0);
             std::fs::read_dir(dir.path().join("cache/stage")).unwrap().count()
         };
         assert_eq!(rest("one"), 2, "as much as is in use may lie idle");

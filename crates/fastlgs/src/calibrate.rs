@@ -84,7 +84,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     let blind = || format!("{}: the encoder tells the generated things not apart by their names; is it CLIP?", image_tower.display());
     let of_texts = Calibration::measured(&by_names(&known, &absent, query)?, anything).with_context(blind)?;
     let of_pictures = Calibration::measured(&by_examples(&known), anything).with_context(blind)?;
-    let calibrations = Calibrations { texts: of_texts, pictures: of_pictures };
+    let calibrations = Calibrations { texts: of_texts, colored: of_texts, pictures: of_pictures };
     let files = eyes.files()?;
     let sum = |role: &str| files.get(role).map(|f| f.sha256.clone()).unwrap_or_default();
     let kept = beside(&image_tower);
@@ -146,6 +146,7 @@ fn best(grid: &Grid, query: &TextQuery) -> Option<f32> {
 /// # Errors
 /// Labels of views that the scene lacks, and a device that fails.
 pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples> {
+    scene.forget_taught();
     let grid = scene.grid()?;
     let seen = || grid.objects.iter().filter(|o| !o.embeddings.is_empty());
     let mut samples = Samples::default();
@@ -162,12 +163,24 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
         }
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
-    for name in ABSENT.into_iter().filter(|name| !there(name)) {
+    let absent: Vec<&str> = ABSENT.into_iter().filter(|name| !there(name)).collect();
+    for name in &absent {
         let query = scene.text_query(name)?;
         samples.margins.extend(seen().filter_map(|o| query::margin(o, &query)));
-        samples.absent.extend(best(&grid, &query));
     }
-    Ok(samples)
+    // Judged with what is known so far, as they will be when it is applied.
+    let known = |text: &str| -> Result<Option<f32>> {
+        let query = scene.text_query(text)?;
+        Ok(best(&grid, &TextQuery { calibration: query.calibration.so_far(&samples), ..query }))
+    };
+    let (mut plain, mut colored) = (Vec::new(), Vec::new());
+    for name in absent {
+        plain.extend(known(name)?);
+        for color in COLORS {
+            colored.extend(known(&format!("{color} {name}"))?);
+        }
+    }
+    Ok(Samples { absent: plain, colored, ..samples })
 }
 
 /// IoU with a label from which an object is what it names.

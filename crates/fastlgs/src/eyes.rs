@@ -104,9 +104,9 @@ pub struct Eyes {
     /// SAM's prompt decoder, instead of --sam.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_encoder"))]
     pub sam_decoder: Option<PathBuf>,
-    /// How SAM is asked for all masks of a photo.
-    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
-    pub sam_preset: SamPreset,
+    /// How SAM is asked for all masks of a photo; by default as its authors do, and as LangSplat does where all is made as the paper has it.
+    #[cfg_attr(feature = "clap", arg(long, value_enum))]
+    pub sam_preset: Option<SamPreset>,
     /// Point prompts along each side of a photo, instead of the preset's 32.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(1..=128)))]
     pub sam_points: Option<u32>,
@@ -136,7 +136,7 @@ impl Default for Eyes {
             sam: "slimsam".to_owned(),
             sam_encoder: None,
             sam_decoder: None,
-            sam_preset: SamPreset::default(),
+            sam_preset: None,
             sam_points: None,
             sam_iou: None,
             sam_stability: None,
@@ -166,7 +166,7 @@ impl Eyes {
     }
 
     fn sam_config(&self) -> sam::Config {
-        let preset = match self.sam_preset {
+        let preset = match self.sam_preset.unwrap_or_default() {
             SamPreset::Meta => sam::Config::default(),
             SamPreset::LangSplat => sam::Config::langsplat(),
         };
@@ -249,7 +249,7 @@ impl Eyes {
                 // SAM's own files alone: another encoder leaves the masks as they are.
                 let files = self.files()?;
                 let sums: Vec<&str> = files.iter().filter(|(role, _)| role.starts_with("sam")).map(|(_, f)| f.sha256.as_str()).collect();
-                Some(format!("sam {:?} {}", self.sam_config(), sums.join(" ")))
+                Some(format!("sam {} {:?} {}", sam::VERSION, self.sam_config(), sums.join(" ")))
             }
             SegmenterKind::Offline => Some(format!("offline {} {}", segmenter::VERSION, models::offline_stamp())),
         })

@@ -2,7 +2,7 @@
 
 use crate::error::{Context, bail};
 use crate::session::Texts;
-use crate::{Result, Run, train};
+use crate::{Result, Run, eyes, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
@@ -128,10 +128,7 @@ impl Search {
     /// A text that cannot be embedded.
     pub fn ask(&self, text: &str) -> Result<Report> {
         let started = Instant::now();
-        let mut query = self.texts.query(text)?;
-        for negative in &self.config.negatives {
-            query.negatives.extend(self.texts.query(negative)?.meant);
-        }
+        let query = self.texts.with_negatives(self.texts.query(text)?, &self.config.negatives)?;
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
         let best = self.index.search(&query, self.config.scenes)?;
@@ -176,8 +173,8 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
             Ok(own) => scenes
                 .first()
                 .map(|s| &s.1)
-                .filter(|first| first.encoder != own.encoder)
-                .map(|first| format!("its encoder is '{}', that of the library '{}'", own.encoder, first.encoder)),
+                .filter(|first| eyes::identity_of(first) != eyes::identity_of(own))
+                .map(|first| format!("its encoder is another ('{}') than that of the library ('{}')", own.encoder, first.encoder)),
         };
         match (why, manifest) {
             (None, Ok(manifest)) => scenes.push((Entry { path, stamp: stamp(&folder)? }, manifest)),

@@ -66,7 +66,7 @@ pub fn make(config: &Config, run: &Run) -> Result<Report> {
         train::Config { scene: config.preprocess.output.clone(), preset: config.effort, minutes: config.minutes, ..Default::default() };
     let mut preprocess = config.preprocess.clone();
     if config.effort == train::Preset::LikePaper {
-        preprocess.eyes.sam_preset = SamPreset::LangSplat;
+        preprocess.eyes.sam_preset.get_or_insert(SamPreset::LangSplat);
     }
     let (state, train) = scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;

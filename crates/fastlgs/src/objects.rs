@@ -94,7 +94,8 @@ pub struct Mapped {
 /// Global mapping up to the objects: masks propose sets of Gaussians and elect some of them, these are nested, and the nodes that masks support
 /// become the objects, whose numbers the Gaussians get. The folder needs masks and cameras.
 pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
-    let pixels = (training[0].width * training[0].height) as usize;
+    // Photos may differ in size.
+    let pixels = training.iter().map(|c| (c.width * c.height) as usize).sum::<usize>() / training.len();
     let clock = std::time::Instant::now();
     let told = |what: &str, count: usize| tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}");
     let (votes, tables) = votes(scene, folder, training, config.antialias, run)?;

@@ -10,7 +10,7 @@ use std::path::Path;
 struct Annotation {
     segmentation: Segmentation,
     #[serde(default)]
-    area: usize,
+    area: f64,
     /// Left, top, width, height.
     #[serde(default)]
     bbox: [f64; 4],
@@ -65,7 +65,7 @@ impl MaskList {
             let bbox = if b[2] > 0 { [b[0], b[1], b[2] - b[0], b[3] - b[1]] } else { [0; 4] };
             Annotation {
                 segmentation: Segmentation { size: [self.height, self.width], counts: Counts::Text(mask.runs.to_text()) },
-                area: mask.runs.area(),
+                area: mask.runs.area() as f64,
                 bbox: bbox.map(f64::from),
                 predicted_iou: mask.predicted_iou,
                 stability_score: mask.stability,
@@ -122,7 +122,7 @@ mod tests {
         list.save(&path).unwrap();
         assert_eq!(MaskList::load(&path).unwrap(), list);
         let text = std::fs::read_to_string(&path).unwrap().replace([' ', '\n'], "");
-        assert!(text.contains("\"bbox\":[2.0,2.0,3.0,1.0]") && text.contains("\"area\":3"), "{text}");
+        assert!(text.contains("\"bbox\":[2.0,2.0,3.0,1.0]") && text.contains("\"area\":3.0"), "{text}");
     }
 
     #[test]
@@ -133,7 +133,8 @@ mod tests {
             std::fs::write(&path, text).unwrap();
             MaskList::load(&path)
         };
-        let list = load(r#"{"image": {}, "annotations": [{"segmentation": {"size": [2, 3], "counts": [1, 2, 3]}, "id": 4}]}"#).unwrap();
+        let list = load(r#"{"image": {}, "annotations": [{"segmentation": {"size": [2, 3], "counts": [1, 2, 3]}, "id": 4, "area": 2.5}]}"#)
+            .unwrap();
         assert_eq!((list.width, list.height, list.masks[0].runs.area()), (3, 2, 2));
         assert_eq!(load("[]").unwrap(), MaskList::default());
         for damaged in [r#"[{"segmentation": {"size": [2, 3], "counts": [1, 2, 9]}}]"#, r#"[{"segmentation": 1}]"#, "[", r#"{"a": 1}"#] {

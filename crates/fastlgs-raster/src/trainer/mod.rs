@@ -141,9 +141,7 @@ impl Trainer {
 
     fn growth_is_over(&self) -> bool {
         let config = &self.course.config;
-        self.course.growth.stopped
-            || !config.channels.color()
-            || self.course.iteration as f32 >= config.iterations as f32 * config.refine_until
+        self.course.growth.stopped || !config.channels.color() || !config.grows(self.course.iteration)
     }
 
     fn view(&self, camera: &Camera, sh_degree: u32) -> View {
@@ -196,7 +194,7 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let config = &self.course.config;
         let before = state.len();
-        let budget = if self.course.growth.stopped { before } else { config.budget.most() };
+        let budget = if self.growth_is_over() { before } else { config.budget.most() };
         match config.strategy {
             Strategy::Classic => {
                 let limits = density::Config { budget, ..density::Config::default() };
@@ -209,10 +207,18 @@ impl Trainer {
                 tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), moved, added, "density control");
             }
         }
-        if config.resets_opacity(self.course.iteration) {
-            density::reset_opacity(&mut state, 0.01);
-        }
         self.replace(&state)
+    }
+
+    /// Makes all Gaussians faint, so that those that no photo asks for stay so. What was counted of gradients goes on being counted.
+    fn reset_opacity(&mut self) -> Result<()> {
+        let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
+        density::reset_opacity(&mut state, 0.01);
+        self.engine.set_state(&state)?;
+        self.engine.set_stats(&stats)?;
+        // The watched views are dark now: what they gain or lose by it says nothing about growth.
+        self.course.growth.forget();
+        Ok(())
     }
 
     fn replace(&mut self, state: &State) -> Result<()> {
@@ -274,6 +280,9 @@ impl Trainer {
             }
             if self.course.config.refines(iteration) {
                 self.refine()?;
+            }
+            if self.course.config.resets_opacity(iteration) {
+                self.reset_opacity()?;
             }
             if self.course.config.aligns(iteration) {
                 self.align()?;

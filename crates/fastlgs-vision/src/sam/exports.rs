@@ -10,6 +10,10 @@ use std::path::Path;
 const SIDE: usize = 1024;
 /// Side of the low-resolution masks.
 const LOW: usize = 256;
+/// Most bytes of masks that one inference may give.
+const ANSWER: usize = 64 << 20;
+/// Masks that decoders give for a prompt.
+const MASKS: usize = 4;
 /// Mean and standard deviation of the training pictures, RGB in [0, 255]: those of SAM and of SAM 2 are the same.
 const MEAN: [f32; 3] = [123.675, 116.28, 103.53];
 const DEVIATION: [f32; 3] = [58.395, 57.12, 57.375];
@@ -209,6 +213,12 @@ impl Exports {
         let points = self.decoder.input(&["point_coords", "batched_point_coords", "input_points"])?;
         let prompts = if matches!(self.kind, Kind::Official | Kind::Stretched) { 0 } else { 1 };
         *points.shape.get(prompts)?
+    }
+
+    /// As many prompts as can be asked at once for [`ANSWER`] bytes: EfficientSAM draws its masks at the size of the picture.
+    pub fn most_prompts(&self, encoded: &Encoded) -> usize {
+        let cells = if self.kind == Kind::Efficient { encoded.size[0] * encoded.size[1] } else { (LOW * LOW) as u32 };
+        (ANSWER / (4 * MASKS * cells as usize)).max(1)
     }
 
     /// That these models cannot be used, and why.

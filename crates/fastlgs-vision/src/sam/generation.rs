@@ -7,6 +7,7 @@ use crate::Result;
 use crate::masks::{BitMask, box_iou};
 use fastlgs_core::Level;
 use image::{RgbImage, imageops};
+use std::collections::HashSet;
 
 /// Prompts in one inference.
 const BATCH: usize = 64;
@@ -68,20 +69,32 @@ fn of_crop(exports: &Exports, photo: &RgbImage, crop: [u32; 4], config: &Config,
     let at = |k: u32| (k as f32 + 0.5) / n as f32;
     let grid: Vec<[f32; 2]> = (0..n).flat_map(|y| (0..n).map(move |x| [at(x), at(y)])).collect();
     let batch = exports.fixed_batch();
-    let mut kept: Vec<Candidate> = Vec::new();
-    for points in grid.chunks(batch.unwrap_or(BATCH)) {
+    let mut found: Vec<Candidate> = Vec::new();
+    for points in grid.chunks(batch.unwrap_or_else(|| exports.most_prompts(&encoded).min(BATCH))) {
         let mut asked = points.to_vec();
         asked.resize(batch.unwrap_or(points.len()), points[0]);
         let logits = exports.decode(&encoded, &asked)?;
         for prompt in 0..points.len() {
-            let own = of_prompt(&logits, prompt, [width, height], config);
-            *single |= logits.masks == 1;
-            kept.extend(own.into_iter().filter_map(|candidate| placed(candidate, photo, crop)));
+            let mut own = of_prompt(&logits, prompt, [width, height], config);
+            if logits.masks == 1 {
+                *single = true;
+                own.iter_mut().for_each(|c| c.level = by_size(&c.mask, photo));
+            }
+            found.extend(own.into_iter().filter_map(|candidate| placed(candidate, photo, crop)));
         }
-        // As they come in, so that memory does not grow with the prompts.
-        kept = thinned(kept, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| c.predicted_iou);
+        // What repeats a better one goes as it comes in, so that memory hardly grows with the prompts.
+        found = without_copies(found);
     }
-    Ok(kept)
+    Ok(thinned(found, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| c.predicted_iou))
+}
+
+/// Of candidates of one level with the same box the best. Whatever the others would drop for their boxes it drops as well, so that the order
+/// in which prompts are asked decides nothing.
+fn without_copies(mut candidates: Vec<Candidate>) -> Vec<Candidate> {
+    candidates.sort_by(|a, b| b.predicted_iou.total_cmp(&a.predicted_iou));
+    let mut seen = HashSet::new();
+    candidates.retain(|c| seen.insert((c.level, c.mask.bounds)));
+    candidates
 }
 
 /// The masks of a prompt that the model believes in, at the size of the crop.
@@ -112,12 +125,16 @@ fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) ->
             continue;
         }
         if let Some(mask) = window.mask(crop) {
-            let share = mask.area() as f32 / (crop[0] * crop[1]) as f32;
-            let by_size = Level::ALL[SHARES.iter().filter(|s| share < **s).count()];
-            out.push(Candidate { level: if logits.masks == 1 { by_size } else { level }, predicted_iou, stability, mask, crop: 1.0 });
+            out.push(Candidate { level, predicted_iou, stability, mask, crop: 1.0 });
         }
     }
     out
+}
+
+/// The level of a mask of which no more is known than its share of the photo.
+fn by_size(mask: &BitMask, photo: &RgbImage) -> Level {
+    let share = mask.area() as f32 / (photo.width() * photo.height()) as f32;
+    Level::ALL[SHARES.iter().filter(|s| share < **s).count()]
 }
 
 /// A crop's mask in the photo; none if the crop's border cut it off.
@@ -203,6 +220,22 @@ mod tests {
         let all = vec![candidate([0, 0, 10, 10], 0.8), candidate([0, 0, 10, 9], 0.9), candidate([20, 0, 30, 10], 0.7)];
         let kept = thinned(all, 0.7, |_, _| true, |c| c.predicted_iou);
         assert_eq!(kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(), [0.9, 0.7]);
+    }
+
+    #[test]
+    fn the_order_of_prompts_decides_nothing() {
+        // The middle one, best but for the last, overlaps both; the first comes back when the last drops the middle one.
+        let of = |x: u32, score: f32| candidate([x, 0, x + 100, 10], score);
+        let all = [of(0, 0.8), of(12, 0.9), of(24, 0.95), of(24, 0.85)];
+        for order in [[0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]] {
+            let mut found = Vec::new();
+            for k in order {
+                found.push(all[k].clone());
+                found = without_copies(found);
+            }
+            let kept = thinned(found, 0.7, |_, _| true, |c| c.predicted_iou);
+            assert_eq!(kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(), [0.95, 0.8], "{order:?}");
+        }
     }
 
     #[test]

@@ -15,7 +15,10 @@ use generation::Candidate;
 use image::RgbImage;
 use std::path::Path;
 
-/// Constants of mask generation; the defaults are those of SAM's own generator.
+/// Changes with what is made of the same models' answers.
+pub const VERSION: u32 = 2;
+
+/// Constants of mask generation; the defaults are those of SAM's own generator, but that a whole does not drop a part of like bounds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
     /// Point prompts along each side of the photo, and of each crop.

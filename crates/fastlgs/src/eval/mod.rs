@@ -67,6 +67,8 @@ pub struct Report {
     pub macc: Option<f64>,
     /// Boundary IoU of the texts' masks.
     pub boundary_iou: Option<f64>,
+    /// Boundary IoU of the object that fits each label best.
+    pub oracle_boundary_iou: Option<f64>,
     /// Whether the relevancy's peak lies in a box of the label.
     pub loc_acc: Option<f64>,
     /// IoU of the object that fits each label best.
@@ -151,6 +153,7 @@ struct Sums {
     apart: Vec<f64>,
     recall: Vec<f64>,
     boundary: Vec<f64>,
+    oracle_boundary: Vec<f64>,
     localised: Vec<f64>,
     top1: Vec<f64>,
     present: Vec<f64>,
@@ -179,6 +182,7 @@ pub fn eval(config: &Config, run: &Run) -> Result<Report> {
 /// # Errors
 /// As [`eval`].
 pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
+    scene.forget_taught();
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
     let label_text = config.label_text.as_deref();
@@ -224,6 +228,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         miou_by_label: sums.by_label.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
         macc: mean(&sums.recall),
         boundary_iou: mean(&sums.boundary),
+        oracle_boundary_iou: mean(&sums.oracle_boundary),
         loc_acc: mean(&sums.localised),
         oracle_miou: mean(&sums.oracle.values().flatten().copied().collect::<Vec<_>>()),
         oracle_by_label: sums.oracle.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
@@ -314,6 +319,7 @@ fn score_label(
     // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
     let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
     let (oracle, found, id) = best_object(grid, field, &truth);
+    sums.oracle_boundary.push(metrics::boundary_iou(&found, &truth, w, h, band));
     sums.ranks.entry(label.category.clone()).or_default().push(ranked.iter().position(|h| h.id == id).map_or(ranked.len(), |k| k) + 1);
     let related = |hit: &Hit| grid.chain(hit.id).any(|a| a == id) || grid.chain(id).any(|a| a == hit.id);
     let outcome = match targets.first() {

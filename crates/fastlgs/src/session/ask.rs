@@ -41,12 +41,7 @@ impl Ask {
 
     /// Embeds what needs embedding; `negatives` are texts that the object must not be nearer to.
     pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
-        let with_negatives = |mut query: TextQuery| -> Result<TextQuery> {
-            for text in negatives {
-                query.negatives.extend(session.text_query(text)?.meant);
-            }
-            Ok(query)
-        };
+        let with_negatives = |query| if negatives.is_empty() { Ok(query) } else { session.texts()?.with_negatives(query, negatives) };
         Ok(match self {
             Self::Point(x, y) => Meaning::Point(*x, *y),
             Self::Image(name, photo) => Meaning::Embedded(Box::new(with_negatives(picture(session, name, photo)?)?), None),

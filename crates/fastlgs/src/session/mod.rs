@@ -44,6 +44,8 @@ pub struct Session {
     /// What cosines are worth, where that is not to be what is known of the scene's encoder.
     pub calibrations: Option<Calibrations>,
     texts: OnceCell<Texts>,
+    /// Whether names that the user taught are known.
+    taught: bool,
 }
 
 impl Session {
@@ -62,7 +64,18 @@ impl Session {
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
         let cameras = folder.cameras()?;
-        Ok(Self { manifest, cameras, folder, gaussians, engine, clip_text: None, trained, calibrations: None, texts: OnceCell::new() })
+        Ok(Self {
+            manifest,
+            cameras,
+            folder,
+            gaussians,
+            engine,
+            clip_text: None,
+            trained,
+            calibrations: None,
+            texts: OnceCell::new(),
+            taught: true,
+        })
     }
 
     /// Puts other Gaussians in the place of the scene's.
@@ -141,6 +154,9 @@ impl Session {
         if self.texts.get().is_none() {
             let mut texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
             texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
+            if !self.taught {
+                texts.forget_names();
+            }
             let _ = self.texts.set(texts);
         }
         Ok(self.texts.get().expect("set above"))
@@ -180,8 +196,18 @@ impl Session {
     /// # Errors
     /// A tower whose embeddings have another length than the scene's.
     pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
-        self.texts = OnceCell::from(Texts::of(encoder, &self.folder, &self.manifest)?);
+        let mut texts = Texts::of(encoder, &self.folder, &self.manifest)?;
+        texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
+        self.texts = OnceCell::from(texts);
         Ok(())
+    }
+
+    /// Takes all texts as words from now on, whatever the user taught: figures tell what the encoder knows by itself.
+    pub fn forget_taught(&mut self) {
+        self.taught = false;
+        if let Some(texts) = self.texts.get_mut() {
+            texts.forget_names();
+        }
     }
 
     /// Forgets the text tower, so that the next text is asked with the names as they are then.

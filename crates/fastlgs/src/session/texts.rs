@@ -7,7 +7,6 @@ use crate::{Result, eyes};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
-use fastlgs_grid::calibration::Calibration;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
@@ -43,6 +42,11 @@ impl Texts {
         }
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
         Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
+    }
+
+    /// Takes all texts as words from now on.
+    pub fn forget_names(&mut self) {
+        self.names = Names::default();
     }
 
     /// Whether the user has taught this name.
@@ -83,6 +87,22 @@ impl Texts {
         self.names.rows().into_iter().map(|row| row.name).filter(|name| self.of_examples(name).is_some()).collect()
     }
 
+    /// Adds texts that the objects must not be nearer to.
+    ///
+    /// # Errors
+    /// As [`Self::query`]; words where pictures are meant, and pictures where words are: their cosines cannot be compared.
+    pub fn with_negatives(&self, mut query: TextQuery, negatives: &[String]) -> Result<TextQuery> {
+        for text in negatives {
+            let negative = self.query(text)?;
+            if negative.shown != query.shown {
+                let [meant, unwanted] = [query.shown, negative.shown].map(|shown| if shown { "a picture" } else { "words" });
+                bail!("--negative '{text}' is {unwanted}, what is looked for {meant}: how like they are to an object cannot be compared");
+            }
+            query.negatives.extend(negative.meant);
+        }
+        Ok(query)
+    }
+
     /// What was taught under a name with this encoder; nothing where nothing was.
     fn of_examples(&self, name: &str) -> Option<TextQuery> {
         let own = self.names.of(name)?.iter().filter(|e| e.encoder == self.identity);
@@ -94,7 +114,7 @@ impl Texts {
     fn worded(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
         let advantage = self.encoder.advantage(text);
         // Only the offline encoder gives one, for what it measures by itself.
-        let calibration = if advantage > 0.0 { Calibration::OFFLINE_COLORED } else { self.calibrations.texts };
+        let calibration = if advantage > 0.0 { self.calibrations.colored } else { self.calibrations.texts };
         let anything = calibration.anything + advantage;
         TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(vec![embedding], calibration) }
     }
