@@ -118,7 +118,7 @@ fn by_largest_weight(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usiz
     let manifest = folder.manifest()?;
     let trained = fastlgs::train::Report::of(&manifest).unwrap_or_default();
     let views: Vec<View> = manifest.training(&folder.cameras()?).iter().map(|camera| trained.view(camera, scene)).collect();
-    let largest = budget::largest_weights(scene, &views);
+    let largest = budget::largest_weights(scene, &views, 0.0);
     let mut order: Vec<usize> = (0..scene.len()).collect();
     order.sort_by(|a, b| largest[*b].total_cmp(&largest[*a]).then(a.cmp(b)));
     Ok(order)

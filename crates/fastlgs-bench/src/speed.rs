@@ -164,7 +164,8 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
     let frozen = Step::new(1, 14..BASE_CHANNELS, &zero);
     let step = Step::new(1, 0..channels(degree), &zero);
     let options = |channels: Channels| StepOptions { channels, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
-    let full = options(Channels::Both);
+    // As `train --feature-mode train` steps.
+    let full = options(Channels::Coupled);
     let target =
         TargetImage { size: views[0].size, color: vec![pack([128; 3], true); pixels], feature: vec![pack([128; 3], true); pixels] };
     (0..views.len()).try_for_each(|id| engine.set_target(id, &target))?;
@@ -186,7 +187,7 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
         engine.losses()?;
         Ok(started.elapsed().as_secs_f64() / f64::from(steps))
     };
-    let full_seconds = timed(Channels::Both, &step)?;
+    let full_seconds = timed(Channels::Coupled, &step)?;
     let color_seconds = timed(Channels::Color, &step)?;
     let feature_seconds = timed(Channels::Feature, &frozen)?;
     let started = Instant::now();

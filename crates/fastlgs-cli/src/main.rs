@@ -24,21 +24,21 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Makes a scene that answers, from photos: preprocess and train in one.
+    /// Makes a scene that answers, from photos or a video: preprocess and train in one.
     #[command(after_help = "Example: fastlgs make photos/fox -o scenes/fox --max-side 480\n\n\
 Called again, it keeps what is there, goes on where it was broken off, or makes anew what other photos or options ask for.")]
     Make(fastlgs::make::Config),
-    /// Photos (with poses) -> masks, embeddings, key points and the object grid.
+    /// Photos, with or without poses -> cameras, masks, key points and first points.
     #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
     Preprocess(fastlgs::preprocess::Config),
-    /// Trains Gaussians: colour and semantic field together.
+    /// Trains Gaussians and finds the objects among them.
     Train(commands::train::Args),
     /// Makes scenes of several folders of photos.
     Batch(commands::batch::Args),
     /// Renders views: colour PNG, depth, feature and objects.
     #[command(after_help = "Example: fastlgs render scenes/fox --view 0027.jpg --what color,depth,feature,objects -o pictures")]
     Render(fastlgs::render::Config),
-    /// Finds what a text names: mask, heat map, JSON.
+    /// Finds what a text, a picture or a point names: masks, heat maps, Gaussians.
     Query(commands::query::Args),
     /// Takes a thing out of a scene and fills its place.
     #[command(after_help = "Example: fastlgs remove scenes/room \"coffee mug\" -o scenes/tidy")]
@@ -53,9 +53,9 @@ Called again, it keeps what is there, goes on where it was broken off, or makes 
     /// Measures accuracy on held-out views against labels.
     #[command(after_help = "Example: fastlgs eval scenes/fox --labels photos/fox/labels --json -")]
     Eval(fastlgs::eval::Config),
-    /// Measures speed.
+    /// Measures: speed, accuracy against time, stability, size, names, the paper's ablations.
     Bench(fastlgs_bench::Args),
-    /// Writes a trained scene as PLY, SPZ or glTF, as a small folder for queries, or as a page for any web server.
+    /// Writes a trained scene as PLY, SPZ, SOG or glTF, as a small folder for queries, or as a page for any web server.
     #[command(
         after_help = "Examples: fastlgs export scenes/fox fox.spz\n          fastlgs export scenes/fox small/fox\n          fastlgs export scenes/fox cameras.json\n          fastlgs export scenes/fox page/fox --html"
     )]

@@ -1,13 +1,17 @@
 //! One bar over all stages of `make`.
 
 use fastlgs::progress::{Message, Sink};
+use fastlgs::train::Preset;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 /// What the bar is called.
 pub const WHOLE: &str = "make";
 
-/// The stages in their order, with the seconds that each took on the fox scene. Those that a scene does not need are passed over.
-const STAGES: [(&str, u64); 12] = [
+/// A stage, and the seconds that it took on the fox scene.
+type Stage = (&'static str, u64);
+
+/// The stages in their order. Those that a scene does not need are passed over.
+const STAGES: [Stage; 12] = [
     ("frames", 15),
     ("poses", 25),
     ("photos", 5),
@@ -22,9 +26,24 @@ const STAGES: [(&str, u64); 12] = [
     ("embeddings", 90),
 ];
 
+/// The same where all is made as the paper has it: objects come before training, which takes most of the time.
+const PAPERS_STAGES: [Stage; 10] = [
+    ("frames", 15),
+    ("poses", 25),
+    ("photos", 5),
+    ("key points for the pose check", 3),
+    ("matches", 4),
+    ("bundle adjustment", 2),
+    ("masks", 60),
+    ("depths", 9),
+    ("embeddings", 300),
+    ("train", 4000),
+];
+
 /// Tells another sink of all stages as one.
 pub struct Whole<'a> {
     sink: &'a dyn Sink,
+    stages: &'static [Stage],
     /// In hundredths of a per cent: stages may come in another order, but the bar goes on.
     reached: AtomicU64,
 }
@@ -33,15 +52,16 @@ pub struct Whole<'a> {
 const PARTS: u64 = 10_000;
 
 impl<'a> Whole<'a> {
-    /// Begins the bar.
-    pub fn new(sink: &'a dyn Sink) -> Self {
+    /// Begins the bar of a scene that is made with some effort.
+    pub fn new(sink: &'a dyn Sink, effort: Preset) -> Self {
         sink.tell(Message::Started { stage: WHOLE, total: PARTS });
-        Self { sink, reached: AtomicU64::new(0) }
+        let stages = if effort == Preset::LikePaper { &PAPERS_STAGES[..] } else { &STAGES };
+        Self { sink, stages, reached: AtomicU64::new(0) }
     }
 
     /// A stage has done `done` of `total`.
     fn reach(&self, stage: &str, done: u64, total: u64, note: &str) {
-        let place = parts_at(stage, done as f64 / total.max(1) as f64);
+        let place = parts_at(self.stages, stage, done as f64 / total.max(1) as f64);
         let place = self.reached.fetch_max(place, Ordering::Relaxed).max(place);
         let note = if note.is_empty() { stage.to_owned() } else { format!("{stage}: {note}") };
         self.sink.tell(Message::Advanced { stage: WHOLE, done: place, total: PARTS, note: &note });
@@ -49,11 +69,11 @@ impl<'a> Whole<'a> {
 }
 
 /// Where the bar stands when a share of a stage is done; nowhere for one that it does not know.
-fn parts_at(stage: &str, share: f64) -> u64 {
-    let Some(place) = STAGES.iter().position(|s| s.0 == stage) else { return 0 };
-    let seconds = |stages: &[(&str, u64)]| stages.iter().map(|s| s.1 as f64).sum::<f64>();
-    let done = seconds(&STAGES[..place]) + share.min(1.0) * STAGES[place].1 as f64;
-    (PARTS as f64 * done / seconds(&STAGES)) as u64
+fn parts_at(stages: &[Stage], stage: &str, share: f64) -> u64 {
+    let Some(place) = stages.iter().position(|s| s.0 == stage) else { return 0 };
+    let seconds = |stages: &[Stage]| stages.iter().map(|s| s.1 as f64).sum::<f64>();
+    let done = seconds(&stages[..place]) + share.min(1.0) * stages[place].1 as f64;
+    (PARTS as f64 * done / seconds(stages)) as u64
 }
 
 impl Sink for Whole<'_> {
@@ -99,7 +119,7 @@ mod tests {
     #[test]
     fn the_bar_goes_on_through_all_stages() {
         let record = Record(Mutex::default());
-        let whole = Whole::new(&record);
+        let whole = Whole::new(&record, Preset::Quick);
         for stage in ["photos", "masks", "a stage that nobody knows", "embeddings"] {
             whole.tell(Message::Started { stage, total: 4 });
             whole.tell(Message::Advanced { stage, done: 2, total: 4, note: "x" });
@@ -110,5 +130,7 @@ mod tests {
         assert_eq!((told[0].1.as_str(), told[1].1.as_str()), ("photos", "photos: x"));
         assert_eq!(told.last().unwrap().0, PARTS);
         assert!(told[0].0 > 0, "poses were there already");
+        let before = |stage: &str| parts_at(&PAPERS_STAGES, stage, 0.0);
+        assert!(before("embeddings") < before("train"), "objects come first there");
     }
 }

@@ -22,9 +22,7 @@ pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Opti
     let feature = |p: usize| Vec3::new(values[p], values[pixels + p], values[2 * pixels + p]);
     let tau_ac = tau_ac.unwrap_or_else(|| codes::spacing(grid.objects.len()) / 4.0);
     let sure = |p: usize| {
-        let feature = feature(p);
-        let nothing = (0, codes::distance(feature, Vec3::ZERO));
-        let nearest = grid.nearest(feature).filter(|found| found.1 < nothing.1).unwrap_or(nothing);
+        let nearest = grid.owner(feature(p));
         if nearest.1 < tau_ac { nearest.0 } else { OPEN }
     };
     let mut labels: Vec<u16> = (0..pixels).into_par_iter().map(sure).collect();

@@ -82,6 +82,12 @@ impl Grid {
         distances.min_by(|a, b| a.1.total_cmp(&b.1))
     }
 
+    /// The same; object 0, which is none, where the origin is nearer: what no mask covers is trained towards it.
+    pub fn owner(&self, feature: Vec3) -> (u16, f32) {
+        let nothing = (0, codes::distance(feature, Vec3::ZERO));
+        self.nearest(feature).filter(|found| found.1 < nothing.1).unwrap_or(nothing)
+    }
+
     /// The objects that contain an object, from small to large, itself first.
     pub fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
         let known = |id: &u16| (1..=self.objects.len()).contains(&usize::from(*id));

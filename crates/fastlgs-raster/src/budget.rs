@@ -74,11 +74,11 @@ pub struct Removal {
     pub psnr_after: Option<f64>,
 }
 
-/// Largest blending weight of each Gaussian over all pixels of all views.
-pub fn largest_weights(scene: &Gaussians, views: &[View]) -> Vec<f32> {
+/// Largest blending weight of each Gaussian over all pixels of all views; those below `least` need not be told.
+pub fn largest_weights(scene: &Gaussians, views: &[View], least: f32) -> Vec<f32> {
     let mut largest = vec![0.0f32; scene.len()];
     for view in views {
-        largest.iter_mut().zip(lift::largest_weights(scene, view)).for_each(|(l, w)| *l = l.max(w));
+        largest.iter_mut().zip(lift::largest_weights(scene, view, least)).for_each(|(l, w)| *l = l.max(w));
     }
     largest
 }
@@ -115,7 +115,7 @@ mod tests {
         }
         scene.push_sphere(Vec3::Z * 0.3, 0.05, 0.99, [0.5; 3]);
         let [camera, other] = [camera, other].map(|c| View::new(&c, scene.len(), 0));
-        assert_eq!(reaching(&largest_weights(&scene, &[camera]), MIN_WEIGHT), [0, 1, 2]);
-        assert_eq!(reaching(&largest_weights(&scene, &[camera, other]), MIN_WEIGHT), [0, 1, 2, 3]);
+        assert_eq!(reaching(&largest_weights(&scene, &[camera], MIN_WEIGHT), MIN_WEIGHT), [0, 1, 2]);
+        assert_eq!(reaching(&largest_weights(&scene, &[camera, other], MIN_WEIGHT), MIN_WEIGHT), [0, 1, 2, 3]);
     }
 }

@@ -1,6 +1,5 @@
 //! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
 
-use crate::cpu;
 use crate::native::blend::{self, Job, Tile};
 use crate::native::{self, Lists};
 use crate::view::{TILE, View};
@@ -73,33 +72,18 @@ fn lists_of(scene: &Gaussians, view: &View) -> Lists {
     Lists::new(view, &native::transposed(&scene.to_channels(), scene.len()))
 }
 
-/// Largest blending weight alpha * transmittance of each Gaussian over all pixels of a view.
-pub fn largest_weights(scene: &Gaussians, view: &View) -> Vec<f32> {
-    let view = View { sh_degree: 0, ..*view };
+/// Largest blending weight alpha * transmittance of each Gaussian over all pixels of a view; those below `least` need not be told.
+pub fn largest_weights(scene: &Gaussians, view: &View, least: f32) -> Vec<f32> {
+    // No weight exceeds the transmittance before it.
+    let view = View { sh_degree: 0, finished: view.finished.max(least), ..*view };
     let lists = lists_of(scene, &view);
-    let of_tile = |tile: u32| {
-        let job = Job::new(&view, tile as usize, &lists);
-        let mut pixels: Vec<_> = cpu::pixels_of(tile, &view).map(|(x, y)| (x, y, cpu::shown(x, y, &view))).collect();
-        let mut out = Vec::new();
-        for gaussian in job.gaussians() {
-            let splat = &lists.splats[gaussian as usize];
-            let (mut largest, mut open) = (0.0f32, false);
-            for (x, y, transmittance) in &mut pixels {
-                let (dx, dy) = (*x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]);
-                let weight = cpu::alpha(splat, dx, dy) * *transmittance;
-                *transmittance -= weight;
-                largest = largest.max(weight);
-                open |= *transmittance >= view.finished;
-            }
-            out.push((gaussian, largest));
-            if !open {
-                break;
-            }
-        }
-        out
+    let of_tile = |peaks: &mut Vec<f32>, tile: usize| {
+        let job = Job::new(&view, tile, &lists);
+        blend::by_peak(&job, &mut blend::shown(&view, &job), peaks);
+        job.gaussians().zip(peaks.iter().copied()).collect::<Vec<_>>()
     };
+    let tiles: Vec<Vec<(u32, f32)>> = (0..view.tile_count() as usize).into_par_iter().map_init(Vec::new, of_tile).collect();
     let mut largest = vec![0.0f32; scene.len()];
-    let tiles: Vec<_> = (0..view.tile_count()).into_par_iter().map(of_tile).collect();
     for (gaussian, weight) in tiles.into_iter().flatten() {
         largest[gaussian as usize] = largest[gaussian as usize].max(weight);
     }

@@ -118,10 +118,13 @@ const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
 const MCMC_UNTIL: f32 = 0.83;
 /// Shares of the iterations after which cameras are aligned: once shapes stand, and so that what is left can follow.
 const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
-/// Weights of the means of opacity and scale in the loss. MCMC's authors have both. In the classic strategy the first stands for opacity
-/// resets, from which runs of a few thousand steps would not recover, and ends with the first removal: what no photo asks for fades, and goes.
+/// Weights of the means of opacity and scale in the loss, as MCMC's authors have them.
 const OPACITY_WEIGHT: f32 = 0.01;
 const SCALE_WEIGHT: f32 = 0.01 / 3.0;
+/// What a mean opacity of 1 costs in the classic strategy, in standard deviations of the photos' brightness: the loss is a difference of brightness, and
+/// a fixed price that suits bright photos takes from dark ones what they show. It stands for opacity resets, from which runs of a few thousand steps
+/// would not recover, and ends with the first removal: what no photo asks for fades, and goes.
+const OPACITY_PRICE: f32 = 0.04;
 /// Noise scale of MCMC against the means' learning rate.
 const NOISE: f32 = 5e5;
 
@@ -216,13 +219,13 @@ impl TrainConfig {
         asked && ALIGN_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
     }
 
-    /// Weights of each of so many Gaussians' opacity and scale in the loss of a step.
-    pub(crate) fn regularisers(&self, iteration: u32, gaussians: usize) -> [f32; 2] {
+    /// Weights of each of so many Gaussians' opacity and scale in the loss of a step. `contrast`: standard deviation of the photos' brightness.
+    pub(crate) fn regularisers(&self, iteration: u32, gaussians: usize, contrast: f32) -> [f32; 2] {
         let each = 1.0 / gaussians as f32;
         match self.strategy {
             _ if !self.channels.color() => [0.0; 2],
             Strategy::Mcmc => [OPACITY_WEIGHT * each, SCALE_WEIGHT * each],
-            Strategy::Classic if iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]) => [OPACITY_WEIGHT * each, 0.0],
+            Strategy::Classic if iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]) => [OPACITY_PRICE * contrast * each, 0.0],
             Strategy::Classic => [0.0; 2],
         }
     }
@@ -255,7 +258,7 @@ mod tests {
         assert!(config.prunes(3600) && config.prunes(5200) && !config.prunes(5201));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
-        assert_eq!([3599, 3600].map(|i| config.regularisers(i, 1)), [[OPACITY_WEIGHT, 0.0], [0.0; 2]]);
+        assert_eq!([3599, 3600].map(|i| config.regularisers(i, 1, 0.5)), [[0.5 * OPACITY_PRICE, 0.0], [0.0; 2]]);
         let continued = TrainConfig { first_degree: 2, ..config.clone() };
         assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };

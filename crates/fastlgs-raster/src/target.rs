@@ -39,6 +39,21 @@ impl Target {
     }
 }
 
+/// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours.
+pub(crate) fn contrast(targets: &[Target]) -> f32 {
+    let deviation = |target: &Target, c: usize| {
+        let counting = target.image.color.iter().map(|p| p.to_le_bytes()).filter(|p| p[3] == 255);
+        let (n, sum, squares) = counting.fold((0u64, 0u64, 0u64), |(n, sum, squares), p| {
+            let value = u64::from(p[c]);
+            (n + 1, sum + value, squares + value * value)
+        });
+        let (n, sum, squares) = (n.max(1) as f64, sum as f64, squares as f64);
+        (squares / n - (sum / n).powi(2)).max(0.0).sqrt() / 255.0
+    };
+    let all = targets.iter().flat_map(|t| (0..3).map(move |c| deviation(t, c)));
+    (all.sum::<f64>() / (3 * targets.len()).max(1) as f64) as f32
+}
+
 fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
     let n = pixels.len() as u32;
     std::array::from_fn(|c| ((pixels.iter().map(|p| u32::from(p[c])).sum::<u32>() + n / 2) / n) as u8)
@@ -54,6 +69,16 @@ fn mode(pixels: &[[u8; 4]]) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn contrast_is_that_of_the_pixels_that_count() {
+        let camera = Camera::look_at("v", glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::Y, 2, 2, 1.0);
+        let color = vec![pack([0, 50, 255], true), pack([102, 50, 0], true), pack([255; 3], false), pack([51, 50, 0], true)];
+        let target = Target { camera, image: TargetImage { size: [2, 2], color, feature: Vec::new() }, gain: [1.0; 3] };
+        // Deviations of 0, 0.2, 0.4 and of 1, 0, 0.
+        let expected = ((0.08f32 / 3.0).sqrt() + (2.0f32 / 9.0).sqrt()) / 3.0;
+        assert!((contrast(&[target]) - expected).abs() < 1e-5);
+    }
 
     #[test]
     fn colours_are_averaged_and_codes_are_not() {

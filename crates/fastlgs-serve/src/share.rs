@@ -121,13 +121,12 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     write(&data.join("splats.bin"), &splats::pack(&desk.scene.gaussians))?;
     write_json(&data.join("objects.json"), &desk.objects()?)?;
     for id in 1..=desk.grid.objects.len() as u16 {
-        let Some(picture) = desk.picture(id)? else { continue };
-        let mut jpeg = Vec::new();
-        picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
-        write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
-        if let Some(view) = desk.best_view(id)? {
-            write_json(&data.join(format!("objects/{id}/view.json")), &json!({ "view": view }))?;
+        if let Some(picture) = desk.picture(id)? {
+            let mut jpeg = Vec::new();
+            picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
+            write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
         }
+        write_json(&data.join(format!("objects/{id}/view.json")), &json!({ "view": desk.best_view(id)? }))?;
     }
     for (name, content) in page::files() {
         write(&root.join(name), content.as_bytes())?;

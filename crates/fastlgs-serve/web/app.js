@@ -89,7 +89,8 @@ async function elsewhere(answer) {
 
 const bestView = async (id) => (await getJson(`/api/objects/${id}/view`)).view;
 
-const lookFrom = (name) => stage.lookFrom(scene.views.findIndex((view) => view.name === name));
+// Nowhere, where no view shows it.
+const lookFrom = (name) => name && stage.lookFrom(scene.views.findIndex((view) => view.name === name));
 
 const find = guarded(async (text) => {
   if (!text.trim()) return clear();

@@ -47,7 +47,8 @@ function near(text, list) {
 export async function postJson(path, { text }) {
   const began = performance.now();
   const { list, rows } = await (table ??= words());
-  const plain = text.trim().toLowerCase().replace(/\s+/g, " ").replace(/^(a|an|the) /, "");
+  const said = text.trim().toLowerCase().replace(/\s+/g, " ");
+  const plain = list.has(said) ? said : said.replace(/^(a|an|the) /, "");
   const place = list.get(plain);
   if (place === undefined) {
     const known = `${list.size.toLocaleString("en")} words`;

@@ -54,9 +54,6 @@ pub struct Report {
     pub train: train::Report,
 }
 
-/// Note of the manifest: what a scene was made with.
-const NOTE: &str = "made";
-
 /// Makes the scene `config.preprocess.output`. A run that was broken off goes on where it was.
 ///
 /// # Errors
@@ -88,8 +85,9 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, how, files(&photos)?]));
     let folder = SceneFolder::new(&preprocess.output);
     let now = with()?;
-    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(NOTE) == Some(&now));
-    if let Some(report) = known.as_ref().and_then(train::Report::of) {
+    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&now));
+    let whole = [folder.ply_path(), folder.root.join("grid.json")].iter().all(|file| file.is_file());
+    if let Some(report) = known.as_ref().filter(|_| whole).and_then(train::Report::of) {
         return Ok((State::Kept, report));
     }
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
@@ -100,12 +98,15 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         crate::preprocess(preprocess, runs[0])?;
         let mut manifest: Manifest = folder.manifest()?;
         // Poses that were found now lie beside the photos.
-        manifest.notes.insert(NOTE.to_owned(), with()?);
+        manifest.notes.insert(train::MADE.to_owned(), with()?);
         folder.save_manifest(&manifest)?;
     }
     // Minutes are those of all stages.
     let minutes = train.minutes.map(|minutes| minutes - started.elapsed().as_secs_f64() / 60.0);
     let report = crate::train(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, runs[1])?;
+    let mut manifest = folder.manifest()?;
+    manifest.notes.insert(train::MADE.to_owned(), with()?);
+    folder.save_manifest(&manifest)?;
     Ok((State::Made, report))
 }
 

@@ -9,7 +9,7 @@ use fastlgs::Run;
 use fastlgs::make::{self, Config, State};
 
 pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
-    let whole = Whole::new(run.progress);
+    let whole = Whole::new(run.progress, config.effort);
     let made = fastlgs::make(config, &Run { progress: &whole, ..*run });
     // The bar goes before the report, or the error, comes.
     drop(whole);
@@ -27,8 +27,7 @@ fn words(made: &make::Report, scene: &str) -> String {
         State::Kept => "was there already, made from the same photos with the same options".to_owned(),
     };
     let [training, held_out] = made.photos;
-    let colour =
-        train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} photos that were kept aside")).unwrap_or_default();
+    let colour = train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} that were kept aside")).unwrap_or_default();
     // A name that a shell would take apart is quoted.
     let plain = scene.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c));
     let scene = if plain { scene.to_owned() } else { format!("'{}'", scene.replace('\'', "'\\''")) };
@@ -48,7 +47,7 @@ mod tests {
         let train = fastlgs::train::Report { gaussians: 12, objects: 3, psnr_held_out: Some(31.26), ..Default::default() };
         let made = make::Report { state: State::Kept, photos: [7, 1], train };
         let said = words(&made, "my photos/fox");
-        assert!(said.contains("7 photos, 12 Gaussians, 3 objects and parts; colour 31.3 dB on 1 photos"), "{said}");
+        assert!(said.contains("7 photos, 12 Gaussians, 3 objects and parts; colour 31.3 dB on 1 that"), "{said}");
         assert!(said.ends_with("fastlgs serve 'my photos/fox'"), "{said}");
     }
 }

@@ -95,7 +95,7 @@ fn told(report: &Report) -> String {
         let place = object.bbox2d.map_or_else(|| "not in this view".to_owned(), |[x0, y0, x1, y1]| format!("at {x0},{y0} to {x1},{y1}"));
         format!("  #{}: {} pixels {place}, confidence {:.2}", object.id, thousands(object.pixels), object.score)
     };
-    let sure = if report.calibrated { "" } else { " (of an encoder that was not calibrated)" };
+    let sure = if report.calibrated { "" } else { " (not calibrated: run fastlgs models calibrate)" };
     let taught = if report.taught { ", taught" } else { "" };
     if !report.found {
         return format!("{text}: not found; the nearest object has a confidence of {score:.2}{sure}{taught}");

@@ -238,6 +238,31 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
     }
 }
 
+dispatched! {
+    /// Largest blending weight of each Gaussian of a tile over its pixels: `[Gaussian of the list]`, as far as the list is walked.
+    fn by_peak(job: &Job<'_>, transmittance: &mut Tile, peaks: &mut Vec<f32>) = by_peak_body
+}
+
+#[inline(always)]
+fn by_peak_body<V: Vector>(job: &Job<'_>, transmittance: &mut Tile, peaks: &mut Vec<f32>) {
+    peaks.clear();
+    for batch in job.list.chunks(BATCH) {
+        for &place in batch {
+            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
+            let mut largest = V::splat(0.0);
+            for p in placed.pixels.clone() {
+                largest = largest.max(taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]));
+            }
+            let mut lanes = EMPTY;
+            largest.store(&mut lanes);
+            peaks.push(lanes[..V::LANES].iter().copied().fold(0.0, f32::max));
+        }
+        if finished(job, transmittance) {
+            break;
+        }
+    }
+}
+
 /// What the backward pass starts from.
 pub struct Given {
     /// dL/d(colour, feature).
@@ -317,15 +342,17 @@ mod tests {
             let mut given = Given { gradient: blended.sums, r_dot_g: blended.transmittance, transmittance: shown, walked: blended.walked };
             let mut slots = vec![[0.0; SUMS]; job.band.gaussians.len()];
             backward_body::<V, true, true, true>(&job, &mut given, &mut slots);
-            let (mut shares, mut inside) = (Vec::new(), Vec::new());
+            let (mut shares, mut inside, mut peaks) = (Vec::new(), Vec::new(), Vec::new());
             by_id_body::<V>(&job, ids, &mut shown.clone(), &mut shares);
             by_mask_body::<V>(&job, masks, &mut shown.clone(), &mut inside);
+            by_peak_body::<V>(&job, &mut shown.clone(), &mut peaks);
             out.extend(blended.sums.concat());
             out.extend(blended.transmittance);
             out.extend(slots.concat());
             shares.sort_by_key(|share| share.0);
             out.extend(shares.iter().flat_map(|share| share.1));
             out.extend(inside);
+            out.extend(peaks);
         }
         out
     }

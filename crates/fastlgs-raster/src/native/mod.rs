@@ -270,7 +270,6 @@ impl Engine for CpuEngine {
 
     fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
         let mut target = target.clone();
-        target.feature.resize(target.color.len(), 0);
         target.color.append(&mut target.feature);
         self.targets.insert(id, target);
         self.cached.remove(&id);
@@ -308,6 +307,11 @@ impl Engine for CpuEngine {
         let channels = options.channels;
         if self.targets.get(&id).is_none_or(|t| t.size != view.size) {
             return Err(Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])));
+        }
+        if channels.feature() {
+            // Pixels without feature do not count.
+            let target = self.targets.get_mut(&id).expect("looked at above");
+            target.color.resize(2 * view.pixels(), 0);
         }
         let frozen = (channels == Channels::Feature).then_some(id);
         self.forward(&view, channels, frozen)?;

@@ -31,7 +31,7 @@ impl Trainer {
             }
             let mut moved = watched.clone();
             for target in &mut moved {
-                target.camera = self.aligned(&target.clone(), &Exposure::default())?;
+                target.camera = self.aligned(&target.clone(), &self.known_exposure(target))?;
             }
             let gain = self.quality(&moved, None)?.zip(self.quality(&watched, None)?).map_or(0.0, |(after, before)| after - before);
             tracing::info!(gain, "watched views gained by aligning their poses");

@@ -10,7 +10,7 @@ use crate::density::{self, State};
 use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::schedule::{Budget, Strategy, TrainConfig};
-use crate::target::Target;
+use crate::target::{self, Target};
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use fastlgs_core::camera::scene_extent;
@@ -65,6 +65,8 @@ pub struct Trainer {
     engine: Box<dyn Engine>,
     targets: Vec<Target>,
     extent: f32,
+    /// Standard deviation of the photos' brightness.
+    contrast: f32,
     course: Course,
     /// Whether the engine holds the targets at half the resolution.
     coarse: Option<bool>,
@@ -112,7 +114,8 @@ impl Trainer {
             alignment_gain: None,
             config,
         };
-        Ok(Self { engine, extent: scene_extent(&cameras), targets, course, coarse: None })
+        let contrast = target::contrast(&targets);
+        Ok(Self { engine, extent: scene_extent(&cameras), contrast, targets, course, coarse: None })
     }
 
     /// Uploads the targets at the resolution of the coming step.
@@ -168,7 +171,7 @@ impl Trainer {
             Channels::Color | Channels::Both | Channels::Coupled => 0..channels(degree),
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
-        [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len());
+        [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);
         self.engine.step(self.view(&camera, degree).trained(), id, &options, &step)?;
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
@@ -232,6 +235,11 @@ impl Trainer {
         self.course.exposures.get(id).map_or_else(Exposure::default, LearnedExposure::exposure)
     }
 
+    /// The exposure of a view that was not trained on, as far as it is known: else photos of other brightness would hide what a scene gains.
+    fn known_exposure(&self, target: &Target) -> Exposure {
+        if self.course.config.exposure { Exposure { gain: target.gain, ..Exposure::default() } } else { Exposure::default() }
+    }
+
     /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
     /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views.
     ///
@@ -240,12 +248,13 @@ impl Trainer {
     pub fn quality(&mut self, views: &[Target], sh_degree: Option<u32>) -> Result<Option<f64>> {
         let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
-        for Target { camera, image, .. } in views {
-            let frame = self.engine.render(self.view(camera, degree), Channels::Color)?;
+        for target in views {
+            let (image, gain) = (&target.image, self.known_exposure(target).gain);
+            let frame = self.engine.render(self.view(&target.camera, degree), Channels::Color)?;
             let (mut rendered, mut wanted) = (Vec::new(), Vec::new());
             for c in 0..3 {
                 for (value, packed) in frame.channels(c, c + 1).iter().zip(&image.color).filter(|(_, p)| p.to_le_bytes()[3] == 255) {
-                    rendered.push(value.clamp(0.0, 1.0));
+                    rendered.push((gain[c] * value).clamp(0.0, 1.0));
                     wanted.push(f32::from(packed.to_le_bytes()[c]) / 255.0);
                 }
             }

@@ -48,7 +48,7 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let views: Vec<View> = self.targets.iter().map(|t| view_of(&self.course, scene.len(), &t.camera, 0)).collect();
-        let largest = budget::largest_weights(&scene, &views);
+        let largest = budget::largest_weights(&scene, &views, budget::MIN_WEIGHT);
         let judges = self.judges();
         let psnr_before = self.quality(&judges, None)?;
         state.keep(&budget::reaching(&largest, budget::MIN_WEIGHT));

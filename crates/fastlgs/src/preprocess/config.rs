@@ -37,7 +37,7 @@ pub enum Poses {
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
-    /// Folder with images/ and poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses COLMAP finds them. Or a video.
+    /// Folder with images/ and poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses pycolmap finds them. Or a video.
     pub photos: PathBuf,
     /// Scene folder to write.
     #[cfg_attr(feature = "clap", arg(short, long))]

@@ -21,6 +21,7 @@ use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::{Encoder, TextEncoder};
 use std::cell::OnceCell;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 pub use texts::Texts;
 pub use views::{ViewChoice, parse_point, parse_size};
@@ -46,6 +47,8 @@ pub struct Session {
     texts: OnceCell<Texts>,
     /// Whether names that the user taught are known.
     taught: bool,
+    /// The views that show objects best, as far as they were asked for.
+    seen_best: BTreeMap<Vec<u16>, Option<String>>,
 }
 
 impl Session {
@@ -75,6 +78,7 @@ impl Session {
             calibrations: None,
             texts: OnceCell::new(),
             taught: true,
+            seen_best: BTreeMap::new(),
         })
     }
 
@@ -82,6 +86,7 @@ impl Session {
     pub fn show(&mut self, gaussians: Gaussians) -> Result<()> {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
+        self.seen_best.clear();
         Ok(())
     }
 
@@ -135,6 +140,9 @@ impl Session {
     pub fn seen_best(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
         /// Longer side of the small pictures that are looked at.
         const SIDE: u32 = 128;
+        if let Some(known) = self.seen_best.get(ids) {
+            return Ok(known.clone());
+        }
         let targets: Vec<Hit> = ids.iter().map(|id| Hit { id: *id, score: 1.0 }).collect();
         let mut best = (0, None);
         for camera in self.cameras.clone() {
@@ -146,6 +154,7 @@ impl Session {
                 best = (pixels, Some(camera.name));
             }
         }
+        self.seen_best.insert(ids.to_vec(), best.1.clone());
         Ok(best.1)
     }
 

@@ -17,6 +17,9 @@ pub(crate) use start::target;
 use std::path::PathBuf;
 use std::time::Instant;
 
+/// Note of the manifest: with what `make` made the scene.
+pub(crate) const MADE: &str = "made";
+
 /// Difference of two photos in stops from which exposures are learned.
 const VARYING: f32 = 0.15;
 
@@ -165,6 +168,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         device,
     };
     manifest.seconds.insert("train".to_owned(), result.seconds);
+    // It is no more what `make` once made; where that called, it says so again.
+    manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
     folder.save_manifest(&manifest)?;
     // Checkpoints serve a broken run only.
@@ -218,9 +223,10 @@ fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread
     }
 }
 
-/// Gives every Gaussian the object whose code is nearest to its trained feature.
+/// Gives every Gaussian the object whose code is nearest to its trained feature; none where the origin is nearer, towards which what no mask
+/// covers was trained.
 fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
     for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
-        *id = grid.nearest(*feature).map_or(0, |(id, _)| id);
+        *id = grid.owner(*feature).0;
     }
 }

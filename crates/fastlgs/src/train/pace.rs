@@ -8,6 +8,7 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};
 use fastlgs_raster::{Target, Trainer};
 use serde_json::json;
+use std::time::Instant;
 
 /// Iterations of the trial, which is a whole run in small: half resolution, growth, removal and all.
 const TRIAL: u32 = 100;
@@ -34,14 +35,16 @@ pub fn fitted(
     let iterations = match decided.filter(|_| config.resume) {
         Some(iterations) => iterations,
         None => {
+            let started = Instant::now();
             let mapping = objects::seconds_of_embedding(folder, training)?;
             let step = GROWTH * trial(config, folder, manifest, targets, run)?;
-            let fit = (60.0 * minutes - mapping) / step;
+            // What the trial took is gone as well.
+            let fit = (60.0 * minutes - started.elapsed().as_secs_f64() - mapping) / step;
             tracing::info!(minutes, mapping, milliseconds_a_step = 1e3 * step, fit, "what fits");
             if fit < f64::from(FEWEST) {
+                let (left, needed) = (minutes.max(0.0), (mapping + step * f64::from(FEWEST)) / 60.0);
                 run.warn(&format!(
-                    "{minutes:.1} minutes are left for training, which are too few for these photos on this machine; it takes about {:.1} with {FEWEST} iterations",
-                    (mapping + step * f64::from(FEWEST)) / 60.0
+                    "{left:.1} minutes are left for training, too few for these photos on this machine: {FEWEST} iterations take about {needed:.1}"
                 ));
             }
             rounded(fit)

@@ -43,8 +43,8 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &[Target], run: &
     Ok(first)
 }
 
-/// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count, nor do
-/// unlabelled ones in the feature loss; transparent ones show the background.
+/// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count;
+/// transparent ones show the background.
 pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, background: &Background) -> Result<Target> {
     let photo = folder.photo(&camera.name)?;
     if (photo.width(), photo.height()) != (camera.width, camera.height) {
@@ -55,22 +55,28 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, backg
     if alpha.is_some() && background.learn {
         bail!("--background learn: the photo of '{}' is transparent, so that its background must be given", camera.name);
     }
+    let counts = |x: u32, y: u32| ignore.as_ref().is_none_or(|m| m.get_pixel(x, y)[0] >= 128);
     let color = photo.enumerate_pixels().map(|(x, y, p)| {
         let covered = alpha.as_ref().map_or(255, |a| a.get_pixel(x, y)[0]);
         let over = |c: usize| {
             let share = f32::from(covered) / 255.0;
             (f32::from(p[c]) * share + 255.0 * background.color[c] * (1.0 - share) + 0.5) as u8
         };
-        pack([over(0), over(1), over(2)], ignore.as_ref().is_none_or(|m| m.get_pixel(x, y)[0] >= 128))
+        pack([over(0), over(1), over(2)], counts(x, y))
     });
     let color = color.collect();
-    let code = |grid: &Grid, id: u16| match grid.objects.get(usize::from(id).wrapping_sub(1)) {
-        Some(object) => pack(object.code.to_array().map(|v| (v * 255.0).round() as u8), true),
-        None => pack([0; 3], true),
+    // What no mask covers is trained towards nothing.
+    let code = |grid: &Grid, id: u16| {
+        let object = grid.objects.get(usize::from(id).wrapping_sub(1));
+        object.map_or([0; 3], |object| object.code.to_array().map(|v| (v * 255.0).round() as u8))
     };
     let feature = match codes {
         None => Vec::new(),
-        Some(grid) => folder.objects(&camera.name)?.labels.iter().map(|id| code(grid, *id)).collect(),
+        Some(grid) => {
+            let map = folder.objects(&camera.name)?;
+            let pixels = (0..map.height).flat_map(|y| (0..map.width).map(move |x| (x, y)));
+            pixels.map(|(x, y)| pack(code(grid, map.at(x, y)), counts(x, y))).collect()
+        }
     };
     Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature }, gain: [1.0; 3] })
 }

@@ -85,9 +85,10 @@ impl Asker<'_> {
         let Some(text) = last else { bail!("nothing was asked yet") };
         let named = self.output.get_or_insert_with(|| PathBuf::from("answers")).clone();
         self.shown = None;
-        let report = self.answer(&Ask::Text(text.to_owned()), 0)?;
-        let sheet = self.sheet()?.unwrap_or(named);
+        let saved = self.answer(&Ask::Text(text.to_owned()), 0).and_then(|report| Ok((report, self.sheet()?.unwrap_or(named))));
+        // Also where it failed: further answers are written only if they were asked to be.
         self.output.clone_from(&self.args.output);
+        let (report, sheet) = saved?;
         Ok(format!("{}\nall of it on one sheet: {}", told(&report), sheet.display()))
     }
 }
