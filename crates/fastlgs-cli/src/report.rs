@@ -1,7 +1,7 @@
 //! Reports: a table for people, JSON for programs.
 
 use crate::outcome::Outcome;
-use crate::ui::Common;
+use crate::ui::{self, Common, say};
 use anyhow::{Context, Result};
 use serde::Serialize;
 use serde_json::Value;
@@ -13,7 +13,7 @@ pub fn tell<R: Serialize>(common: &Common, report: &R, words: impl FnOnce(&R) ->
         return give(common, report);
     }
     if !common.quiet {
-        println!("{}", words(report));
+        say!("{}", words(report));
     }
     Ok(Outcome::Done)
 }
@@ -22,7 +22,7 @@ pub fn tell<R: Serialize>(common: &Common, report: &R, words: impl FnOnce(&R) ->
 pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
     let value = &serde_json::to_value(report)?;
     match common.json.as_deref() {
-        Some(path) if path == Path::new("-") => println!("{}", serde_json::to_string_pretty(value)?),
+        Some(path) if path == Path::new("-") => ui::line(format_args!("{}", serde_json::to_string_pretty(value)?))?,
         Some(path) => fastlgs_core::fs::write_json(path, value).context("writing the report")?,
         None if common.quiet => {}
         None => print_table(value, 0),
@@ -31,17 +31,17 @@ pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
 }
 
 fn print_table(value: &Value, indent: usize) {
-    let Value::Object(map) = value else { return println!("{value}") };
+    let Value::Object(map) = value else { return say!("{value}") };
     let width = map.keys().map(String::len).max().unwrap_or(0);
     for (name, value) in map {
         match value {
             Value::Object(_) => {
-                println!("{:indent$}{name}", "");
+                say!("{:indent$}{name}", "");
                 print_table(value, indent + 2);
             }
-            Value::String(text) => println!("{:indent$}{name:width$}  {text}", ""),
-            Value::Number(n) if n.is_f64() => println!("{:indent$}{name:width$}  {:.4}", "", n.as_f64().unwrap_or(f64::NAN)),
-            other => println!("{:indent$}{name:width$}  {other}", ""),
+            Value::String(text) => say!("{:indent$}{name:width$}  {text}", ""),
+            Value::Number(n) if n.is_f64() => say!("{:indent$}{name:width$}  {:.4}", "", n.as_f64().unwrap_or(f64::NAN)),
+            other => say!("{:indent$}{name:width$}  {other}", ""),
         }
     }
 }

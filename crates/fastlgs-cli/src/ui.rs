@@ -52,3 +52,23 @@ pub fn start_logging(common: &Common) {
         .with_ansi(std::io::stderr().is_terminal())
         .init();
 }
+
+/// Writes a line to standard output. Where nobody listens any more, as behind `head`, it is lost without a word.
+///
+/// # Errors
+/// The system's refusal, as on a full disk.
+pub fn line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
+    use std::io::Write;
+    match writeln!(std::io::stdout(), "{words}") {
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        other => other,
+    }
+}
+
+/// Says something on standard output; what cannot be written is lost.
+macro_rules! say {
+    ($($words:tt)*) => {
+        drop($crate::ui::line(format_args!($($words)*)))
+    };
+}
+pub(crate) use say;

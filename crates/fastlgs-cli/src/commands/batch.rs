@@ -1,6 +1,7 @@
 //! `fastlgs batch`: several folders of photos to trained scenes, in one call.
 
 use crate::outcome::Outcome;
+use crate::ui::say;
 use crate::{report, ui};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Parser;
@@ -59,7 +60,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             }
         }
         if common.json.is_none() && !common.quiet {
-            println!("{}", line(&row));
+            say!("{}", line(&row));
         }
         rows.push(row);
         work.advance()?;

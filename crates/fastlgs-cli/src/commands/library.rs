@@ -1,6 +1,7 @@
 //! `fastlgs query --library`: which scenes of a folder hold what a text names.
 
 use crate::outcome::Outcome;
+use crate::ui::say;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::Run;
@@ -42,8 +43,8 @@ pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, r
 
 fn print(answer: &Report) {
     let found = answer.scenes.iter().filter(|row| row.found);
-    println!("\"{}\": in {} of {} scenes ({:.1} ms)", answer.text, found.clone().count(), answer.searched.scenes, answer.ms.search);
+    say!("\"{}\": in {} of {} scenes ({:.1} ms)", answer.text, found.clone().count(), answer.searched.scenes, answer.ms.search);
     for row in found {
-        println!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
+        say!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
     }
 }

@@ -1,6 +1,7 @@
 //! `fastlgs names`: what the user has taught.
 
 use crate::outcome::Outcome;
+use crate::ui::say;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::names::Names;
@@ -41,9 +42,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         Action::List if common.json.is_none() => {
             if !common.quiet {
                 let rows = names.rows();
-                rows.iter().for_each(|row| println!("{}: {} views, from {}", row.name, row.views, row.from.join("; ")));
+                rows.iter().for_each(|row| say!("{}: {} views, from {}", row.name, row.views, row.from.join("; ")));
                 if rows.is_empty() {
-                    println!("nothing was taught yet; 'fastlgs teach --help' says how");
+                    say!("nothing was taught yet; 'fastlgs teach --help' says how");
                 }
             }
             Ok(Outcome::Done)

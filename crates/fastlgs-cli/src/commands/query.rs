@@ -4,6 +4,7 @@ mod dialogue;
 
 use super::library;
 use crate::outcome::Outcome;
+use crate::ui::say;
 use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::{Result, bail};
@@ -213,8 +214,8 @@ impl Asker<'_> {
         } else if common.json.is_some() {
             report::give(common, &answers)?;
         } else if !common.quiet {
-            answers.iter().for_each(|answer| println!("{}", told(answer)));
-            sheet.iter().for_each(|path| println!("all of it on one sheet: {}", path.display()));
+            answers.iter().for_each(|answer| say!("{}", told(answer)));
+            sheet.iter().for_each(|path| say!("all of it on one sheet: {}", path.display()));
         }
         if !found && !common.quiet {
             let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();

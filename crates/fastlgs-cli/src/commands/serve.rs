@@ -2,6 +2,7 @@
 
 use super::bind::{DEFAULT_BIND, parse_bind};
 use crate::outcome::Outcome;
+use crate::ui::say;
 use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs_core::SceneFolder;
@@ -45,7 +46,7 @@ fn announce(server: &Server, common: &ui::Common) -> Result<()> {
     if common.json.is_some() {
         report::give(common, &serde_json::json!({ "url": server.url }))?;
     } else {
-        println!("open {} in a browser", server.url);
+        say!("open {} in a browser", server.url);
     }
     Ok(std::io::stdout().flush()?)
 }

@@ -1,5 +1,6 @@
 //! The kinds of generated scenes: each shows one thing that methods fail at.
 
+use super::furniture;
 use super::hierarchy::Hierarchy;
 use super::props::{self, Look, Make, Piece};
 use super::solid::{Shape, Solid};
@@ -24,6 +25,7 @@ pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
 #[allow(missing_docs)]
 pub enum Kind {
     Room,
+    Study,
     Table,
     Twins,
     Nested,
@@ -38,8 +40,9 @@ pub enum Kind {
 }
 
 /// Every kind with its name and what it shows.
-pub const KINDS: [(&str, Kind, &str); 12] = [
+pub const KINDS: [(&str, Kind, &str); 13] = [
     ("room", Kind::Room, "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room"),
+    ("study", Kind::Study, "a furnished room: a table with small things on it, a bookcase, a television and more around it"),
     ("table", Kind::Table, "a dozen different things on a table"),
     ("twins", Kind::Twins, "three pairs of the same thing, side by side"),
     ("nested", Kind::Nested, "things with parts with parts"),
@@ -99,6 +102,11 @@ impl Kind {
         let mut exposures = vec![Vec3::ONE; views];
         match self {
             Self::Room => return room(pictures, views, size, seed),
+            Self::Study => {
+                build.study();
+                let ring = Ring { radius: 3.3, height: 1.6, wave: 0.3, target: Vec3::Y * 0.65, fov: 0.8 };
+                cameras = ring.cameras(views, size);
+            }
             Self::Table | Self::Sparse => build.dozen(),
             Self::Dark => {
                 build.dozen();
@@ -187,6 +195,8 @@ impl Builder {
             let own = Mat3::from_rotation_z(piece.tilt[0]) * Mat3::from_rotation_x(piece.tilt[1]);
             let surface = match (piece.look, material) {
                 (Look::Fixed(color), _) => Surface::plain(color),
+                (Look::Painted(color), _) => Surface::Grain { colors: [color * 0.93, (color * 1.03).min(Vec3::ONE)], grain: 2.0 },
+                (Look::Football, _) => Surface::Football,
                 (Look::Own(factor), Material::Grain(color)) => Surface::grained(color * factor, 2.2),
                 (Look::Own(_), Material::Mirror) => Surface::Mirror(Vec3::splat(0.92)),
                 (Look::Own(_), Material::Glass) => Surface::Glass(Vec3::new(0.9, 0.97, 0.95)),
@@ -236,6 +246,29 @@ impl Builder {
             let (color_name, color) = colors[entry];
             let place = if k < 4 { self.on_table(0.42, k as f32 / 4.0, 0.42) } else { self.on_table(1.02, k as f32 / 8.0, 0.42) };
             self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+        }
+    }
+
+    /// A round table with small things on it, and larger ones around it.
+    fn study(&mut self) {
+        let [red, orange] = [Vec3::new(0.75, 0.1, 0.1), Vec3::new(0.95, 0.5, 0.08)];
+        let top = 0.738;
+        let things: [(&str, Make, Vec3, [f32; 3], f32); 12] = [
+            ("dining table", furniture::dining_table, Vec3::new(0.42, 0.27, 0.15), [0.0, 0.0, 0.0], 0.0),
+            ("table lamp", furniture::table_lamp, Vec3::ONE, [0.0, top, 0.0], 0.0),
+            ("orange", furniture::orange, orange, [0.36, top, 0.12], 0.4),
+            ("coffee mug", furniture::coffee_mug, red, [-0.1, top, 0.38], 0.6),
+            ("candle", furniture::candle, Vec3::ONE, [-0.32, top, -0.2], 0.0),
+            ("bookcase", furniture::bookcase, Vec3::ONE, [0.0, 0.0, -1.5], 0.0),
+            ("television", furniture::television, Vec3::ONE, [1.45, 0.0, -0.45], -FRAC_PI_2 + 0.3),
+            ("washing machine", furniture::washing_machine, Vec3::ONE, [-1.4, 0.0, -0.45], FRAC_PI_2 - 0.3),
+            ("umbrella", furniture::umbrella, red, [-1.05, 0.0, 1.05], 0.0),
+            ("dumbbell", furniture::dumbbell, Vec3::ONE, [-0.4, 0.0, 1.45], 0.5),
+            ("soccer ball", furniture::soccer_ball, Vec3::ONE, [0.25, 0.0, 1.35], 0.3),
+            ("traffic light", furniture::traffic_light, Vec3::ONE, [1.15, 0.0, 1.1], 0.8),
+        ];
+        for (name, make, color, at, yaw) in things {
+            self.add(name, make(), Material::Grain(color), &Place { at: at.into(), scale: 1.0, yaw }, false);
         }
     }
 

@@ -2,6 +2,7 @@
 //!
 //! World axes: x and z along the floor y = 0, y up; units are about metres.
 
+mod furniture;
 mod hierarchy;
 mod kinds;
 mod props;

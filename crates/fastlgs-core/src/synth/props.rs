@@ -22,6 +22,10 @@ pub enum Look {
     Own(f32),
     /// A colour of its own.
     Fixed(Vec3),
+    /// The same, and hardly any grain.
+    Painted(Vec3),
+    /// The black pentagons and white hexagons of a football.
+    Football,
 }
 
 /// How a thing is made.
@@ -43,12 +47,12 @@ pub const CATALOGUE: [(&str, Make); 12] = [
     ("hat", hat),
 ];
 
-fn piece(shape: Shape, centre: [f32; 3], half: [f32; 3], look: Look) -> Piece {
+pub fn piece(shape: Shape, centre: [f32; 3], half: [f32; 3], look: Look) -> Piece {
     Piece { part: Vec::new(), shape, centre: centre.into(), half: half.into(), tilt: [0.0; 2], look }
 }
 
 impl Piece {
-    fn tilted(self, around_z: f32, around_x: f32) -> Self {
+    pub fn tilted(self, around_z: f32, around_x: f32) -> Self {
         Self { tilt: [around_z, around_x], ..self }
     }
 
@@ -57,12 +61,12 @@ impl Piece {
     }
 }
 
-const OWN: Look = Look::Own(1.0);
-const DARKER: Look = Look::Own(0.55);
-const BRASS: Look = Look::Fixed(Vec3::new(0.75, 0.6, 0.25));
-const WOOD: Look = Look::Fixed(Vec3::new(0.5, 0.33, 0.18));
+pub const OWN: Look = Look::Own(1.0);
+pub const DARKER: Look = Look::Own(0.55);
+pub const BRASS: Look = Look::Fixed(Vec3::new(0.75, 0.6, 0.25));
+pub const WOOD: Look = Look::Fixed(Vec3::new(0.5, 0.33, 0.18));
 const LEAF: Look = Look::Fixed(Vec3::new(0.2, 0.55, 0.2));
-const CREAM: Look = Look::Fixed(Vec3::new(0.95, 0.9, 0.8));
+pub const CREAM: Look = Look::Fixed(Vec3::new(0.95, 0.9, 0.8));
 
 pub fn mug() -> Vec<Piece> {
     vec![

@@ -9,6 +9,8 @@ use std::sync::Arc;
 pub enum Surface {
     /// Two colours (0..1) mixed by noise of `grain` bumps along the shape's half extent, so that there is something to match.
     Grain { colors: [Vec3; 2], grain: f32 },
+    /// A football: around each corner of an icosahedron a black pentagon, and seams between white hexagons.
+    Football,
     /// A picture on each side of a block.
     Picture(Arc<RgbImage>),
     /// A picture that repeats over the world's planes, with its tint and the times it repeats in a unit.
@@ -37,6 +39,7 @@ impl Surface {
                 let noise = noise(local * *grain) * 0.6 + noise(local * *grain * 2.7 + 7.0) * 0.4;
                 colors[0].lerp(colors[1], noise)
             }
+            Self::Football => football(local.normalize_or_zero()),
             Self::Picture(picture) => {
                 let p = local;
                 // The face is the axis along which the point lies farthest out.
@@ -59,6 +62,26 @@ impl Surface {
             }
             Self::Mirror(tint) | Self::Glass(tint) => *tint,
         }
+    }
+}
+
+/// Colour of a football in a direction from its middle.
+fn football(direction: Vec3) -> Vec3 {
+    let golden = 0.5 * (1.0 + 5f32.sqrt());
+    let signs = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)];
+    let around =
+        |a: f32, b: f32| signs.map(|(s, t)| [Vec3::new(0.0, s * a, t * b), Vec3::new(s * a, t * b, 0.0), Vec3::new(t * b, 0.0, s * a)]);
+    // Middles of the pentagons, and of the hexagons between three of them.
+    let pentagons = around(1.0, golden);
+    let hexagons = around(1.0 / golden, golden);
+    let cubes = signs.map(|(s, t)| [Vec3::new(s, t, -1.0), Vec3::new(s, t, 1.0), Vec3::ZERO]);
+    let mut near: Vec<f32> = [hexagons, cubes].concat().as_flattened().iter().map(|h| h.normalize_or_zero().dot(direction)).collect();
+    near.sort_by(|a, b| b.total_cmp(a));
+    let pentagon = pentagons.as_flattened().iter().map(|p| p.normalize().dot(direction)).fold(-1.0, f32::max);
+    match (pentagon, near[0] - near[1]) {
+        (pentagon, _) if pentagon > 0.94 => Vec3::splat(0.06),
+        (_, seam) if seam < 0.012 => Vec3::splat(0.35),
+        _ => Vec3::splat(0.94),
     }
 }
 

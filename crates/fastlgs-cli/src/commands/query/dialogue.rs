@@ -2,6 +2,7 @@
 
 use super::{Asker, told};
 use crate::outcome::Outcome;
+use crate::ui::say;
 use anyhow::{Result, bail};
 use fastlgs::session::ask::Ask;
 use std::io::Write;
@@ -41,7 +42,7 @@ const HELP: &str = "a text asks for it; view NAME looks from there; views lists 
 impl Asker<'_> {
     /// Questions and answers on a terminal.
     pub(super) fn converse(&mut self) -> Result<Outcome> {
-        println!("{HELP}");
+        say!("{HELP}");
         let mut last = None;
         loop {
             // Only what is saved makes a sheet.
@@ -50,7 +51,7 @@ impl Asker<'_> {
             std::io::stdout().flush()?;
             let mut line = String::new();
             if std::io::stdin().read_line(&mut line)? == 0 {
-                println!();
+                say!("");
                 return Ok(Outcome::Done);
             }
             let said = match Said::of(&line) {
@@ -67,8 +68,8 @@ impl Asker<'_> {
             };
             match said {
                 Ok(words) if words.is_empty() => {}
-                Ok(words) => println!("{words}"),
-                Err(error) => println!("{error:#}"),
+                Ok(words) => say!("{words}"),
+                Err(error) => say!("{error:#}"),
             }
         }
     }

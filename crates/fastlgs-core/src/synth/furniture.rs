@@ -1,0 +1,178 @@
+//! Things of a furnished room, each in metres, standing on y = 0 with its front towards +z: what classifiers of photographs know.
+
+use super::props::{BRASS, DARKER, Look, OWN, Piece, WOOD, piece};
+use super::solid::Shape::{Ball, Block, Cone, Cylinder};
+use glam::Vec3;
+use std::f32::consts::{FRAC_PI_2, TAU};
+
+const BLACK: Look = Look::Painted(Vec3::new(0.07, 0.07, 0.08));
+const STEEL: Look = Look::Painted(Vec3::new(0.62, 0.64, 0.67));
+const WHITE: Look = Look::Painted(Vec3::new(0.93, 0.93, 0.92));
+/// Colours of spines in a bookcase.
+const SPINES: [Vec3; 7] = [
+    Vec3::new(0.62, 0.13, 0.12),
+    Vec3::new(0.13, 0.25, 0.5),
+    Vec3::new(0.85, 0.78, 0.6),
+    Vec3::new(0.16, 0.38, 0.22),
+    Vec3::new(0.75, 0.5, 0.14),
+    Vec3::new(0.3, 0.16, 0.32),
+    Vec3::new(0.9, 0.88, 0.84),
+];
+
+/// Shelves full of books.
+pub fn bookcase() -> Vec<Piece> {
+    let (width, height, depth, shelves) = (0.5, 1.7, 0.16, 5);
+    let mut pieces = vec![piece(Block, [0.0, 0.5 * height, -0.9 * depth], [width, 0.5 * height, 0.012], WOOD)];
+    pieces.extend([-1.0, 1.0].map(|side| piece(Block, [side * width, 0.5 * height, 0.0], [0.02, 0.5 * height, depth], WOOD)));
+    let clear = height / shelves as f32;
+    let mut book = 0;
+    for shelf in 0..=shelves {
+        let floor = shelf as f32 * clear;
+        pieces.push(piece(Block, [0.0, floor.max(0.015), 0.0], [width, 0.015, depth], WOOD));
+        let mut x = -width + 0.03;
+        while shelf < shelves && x < width - 0.06 {
+            // Neither heights nor widths repeat soon.
+            let (thick, tall) = (0.014 + 0.006 * (book * 5 % 4) as f32, 0.1 + 0.012 * (book * 7 % 5) as f32);
+            let look = Look::Painted(SPINES[book * 3 % SPINES.len()]);
+            pieces.push(piece(Block, [x + thick, floor + 0.015 + tall, -0.01], [thick, tall, 0.8 * depth], look));
+            x += 2.0 * thick + 0.004;
+            book += 1;
+        }
+    }
+    pieces
+}
+
+/// A dark screen in a frame on a low cabinet.
+pub fn television() -> Vec<Piece> {
+    let screen = Look::Painted(Vec3::new(0.16, 0.22, 0.3));
+    vec![
+        piece(Block, [0.0, 0.2, 0.0], [0.55, 0.2, 0.2], WOOD),
+        piece(Block, [0.0, 0.42, 0.0], [0.2, 0.02, 0.1], BLACK),
+        piece(Block, [0.0, 0.47, -0.02], [0.04, 0.05, 0.02], BLACK),
+        piece(Block, [0.0, 0.82, 0.0], [0.56, 0.33, 0.03], BLACK),
+        piece(Block, [0.0, 0.83, 0.02], [0.53, 0.295, 0.015], screen),
+    ]
+}
+
+/// A white box with a round window.
+pub fn washing_machine() -> Vec<Piece> {
+    let glass = Look::Painted(Vec3::new(0.12, 0.15, 0.19));
+    let disc =
+        |radius: f32, z: f32, thick: f32, look: Look| piece(Cylinder, [0.0, 0.4, z], [radius, thick, radius], look).tilted(0.0, FRAC_PI_2);
+    vec![
+        piece(Block, [0.0, 0.43, 0.0], [0.3, 0.43, 0.29], WHITE),
+        disc(0.2, 0.295, 0.015, STEEL),
+        disc(0.155, 0.3, 0.02, glass),
+        piece(Block, [0.0, 0.79, 0.292], [0.29, 0.055, 0.005], STEEL),
+        piece(Block, [-0.18, 0.79, 0.298], [0.09, 0.03, 0.004], WHITE),
+        piece(Cylinder, [0.12, 0.79, 0.3], [0.035, 0.015, 0.035], WHITE).tilted(0.0, FRAC_PI_2),
+        piece(Block, [0.22, 0.79, 0.298], [0.04, 0.015, 0.004], BLACK),
+    ]
+}
+
+/// Three lights one below the other, on a pole.
+pub fn traffic_light() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.03, 0.0], [0.16, 0.03, 0.16], STEEL),
+        piece(Cylinder, [0.0, 0.45, 0.0], [0.035, 0.42, 0.035], STEEL),
+        piece(Block, [0.0, 1.2, 0.0], [0.15, 0.38, 0.1], BLACK),
+    ];
+    let lights = [(1.45, Vec3::new(1.0, 0.12, 0.08)), (1.2, Vec3::new(0.45, 0.33, 0.05)), (0.95, Vec3::new(0.04, 0.25, 0.1))];
+    for (y, color) in lights {
+        // From both sides.
+        for side in [-1.0, 1.0] {
+            pieces.push(piece(Cylinder, [0.0, y, side * 0.1], [0.1, 0.012, 0.1], Look::Painted(color)).tilted(0.0, FRAC_PI_2));
+            pieces.push(piece(Block, [0.0, y + 0.1, side * 0.15], [0.11, 0.012, 0.05], BLACK));
+        }
+    }
+    pieces
+}
+
+/// A ball of black pentagons and white hexagons.
+pub fn soccer_ball() -> Vec<Piece> {
+    vec![piece(Ball, [0.0, 0.2, 0.0], [0.2; 3], Look::Football)]
+}
+
+/// A bar between two weights.
+pub fn dumbbell() -> Vec<Piece> {
+    let disc = |x: f32, radius: f32| piece(Cylinder, [x, 0.13, 0.0], [radius, 0.035, radius], BLACK).tilted(FRAC_PI_2, 0.0);
+    let bar = piece(Cylinder, [0.0, 0.13, 0.0], [0.022, 0.3, 0.022], STEEL).tilted(FRAC_PI_2, 0.0);
+    vec![bar, disc(-0.17, 0.13), disc(-0.245, 0.105), disc(0.17, 0.13), disc(0.245, 0.105)]
+}
+
+/// A shade on a pole on a foot.
+pub fn table_lamp() -> Vec<Piece> {
+    // The shade's upper half would be its tip: a disc of light closes it.
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.012, 0.0], [0.09, 0.012, 0.09], BRASS),
+        piece(Cylinder, [0.0, 0.18, 0.0], [0.014, 0.17, 0.014], BRASS),
+    ];
+    for step in 0..8 {
+        let share = step as f32 / 7.0;
+        let glow = Vec3::new(1.0, 0.93, 0.72).lerp(Vec3::new(0.92, 0.8, 0.58), share);
+        pieces.push(piece(
+            Cylinder,
+            [0.0, 0.31 + 0.022 * step as f32, 0.0],
+            [0.17 - 0.09 * share, 0.0115, 0.17 - 0.09 * share],
+            Look::Painted(glow),
+        ));
+    }
+    pieces
+}
+
+/// A fruit with a stem.
+pub fn orange() -> Vec<Piece> {
+    vec![
+        piece(Ball, [0.0, 0.075, 0.0], [0.078, 0.075, 0.078], OWN),
+        piece(Cylinder, [0.0, 0.15, 0.0], [0.008, 0.006, 0.008], Look::Fixed(Vec3::new(0.25, 0.4, 0.15))),
+    ]
+}
+
+/// A cup of coffee with a handle.
+pub fn coffee_mug() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.075, 0.0], [0.062, 0.075, 0.062], OWN),
+        piece(Cylinder, [0.0, 0.147, 0.0], [0.056, 0.004, 0.056], Look::Fixed(Vec3::new(0.2, 0.1, 0.05))),
+    ];
+    for k in 0..9 {
+        let angle = FRAC_PI_2 - std::f32::consts::PI * k as f32 / 8.0;
+        let at = [0.062 + 0.045 * angle.cos(), 0.078 + 0.048 * angle.sin(), 0.0];
+        pieces.push(piece(Block, at, [0.006, 0.012, 0.012], OWN).tilted(angle, 0.0));
+    }
+    pieces
+}
+
+/// A candle that burns, in a holder.
+pub fn candle() -> Vec<Piece> {
+    vec![
+        piece(Cylinder, [0.0, 0.01, 0.0], [0.085, 0.01, 0.085], BRASS),
+        piece(Cylinder, [0.0, 0.14, 0.0], [0.035, 0.12, 0.035], WHITE),
+        piece(Cylinder, [0.0, 0.27, 0.0], [0.004, 0.012, 0.004], BLACK),
+        piece(Ball, [0.0, 0.305, 0.0], [0.014, 0.03, 0.014], Look::Fixed(Vec3::new(1.0, 0.8, 0.25))),
+    ]
+}
+
+/// A round table.
+pub fn dining_table() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.7, 0.0], [0.62, 0.025, 0.62], WOOD),
+        piece(Cylinder, [0.0, 0.36, 0.0], [0.05, 0.33, 0.05], WOOD),
+        piece(Cone, [0.0, 0.06, 0.0], [0.3, 0.06, 0.3], WOOD),
+    ];
+    pieces.push(piece(Cylinder, [0.0, 0.73, 0.0], [0.6, 0.008, 0.6], DARKER));
+    pieces
+}
+
+/// Segments of cloth over a pole.
+pub fn umbrella() -> Vec<Piece> {
+    let mut pieces = vec![
+        piece(Cylinder, [0.0, 0.6, 0.0], [0.018, 0.6, 0.018], STEEL),
+        piece(Cylinder, [0.0, 0.03, 0.0], [0.2, 0.03, 0.2], STEEL),
+        piece(Cone, [0.0, 1.3, 0.0], [0.55, 0.2, 0.55], OWN),
+    ];
+    for k in 0..8 {
+        let angle = TAU * k as f32 / 8.0;
+        pieces.push(piece(Ball, [0.54 * angle.cos(), 1.11, 0.54 * angle.sin()], [0.02; 3], BLACK));
+    }
+    pieces
+}
