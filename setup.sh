@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs what FastLGS needs on Debian or Ubuntu and builds it. Safe to run again: it skips what is there.
-# With --tests also what only the tests need: ffmpeg, Chromium with its driver, Snakemake, and a standard library for wasm32.
+# With --tests also what only the tests need: ffmpeg, npm, Chromium with its driver, Snakemake, and a standard library for wasm32.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -16,6 +16,8 @@ as_root() {
 packages="mesa-vulkan-drivers libvulkan1 libopencv-features2d-dev libopencv-photo-dev pkg-config build-essential python3 python3-venv curl ca-certificates"
 if [ "${1:-}" = --tests ]; then
     packages="$packages chromium chromium-driver ffmpeg"
+    # Programs of others read what is exported; npm brings them.
+    command -v npm >/dev/null || packages="$packages npm"
     # Where rustup cannot reach its server, Debian's compiler with its library's source builds for wasm32.
     if command -v rustup >/dev/null; then timeout 60 rustup target add wasm32-unknown-unknown >/dev/null 2>&1 || true; fi
     [ -d "$(rustc --print sysroot 2>/dev/null)/lib/rustlib/wasm32-unknown-unknown" ] || packages="$packages rustc-web rust-web-src"
