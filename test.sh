@@ -31,7 +31,7 @@ lap "Python"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
 # Counts of kills, damaged inputs and benches are part of the log, and so is what takes longest.
 # shellcheck disable=SC2086
-python3 tests/slowest.py cargo test --release --locked $with -- --show-output
+python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
     # Both kinds of key points, against each other.
     cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output

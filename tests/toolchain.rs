@@ -244,6 +244,7 @@ fn others() -> Option<PathBuf> {
     let npm = |args: &[&str]| Command::new("npm").args(args).current_dir(&root).output();
     std::fs::create_dir_all(&root).expect("a folder");
     if npm(&["--version"]).is_err() {
+        assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "npm is missing: ./setup.sh --tests brings it");
         eprintln!("SKIPPED: npm is not installed, which brings the programs that our files are tried with");
         return None;
     }

@@ -691,6 +691,9 @@ fn the_fox_lights_up_in_the_browser() {
     json(&["train", text(&scene), "--iterations", "700", "--budget", "30000", "--device", "cpu"]);
     let served = Served::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
     page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "fox", "bicycle");
+    let page = json(&["export", text(&scene), text(&dir.path().join("page")), "--html", "--words", "500", "--device", "cpu"]);
+    println!("the fox as a folder: {page}");
+    assert!(page["bytes"].as_u64() < Some(9_000_000), "a megabyte more holds all words: {page}");
 }
 
 /// A folder with every second photo and its pose.

@@ -26,7 +26,8 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         return report::tell(common, &fastlgs::export(config, run)?, words::export);
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    if ending == "json" || ENDINGS.contains(&ending) {
+    let folder = config.output.is_dir() || config.output.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR);
+    if ending == "json" || ENDINGS.contains(&ending) || !(folder || ending.is_empty()) {
         bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
     }
     let share =
