@@ -16,19 +16,20 @@ if [ $# -gt 0 ]; then
     [ $# -gt 0 ] || texts=("chair" "table" "plant" "bicycle")
     max_side=480
 else
-    name=room
-    photos=$PWD/scenes/photos-room
+    name=study
+    photos=$PWD/scenes/photos-study
     mkdir -p scenes
-    $fastlgs synth room -o "$photos" --views 40 --size 320x240
-    texts=("cat" "coffee" "rocket" "bicycle")
-    max_side=320
+    $fastlgs synth study -o "$photos" --views 48 --size 400x300
+    texts=("soccer ball" "traffic light" "bookcase" "bicycle")
+    view=008.png
+    max_side=400
 fi
 scene=scenes/$name
 mkdir -p "$scene"
 
 echo "== make";       $fastlgs make "$photos" -o "$scene" --max-side "$max_side"
 labelled=$(ls "$photos/labels" 2>/dev/null | sed 's/\.json$//' || true)
-view=$(echo "$labelled" | head -n 1)
+view=${view:-$(echo "$labelled" | head -n 1)}
 [ -n "$view" ] && set -- --view "$view" || set --
 echo "== render";     $fastlgs render "$scene" "$@" --what color,depth,feature,objects -o "$scene/pictures"
 echo "== query: ${texts[*]}"
