@@ -10,8 +10,8 @@ pub const WHOLE: &str = "make";
 /// A stage, and the seconds that it took on the fox scene.
 type Stage = (&'static str, u64);
 
-/// The stages in their order. Those that a scene does not need are passed over.
-const STAGES: [Stage; 12] = [
+/// The stages before training, in their order. Those that a scene does not need are passed over.
+const PREPARING: [Stage; 8] = [
     ("frames", 15),
     ("poses", 25),
     ("photos", 5),
@@ -20,30 +20,24 @@ const STAGES: [Stage; 12] = [
     ("bundle adjustment", 2),
     ("masks", 60),
     ("depths", 9),
-    ("train", 125),
-    ("votes", 5),
-    ("objects", 10),
-    ("embeddings", 90),
 ];
 
+/// What follows them: training, and then the objects.
+const OURS: [Stage; 4] = [("train", 125), ("votes", 5), ("objects", 10), ("embeddings", 90)];
+
 /// The same where all is made as the paper has it: objects come before training, which takes most of the time.
-const PAPERS_STAGES: [Stage; 10] = [
-    ("frames", 15),
-    ("poses", 25),
-    ("photos", 5),
-    ("key points for the pose check", 3),
-    ("matches", 4),
-    ("bundle adjustment", 2),
-    ("masks", 60),
-    ("depths", 9),
-    ("embeddings", 300),
-    ("train", 4000),
-];
+const PAPERS: [Stage; 2] = [("embeddings", 300), ("train", 4000)];
+
+/// All stages of a scene that is made with some effort.
+fn stages(effort: Preset) -> Vec<Stage> {
+    let rest = if effort == Preset::LikePaper { &PAPERS[..] } else { &OURS };
+    [&PREPARING[..], rest].concat()
+}
 
 /// Tells another sink of all stages as one.
 pub struct Whole<'a> {
     sink: &'a dyn Sink,
-    stages: &'static [Stage],
+    stages: Vec<Stage>,
     /// In hundredths of a per cent: stages may come in another order, but the bar goes on.
     reached: AtomicU64,
 }
@@ -55,13 +49,12 @@ impl<'a> Whole<'a> {
     /// Begins the bar of a scene that is made with some effort.
     pub fn new(sink: &'a dyn Sink, effort: Preset) -> Self {
         sink.tell(Message::Started { stage: WHOLE, total: PARTS });
-        let stages = if effort == Preset::LikePaper { &PAPERS_STAGES[..] } else { &STAGES };
-        Self { sink, stages, reached: AtomicU64::new(0) }
+        Self { sink, stages: stages(effort), reached: AtomicU64::new(0) }
     }
 
     /// A stage has done `done` of `total`.
     fn reach(&self, stage: &str, done: u64, total: u64, note: &str) {
-        let place = parts_at(self.stages, stage, done as f64 / total.max(1) as f64);
+        let place = parts_at(&self.stages, stage, done as f64 / total.max(1) as f64);
         let place = self.reached.fetch_max(place, Ordering::Relaxed).max(place);
         let note = if note.is_empty() { stage.to_owned() } else { format!("{stage}: {note}") };
         self.sink.tell(Message::Advanced { stage: WHOLE, done: place, total: PARTS, note: &note });
@@ -130,7 +123,7 @@ mod tests {
         assert_eq!((told[0].1.as_str(), told[1].1.as_str()), ("photos", "photos: x"));
         assert_eq!(told.last().unwrap().0, PARTS);
         assert!(told[0].0 > 0, "poses were there already");
-        let before = |stage: &str| parts_at(&PAPERS_STAGES, stage, 0.0);
+        let before = |stage: &str| parts_at(&stages(Preset::LikePaper), stage, 0.0);
         assert!(before("embeddings") < before("train"), "objects come first there");
     }
 }

@@ -7,7 +7,7 @@ use axum::routing::get;
 use std::sync::Arc;
 
 /// Address, kind, and content.
-const FILES: [(&str, &str, &str); 23] = [
+const FILES: [(&str, &str, &str); 24] = [
     ("/", HTML, include_str!("../web/index.html")),
     ("/style.css", "text/css; charset=utf-8", include_str!("../web/style.css")),
     ("/app.js", SCRIPT, include_str!("../web/app.js")),
@@ -21,6 +21,7 @@ const FILES: [(&str, &str, &str); 23] = [
     ("/sentence.js", SCRIPT, include_str!("../web/sentence.js")),
     ("/save.js", SCRIPT, include_str!("../web/save.js")),
     ("/camera.js", SCRIPT, include_str!("../web/camera.js")),
+    ("/frame.js", SCRIPT, include_str!("../web/frame.js")),
     ("/renderer.js", SCRIPT, include_str!("../web/renderer.js")),
     ("/webgpu.js", SCRIPT, include_str!("../web/webgpu.js")),
     ("/webgl2.js", SCRIPT, include_str!("../web/webgl2.js")),

@@ -2,7 +2,8 @@
 
 import { Camera, frustum } from "./camera.js";
 import { Measure, pointAt } from "./measure.js";
-import { OBJECT_ROWS, openRenderer, parseSplats } from "./renderer.js";
+import { OBJECT_ROWS, parseSplats } from "./frame.js";
+import { openRenderer } from "./renderer.js";
 import { getBlob, getBytes } from "./server.js";
 
 // More pixels than this, along the longer side, are not drawn: software rasterisers would crawl.

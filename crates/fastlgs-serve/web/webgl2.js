@@ -1,6 +1,6 @@
 // Draws by WebGL2, with the shaders that the build translated from splat.wgsl. Their names of things are naga's.
 
-import { OBJECT_ROWS, ROW, packFrame } from "./renderer.js";
+import { OBJECT_ROWS, ROW, packFrame } from "./frame.js";
 
 // Whether the browser would draw without a GPU. Asked of another canvas, as a canvas keeps its first context for good.
 function isSlow() {

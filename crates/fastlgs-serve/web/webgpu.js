@@ -1,6 +1,6 @@
 // Draws by WebGPU.
 
-import { OBJECT_ROWS, ROW, packFrame } from "./renderer.js";
+import { OBJECT_ROWS, ROW, packFrame } from "./frame.js";
 
 export async function openWebGpu(canvas, evenSlow) {
   const adapter = await navigator.gpu?.requestAdapter();

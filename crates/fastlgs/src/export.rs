@@ -81,6 +81,11 @@ const PRECISION_VIEWS: usize = 4;
 /// What each group of values may lose there, in dB.
 const PRECISION_LOSS: f64 = 0.01;
 
+/// Whether a folder is meant, whatever the ending of its name.
+pub fn names_folder(path: &Path) -> bool {
+    path.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || path.is_dir()
+}
+
 /// Writes a trained scene for other programs.
 ///
 /// # Errors
@@ -92,7 +97,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         return Ok(Report::Path { scene: config.scene.clone(), output: config.output.clone(), frames: cameras.len() });
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    let folder = config.output.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || config.output.is_dir();
+    let folder = names_folder(&config.output);
     let file = !folder && selection::ENDINGS.contains(&ending);
     if !folder && !file && !ending.is_empty() {
         let path = config.output.display();

@@ -4,7 +4,7 @@ use crate::outcome::Outcome;
 use crate::{report, ui, words};
 use anyhow::{Result, bail};
 use fastlgs::Run;
-use fastlgs::export::Config;
+use fastlgs::export::{Config, names_folder};
 use fastlgs::session::selection::ENDINGS;
 use fastlgs_serve::share;
 
@@ -26,8 +26,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         return report::tell(common, &fastlgs::export(config, run)?, words::export);
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    let folder = config.output.is_dir() || config.output.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR);
-    if ending == "json" || ENDINGS.contains(&ending) || !(folder || ending.is_empty()) {
+    if ending == "json" || ENDINGS.contains(&ending) || !(names_folder(&config.output) || ending.is_empty()) {
         bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
     }
     let share =

@@ -1,6 +1,6 @@
 //! Things of a furnished room, each in metres, standing on y = 0 with its front towards +z: what classifiers of photographs know.
 
-use super::props::{BRASS, DARKER, Look, OWN, Piece, WOOD, piece};
+use super::props::{BRASS, DARKER, Look, Make, OWN, Piece, WOOD, piece};
 use super::solid::Shape::{Ball, Block, Cone, Cylinder};
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, TAU};
@@ -19,8 +19,40 @@ const SPINES: [Vec3; 7] = [
     Vec3::new(0.9, 0.88, 0.84),
 ];
 
+/// A thing in its place.
+pub struct Placed {
+    pub name: &'static str,
+    pub make: Make,
+    /// Of what has no colour of its own.
+    pub color: Vec3,
+    pub at: [f32; 3],
+    /// Turn around y, in radians.
+    pub yaw: f32,
+}
+
+/// A round table with small things on it, and larger ones around it.
+pub fn study() -> [Placed; 12] {
+    let [red, orange_peel, oak] = [Vec3::new(0.75, 0.1, 0.1), Vec3::new(0.95, 0.5, 0.08), Vec3::new(0.42, 0.27, 0.15)];
+    let top = 0.738;
+    let placed = |name, make: Make, color, at, yaw| Placed { name, make, color, at, yaw };
+    [
+        placed("dining table", dining_table, oak, [0.0, 0.0, 0.0], 0.0),
+        placed("table lamp", table_lamp, Vec3::ONE, [0.0, top, 0.0], 0.0),
+        placed("orange", orange, orange_peel, [0.36, top, 0.12], 0.4),
+        placed("coffee mug", coffee_mug, red, [-0.1, top, 0.38], 0.6),
+        placed("candle", candle, Vec3::ONE, [-0.32, top, -0.2], 0.0),
+        placed("bookcase", bookcase, Vec3::ONE, [0.0, 0.0, -1.5], 0.0),
+        placed("television", television, Vec3::ONE, [1.45, 0.0, -0.45], -FRAC_PI_2 + 0.3),
+        placed("washing machine", washing_machine, Vec3::ONE, [-1.4, 0.0, -0.45], FRAC_PI_2 - 0.3),
+        placed("umbrella", umbrella, red, [-1.05, 0.0, 1.05], 0.0),
+        placed("dumbbell", dumbbell, Vec3::ONE, [-0.4, 0.0, 1.45], 0.5),
+        placed("soccer ball", soccer_ball, Vec3::ONE, [0.25, 0.0, 1.35], 0.3),
+        placed("traffic light", traffic_light, Vec3::ONE, [1.15, 0.0, 1.1], 0.8),
+    ]
+}
+
 /// Shelves full of books.
-pub fn bookcase() -> Vec<Piece> {
+fn bookcase() -> Vec<Piece> {
     let (width, height, depth, shelves) = (0.5, 1.7, 0.16, 5);
     let mut pieces = vec![piece(Block, [0.0, 0.5 * height, -0.9 * depth], [width, 0.5 * height, 0.012], WOOD)];
     pieces.extend([-1.0, 1.0].map(|side| piece(Block, [side * width, 0.5 * height, 0.0], [0.02, 0.5 * height, depth], WOOD)));
@@ -43,7 +75,7 @@ pub fn bookcase() -> Vec<Piece> {
 }
 
 /// A dark screen in a frame on a low cabinet.
-pub fn television() -> Vec<Piece> {
+fn television() -> Vec<Piece> {
     let screen = Look::Painted(Vec3::new(0.16, 0.22, 0.3));
     vec![
         piece(Block, [0.0, 0.2, 0.0], [0.55, 0.2, 0.2], WOOD),
@@ -55,7 +87,7 @@ pub fn television() -> Vec<Piece> {
 }
 
 /// A white box with a round window.
-pub fn washing_machine() -> Vec<Piece> {
+fn washing_machine() -> Vec<Piece> {
     let glass = Look::Painted(Vec3::new(0.12, 0.15, 0.19));
     let disc =
         |radius: f32, z: f32, thick: f32, look: Look| piece(Cylinder, [0.0, 0.4, z], [radius, thick, radius], look).tilted(0.0, FRAC_PI_2);
@@ -71,7 +103,7 @@ pub fn washing_machine() -> Vec<Piece> {
 }
 
 /// Three lights one below the other, on a pole.
-pub fn traffic_light() -> Vec<Piece> {
+fn traffic_light() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.03, 0.0], [0.16, 0.03, 0.16], STEEL),
         piece(Cylinder, [0.0, 0.45, 0.0], [0.035, 0.42, 0.035], STEEL),
@@ -89,20 +121,20 @@ pub fn traffic_light() -> Vec<Piece> {
 }
 
 /// A ball of black pentagons and white hexagons.
-pub fn soccer_ball() -> Vec<Piece> {
+fn soccer_ball() -> Vec<Piece> {
     vec![piece(Ball, [0.0, 0.2, 0.0], [0.2; 3], Look::Football)]
 }
 
 /// A bar between two weights.
-pub fn dumbbell() -> Vec<Piece> {
+fn dumbbell() -> Vec<Piece> {
     let disc = |x: f32, radius: f32| piece(Cylinder, [x, 0.13, 0.0], [radius, 0.035, radius], BLACK).tilted(FRAC_PI_2, 0.0);
     let bar = piece(Cylinder, [0.0, 0.13, 0.0], [0.022, 0.3, 0.022], STEEL).tilted(FRAC_PI_2, 0.0);
     vec![bar, disc(-0.17, 0.13), disc(-0.245, 0.105), disc(0.17, 0.13), disc(0.245, 0.105)]
 }
 
 /// A shade on a pole on a foot.
-pub fn table_lamp() -> Vec<Piece> {
-    // The shade's upper half would be its tip: a disc of light closes it.
+fn table_lamp() -> Vec<Piece> {
+    // Discs for a shade: a cone would end in a tip.
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.012, 0.0], [0.09, 0.012, 0.09], BRASS),
         piece(Cylinder, [0.0, 0.18, 0.0], [0.014, 0.17, 0.014], BRASS),
@@ -121,7 +153,7 @@ pub fn table_lamp() -> Vec<Piece> {
 }
 
 /// A fruit with a stem.
-pub fn orange() -> Vec<Piece> {
+fn orange() -> Vec<Piece> {
     vec![
         piece(Ball, [0.0, 0.075, 0.0], [0.078, 0.075, 0.078], OWN),
         piece(Cylinder, [0.0, 0.15, 0.0], [0.008, 0.006, 0.008], Look::Fixed(Vec3::new(0.25, 0.4, 0.15))),
@@ -129,7 +161,7 @@ pub fn orange() -> Vec<Piece> {
 }
 
 /// A cup of coffee with a handle.
-pub fn coffee_mug() -> Vec<Piece> {
+fn coffee_mug() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.075, 0.0], [0.062, 0.075, 0.062], OWN),
         piece(Cylinder, [0.0, 0.147, 0.0], [0.056, 0.004, 0.056], Look::Fixed(Vec3::new(0.2, 0.1, 0.05))),
@@ -143,7 +175,7 @@ pub fn coffee_mug() -> Vec<Piece> {
 }
 
 /// A candle that burns, in a holder.
-pub fn candle() -> Vec<Piece> {
+fn candle() -> Vec<Piece> {
     vec![
         piece(Cylinder, [0.0, 0.01, 0.0], [0.085, 0.01, 0.085], BRASS),
         piece(Cylinder, [0.0, 0.14, 0.0], [0.035, 0.12, 0.035], WHITE),
@@ -153,18 +185,17 @@ pub fn candle() -> Vec<Piece> {
 }
 
 /// A round table.
-pub fn dining_table() -> Vec<Piece> {
-    let mut pieces = vec![
+fn dining_table() -> Vec<Piece> {
+    vec![
         piece(Cylinder, [0.0, 0.7, 0.0], [0.62, 0.025, 0.62], WOOD),
         piece(Cylinder, [0.0, 0.36, 0.0], [0.05, 0.33, 0.05], WOOD),
         piece(Cone, [0.0, 0.06, 0.0], [0.3, 0.06, 0.3], WOOD),
-    ];
-    pieces.push(piece(Cylinder, [0.0, 0.73, 0.0], [0.6, 0.008, 0.6], DARKER));
-    pieces
+        piece(Cylinder, [0.0, 0.73, 0.0], [0.6, 0.008, 0.6], DARKER),
+    ]
 }
 
 /// Segments of cloth over a pole.
-pub fn umbrella() -> Vec<Piece> {
+fn umbrella() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.6, 0.0], [0.018, 0.6, 0.018], STEEL),
         piece(Cylinder, [0.0, 0.03, 0.0], [0.2, 0.03, 0.2], STEEL),

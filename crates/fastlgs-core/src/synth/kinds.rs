@@ -249,25 +249,8 @@ impl Builder {
         }
     }
 
-    /// A round table with small things on it, and larger ones around it.
     fn study(&mut self) {
-        let [red, orange] = [Vec3::new(0.75, 0.1, 0.1), Vec3::new(0.95, 0.5, 0.08)];
-        let top = 0.738;
-        let things: [(&str, Make, Vec3, [f32; 3], f32); 12] = [
-            ("dining table", furniture::dining_table, Vec3::new(0.42, 0.27, 0.15), [0.0, 0.0, 0.0], 0.0),
-            ("table lamp", furniture::table_lamp, Vec3::ONE, [0.0, top, 0.0], 0.0),
-            ("orange", furniture::orange, orange, [0.36, top, 0.12], 0.4),
-            ("coffee mug", furniture::coffee_mug, red, [-0.1, top, 0.38], 0.6),
-            ("candle", furniture::candle, Vec3::ONE, [-0.32, top, -0.2], 0.0),
-            ("bookcase", furniture::bookcase, Vec3::ONE, [0.0, 0.0, -1.5], 0.0),
-            ("television", furniture::television, Vec3::ONE, [1.45, 0.0, -0.45], -FRAC_PI_2 + 0.3),
-            ("washing machine", furniture::washing_machine, Vec3::ONE, [-1.4, 0.0, -0.45], FRAC_PI_2 - 0.3),
-            ("umbrella", furniture::umbrella, red, [-1.05, 0.0, 1.05], 0.0),
-            ("dumbbell", furniture::dumbbell, Vec3::ONE, [-0.4, 0.0, 1.45], 0.5),
-            ("soccer ball", furniture::soccer_ball, Vec3::ONE, [0.25, 0.0, 1.35], 0.3),
-            ("traffic light", furniture::traffic_light, Vec3::ONE, [1.15, 0.0, 1.1], 0.8),
-        ];
-        for (name, make, color, at, yaw) in things {
+        for furniture::Placed { name, make, color, at, yaw } in furniture::study() {
             self.add(name, make(), Material::Grain(color), &Place { at: at.into(), scale: 1.0, yaw }, false);
         }
     }

@@ -66,7 +66,7 @@ pub const DARKER: Look = Look::Own(0.55);
 pub const BRASS: Look = Look::Fixed(Vec3::new(0.75, 0.6, 0.25));
 pub const WOOD: Look = Look::Fixed(Vec3::new(0.5, 0.33, 0.18));
 const LEAF: Look = Look::Fixed(Vec3::new(0.2, 0.55, 0.2));
-pub const CREAM: Look = Look::Fixed(Vec3::new(0.95, 0.9, 0.8));
+const CREAM: Look = Look::Fixed(Vec3::new(0.95, 0.9, 0.8));
 
 pub fn mug() -> Vec<Piece> {
     vec![

@@ -161,14 +161,19 @@ impl Session {
     /// The text tower of the encoder that made the scene's embeddings; the first call loads it.
     fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
-            let mut texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
-            texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
-            if !self.taught {
-                texts.forget_names();
-            }
-            let _ = self.texts.set(texts);
+            let texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
+            let _ = self.texts.set(self.as_asked_here(texts));
         }
         Ok(self.texts.get().expect("set above"))
+    }
+
+    /// A text tower with this session's calibrations, and without names where these are not to count.
+    fn as_asked_here(&self, mut texts: Texts) -> Texts {
+        texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
+        if !self.taught {
+            texts.forget_names();
+        }
+        texts
     }
 
     /// Prepares a text.
@@ -205,9 +210,8 @@ impl Session {
     /// # Errors
     /// A tower whose embeddings have another length than the scene's.
     pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
-        let mut texts = Texts::of(encoder, &self.folder, &self.manifest)?;
-        texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
-        self.texts = OnceCell::from(texts);
+        let texts = Texts::of(encoder, &self.folder, &self.manifest)?;
+        self.texts = OnceCell::from(self.as_asked_here(texts));
         Ok(())
     }
 
