@@ -14,6 +14,6 @@ trap 'rm -rf "$root"' EXIT
 install -Dm755 -s "$target/release/fastlgs" "$root/$name/bin/fastlgs"
 "$root/$name/bin/fastlgs" man -o "$root/$name/share/man/man1"
 for shell in bash zsh fish; do "$root/$name/bin/fastlgs" completions $shell >"$root/$name/fastlgs.$shell"; done
-cp -r README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE docs "$root/$name/"
+cp -r README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE docs assets "$root/$name/"
 tar -C "$root" --sort=name --owner=0 --group=0 --numeric-owner --mtime=@0 -czf "$out/$name.tar.gz" "$name"
 echo "$out/$name.tar.gz"
