@@ -56,13 +56,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     touched[g] = 0u;
     let mean = param3(MEAN, i);
     let t = (view.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
+    let s = exp(param3(LOG_SCALE, i));
     // Written so that a NaN is not drawn either.
-    if !(t.z > NEAR) {
+    if !(t.z > NEAR * length(s)) {
         return;
     }
     let q = vec4<f32>(param(ROTATION, i), param(ROTATION + 1u, i), param(ROTATION + 2u, i), param(ROTATION + 3u, i));
     let r = rotation_matrix(q / max(length(q), 1e-12));
-    let s = exp(param3(LOG_SCALE, i));
     let jw = affine(t, view);
     // A = J W R S, so that the covariance is A A^T.
     let ax = (jw.x * r) * s;

@@ -37,7 +37,9 @@ const ALPHA_MIN: f32 = 0.00392156862745098;
 const ALPHA_MAX: f32 = 0.99;
 // Variance (px^2) added to each projected Gaussian so that none falls between pixels (3DGS).
 const DILATION: f32 = 0.3;
-const NEAR: f32 = 0.05;
+// A Gaussian is drawn from a depth on of so many times its own size, the length of its three scales: nearer, it would fill the picture, and its
+// projection would no longer be one. In units of the scene any bound would be right for some scenes only.
+const NEAR: f32 = 0.5;
 
 // Place of four neighbouring pixels of a row in the planes of a padded picture.
 fn quad_at(channel: u32, x: u32, y: u32, view: View) -> u32 {

@@ -5,6 +5,7 @@ use fastlgs_core::Gaussians;
 use fastlgs_core::gaussians::{channels, logit, sigmoid};
 use fastlgs_core::rng::Rng;
 use glam::{Quat, Vec3};
+use rayon::prelude::*;
 
 /// Trained values and both Adam moments, each `[channels(sh_degree)][n]`.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -99,6 +100,16 @@ impl State {
     pub fn keep(&mut self, places: &[usize]) {
         let sources: Vec<(usize, bool)> = places.iter().map(|&i| (i, false)).collect();
         *self = self.gathered(&sources);
+    }
+
+    /// Removes Gaussians whose mean lies where nothing is; returns how many.
+    pub(crate) fn remove_in(&mut self, free: impl Fn(Vec3) -> bool + Sync) -> usize {
+        let n = self.len();
+        let places: Vec<usize> = (0..n).into_par_iter().filter(|&i| !free(self.vec3(0, i))).collect();
+        if places.len() < n {
+            self.keep(&places);
+        }
+        n - places.len()
     }
 
     fn is_finite(&self, i: usize) -> bool {

@@ -27,6 +27,9 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     scene
 }
 
+/// Pixels that are tried for a random point before one is taken that does not count.
+const TRIES: usize = 32;
+
 /// `count` points in front of random views, coloured as their photos are there, at depths around their distance to the cameras' common
 /// focus: the last resort where nothing else is known.
 pub fn random_points(views: &[Target], count: usize, rng: &mut Rng) -> Vec<SfmPoint> {
@@ -35,11 +38,19 @@ pub fn random_points(views: &[Target], count: usize, rng: &mut Rng) -> Vec<SfmPo
     (0..count)
         .map(|_| {
             let Target { camera, image, .. } = &views[rng.below(views.len())];
-            let pixel = [camera.width, camera.height].map(|side| rng.below(side as usize));
+            let width = camera.width as usize;
+            let counts = |p: &[usize; 2]| image.color[p[1] * width + p[0]].to_le_bytes()[3] == 255;
+            let mut pixel = [0; 2];
+            for _ in 0..TRIES {
+                pixel = [camera.width, camera.height].map(|side| rng.below(side as usize));
+                if counts(&pixel) {
+                    break;
+                }
+            }
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
             let ray = camera.ray(glam::Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
             let position = camera.world_to_camera.inverse().transform_point3(ray * depth);
-            let [r, g, b, _] = image.color[pixel[1] * camera.width as usize + pixel[0]].to_le_bytes();
+            let [r, g, b, _] = image.color[pixel[1] * width + pixel[0]].to_le_bytes();
             SfmPoint { position, color: [r, g, b] }
         })
         .collect()

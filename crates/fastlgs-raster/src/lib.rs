@@ -15,6 +15,7 @@ pub mod cpu;
 pub mod density;
 mod engine;
 mod exposure;
+mod floaters;
 mod gpu;
 mod gpu_engine;
 pub mod init;

@@ -4,7 +4,7 @@
 const LOG_SCALE_LOW = -20, LOG_SCALE_RANGE = 30;
 // What lies behind less than this much light counts as seen.
 const SOLID = 0.5;
-const NEAR = 0.05; // splat.wgsl draws nothing that is nearer
+const NEAR = 0.5; // splat.wgsl draws no Gaussian that is nearer than so many of its sizes
 const FAINT = 1 / 255; // nor what adds less than one grey level
 
 // The rotation of a Gaussian as a matrix, row by row; unpack_rotation of splat.wgsl tells how it is packed.
@@ -27,7 +27,7 @@ function crossing({ data, texels, means }, i, eye, direction, pixel) {
   const at = 4 * texels * i;
   const offset = [0, 1, 2].map((k) => eye[k] - means[3 * i + k]);
   const reach = -dot(offset, direction) / dot(direction, direction);
-  if (!(reach > NEAR)) return null;
+  if (!(reach > 0)) return null;
   const log = [data[at + 3] & 0xffff, data[at + 3] >>> 16, data[at + 4] & 0xffff];
   const scales = log.map((bits) => Math.max(Math.exp(bits / 65535 * LOG_SCALE_RANGE + LOG_SCALE_LOW), 0.5 * pixel * reach));
   const passing = Math.hypot(...[0, 1, 2].map((k) => offset[k] + reach * direction[k]));
@@ -38,7 +38,7 @@ function crossing({ data, texels, means }, i, eye, direction, pixel) {
   const q = scales.map((s, k) => dot(column(k), direction) / s);
   const depth = -dot(p, q) / dot(q, q);
   const alpha = (data[at + 4] >>> 16) / 65535 * Math.exp(-0.5 * (dot(p, p) - dot(p, q) ** 2 / dot(q, q)));
-  return depth > NEAR && alpha >= FAINT ? { depth, alpha } : null;
+  return depth > NEAR * Math.hypot(...scales) && alpha >= FAINT ? { depth, alpha } : null;
 }
 
 // The point of the surface that a pixel shows; nothing where one looks through the scene. `shown` tells which objects there are.

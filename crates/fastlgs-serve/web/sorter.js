@@ -1,7 +1,6 @@
 // A worker that sorts Gaussians from far to near: a counting sort by 16 bits of depth.
 
 const STEPS = 1 << 16;
-const NEAR = 0.05; // splat.wgsl draws nothing that is nearer
 let means = new Float32Array();
 
 onmessage = ({ data }) => {
@@ -16,7 +15,7 @@ onmessage = ({ data }) => {
   for (let i = 0; i < count; i++) {
     // Rounded as it is kept, so that none lies beyond near or far.
     const depth = depths[i] = Math.fround(x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w);
-    if (depth > NEAR) {
+    if (depth > 0) {
       kept++;
       if (depth < near) near = depth;
       if (depth > far) far = depth;
@@ -28,12 +27,12 @@ onmessage = ({ data }) => {
   const starts = new Uint32Array(STEPS + 1);
   const steps = new Uint16Array(count);
   for (let i = 0; i < count; i++) {
-    if (depths[i] > NEAR) starts[(steps[i] = step(depths[i])) + 1]++;
+    if (depths[i] > 0) starts[(steps[i] = step(depths[i])) + 1]++;
   }
   for (let s = 0; s < STEPS; s++) starts[s + 1] += starts[s];
   const order = new Uint32Array(kept);
   for (let i = 0; i < count; i++) {
-    if (depths[i] > NEAR) order[starts[steps[i]]++] = i;
+    if (depths[i] > 0) order[starts[steps[i]]++] = i;
   }
   postMessage({ order, number: data.number }, [order.buffer]);
 };

@@ -109,7 +109,9 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
     let id = b.w >> 16u;
     let hidden = textureLoad(objects, vec2<i32>(i32(id & 255u), i32(id >> 8u)), 0).b > 0.5;
     let t = (frame.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
-    if hidden || !(t.z > NEAR) {
+    let last = unpack2x16unorm(b.x);
+    let s = exp(vec3<f32>(unpack2x16unorm(a.w), last.x) * LOG_SCALE_RANGE + LOG_SCALE_LOW);
+    if hidden || !(t.z > NEAR * length(s)) {
         return out;
     }
     var view: View;
@@ -118,8 +120,6 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
     view.centre = frame.lens.zw;
     view.size = vec2<u32>(frame.size.xy);
     view.antialias = u32(frame.camera.w);
-    let last = unpack2x16unorm(b.x);
-    let s = exp(vec3<f32>(unpack2x16unorm(a.w), last.x) * LOG_SCALE_RANGE + LOG_SCALE_LOW);
     let r = rotation_matrix(unpack_rotation(b.z, b.w & 0xffffu));
     let jw = affine(t, view);
     let cov = dilated((jw.x * r) * s, (jw.y * r) * s);

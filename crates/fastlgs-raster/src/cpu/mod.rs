@@ -72,7 +72,7 @@ pub type Splat = [[f32; 4]; 3];
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
 pub(crate) const DILATION: f32 = 0.3;
-pub(crate) const NEAR: f32 = 0.05;
+pub(crate) const NEAR: f32 = 0.5;
 
 /// The contiguous part of `n` items that invocation `t` owns.
 pub(crate) fn chunk(n: usize, t: usize) -> std::ops::Range<usize> {

@@ -38,11 +38,11 @@ pub(crate) fn project_one(view: &View, param: impl Fn(usize) -> f32) -> Option<P
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));
     let mean = param3(0);
     let t = Mat4::from_cols_array(&view.world_to_camera).transform_point3(mean);
-    if t.z.is_nan() || t.z <= NEAR {
+    let s = param3(3).map(f32::exp);
+    if t.z.is_nan() || t.z <= NEAR * s.length() {
         return None;
     }
     let r = covariance::rotation(&param).1;
-    let s = param3(3).map(f32::exp);
     let [jx, jy] = covariance::affine(t, view);
     let (ax, ay) = (r.transpose() * jx * s, r.transpose() * jy * s);
     let cov = covariance::dilated(ax, ay);

@@ -149,12 +149,12 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
         .sum()
 }
 
-/// Wide, faint Gaussians that cover the whole picture, so that no cut-off moves under a difference.
+/// Wide, faint Gaussians that cover the whole picture, so that no cut-off moves under a difference; far enough to be drawn.
 fn scene(sh_degree: u32) -> Gaussians {
     let mut rng = Rng::new(11, "gradients");
     let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
     for i in 0..6 {
-        let mean = Vec3::new(0.4 * rng.normal(), 0.4 * rng.normal(), 0.8 * i as f32 - 2.0);
+        let mean = Vec3::new(0.4 * rng.normal(), 0.4 * rng.normal(), 0.8 * i as f32 - 1.6);
         scene.push_sphere(mean, 1.0, rng.range(0.3, 0.6), [rng.range(0.3, 0.7), rng.range(0.3, 0.7), rng.range(0.3, 0.7)]);
         scene.log_scales[i] = Vec3::new(rng.range(0.6, 1.0), rng.range(0.6, 1.0), rng.range(0.4, 0.9));
         scene.rotations[i] = [1.0, 0.4 * rng.normal(), 0.4 * rng.normal(), 0.4 * rng.normal()];

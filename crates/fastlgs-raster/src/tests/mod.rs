@@ -46,7 +46,8 @@ pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussia
         scene.push_sphere(Vec3::new(0.0, 0.0, -9.0), 0.1, 0.5, [1.0; 3]); // behind the camera
         scene.push_sphere(at(f32::NAN), 0.1, 0.5, [1.0; 3]);
         scene.push_sphere(at(0.1), 1e-8, 0.9, [1.0, 0.0, 0.0]);
-        scene.push_sphere(at(0.2), 50.0, 0.1, [0.0, 1.0, 0.0]);
+        scene.push_sphere(at(0.2), 4.0, 0.1, [0.0, 1.0, 0.0]); // fills the picture, and yet is drawn
+        scene.push_sphere(at(0.22), 50.0, 0.1, [0.0, 1.0, 0.0]); // one stands in it
         scene.push_sphere(at(0.25), 1e30, 0.1, [0.0, 1.0, 0.0]); // a covariance that is not finite
         scene.push_sphere(at(0.3), 0.1, 0.5, [0.0, 0.0, 1.0]);
         scene.push_sphere(at(0.3), 0.1, 0.5, [1.0, 0.0, 1.0]); // the same depth

@@ -9,6 +9,7 @@ use crate::checkpoint::{self, Course};
 use crate::density::{self, State};
 use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
+use crate::floaters::FreeSpace;
 use crate::schedule::{Budget, Strategy, TrainConfig};
 use crate::target::{self, Target};
 use crate::view::{Step, View};
@@ -67,6 +68,8 @@ pub struct Trainer {
     extent: f32,
     /// Standard deviation of the photos' brightness.
     contrast: f32,
+    /// Where nothing is, by what the run starts from.
+    free: FreeSpace,
     course: Course,
     /// Whether the engine holds the targets at half the resolution.
     coarse: Option<bool>,
@@ -115,7 +118,8 @@ impl Trainer {
             config,
         };
         let contrast = target::contrast(&targets);
-        Ok(Self { engine, extent: scene_extent(&cameras), contrast, targets, course, coarse: None })
+        let free = FreeSpace::of(&cameras, scene);
+        Ok(Self { engine, extent: scene_extent(&cameras), contrast, free, targets, course, coarse: None })
     }
 
     /// Uploads the targets at the resolution of the coming step.
@@ -202,7 +206,8 @@ impl Trainer {
             Strategy::Classic => {
                 let limits = density::Config { budget, ..density::Config::default() };
                 let counts = density::refine(&mut state, &self.engine.stats()?, self.extent, &limits, &mut self.course.rng);
-                tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), ?counts, "density control");
+                let floaters = state.remove_in(|mean| self.free.holds(mean));
+                tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), ?counts, floaters, "density control");
             }
             Strategy::Mcmc => {
                 let moved = density::relocate(&mut state, &mut self.course.rng);

@@ -154,6 +154,13 @@ const FEATURE_WEIGHT: f32 = 0.2;
 /// where there are few pixels a Gaussian, as with 170,000 of them on 28 photos of 240x180, they learn the photos by heart.
 const PIXELS_A_GAUSSIAN: usize = 20;
 
+/// Where fewer views than these are trained on, colour has at most [`DEGREE_OF_FEW`]: each Gaussian is seen by some of them only, and nine
+/// numbers a channel learn what each sees by heart. Oracle mIoU at degrees 0, 1, 2: generated table of 20 views 0.966, 0.959, 0.883 (30.3, 29.5,
+/// 28.2 dB), fox of 18 views 0.77, 0.83, 0.81 at the same PSNR.
+const FEW_VIEWS: usize = 25;
+/// SH degree of few views.
+const DEGREE_OF_FEW: u32 = 1;
+
 /// So many Gaussians; nothing for `auto`.
 type BudgetChoice = Option<usize>;
 
@@ -197,7 +204,8 @@ pub struct Config {
     /// How their number is controlled.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub strategy: Strategy,
-    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init-ply, else the preset's.
+    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init-ply, else the preset's, but 1 where fewer than 25 photos are
+    /// trained on.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
     pub sh_degree: Option<u32>,
     /// Anti-aliasing by the 2-D Mip filter.
@@ -297,6 +305,12 @@ impl Config {
     /// Iterations of the run.
     pub fn iterations(&self) -> u32 {
         self.iterations.unwrap_or(self.preset.values().0)
+    }
+
+    /// Highest SH degree of a run on so many views, unless it is asked for.
+    pub(super) fn degree(&self, views: usize) -> u32 {
+        let (_, degree, _) = self.preset.values();
+        if views < FEW_VIEWS { degree.min(DEGREE_OF_FEW) } else { degree }
     }
 
     /// How many Gaussians there may be, for views of so many pixels in all.

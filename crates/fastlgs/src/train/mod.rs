@@ -12,6 +12,7 @@ pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
+use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::{Alignment, Channels, Choice, Target, TrainConfig, Trainer};
 pub(crate) use start::target;
 use std::path::PathBuf;
@@ -82,7 +83,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
         );
     }
-    let settings = settings(config, &first, start::pixels(&targets), light.spread_stops, run.seed);
+    let settings = settings(config, &first, &targets, light.spread_stops, run.seed);
     let device = device(settings.iterations, run)?;
     let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
@@ -186,13 +187,12 @@ fn device(iterations: u32, run: &Run) -> Result<Choice> {
 }
 
 /// What the trainer is told: options, else what the preset says.
-fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread: f32, seed: u64) -> TrainConfig {
-    let (_, preset_degree, _) = config.preset.values();
+fn settings(config: &Config, first: &Gaussians, views: &[Target], brightness_spread: f32, seed: u64) -> TrainConfig {
     let by_descent = config.feature_mode == FeatureMode::Train;
     TrainConfig {
         iterations: config.iterations(),
         seed,
-        budget: config.budget(pixels),
+        budget: config.budget(start::pixels(views)),
         strategy: match config.strategy {
             Strategy::Classic => fastlgs_raster::Strategy::Classic,
             Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
@@ -203,7 +203,7 @@ fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread
             // As the paper's authors train.
             (false, true) => Channels::Coupled,
         },
-        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { preset_degree }),
+        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { config.degree(views.len()) }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
         antialias: config.antialias,
@@ -226,7 +226,6 @@ fn settings(config: &Config, first: &Gaussians, pixels: usize, brightness_spread
 /// Gives every Gaussian the object whose code is nearest to its trained feature; none where the origin is nearer, towards which what no mask
 /// covers was trained.
 fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
-    for (id, feature) in scene.object_ids.iter_mut().zip(&scene.features) {
-        *id = grid.owner(*feature).0;
-    }
+    let codebook = Codebook::of(grid);
+    scene.object_ids = scene.features.iter().map(|feature| codebook.owner(*feature).0).collect();
 }

