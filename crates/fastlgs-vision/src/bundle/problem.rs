@@ -292,3 +292,40 @@ impl Eliminated {
         DVec3::new(step[0], step[1], step[2])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::Vec3;
+
+    /// `size` along axis k, zero along the others.
+    fn along<const N: usize>(k: usize, size: f64) -> [f64; N] {
+        std::array::from_fn(|c| if c == k { size } else { 0.0 })
+    }
+
+    #[test]
+    fn slopes_are_those_of_finite_differences() {
+        let camera = Camera::look_at("a", Vec3::new(0.3, -0.2, -4.0), Vec3::ZERO, Vec3::Y, 320, 240, 0.9);
+        let problem = Problem { cameras: std::slice::from_ref(&camera), lens: vec![Some(0)], seen: Vec::new() };
+        let point = DVec3::new(0.7, -0.5, 0.4);
+        let values = Values { poses: vec![Pose::of(&camera)], lenses: vec![Lens { log_focal: 0.02, k1: -0.1 }], points: vec![point] };
+        // The key point lies beside where the point is seen, so that the loss has a slope and a weight.
+        let observation = Observation { view: 0, pixel: problem.project(&values, 0, point).unwrap() + DVec2::new(0.4, -0.7) };
+        let (residual, by_camera, by_point) = problem.linear(&values, &observation, point).unwrap();
+        let weight = residual.norm() / DVec2::new(0.4, -0.7).length();
+        let seen = |camera: [f64; ALL], moved: DVec3| {
+            let values = values.stepped(&DVector::from_row_slice(&camera), &[moved]);
+            problem.project(&values, 0, values.points[0]).unwrap()
+        };
+        const H: f64 = 1e-5;
+        for k in 0..ALL + 3 {
+            let at = |size: f64| {
+                if k < ALL { seen(along(k, size), DVec3::ZERO) } else { seen([0.0; ALL], DVec3::from(along::<3>(k - ALL, size))) }
+            };
+            let slope = weight * (at(H) - at(-H)) / (2.0 * H);
+            let told = if k < ALL { by_camera.column(k) } else { by_point.column(k - ALL) };
+            let apart = (slope - DVec2::new(told[0], told[1])).length();
+            assert!(apart < 1e-5 * slope.length().max(1.0), "number {k}: {slope} by differences, {told} as computed");
+        }
+    }
+}

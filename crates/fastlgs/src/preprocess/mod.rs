@@ -76,7 +76,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     poses::warn(&known, &checked, run, &mut warnings);
     let adjusted = match config.poses {
         Poses::Keep => None,
-        asked => poses::adjust(&mut known, &matches, asked, run, &mut warnings),
+        asked => poses::adjust(&mut known, &matches, asked, &folder, run, &mut warnings)?,
     };
     lap("adjusting");
     let cameras: Vec<Camera> = known.iter().map(|p| p.camera.clone()).collect();
@@ -121,17 +121,15 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let light = Brightness { spread_stops: compared.spread_stops, gains };
 
     let tracks = tracks::tracks(&poses, &keypoints, &matches, tracks::TOLERANCE);
-    let mut points = tracks::points(&tracks, &colors);
+    // Those that came with the poses lie where these were.
+    let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
+    let mut points =
+        if poses_are_given && dataset.points.len() > tracks.len() { dataset.points.clone() } else { tracks::points(&tracks, &colors) };
     lap("tracks");
     let work = run.work("depths", poses.len() as u64);
     points.extend(sweep::points(&poses, &tracks, |camera| Ok(folder.photo(&camera.name)?), || work.advance())?);
     drop(work);
     lap("depths");
-    // Those that came with the poses lie where these were.
-    let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
-    if poses_are_given && dataset.points.len() > points.len() {
-        points.clone_from(&dataset.points);
-    }
     folder.save_points(&points)?;
     evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &matches)?)?;
     lap("points");

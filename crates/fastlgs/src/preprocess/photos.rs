@@ -5,13 +5,14 @@ use crate::cache::{self, Cache, Key};
 use crate::error::{Context, bail};
 use crate::{Result, Run};
 use fastlgs_core::dataset::{Dataset, PosedPhoto};
-use fastlgs_core::undistort::{undistort, undistort_gray};
+use fastlgs_core::undistort::{Distortion, undistort, undistort_gray};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
 use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
+use std::path::PathBuf;
 
 /// A working photo: undistorted and scaled.
 pub struct Photo {
@@ -77,9 +78,13 @@ pub(super) fn load(dataset: &Dataset, config: &Config, folder: &SceneFolder, cac
     Ok(photos)
 }
 
+fn fingerprint(camera: &Camera, pixels: &RgbImage) -> Key {
+    cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()])
+}
+
 /// What stays in memory of a photo.
 fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
-    let key = cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()]);
+    let key = fingerprint(&camera, &pixels);
     let inputs = cache::key(&[&key, keypoints::backend().as_bytes()]);
     let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
     let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
@@ -100,6 +105,25 @@ fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
         }
     }
     Ok(())
+}
+
+/// Frees the photos in the scene folder, and their key points, from a bend of the lens that nothing had told of: `k1` for each photo, with the
+/// focal length that its camera has by now.
+pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder) -> Result<()> {
+    photos.par_iter_mut().zip(k1).try_for_each(|(known, &k1)| {
+        let (camera, lens) = (known.camera.clone(), Distortion { k1, ..Distortion::default() });
+        let mask = |path: PathBuf| -> Result<Option<GrayImage>> {
+            let mask = path.is_file().then(|| image_io::load_gray(&path)).transpose()?;
+            Ok(mask.map(|m| undistort_gray(&m, &camera, &lens)))
+        };
+        let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
+        let pixels = undistort(&folder.photo(&camera.name)?, &camera, &lens);
+        known.key = fingerprint(&camera, &pixels);
+        known.points.positions.iter_mut().for_each(|p| {
+            *p = camera.to_pixel(lens.straight(camera.ray(*p).truncate()).extend(1.0));
+        });
+        save_photo(&Photo { camera, pixels, alpha, ignore }, folder)
+    })
 }
 
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.

@@ -84,8 +84,8 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
     Ok(points)
 }
 
-/// Pixels that a lens may bend a photo's corners by before the user hears of it.
-const BENT: f32 = 3.0;
+/// Pixels by which a lens may bend a photo's corners before the photos are straightened: resampling costs some sharpness.
+const BENT: f32 = 1.0;
 /// Adjusted poses are used where the error of the key points falls below this share of what it was: that of exact poses falls by some
 /// hundredths, as adjusting fits the noise of the key points as well.
 const MENDED: f32 = 0.9;
@@ -96,13 +96,14 @@ pub(super) fn adjust(
     photos: &mut [Known],
     matches: &[PairMatches],
     asked: Poses,
+    folder: &SceneFolder,
     run: &Run,
     warnings: &mut Vec<String>,
-) -> Option<Adjusted> {
+) -> Result<Option<Adjusted>> {
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
     let work = run.work("bundle adjustment", 0);
-    let report = bundle::adjust(&mut cameras, &points, matches)?;
+    let Some(report) = bundle::adjust(&mut cameras, &points, matches) else { return Ok(None) };
     drop(work);
     let mut moved = report.moved.clone();
     moved.sort_by(f32::total_cmp);
@@ -117,15 +118,16 @@ pub(super) fn adjust(
     };
     let bent = photos.iter().map(|p| &p.camera).zip(&report.k1).map(bend).fold(0.0, f32::max);
     let k1 = report.k1.iter().copied().fold(0.0, |a: f32, b| if b.abs() > a.abs() { b } else { a });
-    if bent > BENT {
+    if used && bent > BENT {
+        super::photos::straighten(photos, &report.k1, folder)?;
         let warning = format!(
-            "the lens bends the photos by {bent:.0} pixels at their corners, which the given poses do not say: add \"k1\": {k1:.4} to a \
-             transforms.json, or a radial term to COLMAP's camera model"
+            "the lens bends the photos by {bent:.1} pixels at their corners, which the given poses do not say; the photos were straightened \
+             (\"k1\": {k1:.4} in a transforms.json, or a radial term in COLMAP's camera model, does it at full size)"
         );
         run.warn(&warning);
         warnings.push(warning);
     }
-    Some(Adjusted {
+    Ok(Some(Adjusted {
         error_before: report.error[0],
         error_after: report.error[1],
         explained,
@@ -134,5 +136,5 @@ pub(super) fn adjust(
         focal: report.focal.iter().sum::<f32>() / report.focal.len().max(1) as f32,
         k1,
         used,
-    })
+    }))
 }

@@ -1,0 +1,222 @@
+//! Photos as people take them: none of them posed, parts of them masked, a lens that bends them, a video in their place; and what is done again
+//! when some of them change.
+//!
+//! Needs the offline models and any Vulkan device; skips loudly without them unless FASTLGS_REQUIRE_GPU is set.
+
+#[path = "support/run.rs"]
+mod run;
+
+use fastlgs_core::image_io::{load_rgb, save_png};
+use fastlgs_core::metrics::psnr;
+use fastlgs_core::undistort::{Distortion, undistort};
+use run::{fails, json, text};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+#[test]
+fn transparent_and_masked_pixels_do_not_count() {
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+    json(&["synth", "room", "-o", text(&photos), "--views", "8", "--size", "96x64"]);
+    let opaque = image::open(photos.join("images/001.png")).expect("a photo").into_rgb8();
+    // The left half is transparent, and holds nonsense.
+    let half = |x: u32| x < opaque.width() / 2;
+    let nonsense = |x: u32, y: u32| {
+        if half(x) {
+            [255, 0, 255, 0]
+        } else {
+            let p = opaque.get_pixel(x, y);
+            [p[0], p[1], p[2], 255]
+        }
+    };
+    image::RgbaImage::from_fn(96, 64, |x, y| image::Rgba(nonsense(x, y))).save(photos.join("images/001.png")).expect("a photo");
+    std::fs::create_dir_all(photos.join("ignore")).expect("a folder");
+    image::GrayImage::from_fn(96, 64, |_, y| image::Luma([if y < 32 { 0 } else { 255 }]))
+        .save(photos.join("ignore/002.png"))
+        .expect("a mask");
+    json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--holdout", "0"]);
+    assert!(scene.join("alpha/001.png.png").is_file() && scene.join("ignore/002.png.png").is_file());
+    assert!(!scene.join("alpha/003.png.png").exists());
+    let train = |background: &str| {
+        json(&[
+            "train",
+            text(&scene),
+            "--iterations",
+            "60",
+            "--budget",
+            "2000",
+            "--device",
+            "cpu",
+            "--curve",
+            "40",
+            "--background",
+            background,
+        ])
+    };
+    let report = train("0,1,0");
+    assert_eq!(report["background"], serde_json::json!([0.0, 1.0, 0.0]));
+    assert_eq!(report["curve"][0]["iteration"], 40);
+    fails(&["train", text(&scene), "--iterations", "1", "--background", "learn"], &["001.png", "transparent"]);
+}
+
+/// The lens bends the photos, and neither the poses nor anything else says so.
+#[test]
+fn an_untold_bend_of_the_lens_is_found_and_removed() {
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+    json(&["synth", "study", "-o", text(&photos), "--views", "20", "--size", "400x300"]);
+    const K1: f32 = -0.08;
+    let camera = fastlgs_core::dataset::load(&photos).expect("photos").photos[0].camera.clone();
+    // What undoes a bend, to the second order, is a bend the other way.
+    let lens = Distortion { k1: -K1, k2: 3.0 * K1 * K1, ..Distortion::default() };
+    let straight: Vec<(PathBuf, image::RgbImage)> = std::fs::read_dir(photos.join("images"))
+        .expect("photos")
+        .map(|entry| {
+            let path = entry.expect("a photo").path();
+            let photo = load_rgb(&path).expect("a photo");
+            save_png(&path, undistort(&photo, &camera, &lens)).expect("a photo");
+            (path, photo)
+        })
+        .collect();
+    let report = json(&["preprocess", text(&photos), "-o", text(&scene)]);
+    let found = report["adjusted"]["k1"].as_f64().expect("a number") as f32;
+    assert!((found - K1).abs() < 0.02, "{report}");
+    let warned = report["warnings"].as_array().expect("a list").iter().any(|w| w.as_str().expect("words").contains("were straightened"));
+    assert!(warned, "{report}");
+    // Away from the edges, which the bent photos do not show.
+    let inner = |photo: &image::RgbImage| {
+        let inside = image::imageops::crop_imm(photo, 40, 30, 320, 240).to_image();
+        inside.into_raw().into_iter().map(|v| f32::from(v) / 255.0).collect::<Vec<_>>()
+    };
+    let folder = fastlgs_core::SceneFolder::open(&scene).expect("a scene");
+    let mean = |photo: &dyn Fn(&Path) -> image::RgbImage| {
+        straight.iter().map(|(path, truth)| psnr(&inner(&photo(path)), &inner(truth))).sum::<f64>() / straight.len() as f64
+    };
+    let bent = mean(&|path| load_rgb(path).expect("a photo"));
+    let mended = mean(&|path| folder.photo(&path.file_name().expect("a name").to_string_lossy()).expect("a photo"));
+    println!("k1 {found:.3} of {K1}; photos agree with straight ones to {bent:.1} dB before, {mended:.1} dB after");
+    assert!(mended > bent + 2.0, "{bent} dB before, {mended} dB after");
+}
+
+#[test]
+fn preprocessing_does_again_only_what_changed() {
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+    json(&["synth", "room", "-o", text(&photos), "--views", "10", "--size", "160x120"]);
+    let run = || json(&["preprocess", text(&photos), "-o", text(&scene), "--memory", "20M"]);
+    let counts = |report: &Value, stage: &str| [0, 1].map(|k| report["cached"][stage][k].as_u64().expect("a number"));
+    let first = run();
+    let results = || ["points.safetensors", "pairs.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
+    let before = results();
+    assert_eq!([counts(&first, "masks"), counts(&first, "poses")], [[0, 8], [0, 1]]);
+    let second = run();
+    for stage in ["masks", "poses", "key points", "matches"] {
+        let [there, all] = counts(&second, stage);
+        assert_eq!(there, all, "{stage}");
+    }
+    assert!(before == results(), "what is taken from the cache gives the same bytes");
+    // A photo changes: its own masks and matches are made again, and no others.
+    let path = photos.join("images/003.png");
+    let changed = image::imageops::huerotate(&load_rgb(&path).expect("a photo"), 90);
+    save_png(&path, changed).expect("a photo");
+    let third = run();
+    assert_eq!([counts(&third, "masks"), counts(&third, "poses")], [[7, 8], [0, 1]]);
+    assert!(before != results());
+}
+
+/// The exact poses are taken away; what structure from motion finds must agree with them but for a similarity.
+#[test]
+fn photos_without_poses_are_placed() {
+    if !run::ready() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, exact, scene) = (dir.path().join("photos"), dir.path().join("exact"), dir.path().join("scene"));
+    json(&["synth", "table", "-o", text(&photos), "--views", "24", "--size", "400x300"]);
+    // Names of photos may have spaces.
+    for [from, to] in ["images/*", "masks/*.png", "masks/part/*.png", "masks/subpart/*.png"]
+        .map(|f| ["003.png", "photo 3.png"].map(|n| photos.join(f.replace('*', n))))
+    {
+        if from.is_file() {
+            std::fs::rename(from, to).expect("another name");
+        }
+    }
+    let poses = std::fs::read_to_string(photos.join("transforms.json")).expect("poses");
+    std::fs::write(photos.join("transforms.json"), poses.replace("images/003.png", "images/photo 3.png")).expect("poses");
+    json(&["preprocess", text(&photos), "-o", text(&exact), "--segmenter", "import"]);
+    std::fs::remove_file(photos.join("transforms.json")).expect("the poses");
+    let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+    assert!(report["photos"].as_u64() >= Some(22), "{report}");
+    assert!(std::fs::read(scene.join("cameras/cameras.json")).is_ok_and(|c| String::from_utf8_lossy(&c).contains("photo 3.png")));
+    assert!(photos.join("sparse/0/images.bin").is_file() && !photos.join("sparse.partial").exists());
+    let cameras = |scene: &Path| -> Vec<fastlgs_core::Camera> {
+        fastlgs_core::SceneFolder::open(scene).and_then(|folder| folder.cameras()).expect("cameras")
+    };
+    let (exact, found) = (cameras(&exact), cameras(&scene));
+    // Distances between centres, as shares of their mean, know no similarity.
+    let pairs = |all: &[fastlgs_core::Camera]| -> Vec<f32> {
+        let centre = |name: &str| all.iter().find(|c| c.name == name).expect("a camera").centre();
+        let names: Vec<&str> = found.iter().map(|c| c.name.as_str()).collect();
+        let far = names.iter().zip(names.iter().skip(5)).map(|(a, b)| centre(a).distance(centre(b))).collect::<Vec<_>>();
+        let mean = far.iter().sum::<f32>() / far.len() as f32;
+        far.iter().map(|d| d / mean).collect()
+    };
+    let mut off: Vec<f32> = pairs(&exact).iter().zip(pairs(&found)).map(|(a, b)| (a - b).abs()).collect();
+    off.sort_by(f32::total_cmp);
+    let (median, worst) = (off[off.len() / 2], off[off.len() - 1]);
+    println!("{} of 24 photos placed; distances between centres differ by {median:.4} of their mean, at most {worst:.4}", found.len());
+    // Some three dozen points a photo are all that the table's plain surfaces give: single photos may be off.
+    assert!(median < 0.02 && worst < 0.3, "{off:?}");
+}
+
+/// A camera that goes around a table, and shakes for a moment.
+#[test]
+fn videos_become_photos() {
+    if !run::ready() {
+        return;
+    }
+    if Command::new("ffmpeg").arg("-version").output().is_err() {
+        assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "ffmpeg is missing");
+        eprintln!("SKIPPED: ffmpeg is missing");
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (frames, video, scene) = (dir.path().join("frames"), dir.path().join("walk 100%.mp4"), dir.path().join("scene"));
+    json(&["synth", "table", "-o", text(&frames), "--views", "180", "--size", "400x300"]);
+    let shaken: Vec<PathBuf> = (60..75).map(|k| frames.join(format!("images/{k:03}.png"))).collect();
+    for frame in &shaken {
+        let sharp = load_rgb(frame).expect("a frame");
+        save_png(frame, image::imageops::fast_blur(&sharp, 6.0)).expect("a frame");
+    }
+    let pattern = frames.join("images/%03d.png");
+    let made = Command::new("ffmpeg")
+        .args(["-v", "error", "-framerate", "15", "-i", text(&pattern), "-c:v", "mpeg4", "-q:v", "2", text(&video)])
+        .status();
+    assert!(made.expect("ffmpeg starts").success());
+
+    let preprocess = || json(&["preprocess", text(&video), "-o", text(&scene)]);
+    let report = preprocess();
+    let photos: Vec<PathBuf> = std::fs::read_dir(scene.join("video/images")).expect("photos").map(|e| e.expect("a photo").path()).collect();
+    println!("{} of 180 frames became photos, {} of which were placed", photos.len(), report["photos"]);
+    assert!((16..90).contains(&photos.len()), "{} photos", photos.len());
+    assert!(report["photos"].as_u64() >= Some(photos.len() as u64 * 9 / 10), "{report}");
+    assert!(report["warnings"].as_array().expect("a list").iter().all(|w| !w.as_str().expect("words").contains("blurred")), "{report}");
+    let changed = |path: &Path| path.metadata().and_then(|m| m.modified()).expect("a time");
+    let before = changed(&photos[0]);
+    assert_eq!(preprocess()["photos"], report["photos"]);
+    assert_eq!(changed(&photos[0]), before, "frames of the same video are kept");
+
+    std::fs::write(&video, "no video").expect("a file");
+    fails(&["preprocess", text(&video), "-o", text(&scene)], &["walk 100%.mp4", "ffmpeg cannot read"]);
+    assert_eq!(changed(&photos[0]), before, "what was there is not damaged");
+}
