@@ -72,7 +72,8 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
     let Some(f) = fixture() else { return };
     let at = |name: &str| f.dir.path().join("removal").join(name);
     let (truth, tidy) = (at("truth"), at("tidy"));
-    json(&["synth", "room", "-o", text(&truth), "--views", "32", "--size", "320x240", "--without", "coffee"]);
+    let made = json(&["synth", "room", "-o", text(&truth), "--views", "32", "--size", "320x240", "--without", "coffee"]);
+    assert!(made["objects"].as_array().is_some_and(|names| !names.is_empty() && names.iter().all(|name| name != "coffee")), "{made}");
     let id = coffee(f).to_string();
     let report = json(&["remove", text(&f.scene), "--object", &id, "-o", text(&tidy)]);
     assert!(report["removed"].as_u64().is_some_and(|n| n > 50), "{report}");

@@ -15,7 +15,7 @@ use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
-use fastlgs_raster::{Channels, View, lift};
+use fastlgs_raster::{Channels, lift};
 use fastlgs_vision::Encoder;
 use glam::Vec3;
 use ndarray::{Array2, Axis};
@@ -292,7 +292,7 @@ fn rendered(scene: &mut Session, camera: &Camera, vectors: &Vectors) -> Result<V
         let at = |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
         scene.gaussians.features = vectors.rows().into_iter().map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2))).collect();
         scene.engine.set_state(&State::of(&scene.gaussians))?;
-        let frame = scene.engine.render(View::new(camera, scene.gaussians.len(), scene.gaussians.sh_degree), Channels::Feature)?;
+        let frame = scene.engine.render(scene.view(camera), Channels::Feature)?;
         for (k, channel) in covered(&frame).into_iter().enumerate().take(width - first) {
             out.column_mut(first + k).iter_mut().zip(channel).for_each(|(o, v)| *o = v);
         }

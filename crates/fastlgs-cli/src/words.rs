@@ -72,11 +72,12 @@ pub fn train(r: &fastlgs::train::Report) -> String {
         (
             "time",
             format!(
-                "{:.0} s for {} iterations of {}, {:.0} s for objects",
+                "{:.0} s for {} iterations of {}, {:.0} s for objects{}",
                 r.seconds,
                 thousands(r.iterations as usize),
                 r.size,
-                r.mapping_seconds
+                r.mapping_seconds,
+                r.mapping_summary.as_ref().map_or_else(String::new, |s| format!(" in {} MB", s.megabytes + 1))
             ),
         ),
         ("device", format!("{} ({})", r.adapter, r.device.why)),

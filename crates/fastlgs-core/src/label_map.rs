@@ -134,20 +134,42 @@ impl LabelMap {
         image_io::save_png(path, DynamicImage::ImageLuma16(picture))
     }
 
-    /// Reads a grey PNG of 8 or 16 bits.
+    /// Reads a grey PNG of 8 or 16 bits, or the places in the palette of a PNG that has one: trackers and DAVIS's tools keep ids so.
     ///
     /// # Errors
-    /// [`Error::Io`], or [`Error::Format`] when it is not a grey picture.
+    /// [`Error::Io`], or [`Error::Format`] when it is neither.
     pub fn load(path: &Path) -> Result<Self> {
-        let reader = ImageReader::new(Cursor::new(fs::read(path)?)).with_guessed_format().map_err(Error::io(path))?;
+        let bytes = fs::read(path)?;
+        if let Some(indexed) = Self::indexed(&bytes) {
+            return indexed.map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")));
+        }
+        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(Error::io(path))?;
         let decoded = reader.decode().map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")))?;
         let (width, height) = (decoded.width(), decoded.height());
         let labels = match decoded {
             DynamicImage::ImageLuma16(map) => map.into_raw(),
             DynamicImage::ImageLuma8(map) => map.into_raw().into_iter().map(u16::from).collect(),
-            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits")),
+            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits, or one with a palette")),
         };
         Ok(Self { width, height, labels })
+    }
+
+    /// The places in the palette of a PNG; nothing for a file without one. Other readers would give the colours.
+    fn indexed(bytes: &[u8]) -> Option<Result<Self, png::DecodingError>> {
+        let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().ok()?;
+        let (width, height, bits) = (reader.info().width, reader.info().height, reader.info().bit_depth as usize);
+        if reader.info().color_type != png::ColorType::Indexed {
+            return None;
+        }
+        let mut packed = vec![0; reader.output_buffer_size()?];
+        if let Err(error) = reader.next_frame(&mut packed) {
+            return Some(Err(error));
+        }
+        // Rows begin with a byte of their own; within it the first pixel has the highest bits.
+        let row = reader.output_line_size(width)?;
+        let label = |x: usize, y: usize| u16::from(packed[y * row + x * bits / 8] << (x * bits % 8) >> (8 - bits));
+        let labels = (0..height as usize).flat_map(|y| (0..width as usize).map(move |x| (x, y))).map(|(x, y)| label(x, y)).collect();
+        Some(Ok(Self { width, height, labels }))
     }
 }
 
@@ -166,6 +188,23 @@ mod tests {
         assert_eq!(map.areas()[2], 2);
         let double = map.resized(6, 4);
         assert_eq!((double.at(4, 1), double.at(0, 2), double.at(2, 3)), (300, 65535, 2));
+    }
+
+    #[test]
+    fn a_palette_gives_places_and_not_colours() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("tracked.png");
+        for (depth, packed) in [(png::BitDepth::Eight, vec![0, 3, 1, 2, 2, 0]), (png::BitDepth::Two, vec![0b0011_0100, 0b1010_0000])] {
+            let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), 3, 2);
+            encoder.set_color(png::ColorType::Indexed);
+            encoder.set_depth(depth);
+            encoder.set_palette(vec![0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]);
+            encoder.write_header().unwrap().write_image_data(&packed).unwrap();
+            let map = LabelMap::load(&path).unwrap();
+            assert_eq!((map.width, map.height, map.labels), (3, 2, vec![0, 3, 1, 2, 2, 0]), "{depth:?}");
+        }
+        std::fs::write(&path, &std::fs::read(&path).unwrap()[..60]).unwrap();
+        assert!(LabelMap::load(&path).unwrap_err().to_string().contains("tracked.png"));
     }
 
     #[test]

@@ -81,9 +81,11 @@ pub fn ssim_window() -> [f32; 2 * SSIM_RADIUS + 1] {
     raw.map(|w| (w / sum) as f32)
 }
 
-/// Mean structural similarity of planar pictures `[channels][h][w]` in [0, 1], with zeros outside, as 3DGS measures it.
-pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
+/// Mean structural similarity of planar pictures `[channels][h][w]` in [0, 1], with zeros outside, as 3DGS measures it, over the windows around
+/// the pixels that count, `[h][w]`.
+pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, counts: &[bool]) -> f64 {
     let n = width * height;
+    let counting = a.len() / n * counts.iter().filter(|c| **c).count();
     let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
     let mut total = 0.0;
     for (a, b) in a.chunks_exact(n).zip(b.chunks_exact(n)) {
@@ -91,13 +93,13 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize) -> f64 {
         let blur = |x: &[f32]| blur(x, width, height);
         let (ma, mb) = (blur(a), blur(b));
         let (aa, bb, ab) = (blur(&product(a, a)), blur(&product(b, b)), blur(&product(a, b)));
-        for i in 0..n {
+        for i in (0..n).filter(|&i| counts[i]) {
             let (ma, mb) = (f64::from(ma[i]), f64::from(mb[i]));
             let (va, vb, cov) = (f64::from(aa[i]) - ma * ma, f64::from(bb[i]) - mb * mb, f64::from(ab[i]) - ma * mb);
             total += (2.0 * ma * mb + c1) * (2.0 * cov + c2) / ((ma * ma + mb * mb + c1) * (va + vb + c2));
         }
     }
-    total / a.len().max(1) as f64
+    total / counting.max(1) as f64
 }
 
 /// Separable blur with the SSIM window, zeros outside.
@@ -200,8 +202,13 @@ mod tests {
     #[test]
     fn ssim_and_psnr_of_known_pictures() {
         let a: Vec<f32> = (0..32 * 24).map(|i| ((i * 37) % 101) as f32 / 100.0).collect();
-        assert!((ssim(&a, &a, 32, 24) - 1.0).abs() < 1e-6);
-        assert!(ssim(&a, &a.iter().map(|v| 1.0 - v).collect::<Vec<_>>(), 32, 24) < 0.2);
+        let (inverse, all): (Vec<f32>, _) = (a.iter().map(|v| 1.0 - v).collect(), vec![true; a.len()]);
+        assert!((ssim(&a, &a, 32, 24, &all) - 1.0).abs() < 1e-6);
+        assert!(ssim(&a, &inverse, 32, 24, &all) < 0.2);
+        // Far from the half that counts, nothing matters.
+        let left = |k: usize| k % 32 < 8;
+        let half: Vec<f32> = a.iter().zip(&inverse).enumerate().map(|(k, (v, other))| if k % 32 < 16 { *v } else { *other }).collect();
+        assert!((ssim(&a, &half, 32, 24, &(0..32 * 24).map(left).collect::<Vec<_>>()) - 1.0).abs() < 1e-6);
         assert!((psnr(&[0.5, 0.5], &[0.6, 0.4]) - 20.0).abs() < 1e-4);
     }
 

@@ -22,11 +22,6 @@ pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     cells.iter().take(count).map(|c| (c.as_vec3() + 0.5) / side as f32).collect()
 }
 
-/// How far apart the codes of so many objects lie, on the 0..255 scale.
-pub fn spacing(count: usize) -> f32 {
-    SCALE / side(count) as f32
-}
-
 /// The paper's Dis_gf: Euclidean distance on the 0..255 scale.
 pub fn distance(feature: Vec3, code: Vec3) -> f32 {
     SCALE * feature.distance(code)

@@ -71,7 +71,7 @@ fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &m
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Vote;
+    use crate::sightings::Sighting;
     use fastlgs_core::mask_list::{Mask, RunLengths, Table};
     use fastlgs_core::{Level, MaskList};
 
@@ -87,12 +87,11 @@ mod tests {
         };
         let atoms: Vec<_> = views.iter().map(atoms).collect();
         let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
-        let votes = |g| {
-            let shown = atoms.iter().enumerate().filter(|(view, _)| shows(*view, g));
-            shown.map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 50.0)).collect()
-        };
-        let votes: Vec<Vec<Vote>> = (0..12).map(votes).collect();
-        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(&votes, &tables), 3).into_iter().map(|p| p.set).collect();
+        let seen = atoms.iter().enumerate().map(|(view, a)| {
+            let shown = (0..12).filter(|g| shows(view, *g));
+            shown.map(|g| Sighting::new(g, a.map.at(g, 0), 50.0)).collect()
+        });
+        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(12, seen.collect(), &tables), 3).into_iter().map(|p| p.set).collect();
         sets.sort();
         sets
     }

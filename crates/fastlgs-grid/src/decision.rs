@@ -4,14 +4,12 @@
 //! and are within 5 of none: the paper's threshold alone leaves halos of both kinds. Blends show one of the objects beside them, so they are
 //! decided from there.
 
+use crate::codebook::Codebook;
 use crate::codes;
 use crate::grid::Grid;
 use fastlgs_core::LabelMap;
 use glam::Vec3;
 use rayon::prelude::*;
-
-/// Not decided yet.
-const OPEN: u16 = u16::MAX;
 
 /// The object that each pixel shows; 0 for none. `values`: blended codes, `[3][h][w]`.
 ///
@@ -20,30 +18,30 @@ const OPEN: u16 = u16::MAX;
 pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Option<f32>) -> LabelMap {
     let pixels = (width * height) as usize;
     let feature = |p: usize| Vec3::new(values[p], values[pixels + p], values[2 * pixels + p]);
-    let tau_ac = tau_ac.unwrap_or_else(|| codes::spacing(grid.objects.len()) / 4.0);
+    let codebook = Codebook::of(grid);
+    let tau_ac = tau_ac.unwrap_or_else(|| codebook.spacing() / 4.0);
     let sure = |p: usize| {
-        let nearest = grid.owner(feature(p));
-        if nearest.1 < tau_ac { nearest.0 } else { OPEN }
+        let (owner, distance) = codebook.owner(feature(p));
+        (distance < tau_ac).then_some(owner)
     };
-    let mut labels: Vec<u16> = (0..pixels).into_par_iter().map(sure).collect();
-    let mut open: Vec<usize> = (0..pixels).filter(|p| labels[*p] == OPEN).collect();
+    let mut labels: Vec<Option<u16>> = (0..pixels).into_par_iter().map(sure).collect();
+    let mut open: Vec<usize> = (0..pixels).filter(|p| labels[*p].is_none()).collect();
     while !open.is_empty() {
         let beside = |p: usize| {
             let feature = feature(p);
-            let decided = neighbours(p, width as usize, pixels).map(|q| labels[q]).filter(|label| *label != OPEN);
+            let decided = neighbours(p, width as usize, pixels).filter_map(|q| labels[q]);
             let distance = |label: u16| codes::distance(feature, grid.code_of(label));
             decided.min_by(|a, b| distance(*a).total_cmp(&distance(*b)).then(a.cmp(b))).map(|label| (p, label))
         };
         let found: Vec<(usize, u16)> = open.par_iter().filter_map(|p| beside(*p)).collect();
         if found.is_empty() {
             // Nothing is sure anywhere.
-            labels.fill(0);
             break;
         }
-        found.into_iter().for_each(|(p, label)| labels[p] = label);
-        open.retain(|p| labels[*p] == OPEN);
+        found.into_iter().for_each(|(p, label)| labels[p] = Some(label));
+        open.retain(|p| labels[*p].is_none());
     }
-    LabelMap { width, height, labels }
+    LabelMap { width, height, labels: labels.into_iter().map(Option::unwrap_or_default).collect() }
 }
 
 /// The up to eight pixels around a pixel.

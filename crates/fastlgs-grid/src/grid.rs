@@ -1,7 +1,7 @@
 //! The object table: for each object its code and the embeddings of all its views.
 
+use crate::Result;
 use crate::mapping::Mask;
-use crate::{Result, codes};
 use fastlgs_core::scene_folder::{parse_tensors, save_tensors};
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
@@ -74,18 +74,6 @@ impl Grid {
             })
             .collect();
         Self { objects }
-    }
-
-    /// The object whose code is nearest to a rendered feature, with the distance on the 0..255 scale.
-    pub fn nearest(&self, feature: Vec3) -> Option<(u16, f32)> {
-        let distances = self.objects.iter().map(|o| (o.id, codes::distance(feature, o.code)));
-        distances.min_by(|a, b| a.1.total_cmp(&b.1))
-    }
-
-    /// The same; object 0, which is none, where the origin is nearer: what no mask covers is trained towards it.
-    pub fn owner(&self, feature: Vec3) -> (u16, f32) {
-        let nothing = (0, codes::distance(feature, Vec3::ZERO));
-        self.nearest(feature).filter(|found| found.1 < nothing.1).unwrap_or(nothing)
     }
 
     /// The objects that contain an object, from small to large, itself first.

@@ -3,6 +3,7 @@
 //! finds its object ([`relevancy`], [`query`]).
 
 pub mod calibration;
+pub mod codebook;
 pub mod codes;
 pub mod consensus;
 pub mod decision;

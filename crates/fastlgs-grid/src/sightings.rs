@@ -3,27 +3,41 @@
 use fastlgs_core::mask_list::Table;
 use rayon::prelude::*;
 
-/// How much of a Gaussian falls on an atom of a view: six bytes, since a scene has hundreds of millions of them.
+/// Sum of blending weights, in pixels, to three digits: the upper half of a 32-bit float. A scene has hundreds of millions of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Vote {
-    /// Index of the training view.
-    pub view: u16,
-    /// Atom of the view's masks.
-    pub atom: u16,
-    /// Upper half of a 32-bit float.
-    weight: u16,
+struct Weight(u16);
+
+impl Weight {
+    fn new(pixels: f32) -> Self {
+        Self((pixels.to_bits().saturating_add(0x8000) >> 16) as u16)
+    }
+
+    fn pixels(self) -> f32 {
+        f32::from_bits(u32::from(self.0) << 16)
+    }
 }
 
-impl Vote {
-    /// `weight`: sum of blending weights, in pixels.
-    pub fn new(view: u16, atom: u16, weight: f32) -> Self {
-        Self { view, atom, weight: (weight.to_bits().saturating_add(0x8000) >> 16) as u16 }
-    }
+/// How much of a Gaussian falls on an atom of a view's masks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sighting {
+    gaussian: u32,
+    atom: u16,
+    weight: Weight,
+}
 
-    /// Sum of blending weights in pixels, to three digits.
-    pub fn weight(self) -> f32 {
-        f32::from_bits(u32::from(self.weight) << 16)
+impl Sighting {
+    /// `weight`: sum of blending weights, in pixels.
+    pub fn new(gaussian: u32, atom: u16, weight: f32) -> Self {
+        Self { gaussian, atom, weight: Weight::new(weight) }
     }
+}
+
+/// The same, as it is kept for the Gaussian.
+#[derive(Clone, Copy)]
+struct Vote {
+    view: u16,
+    atom: u16,
+    weight: Weight,
 }
 
 /// A mask by its number among those of all views, which follow each other.
@@ -35,32 +49,38 @@ struct Held {
     first: MaskId,
     /// By mask.
     atoms: Vec<Vec<u16>>,
-    /// (Gaussian, its vote for the atom), atom by atom.
-    votes: Vec<(u32, Vote)>,
-    /// By atom: where its votes begin; one more at the end.
+    /// Gaussians, atom by atom.
+    gaussians: Vec<u32>,
+    /// Of each, how much of it falls on the atom.
+    weights: Vec<Weight>,
+    /// By atom: where its Gaussians begin; one more at the end.
     begin: Vec<usize>,
 }
 
 impl Held {
-    fn new(mut votes: Vec<(u32, Vote)>, table: &Table, first: MaskId) -> Self {
-        votes.sort_by_key(|(g, vote)| (vote.atom, *g));
+    fn new(mut seen: Vec<Sighting>, table: &Table, first: MaskId) -> Self {
+        seen.sort_by_key(|s| (s.atom, s.gaussian));
         let mut atoms = vec![Vec::new(); table.areas.len()];
         for atom in 0..table.count() {
             table.masks(atom as u16).iter().for_each(|m| atoms[usize::from(*m)].push(atom as u16));
         }
-        let begin = (0..=table.count()).map(|atom| votes.partition_point(|v| usize::from(v.1.atom) < atom)).collect();
-        Self { first, atoms, votes, begin }
+        let begin = (0..=table.count()).map(|atom| seen.partition_point(|s| usize::from(s.atom) < atom)).collect();
+        Self { first, atoms, gaussians: seen.iter().map(|s| s.gaussian).collect(), weights: seen.iter().map(|s| s.weight).collect(), begin }
     }
 
-    fn of(&self, atom: u16) -> &[(u32, Vote)] {
-        let at = usize::from(atom);
-        &self.votes[self.begin[at]..self.begin[at + 1]]
+    /// Gaussians on an atom, with their pixels there.
+    fn of(&self, atom: u16) -> impl Iterator<Item = (u32, f32)> {
+        let own = self.begin[usize::from(atom)]..self.begin[usize::from(atom) + 1];
+        self.gaussians[own.clone()].iter().copied().zip(self.weights[own].iter().map(|w| w.pixels()))
     }
 }
 
-/// All votes, by Gaussian and by mask.
+/// All sightings, by Gaussian and by mask.
 pub struct Sightings<'a> {
-    votes: &'a [Vec<Vote>],
+    /// Gaussian by Gaussian, rising by view.
+    votes: Vec<Vote>,
+    /// By Gaussian: where its votes begin; one more at the end.
+    begin: Vec<usize>,
     tables: &'a [Table],
     held: Vec<Held>,
     /// By view: the number of its first atom among those of all views; one more at the end.
@@ -89,44 +109,71 @@ pub struct Scratch {
 pub const MIN_PIXELS: f32 = 30.0;
 
 impl<'a> Sightings<'a> {
-    /// `votes` holds each Gaussian's, rising by view; `tables` are those of all views.
-    pub fn new(votes: &'a [Vec<Vote>], tables: &'a [Table]) -> Self {
-        let mut by_view: Vec<Vec<(u32, Vote)>> = vec![Vec::new(); tables.len()];
-        for (g, votes) in votes.iter().enumerate() {
-            votes.iter().for_each(|vote| by_view[usize::from(vote.view)].push((g as u32, *vote)));
+    /// Those of so many Gaussians, view by view; `tables` are those of all views.
+    pub fn new(gaussians: usize, views: Vec<Vec<Sighting>>, tables: &'a [Table]) -> Self {
+        let mut begin = vec![0usize; gaussians + 1];
+        views.iter().flatten().for_each(|seen| begin[seen.gaussian as usize + 1] += 1);
+        (0..gaussians).for_each(|g| begin[g + 1] += begin[g]);
+        let mut next = begin.clone();
+        let mut votes = vec![Vote { view: 0, atom: 0, weight: Weight(0) }; begin[gaussians]];
+        for (view, seen) in views.iter().enumerate() {
+            for Sighting { gaussian, atom, weight } in seen {
+                let place = &mut next[*gaussian as usize];
+                votes[*place] = Vote { view: view as u16, atom: *atom, weight: *weight };
+                *place += 1;
+            }
         }
+        drop(next);
         let mut first = 0;
         let mut place = |table: &Table| {
             first += table.areas.len() as MaskId;
             first - table.areas.len() as MaskId
         };
         let firsts: Vec<MaskId> = tables.iter().map(&mut place).collect();
-        let of_view = |((votes, table), first)| Held::new(votes, table, first);
-        let held: Vec<Held> = by_view.into_par_iter().zip(tables).zip(firsts).map(of_view).collect();
+        let of_view = |((seen, table), first)| Held::new(seen, table, first);
+        let held: Vec<Held> = views.into_par_iter().zip(tables).zip(firsts).map(of_view).collect();
         let pixels = |view: &Held| -> Vec<f32> {
-            let of_atom: Vec<f32> =
-                (0..view.begin.len() as u32 - 1).map(|a| view.of(a as u16).iter().map(|v| v.1.weight()).sum()).collect();
+            let of_atom: Vec<f32> = (0..view.begin.len() as u32 - 1).map(|a| view.of(a as u16).map(|seen| seen.1).sum()).collect();
             view.atoms.iter().map(|atoms| atoms.iter().map(|a| of_atom[usize::from(*a)]).sum()).collect()
         };
         let pixels = held.par_iter().map(pixels).collect::<Vec<_>>().concat();
         let first_atom = (0..=tables.len()).map(|v| tables[..v].iter().map(|t| t.count() as u32).sum()).collect();
-        Self { votes, tables, held, first_atom, pixels }
+        Self { votes, begin, tables, held, first_atom, pixels }
     }
 
     /// Room for [`Self::held_by`] and [`Self::best_fits`].
     pub fn scratch(&self) -> Scratch {
         let atoms = self.first_atom.last().map_or(0, |count| *count as usize);
-        Scratch { gaussians: vec![0.0; self.votes.len()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
+        Scratch { gaussians: vec![0.0; self.gaussians()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
     }
 
     /// How many Gaussians there are.
     pub fn gaussians(&self) -> usize {
+        self.begin.len() - 1
+    }
+
+    /// Pairs of a Gaussian and an atom that it falls on.
+    pub fn len(&self) -> usize {
         self.votes.len()
+    }
+
+    /// Whether no mask sees anything.
+    pub fn is_empty(&self) -> bool {
+        self.votes.is_empty()
+    }
+
+    /// Bytes that these pairs take.
+    pub fn bytes(&self) -> usize {
+        self.len() * (size_of::<Vote>() + size_of::<u32>() + size_of::<Weight>())
+    }
+
+    fn votes_of(&self, gaussian: u32) -> &[Vote] {
+        &self.votes[self.begin[gaussian as usize]..self.begin[gaussian as usize + 1]]
     }
 
     /// The pixels of a Gaussian in all views.
     pub fn weight(&self, gaussian: u32) -> f32 {
-        self.votes[gaussian as usize].iter().map(|v| v.weight()).sum()
+        self.votes_of(gaussian).iter().map(|v| v.weight.pixels()).sum()
     }
 
     fn view_of(&self, mask: MaskId) -> usize {
@@ -151,14 +198,14 @@ impl<'a> Sightings<'a> {
             let view = self.view_of(mask);
             asked[view] = true;
             let held = &self.held[view];
-            for (g, vote) in held.atoms[(mask - held.first) as usize].iter().flat_map(|atom| held.of(*atom)) {
-                add(&mut scratch.gaussians, *g, vote.weight(), &mut met);
+            for (g, pixels) in held.atoms[(mask - held.first) as usize].iter().flat_map(|atom| held.of(*atom)) {
+                add(&mut scratch.gaussians, g, pixels, &mut met);
             }
         }
         let mut met = listed(met);
         met.retain(|g| {
             let inside = std::mem::take(&mut scratch.gaussians[*g as usize]);
-            let shown: f32 = self.votes[*g as usize].iter().filter(|v| asked[usize::from(v.view)]).map(|v| v.weight()).sum();
+            let shown: f32 = self.votes_of(*g).iter().filter(|v| asked[usize::from(v.view)]).map(|v| v.weight.pixels()).sum();
             2.0 * inside > shown
         });
         met
@@ -167,9 +214,9 @@ impl<'a> Sightings<'a> {
     /// Of each view that shows these Gaussians the mask that fits them best, if one holds any of them at all.
     pub fn best_fits(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
         let mut atoms = Vec::new();
-        for vote in set.iter().flat_map(|g| &self.votes[*g as usize]) {
+        for vote in set.iter().flat_map(|g| self.votes_of(*g)) {
             let atom = self.first_atom[usize::from(vote.view)] + u32::from(vote.atom);
-            add(&mut scratch.atoms, atom, vote.weight(), &mut atoms);
+            add(&mut scratch.atoms, atom, vote.weight.pixels(), &mut atoms);
         }
         let (mut met, mut shown) = (Vec::new(), vec![0.0f32; self.tables.len()]);
         for atom in listed(atoms) {
@@ -216,9 +263,9 @@ mod tests {
     use fastlgs_core::{Level, MaskList};
 
     #[test]
-    fn votes_keep_three_digits() {
+    fn weights_keep_three_digits() {
         for weight in [0.02, 1.0, 3.3, 700.0, 1e6] {
-            assert!((Vote::new(0, 0, weight).weight() / weight - 1.0).abs() < 0.005, "{weight}");
+            assert!((Weight::new(weight).pixels() / weight - 1.0).abs() < 0.005, "{weight}");
         }
     }
 
@@ -231,9 +278,8 @@ mod tests {
         };
         let atoms = [atoms(&[4, 2], None), atoms(&[5], Some(7))];
         let tables = atoms.each_ref().map(|a| a.table.clone());
-        let votes = |g| atoms.iter().enumerate().map(|(view, a)| Vote::new(view as u16, a.map.at(g, 0), 40.0)).collect();
-        let votes: Vec<Vec<Vote>> = (0..10).map(votes).collect();
-        let sightings = Sightings::new(&votes, &tables);
+        let seen = atoms.iter().map(|a| (0..10).map(|g| Sighting::new(g, a.map.at(g, 0), 40.0)).collect()).collect();
+        let sightings = Sightings::new(10, seen, &tables);
         assert_eq!(
             (sightings.pixels.as_slice(), sightings.weight(3), sightings.tracks()),
             (&[160.0, 80.0, 200.0][..], 80.0, vec![vec![2]])

@@ -121,14 +121,14 @@ fn compatible<'a>(elected: &'a [Proposal], weights: &[f32]) -> Vec<&'a Proposal>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Vote;
+    use crate::sightings::Sighting;
 
     /// The tree of sets of 20 Gaussians of one pixel each, and the Gaussians of its nodes.
     fn nested(sets: &[std::ops::Range<u32>]) -> (Tree, Vec<Vec<usize>>) {
-        let votes = vec![vec![Vote::new(0, 0, 1.0)]; 20];
+        let seen = (0..20).map(|g| Sighting::new(g, 0, 1.0)).collect();
         let elected: Vec<Proposal> = sets.iter().map(|set| Proposal { set: set.clone().collect(), masks: Vec::new() }).collect();
         let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
-        let tree = Tree::nest(&Sightings::new(&votes, &[table]), &elected);
+        let tree = Tree::nest(&Sightings::new(20, vec![seen], &[table]), &elected);
         let mut sets = vec![Vec::new(); tree.parents.len()];
         for (g, node) in tree.of.iter().enumerate() {
             node.iter().flat_map(|n| tree.upwards(*n)).for_each(|n| sets[n.place()].push(g));

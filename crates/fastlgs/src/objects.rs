@@ -2,12 +2,12 @@
 
 use crate::error::{Context, bail};
 use crate::{Result, Run, eyes, masks};
-use fastlgs_core::mask_list::Table;
+use fastlgs_core::mask_list::{Atoms, Table};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::field::smallest_objects;
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as nodes, Chosen};
-use fastlgs_grid::sightings::{Sightings, Vote};
+use fastlgs_grid::sightings::{Sighting, Sightings};
 use fastlgs_grid::support::{Shown, Support, support};
 use fastlgs_grid::tree::Tree;
 use fastlgs_grid::{Grid, codes, consensus, election, evidence};
@@ -98,14 +98,15 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     let pixels = training.iter().map(|c| (c.width * c.height) as usize).sum::<usize>() / training.len();
     let clock = std::time::Instant::now();
     let told = |what: &str, count: usize| tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}");
-    let (votes, tables) = votes(scene, folder, training, config.antialias, run)?;
+    let (seen, tables) = sightings(scene, folder, training, config.antialias, run)?;
     let masks = tables.iter().map(|t| t.areas.len()).sum();
     let left_out: usize = tables.iter().map(|t| t.left_out).sum();
     if left_out > 0 {
         run.warn(&format!("{left_out} masks cut others into more pieces than can be numbered; they were left out"));
     }
-    told("votes", votes.iter().map(Vec::len).sum());
-    let sightings = Sightings::new(&votes, &tables);
+    let sightings = Sightings::new(scene.len(), seen, &tables);
+    let megabytes = (sightings.bytes() >> 20) as u32;
+    told("sightings", sightings.len());
     let proposals = consensus::proposals(&sightings, config.objects.min_views);
     told("proposals", proposals.len());
     let elected = election::elected(proposals, config.objects.min_views);
@@ -122,7 +123,7 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, config.antialias), &labels)?;
         let own = |label: u16| usize::from(label).checked_sub(1).map(|k| owners[k]);
-        shown.push(Shown::of(shares.smallest(own, |node| tree.parents[node.place()]), &folder.masks(camera)?.atoms().map));
+        shown.push(Shown::of(shares.smallest(own, |node| tree.parents[node.place()]), &atoms(folder, camera)?.map));
         work.advance()?;
     }
     let support = support(&tree, &shown, &tables);
@@ -131,7 +132,7 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     let object_of_label: Vec<u16> = std::iter::once(0).chain(owners.iter().map(|node| chosen.object(*node))).collect();
     scene.object_ids = labels.iter().map(|label| object_of_label[usize::from(*label)]).collect();
     let [few_views, small, unsupported, same] = chosen.dropped;
-    let summary = Summary { masks, nodes: tree.parents.len(), few_views, small, unsupported, same };
+    let summary = Summary { masks, megabytes, nodes: tree.parents.len(), few_views, small, unsupported, same };
     Ok(Mapped { chosen, support, summary })
 }
 
@@ -223,6 +224,8 @@ pub fn seconds_of_embedding(folder: &SceneFolder, training: &[Camera]) -> Result
 pub struct Summary {
     /// Masks of all views.
     pub masks: usize,
+    /// Memory that the pairs of Gaussians and masks' atoms took: what grows most.
+    pub megabytes: u32,
     /// Sets of Gaussians that the masks speak of.
     pub nodes: usize,
     /// Nodes that too few views show.
@@ -235,19 +238,29 @@ pub struct Summary {
     pub same: usize,
 }
 
+/// Where the masks of a view end.
+fn atoms(folder: &SceneFolder, camera: &Camera) -> Result<Atoms> {
+    Ok(folder.masks(camera)?.atoms().without_gaps())
+}
+
 /// How much of each Gaussian falls on the atoms of each view's masks, and which masks these lie in.
-fn votes(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], antialias: bool, run: &Run) -> Result<(Vec<Vec<Vote>>, Vec<Table>)> {
-    let (mut votes, mut tables) = (vec![Vec::new(); scene.len()], Vec::new());
+fn sightings(
+    scene: &Gaussians,
+    folder: &SceneFolder,
+    training: &[Camera],
+    antialias: bool,
+    run: &Run,
+) -> Result<(Vec<Vec<Sighting>>, Vec<Table>)> {
+    let (mut seen, mut tables) = (Vec::new(), Vec::new());
     let work = run.work("votes", training.len() as u64);
-    for (view, camera) in training.iter().enumerate() {
-        let atoms = folder.masks(camera)?.atoms();
-        for vote in lift::votes(scene, &frame(scene, camera, antialias), &atoms.map) {
-            votes[vote.gaussian as usize].push(Vote::new(view as u16, vote.label, vote.weight));
-        }
+    for camera in training {
+        let atoms = atoms(folder, camera)?;
+        let votes = lift::votes(scene, &frame(scene, camera, antialias), &atoms.map);
+        seen.push(votes.into_iter().map(|vote| Sighting::new(vote.gaussian, vote.label, vote.weight)).collect());
         tables.push(atoms.table);
         work.advance()?;
     }
-    Ok((votes, tables))
+    Ok((seen, tables))
 }
 
 /// The views that show most of each object.

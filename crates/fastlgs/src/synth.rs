@@ -88,8 +88,7 @@ pub fn synth(config: &Config, run: &Run) -> Result<Report> {
     let pictures = config.pictures.clone().unwrap_or_else(models::pictures_dir);
     let mut world = kind.world(&pictures, views, config.size, run.seed)?;
     if let Some(name) = config.without.as_ref().filter(|name| !world.remove(name)) {
-        let names: Vec<&str> = world.things.iter().map(|t| t.name.as_str()).collect();
-        bail!("--without: '{name}' is none of {}", names.join(", "));
+        bail!("--without: '{name}' is none of {}", world.names().join(", "));
     }
     let work = run.work("synth", views as u64);
     let masks = if config.mask_lists { Masks::Lists } else { Masks::Levels };
@@ -100,6 +99,6 @@ pub fn synth(config: &Config, run: &Run) -> Result<Report> {
         photos: config.output.clone(),
         views,
         size: format!("{}x{}", config.size.0, config.size.1),
-        objects: world.things.iter().map(|t| t.name.to_string()).collect(),
+        objects: world.names().into_iter().map(str::to_owned).collect(),
     })
 }

@@ -1,6 +1,6 @@
 //! Pixels that lie in the same set of masks: votes for these are votes for all masks at once.
 
-use super::MaskList;
+use super::{MaskList, gaps};
 use crate::LabelMap;
 use std::collections::BTreeMap;
 
@@ -35,6 +35,19 @@ impl Table {
     /// The masks that an atom lies in, by their places in the list.
     pub fn masks(&self, atom: u16) -> &[u16] {
         &self.masks[usize::from(atom)]
+    }
+}
+
+impl Atoms {
+    /// The same with narrow gaps between masks closed: each pixel of a gap joins the atom nearest to it.
+    #[must_use]
+    pub fn without_gaps(mut self) -> Self {
+        let before = self.map.labels.clone();
+        gaps::close(&mut self.map);
+        for (atom, _) in self.map.labels.iter().zip(before).filter(|(atom, before)| *before != **atom) {
+            self.table.masks[usize::from(*atom)].iter().for_each(|mask| self.table.areas[usize::from(*mask)] += 1);
+        }
+        self
     }
 }
 

@@ -2,6 +2,7 @@
 
 mod atoms;
 mod file;
+mod gaps;
 mod run_lengths;
 
 use crate::LabelMap;

@@ -112,6 +112,12 @@ impl World {
         true
     }
 
+    /// Names of the things that are there: not of those that were taken away.
+    pub fn names(&self) -> Vec<&str> {
+        let there = |number: u16| self.solids.iter().any(|solid| chain(&self.things, solid.thing).any(|id| id == number));
+        (1..).zip(&self.things).filter(|(number, _)| there(*number)).map(|(_, thing)| thing.name.as_str()).collect()
+    }
+
     /// Nearest hit of a ray.
     fn trace(&self, origin: Vec3, direction: Vec3, bounces: u32) -> Hit {
         let Some((index, hit)) = self.tree.nearest(&self.solids, origin, direction) else { return self.backdrop.hit(origin, direction) };

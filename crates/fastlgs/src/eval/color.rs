@@ -28,7 +28,8 @@ pub fn quality(scene: &mut Session) -> Result<Option<Quality>> {
         let given = scene.render(camera)?;
         let compared = Compared::of(&target, given.channels(0, 3));
         sum.psnr += compared.psnr();
-        sum.ssim += metrics::ssim(&compared.rendered, &compared.photo, camera.width as usize, camera.height as usize);
+        let [w, h] = [camera.width, camera.height].map(|side| side as usize);
+        sum.ssim += metrics::ssim(&compared.rendered, &compared.photo, w, h, &compared.counts);
         let camera = aligned(scene, &target)?;
         let aligned = scene.render(&camera)?;
         let mut compared = Compared::of(&target, aligned.channels(0, 3));

@@ -5,7 +5,7 @@ use crate::{Result, Session};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
-use image::{GrayImage, Luma, Rgb};
+use image::{GrayImage, Luma, Rgb, RgbImage};
 use std::path::Path;
 
 /// What is not taken over: it speaks of the photos as they were.
@@ -14,17 +14,17 @@ const LEFT_BEHIND: [&str; 4] = ["cache", "checkpoints", "objects", "embeddings.s
 /// Share of a mask's pixels that must be hidden for it to be one of the thing.
 const OF_THE_THING: f64 = 0.5;
 
-/// A view, the pixels that the thing may have coloured, and the colours that take their place, `[3][h][w]`.
-type Filled = (Camera, Vec<bool>, Vec<f32>);
+/// A view, and the pixels that the thing may have coloured.
+type Hidden = (Camera, Vec<bool>);
 
 /// Writes the scene that `session` holds now to `output`: photos to train on show it without the thing; in photos that are held out, which still
 /// show the thing, those pixels do not count.
-pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
+pub fn write(output: &Path, session: &mut Session, grid: &Grid, views: &[Hidden], what: &str) -> Result<()> {
     let name = output.file_name().with_context(|| format!("{}: it has no name", output.display()))?;
     // Beside its place, so that it can be renamed; a folder that is not finished never bears its name.
     let unfinished = output.with_file_name(format!(".{}.unfinished", name.to_string_lossy()));
     let _ = std::fs::remove_dir_all(&unfinished);
-    let written = assemble(&unfinished, session, grid, pictures, what);
+    let written = assemble(&unfinished, session, grid, views, what);
     if written.is_err() {
         let _ = std::fs::remove_dir_all(&unfinished);
     }
@@ -33,13 +33,13 @@ pub fn write(output: &Path, session: &Session, grid: &Grid, pictures: &[Filled],
 }
 
 /// Writes the folder under the name that it has until it is finished.
-fn assemble(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Filled], what: &str) -> Result<()> {
+fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidden], what: &str) -> Result<()> {
     copy(&session.folder.root, unfinished).map_err(Error::io(unfinished))?;
     let folder = SceneFolder::new(unfinished);
     let mut manifest = session.manifest.clone();
     let held_out = manifest.held_out(&session.cameras);
-    for (camera, hidden, color) in pictures {
-        let (w, n) = (camera.width, hidden.len());
+    for (camera, hidden) in views {
+        let w = camera.width;
         if held_out.iter().any(|c| c.name == camera.name) {
             let path = folder.ignore_path(&camera.name);
             let before = path.is_file().then(|| image_io::load_gray(&path)).transpose()?;
@@ -49,9 +49,7 @@ fn assemble(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Fille
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
-        for (p, pixel) in photo.pixels_mut().enumerate().filter(|(p, _)| hidden[*p]) {
-            *pixel = Rgb(std::array::from_fn(|c| (255.0 * color[c * n + p].clamp(0.0, 1.0) + 0.5) as u8));
-        }
+        patch(&mut photo, hidden, session.render(camera)?.channels(0, 3));
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
             let mut masks = folder.masks(camera)?;
@@ -79,6 +77,19 @@ fn assemble(unfinished: &Path, session: &Session, grid: &Grid, pictures: &[Fille
     Ok(folder.save_manifest(&manifest)?)
 }
 
+/// Shows a rendered picture, `[3][h][w]`, where a photo is hidden, as bright as the rest of the photo is.
+fn patch(photo: &mut RgbImage, hidden: &[bool], color: &[f32]) {
+    let n = hidden.len();
+    let gain: [f32; 3] = std::array::from_fn(|c| {
+        let open = photo.pixels().zip(&color[c * n..(c + 1) * n]).zip(hidden).filter(|(_, hidden)| !**hidden);
+        let (shown, rendered) = open.fold((0.0, 0.0), |(a, b), ((p, v), _)| (a + f32::from(p[c]) / 255.0, b + v.clamp(0.0, 1.0)));
+        if rendered > 0.0 { shown / rendered } else { 1.0 }
+    });
+    for (p, pixel) in photo.pixels_mut().enumerate().filter(|(p, _)| hidden[*p]) {
+        *pixel = Rgb(std::array::from_fn(|c| (255.0 * (gain[c] * color[c * n + p]).clamp(0.0, 1.0) + 0.5) as u8));
+    }
+}
+
 fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
     std::fs::create_dir_all(to)?;
     for entry in std::fs::read_dir(from)? {
@@ -93,4 +104,18 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_patch_is_as_bright_as_its_photo() {
+        // The photo is half as bright as the scene, in which its right half is hidden.
+        let mut photo = RgbImage::from_fn(8, 2, |x, _| Rgb([if x < 4 { 50 } else { 255 }; 3]));
+        let hidden: Vec<bool> = (0..16).map(|p| p % 8 >= 4).collect();
+        patch(&mut photo, &hidden, &[100.0 / 255.0; 3 * 16]);
+        assert!(photo.pixels().all(|p| p.0 == [50; 3]), "{photo:?}");
+    }
 }

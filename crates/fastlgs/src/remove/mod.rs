@@ -123,17 +123,12 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     let seen = 1.0 - count(&mut gaps.iter().map(|g| set(g))) / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
     let filled = fill(&mut session, &grid, &shown, &gaps, &*inpainter, run)?;
 
-    let mut pictures = Vec::new();
-    for (camera, hidden) in hidden {
-        let color = session.render(&camera)?.channels(0, 3).to_vec();
-        pictures.push((camera, hidden, color));
-    }
     let (left_over, ids) = grid.without(&objects);
     for id in &mut session.gaussians.object_ids {
         *id = ids[usize::from(*id)];
     }
     let what = config.text.clone().unwrap_or_else(|| format!("object {}", objects[0]));
-    folder::write(&config.output, &session, &left_over, &pictures, &what)?;
+    folder::write(&config.output, &mut session, &left_over, &hidden, &what)?;
     Ok(Report { scene: config.scene.clone(), output: config.output.clone(), objects, removed, filled, seen, left: left_over.objects.len() })
 }
 

@@ -1,0 +1,49 @@
+//! Gaps between masks: segmenters leave a pixel or two between things that touch, which belong to one of them all the same.
+
+use crate::LabelMap;
+use crate::metrics::dilate;
+
+/// Half the width of the widest gap, in pixels: what a square of five does not fit into.
+const HALF: u32 = 2;
+
+/// Gives every pixel of a gap, which lies in no mask (label 0), the label nearest to it. What is wider than a gap stays: it is what no mask
+/// covers.
+pub(super) fn close(map: &mut LabelMap) {
+    let (width, height) = (map.width as usize, map.height as usize);
+    let covered: Vec<bool> = map.labels.iter().map(|label| *label > 0).collect();
+    // What a square fits into, where nothing is: what is free, eroded and dilated again.
+    let widened = |mask: &[bool]| dilate(mask, map.width, map.height, [HALF; 2]);
+    let wide = widened(&widened(&covered).iter().map(|near| !near).collect::<Vec<_>>());
+    let mut gaps: Vec<usize> = (0..covered.len()).filter(|&p| !covered[p] && !wide[p]).collect();
+    // From both sides at once, a pixel a round.
+    for _ in 0..=HALF {
+        let beside = |p: &usize| {
+            let (x, y) = (p % width, p / width);
+            let near = [(x > 0, p.wrapping_sub(1)), (x + 1 < width, p + 1), (y > 0, p.wrapping_sub(width)), (y + 1 < height, p + width)];
+            near.into_iter().filter(|n| n.0).map(|(_, q)| map.labels[q]).find(|label| *label > 0)
+        };
+        let found: Vec<(usize, u16)> = gaps.iter().filter_map(|p| Some((*p, beside(p)?))).collect();
+        found.into_iter().for_each(|(p, label)| map.labels[p] = label);
+        gaps.retain(|p| map.labels[*p] == 0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gap_goes_to_both_sides_and_what_is_wide_stays() {
+        // Labels 1 and 2 with four columns between them, then eight columns of nothing.
+        let column = |x: u32| match x {
+            0..6 => 1,
+            10..16 => 2,
+            _ => 0,
+        };
+        let mut map = LabelMap { width: 24, height: 12, labels: (0..24 * 12).map(|p| column(p % 24)).collect() };
+        close(&mut map);
+        let row: Vec<u16> = map.labels[6 * 24..][..24].to_vec();
+        assert_eq!(row, [[1; 8].as_slice(), &[2; 8], &[0; 8]].concat());
+        assert!(map.labels.chunks(24).all(|other| other == row));
+    }
+}
