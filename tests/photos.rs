@@ -6,8 +6,9 @@
 #[path = "support/run.rs"]
 mod run;
 
+use fastlgs_core::LabelMap;
 use fastlgs_core::image_io::{load_rgb, save_png};
-use fastlgs_core::metrics::psnr;
+use fastlgs_core::metrics::{iou, psnr};
 use fastlgs_core::undistort::{Distortion, undistort};
 use run::{fails, json, text};
 use serde_json::Value;
@@ -85,7 +86,21 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
             (path, photo)
         })
         .collect();
-    let report = json(&["preprocess", text(&photos), "-o", text(&scene)]);
+    // What others drew on the photos is as bent as these are.
+    let drawn: Vec<[LabelMap; 2]> = straight
+        .iter()
+        .map(|(photo, _)| {
+            let path = photos.join("masks").join(format!("{}.png", photo.file_name().expect("a name").to_string_lossy()));
+            let map = LabelMap::load(&path).expect("masks");
+            let bent = map.undistorted(&camera, &lens);
+            bent.save(&path).expect("masks");
+            [map, bent]
+        })
+        .collect();
+    for finer in ["part", "subpart"] {
+        let _ = std::fs::remove_dir_all(photos.join("masks").join(finer));
+    }
+    let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
     let found = report["adjusted"]["k1"].as_f64().expect("a number") as f32;
     assert!((found - K1).abs() < 0.02, "{report}");
     let warned = report["warnings"].as_array().expect("a list").iter().any(|w| w.as_str().expect("words").contains("were straightened"));
@@ -103,6 +118,27 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
     let mended = mean(&|path| folder.photo(&path.file_name().expect("a name").to_string_lossy()).expect("a photo"));
     println!("k1 {found:.3} of {K1}; photos agree with straight ones to {bent:.1} dB before, {mended:.1} dB after");
     assert!(mended > bent + 2.0, "{bent} dB before, {mended} dB after");
+
+    // Of each thing of some size the IoU with what is drawn as the same.
+    let manifest = folder.manifest().expect("a manifest");
+    let cameras = manifest.training(&folder.cameras().expect("cameras"));
+    let mut agreement = [Vec::new(), Vec::new()];
+    for ((path, _), [truth, bent]) in straight.iter().zip(&drawn) {
+        let Some(camera) = cameras.iter().find(|c| path.ends_with(&c.name)) else { continue };
+        let mended = folder.masks(camera).expect("masks").painted(fastlgs_core::Level::Whole);
+        let areas = truth.areas();
+        for label in (1..areas.len()).filter(|label| (400..20_000).contains(&areas[*label])) {
+            let inside = |map: &LabelMap, label: u16| map.labels.iter().map(|l| *l == label).collect::<Vec<_>>();
+            let thing = inside(truth, label as u16);
+            for (map, found) in [bent, &mended].into_iter().zip(&mut agreement) {
+                let best = (1..=map.max()).map(|other| iou(&inside(map, other), &thing)).fold(0.0, f64::max);
+                found.push(best);
+            }
+        }
+    }
+    let [bent, mended] = agreement.map(|all| all.iter().sum::<f64>() / all.len() as f64);
+    println!("masks agree with straight ones to an IoU of {bent:.3} before, {mended:.3} after");
+    assert!(mended > 0.95 && mended > bent, "{bent} before, {mended} after");
 }
 
 #[test]

@@ -8,6 +8,9 @@ use std::collections::BTreeSet;
 use std::io::Cursor;
 use std::path::Path;
 
+/// Most bytes that a picture with a palette may take: a damaged header may claim any size.
+const MOST_BYTES: usize = 1 << 28;
+
 /// Non-overlapping masks of one view and level; label 0 is unlabelled.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LabelMap {
@@ -161,7 +164,7 @@ impl LabelMap {
         if reader.info().color_type != png::ColorType::Indexed {
             return None;
         }
-        let mut packed = vec![0; reader.output_buffer_size()?];
+        let mut packed = vec![0; reader.output_buffer_size().filter(|bytes| *bytes <= MOST_BYTES)?];
         if let Err(error) = reader.next_frame(&mut packed) {
             return Some(Err(error));
         }

@@ -6,8 +6,10 @@
 use fastlgs_core::{Camera, Gaussians};
 use glam::Vec3;
 
-/// Share of the median depth of a camera's points within which nothing is.
+/// Share of the median depth of a camera's points within which nothing is, unless more than a few of them are.
 const FREE: f32 = 0.2;
+/// Each how-manieth of the points may be wrong.
+const OUTLIER: usize = 50;
 /// Fewest points by which a camera tells what is near.
 const FEW: usize = 50;
 
@@ -22,7 +24,7 @@ impl FreeSpace {
             let mut depths: Vec<f32> = start.means.iter().filter_map(|mean| depth(camera, *mean)).collect();
             depths.sort_by(f32::total_cmp);
             let median = depths.get(depths.len() / 2).filter(|_| depths.len() >= FEW)?;
-            Some((camera.clone(), FREE * median))
+            Some((camera.clone(), (FREE * median).min(depths[depths.len() / OUTLIER])))
         };
         Self(cameras.iter().filter_map(free).collect())
     }

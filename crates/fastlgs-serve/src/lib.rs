@@ -144,7 +144,7 @@ fn focus(means: &[Vec3], camera: &Camera) -> f32 {
         let p = camera.world_to_camera.transform_point3(*m);
         let pixel = camera.to_pixel(p);
         let near = |v: f32, size: u32| (v / size as f32 - 0.5).abs() < 0.2;
-        (p.z > 0.05 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
+        (p.z > 0.0 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
     };
     let mut depths: Vec<f32> = means.iter().step_by(means.len().div_ceil(SAMPLES).max(1)).filter_map(middle).collect();
     depths.sort_by(f32::total_cmp);

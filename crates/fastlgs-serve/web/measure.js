@@ -23,13 +23,15 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 // Where along a ray a Gaussian is densest, and how much light it takes there; nothing where it hardly touches the ray. `pixel` is what
 // a pixel covers at distance 1: nothing is thinner.
-function crossing({ data, texels, means }, i, eye, direction, pixel) {
+function crossing({ data, texels, means }, i, { eye, forward }, direction, pixel) {
   const at = 4 * texels * i;
   const offset = [0, 1, 2].map((k) => eye[k] - means[3 * i + k]);
   const reach = -dot(offset, direction) / dot(direction, direction);
   if (!(reach > 0)) return null;
   const log = [data[at + 3] & 0xffff, data[at + 3] >>> 16, data[at + 4] & 0xffff];
-  const scales = log.map((bits) => Math.max(Math.exp(bits / 65535 * LOG_SCALE_RANGE + LOG_SCALE_LOW), 0.5 * pixel * reach));
+  const sizes = log.map((bits) => Math.exp(bits / 65535 * LOG_SCALE_RANGE + LOG_SCALE_LOW));
+  if (!(-dot(offset, forward) > NEAR * Math.hypot(...sizes))) return null;
+  const scales = sizes.map((size) => Math.max(size, 0.5 * pixel * reach));
   const passing = Math.hypot(...[0, 1, 2].map((k) => offset[k] + reach * direction[k]));
   if (passing > 3.4 * Math.max(...scales)) return null;
   const r = rotation(data[at + 6], data[at + 7]);
@@ -38,7 +40,7 @@ function crossing({ data, texels, means }, i, eye, direction, pixel) {
   const q = scales.map((s, k) => dot(column(k), direction) / s);
   const depth = -dot(p, q) / dot(q, q);
   const alpha = (data[at + 4] >>> 16) / 65535 * Math.exp(-0.5 * (dot(p, p) - dot(p, q) ** 2 / dot(q, q)));
-  return depth > NEAR * Math.hypot(...scales) && alpha >= FAINT ? { depth, alpha } : null;
+  return depth > 0 && alpha >= FAINT ? { depth, alpha } : null;
 }
 
 // The point of the surface that a pixel shows; nothing where one looks through the scene. `shown` tells which objects there are.
@@ -46,7 +48,7 @@ export function pointAt(splats, camera, lens, x, y, shown) {
   const direction = camera.ray(x, y, lens);
   const crossings = [];
   for (let i = 0; i < splats.count; i++) {
-    const hit = crossing(splats, i, camera.eye, direction, 1 / lens.fx);
+    const hit = crossing(splats, i, camera, direction, 1 / lens.fx);
     if (hit && shown(splats.data[4 * splats.texels * i + 7] >>> 16)) crossings.push(hit);
   }
   crossings.sort((a, b) => a.depth - b.depth);

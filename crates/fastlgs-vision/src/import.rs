@@ -166,8 +166,10 @@ impl Import {
             }
             Layout::SpinNerf => {
                 let folder = spin_nerf_folder(&self.photos).expect("found when it was opened");
-                let mut map = LabelMap::load(&self.find(view, &named(folder, "png"))?)?;
-                map.labels.iter_mut().for_each(|l| *l = u16::from(*l > 0));
+                // Black and white, whatever a palette calls them.
+                let mask = image_io::load_gray(&self.find(view, &named(folder, "png"))?)?;
+                let labels = mask.pixels().map(|p| u16::from(p[0] > 0)).collect();
+                let map = LabelMap { width: mask.width(), height: mask.height(), labels };
                 Ok(Found::of_maps(&[map]))
             }
         }

@@ -256,7 +256,10 @@ fn sightings(
     for camera in training {
         let atoms = atoms(folder, camera)?;
         let votes = lift::votes(scene, &frame(scene, camera, antialias), &atoms.map);
-        seen.push(votes.into_iter().map(|vote| Sighting::new(vote.gaussian, vote.label, vote.weight)).collect());
+        // Collected in place, they would keep the room of all that was summed up to them.
+        let mut own: Vec<Sighting> = votes.into_iter().map(|vote| Sighting::new(vote.gaussian, vote.label, vote.weight)).collect();
+        own.shrink_to_fit();
+        seen.push(own);
         tables.push(atoms.table);
         work.advance()?;
     }

@@ -16,7 +16,7 @@ pub(super) fn close(map: &mut LabelMap) {
     let wide = widened(&widened(&covered).iter().map(|near| !near).collect::<Vec<_>>());
     let mut gaps: Vec<usize> = (0..covered.len()).filter(|&p| !covered[p] && !wide[p]).collect();
     // From both sides at once, a pixel a round.
-    for _ in 0..=HALF {
+    for _ in 0..2 * HALF {
         let beside = |p: &usize| {
             let (x, y) = (p % width, p / width);
             let near = [(x > 0, p.wrapping_sub(1)), (x + 1 < width, p + 1), (y > 0, p.wrapping_sub(width)), (y + 1 < height, p + width)];

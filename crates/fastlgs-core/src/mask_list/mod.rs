@@ -5,7 +5,8 @@ mod file;
 mod gaps;
 mod run_lengths;
 
-use crate::LabelMap;
+use crate::undistort::Distortion;
+use crate::{Camera, LabelMap};
 pub use atoms::{Atoms, Table};
 pub use run_lengths::RunLengths;
 use serde::{Deserialize, Serialize};
@@ -101,6 +102,19 @@ impl MaskList {
     /// Masks of a level.
     pub fn count(&self, level: Level) -> usize {
         self.masks.iter().filter(|m| m.level == level).count()
+    }
+
+    /// The masks as the ideal pinhole `camera` of their size would have seen them; those of which nothing is left go.
+    #[must_use]
+    pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
+        let straight = |mask: &Mask| {
+            let mut map = LabelMap::new(self.width, self.height);
+            self.places(mask).for_each(|p| map.labels[p] = 1);
+            let map = map.undistorted(camera, distortion);
+            let runs = RunLengths::of(self.width, self.height, |x, y| map.at(x, y) > 0);
+            (runs.area() > 0).then(|| Mask { runs, ..mask.clone() })
+        };
+        Self { masks: self.masks.iter().filter_map(straight).collect(), ..Self::new(self.width, self.height) }
     }
 
     /// A level's masks as a label map: large ones first, so that smaller ones lie on top. Labels 1, 2, ... follow falling area.

@@ -7,6 +7,7 @@ use crate::keypoints::Keypoints;
 use crate::similarity::Similarity;
 use crate::tracks::{PairMatches, TOLERANCE, Track, tracks};
 use fastlgs_core::Camera;
+use fastlgs_core::undistort::Distortion;
 use glam::Vec3;
 use problem::{Lens, Observation, Pose, Problem, Values};
 use serde::{Deserialize, Serialize};
@@ -34,16 +35,17 @@ pub struct Report {
 /// Moves `cameras` to where `matches` agree best; none where no tracks tell. Where the centres of all cameras lie as a whole stays as given.
 pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMatches]) -> Option<Report> {
     let given = cameras.to_vec();
-    let obeying = |cameras: &[Camera], tolerance: f32| -> Vec<Track> {
+    let obeying = |cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32| -> Vec<Track> {
         let matches: Vec<PairMatches> = matches.iter().map(|m| m.obeying(cameras, keypoints, tolerance)).collect();
         tracks(cameras, keypoints, &matches, tolerance)
     };
-    let before = quality(&obeying(&given, TOLERANCE));
+    let before = quality(&obeying(&given, keypoints, TOLERANCE));
     let lens = lenses(&given);
     let mut values =
         Values { poses: Vec::new(), lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)], points: Vec::new() };
     for round in ROUNDS {
-        let tracks = obeying(cameras, round * TOLERANCE);
+        // Without the bend of the lens as far as it is known, or what the corners show would be left out.
+        let tracks = obeying(cameras, &straight(keypoints, cameras, &lens, &values.lenses), round * TOLERANCE);
         if tracks.is_empty() {
             return None;
         }
@@ -54,7 +56,7 @@ pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMa
         values.apply(&problem, cameras);
     }
     keep_gauge(cameras, &given);
-    let after = obeying(cameras, TOLERANCE);
+    let after = obeying(cameras, &straight(keypoints, cameras, &lens, &values.lenses), TOLERANCE);
     let lens_of = |view: usize| lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
     Some(Report {
         error: [before.0, quality(&after).0],
@@ -63,6 +65,18 @@ pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMa
         focal: (0..cameras.len()).map(|v| lens_of(v).log_focal.exp() as f32).collect(),
         k1: (0..cameras.len()).map(|v| lens_of(v).k1 as f32).collect(),
     })
+}
+
+/// Key points as lenses without a bend would have shown them.
+fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>], lenses: &[Lens]) -> Vec<Keypoints> {
+    let mut out = keypoints.to_vec();
+    for (view, points) in out.iter_mut().enumerate() {
+        let Some(bend) = lens[view].map(|l| Distortion { k1: lenses[l].k1 as f32, ..Distortion::default() }) else { continue };
+        points.positions.iter_mut().for_each(|p| {
+            *p = cameras[view].to_pixel(bend.straight(cameras[view].ray(*p).truncate()).extend(1.0));
+        });
+    }
+    out
 }
 
 /// Root mean square error and observations of tracks.

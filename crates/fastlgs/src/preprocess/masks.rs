@@ -4,7 +4,9 @@ use super::config::Config;
 use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::error::Context;
+use crate::eyes::SegmenterKind;
 use crate::{Result, Run};
+use fastlgs_core::undistort::Distortion;
 use fastlgs_core::{Level, SceneFolder};
 use fastlgs_vision::Segmenter;
 use rayon::prelude::*;
@@ -28,6 +30,10 @@ pub(super) fn segment(
             Some(identity) => cache.get("masks", &cache::key(&[b"list", &photo.key, identity.as_bytes()]), make)?,
             None => make()?,
         };
+        if photo.bend != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
+            // Drawn on the photo before it was straightened.
+            list = list.undistorted(&photo.camera, &Distortion { k1: photo.bend, ..Distortion::default() });
+        }
         list.masks.retain(|mask| config.eyes.keeps(mask.level));
         list.save(&folder.masks_path(name))?;
         work.advance()?;

@@ -70,7 +70,9 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
 pub(super) fn between_masks(folder: &SceneFolder, cameras: &[Camera], points: &[Keypoints], matches: &[PairMatches]) -> Result<Pairs> {
     let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<u16>> {
         let map = masks::whole(folder, camera)?;
-        let label = |p: &Vec2| map.at((p.x as u32).min(map.width - 1), (p.y as u32).min(map.height - 1));
+        // Straightened photos lose what lay at their edges.
+        let inside = |p: &Vec2| p.x >= 0.0 && p.y >= 0.0 && p.x < map.width as f32 && p.y < map.height as f32;
+        let label = |p: &Vec2| if inside(p) { map.at(p.x as u32, p.y as u32) } else { 0 };
         Ok(points[view].positions.iter().map(label).collect())
     };
     let label_at: Vec<Vec<u16>> = cameras.iter().enumerate().map(of_view).collect::<Result<_>>()?;

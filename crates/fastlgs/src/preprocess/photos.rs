@@ -35,6 +35,8 @@ pub(super) struct Known {
     pub points: Keypoints,
     /// Colour at each key point.
     pub colors: Vec<[u8; 3]>,
+    /// The first radial term of a bend that was taken out of it beyond what its lens was said to have.
+    pub bend: f32,
 }
 
 /// Blurred and repeated photos are used all the same, but the user hears of them.
@@ -89,7 +91,7 @@ fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
     let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
     let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
     let colors = points.positions.iter().map(color).collect();
-    Ok(Known { impression: Impression::of(&pixels), camera, key, points, colors })
+    Ok(Known { impression: Impression::of(&pixels), camera, key, points, colors, bend: 0.0 })
 }
 
 /// Writes a working photo with its masks into the scene folder.
@@ -118,7 +120,7 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
         };
         let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
         let pixels = undistort(&folder.photo(&camera.name)?, &camera, &lens);
-        known.key = fingerprint(&camera, &pixels);
+        (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
         known.points.positions.iter_mut().for_each(|p| {
             *p = camera.to_pixel(lens.straight(camera.ray(*p).truncate()).extend(1.0));
         });

@@ -122,7 +122,8 @@ pub(super) fn adjust(
         super::photos::straighten(photos, &report.k1, folder)?;
         let warning = format!(
             "the lens bends the photos by {bent:.1} pixels at their corners, which the given poses do not say; the photos were straightened \
-             (\"k1\": {k1:.4} in a transforms.json, or a radial term in COLMAP's camera model, does it at full size)"
+             (\"k1\": {k1:.4} in a transforms.json, or a radial term in COLMAP's camera model, does it at full size; labels drawn on them are \
+             as bent as they were)"
         );
         run.warn(&warning);
         warnings.push(warning);

@@ -49,7 +49,8 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
-        patch(&mut photo, hidden, session.render(camera)?.channels(0, 3));
+        let counts = counting(&folder, &camera.name, hidden.len())?;
+        patch(&mut photo, hidden, &counts, session.render(camera)?.channels(0, 3));
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
             let mut masks = folder.masks(camera)?;
@@ -77,13 +78,29 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
     Ok(folder.save_manifest(&manifest)?)
 }
 
-/// Shows a rendered picture, `[3][h][w]`, where a photo is hidden, as bright as the rest of the photo is.
-fn patch(photo: &mut RgbImage, hidden: &[bool], color: &[f32]) {
+/// The pixels of a photo that it shows: opaque ones that no mask blackens.
+fn counting(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
+    let mut counts = vec![true; pixels];
+    for path in [folder.alpha_path(name), folder.ignore_path(name)].into_iter().filter(|path| path.is_file()) {
+        counts.iter_mut().zip(image_io::load_gray(&path)?.pixels()).for_each(|(counts, p)| *counts &= p[0] >= 128);
+    }
+    Ok(counts)
+}
+
+/// Factors within which photos differ in brightness.
+const GAINS: [f32; 2] = [0.25, 4.0];
+
+/// Shows a rendered picture, `[3][h][w]`, where a photo is hidden, as bright as the rest of the photo is, as far as it `counts`.
+fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) {
     let n = hidden.len();
     let gain: [f32; 3] = std::array::from_fn(|c| {
-        let open = photo.pixels().zip(&color[c * n..(c + 1) * n]).zip(hidden).filter(|(_, hidden)| !**hidden);
+        let open = photo
+            .pixels()
+            .zip(&color[c * n..(c + 1) * n])
+            .zip(hidden.iter().zip(counts))
+            .filter(|(_, (hidden, counts))| !**hidden && **counts);
         let (shown, rendered) = open.fold((0.0, 0.0), |(a, b), ((p, v), _)| (a + f32::from(p[c]) / 255.0, b + v.clamp(0.0, 1.0)));
-        if rendered > 0.0 { shown / rendered } else { 1.0 }
+        if rendered > 0.0 { (shown / rendered).clamp(GAINS[0], GAINS[1]) } else { 1.0 }
     });
     for (p, pixel) in photo.pixels_mut().enumerate().filter(|(p, _)| hidden[*p]) {
         *pixel = Rgb(std::array::from_fn(|c| (255.0 * (gain[c] * color[c * n + p]).clamp(0.0, 1.0) + 0.5) as u8));
@@ -115,7 +132,10 @@ mod tests {
         // The photo is half as bright as the scene, in which its right half is hidden.
         let mut photo = RgbImage::from_fn(8, 2, |x, _| Rgb([if x < 4 { 50 } else { 255 }; 3]));
         let hidden: Vec<bool> = (0..16).map(|p| p % 8 >= 4).collect();
-        patch(&mut photo, &hidden, &[100.0 / 255.0; 3 * 16]);
-        assert!(photo.pixels().all(|p| p.0 == [50; 3]), "{photo:?}");
+        // What does not count says nothing about it.
+        photo.put_pixel(0, 0, Rgb([255; 3]));
+        let counts: Vec<bool> = (0..16).map(|p| p != 0).collect();
+        patch(&mut photo, &hidden, &counts, &[100.0 / 255.0; 3 * 16]);
+        assert!(photo.pixels().skip(1).all(|p| p.0 == [50; 3]), "{photo:?}");
     }
 }

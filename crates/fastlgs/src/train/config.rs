@@ -310,7 +310,7 @@ impl Config {
     /// Highest SH degree of a run on so many views, unless it is asked for.
     pub(super) fn degree(&self, views: usize) -> u32 {
         let (_, degree, _) = self.preset.values();
-        if views < FEW_VIEWS { degree.min(DEGREE_OF_FEW) } else { degree }
+        if views < FEW_VIEWS && self.preset != Preset::LikePaper { degree.min(DEGREE_OF_FEW) } else { degree }
     }
 
     /// How many Gaussians there may be, for views of so many pixels in all.
