@@ -72,8 +72,8 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
-    json(&["synth", "study", "-o", text(&photos), "--views", "20", "--size", "400x300"]);
-    const K1: f32 = -0.08;
+    json(&["synth", "study", "-o", text(&photos), "--views", "40", "--size", "480x360"]);
+    const K1: f32 = -0.15;
     let camera = fastlgs_core::dataset::load(&photos).expect("photos").photos[0].camera.clone();
     // What undoes a bend, to the second order, is a bend the other way.
     let lens = Distortion { k1: -K1, k2: 3.0 * K1 * K1, ..Distortion::default() };
@@ -102,12 +102,12 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
     }
     let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
     let found = report["adjusted"]["k1"].as_f64().expect("a number") as f32;
-    assert!((found - K1).abs() < 0.02, "{report}");
+    assert!((found - K1).abs() < 0.03, "{report}");
     let warned = report["warnings"].as_array().expect("a list").iter().any(|w| w.as_str().expect("words").contains("were straightened"));
     assert!(warned, "{report}");
     // Away from the edges, which the bent photos do not show.
     let inner = |photo: &image::RgbImage| {
-        let inside = image::imageops::crop_imm(photo, 40, 30, 320, 240).to_image();
+        let inside = image::imageops::crop_imm(photo, 60, 45, 360, 270).to_image();
         inside.into_raw().into_iter().map(|v| f32::from(v) / 255.0).collect::<Vec<_>>()
     };
     let folder = fastlgs_core::SceneFolder::open(&scene).expect("a scene");
