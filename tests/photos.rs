@@ -15,12 +15,14 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// A folder to make scenes in; nothing where models or device are missing.
+fn workshop() -> Option<tempfile::TempDir> {
+    run::ready().then(|| tempfile::tempdir().expect("a temporary folder"))
+}
+
 #[test]
 fn transparent_and_masked_pixels_do_not_count() {
-    if !run::ready() {
-        return;
-    }
-    let dir = tempfile::tempdir().expect("a temporary folder");
+    let Some(dir) = workshop() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&["synth", "room", "-o", text(&photos), "--views", "8", "--size", "96x64"]);
     let opaque = image::open(photos.join("images/001.png")).expect("a photo").into_rgb8();
@@ -67,10 +69,7 @@ fn transparent_and_masked_pixels_do_not_count() {
 /// The lens bends the photos, and neither the poses nor anything else says so.
 #[test]
 fn an_untold_bend_of_the_lens_is_found_and_removed() {
-    if !run::ready() {
-        return;
-    }
-    let dir = tempfile::tempdir().expect("a temporary folder");
+    let Some(dir) = workshop() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&["synth", "study", "-o", text(&photos), "--views", "40", "--size", "480x360"]);
     const K1: f32 = -0.15;
@@ -143,10 +142,7 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
 
 #[test]
 fn preprocessing_does_again_only_what_changed() {
-    if !run::ready() {
-        return;
-    }
-    let dir = tempfile::tempdir().expect("a temporary folder");
+    let Some(dir) = workshop() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&["synth", "room", "-o", text(&photos), "--views", "10", "--size", "160x120"]);
     let run = || json(&["preprocess", text(&photos), "-o", text(&scene), "--memory", "20M"]);
@@ -173,10 +169,7 @@ fn preprocessing_does_again_only_what_changed() {
 /// The exact poses are taken away; what structure from motion finds must agree with them but for a similarity.
 #[test]
 fn photos_without_poses_are_placed() {
-    if !run::ready() {
-        return;
-    }
-    let dir = tempfile::tempdir().expect("a temporary folder");
+    let Some(dir) = workshop() else { return };
     let (photos, exact, scene) = (dir.path().join("photos"), dir.path().join("exact"), dir.path().join("scene"));
     json(&["synth", "table", "-o", text(&photos), "--views", "24", "--size", "400x300"]);
     // Names of photos may have spaces.

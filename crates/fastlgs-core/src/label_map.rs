@@ -168,7 +168,7 @@ impl LabelMap {
         if let Err(error) = reader.next_frame(&mut packed) {
             return Some(Err(error));
         }
-        // Rows begin with a byte of their own; within it the first pixel has the highest bits.
+        // Each row begins with a new byte, whose highest bits are the first pixel's.
         let row = reader.output_line_size(width)?;
         let label = |x: usize, y: usize| u16::from(packed[y * row + x * bits / 8] << (x * bits % 8) >> (8 - bits));
         let labels = (0..height as usize).flat_map(|y| (0..width as usize).map(move |x| (x, y))).map(|(x, y)| label(x, y)).collect();

@@ -72,6 +72,11 @@ impl Distortion {
         (0..STEPS).for_each(|_| ray += place - self.distort(ray));
         ray
     }
+
+    /// Where `camera` would see without this lens what it shows at a pixel.
+    pub fn straight_pixel(&self, camera: &Camera, pixel: Vec2) -> Vec2 {
+        camera.to_pixel(self.straight(camera.ray(pixel).truncate()).extend(1.0))
+    }
 }
 
 /// Steps that find the ray of a place on the distorted image plane: each leaves some hundredths of the error of the one before.

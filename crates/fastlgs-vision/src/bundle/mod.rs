@@ -72,9 +72,7 @@ fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>],
     let mut out = keypoints.to_vec();
     for (view, points) in out.iter_mut().enumerate() {
         let Some(bend) = lens[view].map(|l| Distortion { k1: lenses[l].k1 as f32, ..Distortion::default() }) else { continue };
-        points.positions.iter_mut().for_each(|p| {
-            *p = cameras[view].to_pixel(bend.straight(cameras[view].ray(*p).truncate()).extend(1.0));
-        });
+        points.positions.iter_mut().for_each(|p| *p = bend.straight_pixel(&cameras[view], *p));
     }
     out
 }

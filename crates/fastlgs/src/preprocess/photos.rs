@@ -121,9 +121,7 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
         let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
         let pixels = undistort(&folder.photo(&camera.name)?, &camera, &lens);
         (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
-        known.points.positions.iter_mut().for_each(|p| {
-            *p = camera.to_pixel(lens.straight(camera.ray(*p).truncate()).extend(1.0));
-        });
+        known.points.positions.iter_mut().for_each(|p| *p = lens.straight_pixel(&camera, *p));
         save_photo(&Photo { camera, pixels, alpha, ignore }, folder)
     })
 }
