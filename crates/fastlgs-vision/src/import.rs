@@ -193,21 +193,15 @@ impl Import {
         if (list.width, list.height) == (width, height) && lens.is_none() {
             return Ok(Found { list, rows });
         }
-        let mut fitted = Found::in_order(MaskList::new(width, height));
-        for (mask, row) in list.masks.iter().zip(rows) {
-            let mut map = LabelMap::new(list.width, list.height);
-            list.places(mask).for_each(|p| map.labels[p] = 1);
-            let mut map = map.resized(width, height);
-            if let Some((camera, distortion)) = lens {
-                map = map.undistorted(&camera.resized(width, height), distortion);
+        let fit = |map: LabelMap| {
+            let map = map.resized(width, height);
+            match lens {
+                Some((camera, distortion)) => map.undistorted(&camera.resized(width, height), distortion),
+                None => map,
             }
-            let runs = RunLengths::of(width, height, |x, y| map.at(x, y) > 0);
-            if runs.area() > 0 {
-                fitted.list.masks.push(Mask { runs, ..mask.clone() });
-                fitted.rows.push(row);
-            }
-        }
-        Ok(fitted)
+        };
+        let (masks, rows) = list.redrawn(fit).zip(rows).filter_map(|(mask, row)| Some((mask?, row))).unzip();
+        Ok(Found { list: MaskList { masks, ..MaskList::new(width, height) }, rows })
     }
 
     /// Embeddings of a view's *whole* masks, label 1 first; none where the layout has none.

@@ -107,14 +107,19 @@ impl MaskList {
     /// The masks as the ideal pinhole `camera` of their size would have seen them; those of which nothing is left go.
     #[must_use]
     pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
-        let straight = |mask: &Mask| {
+        let masks = self.redrawn(|map| map.undistorted(camera, distortion)).flatten().collect();
+        Self { masks, ..Self::new(self.width, self.height) }
+    }
+
+    /// Each mask drawn anew: `redraw` gets it as a map of ones. Nothing where none of it is left.
+    pub fn redrawn(&self, redraw: impl Fn(LabelMap) -> LabelMap) -> impl Iterator<Item = Option<Mask>> {
+        self.masks.iter().map(move |mask| {
             let mut map = LabelMap::new(self.width, self.height);
             self.places(mask).for_each(|p| map.labels[p] = 1);
-            let map = map.undistorted(camera, distortion);
-            let runs = RunLengths::of(self.width, self.height, |x, y| map.at(x, y) > 0);
+            let map = redraw(map);
+            let runs = RunLengths::of(map.width, map.height, |x, y| map.at(x, y) > 0);
             (runs.area() > 0).then(|| Mask { runs, ..mask.clone() })
-        };
-        Self { masks: self.masks.iter().filter_map(straight).collect(), ..Self::new(self.width, self.height) }
+        })
     }
 
     /// A level's masks as a label map: large ones first, so that smaller ones lie on top. Labels 1, 2, ... follow falling area.
