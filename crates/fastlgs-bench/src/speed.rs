@@ -168,7 +168,7 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
     let full = options(Channels::Coupled);
     let target =
         TargetImage { size: views[0].size, color: vec![pack([128; 3], true); pixels], feature: vec![pack([128; 3], true); pixels] };
-    (0..views.len()).try_for_each(|id| engine.set_target(id, &target))?;
+    (0..views.len()).try_for_each(|id| engine.set_target(id, target.clone()))?;
     let (mut pairs, mut walked) = (0.0, 0.0);
     for (id, view) in views.iter().enumerate() {
         let frame = engine.render(*view, Channels::Both)?;

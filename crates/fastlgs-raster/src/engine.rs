@@ -60,6 +60,11 @@ pub fn pack(values: [u8; 3], counts: bool) -> u32 {
 }
 
 impl TargetImage {
+    /// Bytes of its planes.
+    pub(crate) fn bytes(&self) -> usize {
+        4 * (self.color.len() + self.feature.len())
+    }
+
     /// `[2][padded rows][padded columns]`, as it lies on the device; pixels without feature do not count.
     pub(crate) fn padded(&self, view: &View) -> Vec<u32> {
         let mut planes = self.color.clone();
@@ -153,7 +158,9 @@ pub trait Engine: Send {
     ///
     /// # Errors
     /// When it does not fit.
-    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()>;
+    fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()>;
+    /// Keeps it no longer.
+    fn forget_target(&mut self, id: usize);
     /// Renders a frame; `view.gaussians` must equal [`Self::len`].
     ///
     /// # Errors

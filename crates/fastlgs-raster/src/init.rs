@@ -1,6 +1,7 @@
 //! First Gaussians: from points, or at worst at random in what the cameras see together.
 
-use crate::target::Target;
+use crate::Result;
+use crate::target::{Target, Targets};
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
@@ -30,16 +31,20 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
 /// Pixels that are tried for a random point before one is taken that does not count.
 const TRIES: usize = 32;
 
-/// `count` points in front of random views, coloured as their photos are there, at depths around their distance to the cameras' common
+/// `count` points in front of the views, as many of each, coloured as their photos are there, at depths around their distance to the cameras' common
 /// focus: the last resort where nothing else is known.
-pub fn random_points(views: &[Target], count: usize, rng: &mut Rng) -> Vec<SfmPoint> {
-    let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();
-    let focus = common_focus(&cameras);
-    (0..count)
-        .map(|_| {
-            let Target { camera, image, .. } = &views[rng.below(views.len())];
-            let width = camera.width as usize;
-            let counts = |p: &[usize; 2]| image.color[p[1] * width + p[0]].to_le_bytes()[3] == 255;
+///
+/// # Errors
+/// When a picture cannot be read.
+pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec<SfmPoint>> {
+    let focus = common_focus(&views.cameras);
+    let mut out = Vec::with_capacity(count);
+    for id in 0..views.len() {
+        let Target { camera, image, .. } = views.get(id)?;
+        let width = camera.width as usize;
+        let counts = |p: &[usize; 2]| image.color[p[1] * width + p[0]].to_le_bytes()[3] == 255;
+        let inverse = camera.world_to_camera.inverse();
+        while out.len() < count * (id + 1) / views.len() {
             let mut pixel = [0; 2];
             for _ in 0..TRIES {
                 pixel = [camera.width, camera.height].map(|side| rng.below(side as usize));
@@ -49,11 +54,11 @@ pub fn random_points(views: &[Target], count: usize, rng: &mut Rng) -> Vec<SfmPo
             }
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
             let ray = camera.ray(glam::Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
-            let position = camera.world_to_camera.inverse().transform_point3(ray * depth);
             let [r, g, b, _] = image.color[pixel[1] * width + pixel[0]].to_le_bytes();
-            SfmPoint { position, color: [r, g, b] }
-        })
-        .collect()
+            out.push(SfmPoint { position: inverse.transform_point3(ray * depth), color: [r, g, b] });
+        }
+    }
+    Ok(out)
 }
 
 /// The point nearest to all viewing axes (least squares).

@@ -44,7 +44,7 @@ pub use open::{Choice, choice, open_engine};
 
 pub use schedule::{Alignment, Budget, Strategy, TrainConfig};
 pub use shape::Shape;
-pub use target::Target;
+pub use target::{Target, Targets};
 pub use trainer::{Progress, TrainReport, Trainer};
 pub use view::{Rates, Step, View};
 
@@ -68,6 +68,9 @@ pub enum Error {
     /// Input that cannot be trained or rendered.
     #[error("{0}")]
     Invalid(String),
+    /// A picture that is trained towards cannot be read.
+    #[error(transparent)]
+    Picture(Box<dyn std::error::Error + Send + Sync>),
     /// Reading or writing a checkpoint failed.
     #[error(transparent)]
     Core(#[from] fastlgs_core::Error),

@@ -1,7 +1,10 @@
 //! What training is towards: a camera and what it should see.
 
 use crate::engine::{TargetImage, pack};
+use crate::{Result, exposure};
 use fastlgs_core::Camera;
+use rayon::prelude::*;
+use std::sync::Arc;
 
 /// A training view.
 #[derive(Clone)]
@@ -15,10 +18,17 @@ pub struct Target {
 }
 
 impl Target {
-    /// The view at half the resolution, over 2x2 pixels of those that count: the mean of their colours, and the code that most of them have. The mean of
-    /// two codes is near a third object's.
+    /// The view at half the resolution.
     pub(crate) fn halved(&self) -> Self {
-        let [w, h] = self.image.size;
+        Self { camera: self.camera.halved(), image: self.image.halved(), gain: self.gain }
+    }
+}
+
+impl TargetImage {
+    /// The picture at half the resolution, over 2x2 pixels of those that count: the mean of their colours, and the code that most of them have. The mean
+    /// of two codes is near a third object's.
+    pub(crate) fn halved(&self) -> Self {
+        let [w, h] = self.size;
         let size = [w.div_ceil(2), h.div_ceil(2)];
         let halve = |plane: &[u32], of: fn(&[[u8; 4]]) -> [u8; 3]| -> Vec<u32> {
             if plane.is_empty() {
@@ -34,24 +44,101 @@ impl Target {
                 })
                 .collect()
         };
-        let image = TargetImage { size, color: halve(&self.image.color, mean), feature: halve(&self.image.feature, mode) };
-        Self { camera: self.camera.halved(), image, gain: self.gain }
+        Self { size, color: halve(&self.color, mean), feature: halve(&self.feature, mode) }
+    }
+
+    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over colours.
+    fn contrast(&self) -> f64 {
+        let deviation = |c: usize| {
+            let counting = self.color.iter().map(|p| p.to_le_bytes()).filter(|p| p[3] == 255);
+            let (n, sum, squares) = counting.fold((0u64, 0u64, 0u64), |(n, sum, squares), p| {
+                let value = u64::from(p[c]);
+                (n + 1, sum + value, squares + value * value)
+            });
+            let (n, sum, squares) = (n.max(1) as f64, sum as f64, squares as f64);
+            (squares / n - (sum / n).powi(2)).max(0.0).sqrt() / 255.0
+        };
+        (0..3).map(deviation).sum::<f64>() / 3.0
     }
 }
 
-/// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours.
-pub(crate) fn contrast(targets: &[Target]) -> f32 {
-    let deviation = |target: &Target, c: usize| {
-        let counting = target.image.color.iter().map(|p| p.to_le_bytes()).filter(|p| p[3] == 255);
-        let (n, sum, squares) = counting.fold((0u64, 0u64, 0u64), |(n, sum, squares), p| {
-            let value = u64::from(p[c]);
-            (n + 1, sum + value, squares + value * value)
-        });
-        let (n, sum, squares) = (n.max(1) as f64, sum as f64, squares as f64);
-        (squares / n - (sum / n).powi(2)).max(0.0).sqrt() / 255.0
-    };
-    let all = targets.iter().flat_map(|t| (0..3).map(move |c| deviation(t, c)));
-    (all.sum::<f64>() / (3 * targets.len()).max(1) as f64) as f32
+/// Training views whose pictures are read when they are needed: 300 photos of 1600x1066 would take two gigabytes.
+#[derive(Clone)]
+pub struct Targets {
+    /// Cameras at the training resolution.
+    pub cameras: Vec<Camera>,
+    /// [`Target::gain`] of each.
+    gains: Vec<[f32; 3]>,
+    read: Arc<dyn Fn(usize) -> Result<TargetImage> + Send + Sync>,
+}
+
+impl Targets {
+    /// Views of which `read` tells the pictures, the same whenever it is asked.
+    pub fn new(cameras: Vec<Camera>, gains: Vec<[f32; 3]>, read: impl Fn(usize) -> Result<TargetImage> + Send + Sync + 'static) -> Self {
+        Self { cameras, gains, read: Arc::new(read) }
+    }
+
+    /// Number of views.
+    pub fn len(&self) -> usize {
+        self.cameras.len()
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.cameras.is_empty()
+    }
+
+    /// Pixels of all views.
+    pub fn pixels(&self) -> usize {
+        self.cameras.iter().map(|c| (c.width * c.height) as usize).sum()
+    }
+
+    /// How bright each photo is against the mean, as far as that is known before training.
+    pub(crate) fn gains(&self) -> &[[f32; 3]] {
+        &self.gains
+    }
+
+    /// A view with its picture.
+    ///
+    /// # Errors
+    /// When the picture cannot be read.
+    pub fn get(&self, id: usize) -> Result<Target> {
+        Ok(Target { camera: self.cameras[id].clone(), image: (self.read)(id)?, gain: self.gains[id] })
+    }
+
+    /// Some of the views.
+    pub(crate) fn some(&self, ids: Vec<usize>) -> Self {
+        let (cameras, gains) = ids.iter().map(|&id| (self.cameras[id].clone(), self.gains[id])).unzip();
+        let read = self.read.clone();
+        Self::new(cameras, gains, move |k| read(ids[k]))
+    }
+
+    /// The views without the pixels that their photos may have cut off; `exposure.rs`.
+    pub(crate) fn without_clipped(self) -> Self {
+        let (read, gains) = (self.read, self.gains.clone());
+        let unclipped = move |id: usize| {
+            let mut image = read(id)?;
+            image.color.iter_mut().filter(|pixel| exposure::is_clipped(**pixel, gains[id])).for_each(|pixel| *pixel &= 0x00ff_ffff);
+            Ok(image)
+        };
+        Self::new(self.cameras, self.gains, unclipped)
+    }
+
+    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours.
+    ///
+    /// # Errors
+    /// When a picture cannot be read.
+    pub(crate) fn contrast(&self) -> Result<f32> {
+        let each = (0..self.len()).into_par_iter().map(|id| Ok((self.read)(id)?.contrast())).collect::<Result<Vec<f64>>>()?;
+        Ok((each.iter().sum::<f64>() / each.len().max(1) as f64) as f32)
+    }
+}
+
+impl From<Vec<Target>> for Targets {
+    fn from(targets: Vec<Target>) -> Self {
+        let (cameras, gains) = targets.iter().map(|t| (t.camera.clone(), t.gain)).unzip();
+        Self::new(cameras, gains, move |id| Ok(targets[id].image.clone()))
+    }
 }
 
 fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
@@ -77,7 +164,7 @@ mod tests {
         let target = Target { camera, image: TargetImage { size: [2, 2], color, feature: Vec::new() }, gain: [1.0; 3] };
         // Deviations of 0, 0.2, 0.4 and of 1, 0, 0.
         let expected = ((0.08f32 / 3.0).sqrt() + (2.0f32 / 9.0).sqrt()) / 3.0;
-        assert!((contrast(&[target]) - expected).abs() < 1e-5);
+        assert!((Targets::from(vec![target]).contrast().unwrap() - expected).abs() < 1e-5);
     }
 
     #[test]

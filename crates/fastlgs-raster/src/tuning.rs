@@ -132,7 +132,7 @@ fn measure(engine: &mut dyn Engine) -> Result<f64> {
     let camera = Camera::look_at("tuning", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, SIZE, SIZE, 0.9);
     let view = View::new(&camera, scene.len(), 0);
     let gray = vec![pack([128; 3], true); view.pixels()];
-    engine.set_target(0, &TargetImage { size: view.size, color: gray.clone(), feature: gray })?;
+    engine.set_target(0, TargetImage { size: view.size, color: gray.clone(), feature: gray })?;
     let options = StepOptions { channels: Channels::Both, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
     let still = Step::new(1, 0..BASE_CHANNELS, &[0.0; BASE_CHANNELS + 1]);
     let mut fastest = f64::INFINITY;

@@ -152,13 +152,18 @@ impl Engine for GpuEngine {
         self.read_pages(|p| &p.gradients)
     }
 
-    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
+    fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()> {
         let camera_less =
             View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
         let buffer = self.gpu.storage_with("a target picture", &target.padded(&camera_less))?;
         self.targets.insert(id, (target.size, buffer));
         self.lists.forget_view(id);
         Ok(())
+    }
+
+    fn forget_target(&mut self, id: usize) {
+        self.targets.remove(&id);
+        self.lists.forget_view(id);
     }
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {

@@ -268,12 +268,16 @@ impl Engine for CpuEngine {
         Ok(transposed(&self.gradients, channels_of(self.sh_degree)))
     }
 
-    fn set_target(&mut self, id: usize, target: &TargetImage) -> Result<()> {
-        let mut target = target.clone();
+    fn set_target(&mut self, id: usize, mut target: TargetImage) -> Result<()> {
         target.color.append(&mut target.feature);
         self.targets.insert(id, target);
         self.cached.remove(&id);
         Ok(())
+    }
+
+    fn forget_target(&mut self, id: usize) {
+        self.targets.remove(&id);
+        self.cached.remove(&id);
     }
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {

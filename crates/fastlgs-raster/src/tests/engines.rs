@@ -14,7 +14,7 @@ fn options(channels: Channels) -> StepOptions {
 /// Frame and gradients of one step with learning rates of zero.
 fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, size: (u32, u32)) -> (Vec<f32>, Vec<f32>, crate::Losses) {
     engine.set_state(state).unwrap();
-    engine.set_target(0, &target(size.0, size.1)).unwrap();
+    engine.set_target(0, target(size.0, size.1)).unwrap();
     let frame = engine.render(view, channels).unwrap();
     let all = 0..channels_of(state.sh_degree);
     engine.step(view, 0, &options(channels), &Step::new(1, all, &[0.0; BASE_CHANNELS + 1])).unwrap();
@@ -104,7 +104,7 @@ fn frozen_geometry_keeps_its_lists_and_learns_features() {
         let scene = cloud(2000, 7, 0, false);
         let state = State::of(&scene);
         engine.set_state(&state).unwrap();
-        engine.set_target(0, &target(96, 64)).unwrap();
+        engine.set_target(0, target(96, 64)).unwrap();
         let view = View::new(&camera(96, 64), scene.len(), 0);
         let mut errors = Vec::new();
         for t in 1..=20 {
@@ -125,7 +125,7 @@ fn the_gpu_repeats_itself_to_the_byte() {
     let run = || {
         let mut engine = GpuEngine::new(gpu().unwrap());
         engine.set_state(&State::of(&scene)).unwrap();
-        engine.set_target(0, &target(96, 64)).unwrap();
+        engine.set_target(0, target(96, 64)).unwrap();
         for t in 1..=5 {
             let step = Step::new(t, 0..channels_of(2), &[1e-3; BASE_CHANNELS + 1]);
             engine.step(View::new(&camera(96, 64), 2000, 2), 0, &options(Channels::Coupled), &step).unwrap();

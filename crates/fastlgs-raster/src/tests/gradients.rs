@@ -182,7 +182,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     let wanted: Vec<f64> = (0..6 * pixels).map(|i| f64::from(wave(i)) / 255.0).collect();
 
     engine.set_state(&State::of(&scene)).unwrap();
-    engine.set_target(0, &target).unwrap();
+    engine.set_target(0, target).unwrap();
     let exposure = Exposure { gain: around.gain.map(|v| v as f32), offset: around.offset.map(|v| v as f32) };
     let options = StepOptions { channels: Channels::Coupled, lambda: LAMBDA as f32, feature_weight: FEATURE_WEIGHT as f32, exposure };
     engine.step(view, 0, &options, &Step::new(1, 0..channels_of(sh_degree), &[0.0; BASE_CHANNELS + 1])).unwrap();

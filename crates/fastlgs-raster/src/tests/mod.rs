@@ -61,7 +61,7 @@ pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussia
 }
 
 /// A wavy picture; every 31st pixel does not count.
-fn target(width: u32, height: u32) -> TargetImage {
+pub(crate) fn target(width: u32, height: u32) -> TargetImage {
     let wave = |i: u32, c: u32| (127.0 + 100.0 * ((i + 977 * c) as f32 * 0.013).sin()) as u8;
     let plane = |from: u32| (0..width * height).map(|i| pack([wave(i, from), wave(i, from + 1), wave(i, from + 2)], i % 31 != 0)).collect();
     TargetImage { size: [width, height], color: plane(0), feature: plane(3) }

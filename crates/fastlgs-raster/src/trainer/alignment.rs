@@ -30,8 +30,9 @@ impl Trainer {
                 return Ok(());
             }
             let mut moved = watched.clone();
-            for target in &mut moved {
-                target.camera = self.aligned(&target.clone(), &self.known_exposure(target))?;
+            for id in 0..watched.len() {
+                let target = watched.get(id)?;
+                moved.cameras[id] = self.aligned(&target, &self.known_exposure(&target))?;
             }
             let gain = self.quality(&moved, None)?.zip(self.quality(&watched, None)?).map_or(0.0, |(after, before)| after - before);
             tracing::info!(gain, "watched views gained by aligning their poses");
@@ -43,19 +44,19 @@ impl Trainer {
         let before = self.cameras();
         let mut after = Vec::with_capacity(before.len());
         for id in 0..self.targets.len() {
-            let (target, exposure) = (self.targets[id].clone(), self.exposure(id));
+            let (target, exposure) = (self.targets.get(id)?, self.exposure(id));
             after.push(self.aligned(&target, &exposure)?);
         }
         align::keep_mean(&before, &mut after);
         for (id, camera) in after.into_iter().enumerate() {
             self.course.poses[id] = camera.world_to_camera;
-            self.targets[id].camera = camera;
+            self.targets.cameras[id] = camera;
         }
         Ok(())
     }
 
     /// Cameras of the training views as they are now.
     pub fn cameras(&self) -> Vec<Camera> {
-        self.targets.iter().map(|t| t.camera.clone()).collect()
+        self.targets.cameras.clone()
     }
 }

@@ -1,6 +1,7 @@
 //! Training of scene and semantic field together (paper, "Training Features for Gaussians").
 
 mod alignment;
+mod shown;
 mod watched;
 
 use crate::budget::{self, Growth, Removal};
@@ -11,7 +12,7 @@ use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
 use crate::schedule::{Budget, Strategy, TrainConfig};
-use crate::target::{self, Target};
+use crate::target::{Target, Targets};
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use fastlgs_core::camera::scene_extent;
@@ -20,6 +21,7 @@ use fastlgs_core::metrics::psnr;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
 use serde::Serialize;
+use shown::Shown;
 use std::path::Path;
 use std::time::Instant;
 
@@ -64,15 +66,14 @@ pub struct TrainReport {
 /// A training run; drive it with [`Trainer::run`].
 pub struct Trainer {
     engine: Box<dyn Engine>,
-    targets: Vec<Target>,
+    targets: Targets,
     extent: f32,
     /// Standard deviation of the photos' brightness.
     contrast: f32,
     /// Where nothing is, by what the run starts from.
     free: FreeSpace,
     course: Course,
-    /// Whether the engine holds the targets at half the resolution.
-    coarse: Option<bool>,
+    shown: Shown,
 }
 
 /// The frame of a camera as a run has it.
@@ -87,21 +88,18 @@ fn view_of(course: &Course, gaussians: usize, camera: &Camera, sh_degree: u32) -
 }
 
 impl Trainer {
-    /// Puts the first Gaussians and all targets on the device.
+    /// Puts the first Gaussians on the device.
     ///
     /// # Errors
-    /// When there is nothing to train, or it does not fit the device.
-    pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, mut targets: Vec<Target>, config: TrainConfig) -> Result<Self> {
+    /// When there is nothing to train, it does not fit the device, or a picture cannot be read.
+    pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, targets: impl Into<Targets>, config: TrainConfig) -> Result<Self> {
+        let mut targets: Targets = targets.into();
         if scene.is_empty() || targets.is_empty() {
             return Err(Error::Invalid("nothing to train: there are no points or no training views".to_owned()));
         }
         engine.set_state(&State::of(&scene.clone().with_sh_degree(config.sh_degree)))?;
-        let cameras: Vec<Camera> = targets.iter().map(|t| t.camera.clone()).collect();
         if config.exposure {
-            for target in &mut targets {
-                let clipped = |pixel: &&mut u32| exposure::is_clipped(**pixel, target.gain);
-                target.image.color.iter_mut().filter(clipped).for_each(|pixel| *pixel &= 0x00ff_ffff);
-            }
+            targets = targets.without_clipped();
         }
         let background = Learned::new(std::array::from_fn(|c| if c < 3 { config.background[c] } else { 0.0 }));
         let course = Course {
@@ -111,28 +109,14 @@ impl Trainer {
             rng: Rng::new(config.seed, "train"),
             growth: Growth::default(),
             removals: Vec::new(),
-            exposures: targets.iter().filter(|_| config.exposure).map(|t| LearnedExposure::from_gain(t.gain)).collect(),
+            exposures: targets.gains().iter().filter(|_| config.exposure).map(|gain| LearnedExposure::from_gain(*gain)).collect(),
             background,
-            poses: cameras.iter().map(|c| c.world_to_camera).collect(),
+            poses: targets.cameras.iter().map(|c| c.world_to_camera).collect(),
             alignment_gain: None,
             config,
         };
-        let contrast = target::contrast(&targets);
-        let free = FreeSpace::of(&cameras, scene);
-        Ok(Self { engine, extent: scene_extent(&cameras), contrast, free, targets, course, coarse: None })
-    }
-
-    /// Uploads the targets at the resolution of the coming step.
-    fn set_resolution(&mut self) -> Result<()> {
-        let coarse = self.course.config.coarse(self.course.iteration);
-        if self.coarse != Some(coarse) {
-            for (id, target) in self.targets.iter().enumerate() {
-                let image = if coarse { target.halved().image } else { target.image.clone() };
-                self.engine.set_target(id, &image)?;
-            }
-            self.coarse = Some(coarse);
-        }
-        Ok(())
+        let (contrast, free) = (targets.contrast()?, FreeSpace::of(&targets.cameras, scene));
+        Ok(Self { engine, extent: scene_extent(&targets.cameras), contrast, free, targets, course, shown: Shown::default() })
     }
 
     /// The next training view: every view once in random order, then again. Watched views wait until growth is over.
@@ -156,12 +140,12 @@ impl Trainer {
     }
 
     fn step(&mut self) -> Result<()> {
-        self.set_resolution()?;
         let id = self.next_view();
+        self.show(id)?;
         let config = self.course.config.clone();
         let iteration = self.course.iteration;
-        let target = &self.targets[id];
-        let camera = if config.coarse(iteration) { target.camera.halved() } else { target.camera.clone() };
+        let camera = &self.targets.cameras[id];
+        let camera = if config.coarse(iteration) { camera.halved() } else { camera.clone() };
         let degree = config.degree(iteration);
         let options = StepOptions {
             channels: config.channels,
@@ -177,6 +161,7 @@ impl Trainer {
         let mut step = Step::new(iteration + 1, trained, &rates);
         [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);
         self.engine.step(self.view(&camera, degree).trained(), id, &options, &step)?;
+        self.make_room(id);
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
         }
@@ -249,12 +234,13 @@ impl Trainer {
     /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views.
     ///
     /// # Errors
-    /// As [`Engine::render`].
-    pub fn quality(&mut self, views: &[Target], sh_degree: Option<u32>) -> Result<Option<f64>> {
+    /// As [`Engine::render`], and when a picture cannot be read.
+    pub fn quality(&mut self, views: &Targets, sh_degree: Option<u32>) -> Result<Option<f64>> {
         let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
-        for target in views {
-            let (image, gain) = (&target.image, self.known_exposure(target).gain);
+        for id in 0..views.len() {
+            let target = views.get(id)?;
+            let (image, gain) = (&target.image, self.known_exposure(&target).gain);
             let frame = self.engine.render(self.view(&target.camera, degree), Channels::Color)?;
             let (mut rendered, mut wanted) = (Vec::new(), Vec::new());
             for c in 0..3 {
@@ -386,8 +372,8 @@ impl Trainer {
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;
-        for (target, pose) in self.targets.iter_mut().zip(&course.poses) {
-            target.camera.world_to_camera = *pose;
+        for (camera, pose) in self.targets.cameras.iter_mut().zip(&course.poses) {
+            camera.world_to_camera = *pose;
         }
         tracing::info!(iteration = course.iteration, "training goes on from its checkpoint");
         self.course = course;

@@ -5,7 +5,7 @@ use super::{Trainer, view_of};
 use crate::Result;
 use crate::budget::{self, Removal};
 use crate::schedule::Budget;
-use crate::target::Target;
+use crate::target::Targets;
 use crate::view::View;
 use fastlgs_core::Gaussians;
 
@@ -21,9 +21,9 @@ impl Trainer {
     }
 
     /// The training views that are kept aside while the scene grows.
-    pub(super) fn watched(&self) -> Vec<Target> {
+    pub(super) fn watched(&self) -> Targets {
         let count = self.targets.len();
-        (0..count).filter(|&i| budget::is_watched(i, count)).map(|i| self.targets[i].clone()).collect()
+        self.targets.some((0..count).filter(|&i| budget::is_watched(i, count)).collect())
     }
 
     /// The lowest SH degree that shows the watched views as well as all degrees do, but for [`budget::DEGREE_LOSS`] dB; the
@@ -47,7 +47,7 @@ impl Trainer {
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut state = self.engine.state()?;
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        let views: Vec<View> = self.targets.iter().map(|t| view_of(&self.course, scene.len(), &t.camera, 0)).collect();
+        let views: Vec<View> = self.targets.cameras.iter().map(|camera| view_of(&self.course, scene.len(), camera, 0)).collect();
         let largest = budget::largest_weights(&scene, &views, budget::MIN_WEIGHT);
         let judges = self.judges();
         let psnr_before = self.quality(&judges, None)?;
@@ -61,8 +61,8 @@ impl Trainer {
     }
 
     /// The views that tell what a removal costs: the watched ones, else some of all.
-    pub(super) fn judges(&self) -> Vec<Target> {
+    pub(super) fn judges(&self) -> Targets {
         let watched = self.watched();
-        if watched.is_empty() { self.targets.iter().step_by(budget::WATCHED).cloned().collect() } else { watched }
+        if watched.is_empty() { self.targets.some((0..self.targets.len()).step_by(budget::WATCHED).collect()) } else { watched }
     }
 }

@@ -10,10 +10,10 @@ use crate::{Result, Run, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
-use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
+use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
-use fastlgs_raster::{Alignment, Channels, Choice, Target, TrainConfig, Trainer};
+use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
 pub(crate) use start::target;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -68,10 +68,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     };
     let codes = known.as_ref().filter(|_| by_descent);
     let light = preprocess::Brightness::of(&manifest);
-    let target = |c: &Camera| Ok(Target { gain: light.gain(&c.name), ..start::target(&folder, c, codes, &config.background)? });
-    let targets = training.iter().map(target).collect::<Result<Vec<_>>>()?;
-    let held_out = manifest.held_out(&cameras);
-    let held_out = held_out.iter().map(|c| start::target(&folder, c, None, &config.background)).collect::<Result<Vec<_>>>()?;
+    let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &config.background, |name| light.gain(name));
+    let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &config.background, |_| [1.0; 3]);
     let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
@@ -187,12 +185,12 @@ fn device(iterations: u32, run: &Run) -> Result<Choice> {
 }
 
 /// What the trainer is told: options, else what the preset says.
-fn settings(config: &Config, first: &Gaussians, views: &[Target], brightness_spread: f32, seed: u64) -> TrainConfig {
+fn settings(config: &Config, first: &Gaussians, views: &Targets, brightness_spread: f32, seed: u64) -> TrainConfig {
     let by_descent = config.feature_mode == FeatureMode::Train;
     TrainConfig {
         iterations: config.iterations(),
         seed,
-        budget: config.budget(start::pixels(views)),
+        budget: config.budget(views.pixels()),
         strategy: match config.strategy {
             Strategy::Classic => fastlgs_raster::Strategy::Classic,
             Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,

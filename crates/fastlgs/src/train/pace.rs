@@ -6,7 +6,7 @@ use crate::preprocess::Brightness;
 use crate::{Result, Run, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};
-use fastlgs_raster::{Target, Trainer};
+use fastlgs_raster::{Targets, Trainer};
 use serde_json::json;
 use std::time::Instant;
 
@@ -27,7 +27,7 @@ pub fn fitted(
     folder: &SceneFolder,
     manifest: &mut Manifest,
     training: &[Camera],
-    targets: &[Target],
+    targets: &Targets,
     run: &Run,
 ) -> Result<Config> {
     let Some(minutes) = config.minutes else { return Ok(config.clone()) };
@@ -62,14 +62,14 @@ fn rounded(iterations: f64) -> u32 {
 }
 
 /// Seconds that an iteration of the trial takes.
-fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &[Target], run: &Run) -> Result<f64> {
+fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &Targets, run: &Run) -> Result<f64> {
     let short = Config { iterations: Some(TRIAL), ..config.clone() };
     let first = start::gaussians(&short, folder, targets, run)?;
     let light = Brightness::of(manifest);
     let settings = settings(&short, &first, targets, light.spread_stops, run.seed);
     let engine = fastlgs_raster::open_engine(&device(MOST, run)?.device)?;
     let work = run.work("trial", u64::from(TRIAL));
-    let mut trainer = Trainer::new(engine, &first, targets.to_vec(), settings)?;
+    let mut trainer = Trainer::new(engine, &first, targets.clone(), settings)?;
     let result = trainer.run(None, |_, _| work.check())?;
     Ok(1.0 / result.iterations_per_second)
 }

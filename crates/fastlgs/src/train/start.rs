@@ -6,21 +6,17 @@ use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{Target, TargetImage, init, pack};
+use fastlgs_raster::{Target, TargetImage, Targets, init, pack};
 use std::path::PathBuf;
+use std::sync::Arc;
 
 /// Share of the distance to its neighbours that a Gaussian has at first with MCMC.
 const MCMC_SCALE: f32 = 0.1;
 /// Points from which training starts; where fewer are known, random ones make up for the rest.
 const ENOUGH: usize = 5000;
 
-/// Pixels of all views.
-pub fn pixels(views: &[Target]) -> usize {
-    views.iter().map(|v| (v.camera.width * v.camera.height) as usize).sum()
-}
-
 /// The given PLY, else the scene's points, with random ones where these are too few.
-pub fn gaussians(config: &Config, folder: &SceneFolder, views: &[Target], run: &Run) -> Result<Gaussians> {
+pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
     if let Some(path) = &config.init_ply {
         return Ok(ply::read(path)?);
     }
@@ -29,11 +25,11 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &[Target], run: &
     let missing = ENOUGH.saturating_sub(points.len());
     if missing > 0 {
         run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
-        points.extend(init::random_points(views, missing, &mut rng));
+        points.extend(init::random_points(views, missing, &mut rng)?);
     }
     // More points than half the budget would leave no room to grow where it matters.
     rng.shuffle(&mut points);
-    points.truncate((config.budget(pixels(views)).most() / 2).max(1));
+    points.truncate((config.budget(views.pixels()).most() / 2).max(1));
     let mut first = init::from_points(&points);
     if config.strategy == Strategy::Mcmc {
         // As its authors start: what is small and solid is moved, rather than grown.
@@ -43,9 +39,27 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &[Target], run: &
     Ok(first)
 }
 
+/// Codes of objects as pictures have them, the first object's first.
+type Codes = Arc<Vec<[u8; 3]>>;
+
+/// The codes that views are trained towards.
+pub fn codes(grid: &Grid) -> Codes {
+    Arc::new(grid.objects.iter().map(|object| object.code.to_array().map(|v| (v * 255.0).round() as u8)).collect())
+}
+
+/// The views of `cameras` as they are trained towards; `gain` tells how bright each photo is against the mean.
+pub fn targets(folder: &SceneFolder, cameras: &[Camera], codes: Option<&Codes>, background: &Background, gain: impl Fn(&str) -> [f32; 3]) -> Targets {
+    let gains = cameras.iter().map(|c| gain(&c.name)).collect();
+    let (folder, views, codes, background) = (folder.clone(), cameras.to_vec(), codes.cloned(), *background);
+    Targets::new(cameras.to_vec(), gains, move |id| match target(&folder, &views[id], codes.as_ref(), &background) {
+        Ok(target) => Ok(target.image),
+        Err(error) => Err(fastlgs_raster::Error::Picture(Box::new(error))),
+    })
+}
+
 /// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count;
 /// transparent ones show the background.
-pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, background: &Background) -> Result<Target> {
+pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, background: &Background) -> Result<Target> {
     let photo = folder.photo(&camera.name)?;
     if (photo.width(), photo.height()) != (camera.width, camera.height) {
         bail!("{}: photo and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
@@ -66,16 +80,13 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Grid>, backg
     });
     let color = color.collect();
     // What no mask covers is trained towards nothing.
-    let code = |grid: &Grid, id: u16| {
-        let object = grid.objects.get(usize::from(id).wrapping_sub(1));
-        object.map_or([0; 3], |object| object.code.to_array().map(|v| (v * 255.0).round() as u8))
-    };
+    let code = |codes: &Codes, id: u16| codes.get(usize::from(id).wrapping_sub(1)).copied().unwrap_or_default();
     let feature = match codes {
         None => Vec::new(),
-        Some(grid) => {
+        Some(codes) => {
             let map = folder.objects(&camera.name)?;
             let pixels = (0..map.height).flat_map(|y| (0..map.width).map(move |x| (x, y)));
-            pixels.map(|(x, y)| pack(code(grid, map.at(x, y)), counts(x, y))).collect()
+            pixels.map(|(x, y)| pack(code(codes, map.at(x, y)), counts(x, y))).collect()
         }
     };
     Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature }, gain: [1.0; 3] })
