@@ -1,7 +1,8 @@
 """Poses of photos from their matched key points, with pycolmap: FOLDER/features.json and .bin -> FOLDER/sparse/K (COLMAP's binary files).
 
-features.json: images (name, path of the photo, width, height, key points), pairs (a, b, matches), seed, camera_model. features.bin holds, in that
-order, the key points of each image (x, y as 32-bit floats) and the matches of each pair (two 32-bit numbers each)."""
+features.json: images (name, path of the photo, width, height, key points, and where the lens is known fx, fy, cx, cy), pairs (a, b, matches), seed,
+camera_model. features.bin holds, in that order, the key points of each image (x, y as 32-bit floats) and the matches of each pair (two 32-bit numbers
+each). Where lenses are known FOLDER/poses.json is all that is written: three rows of [R t] for each image of the largest model, null for others."""
 
 import json
 import pathlib
@@ -53,6 +54,16 @@ def alias(k):
     return f"{k:06}" + pathlib.Path(plan["images"][k]["path"]).suffix
 
 
+lenses_are_known = all("lens" in image for image in plan["images"])
+
+
+def lens_of(image):
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.PINHOLE, image["lens"][0], image["width"], image["height"])
+    camera.params = image["lens"]
+    camera.has_prior_focal_length = True
+    return camera
+
+
 images = work / "images"
 images.mkdir()
 for k, image in enumerate(plan["images"]):
@@ -61,9 +72,9 @@ for k, image in enumerate(plan["images"]):
 database = pycolmap.Database.open(work / "database.db")
 cameras, ids = {}, []
 for image in plan["images"]:
-    size = (image["width"], image["height"])
+    size = (image["width"], image["height"], *image.get("lens", []))
     if size not in cameras:
-        camera = camera_of(image)
+        camera = lens_of(image) if lenses_are_known else camera_of(image)
         camera.camera_id = database.write_camera(camera)
         rig = pycolmap.Rig()
         rig.add_ref_sensor(camera.sensor_id)
@@ -97,6 +108,9 @@ def all_at_once():
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = options.mapper.random_seed = plan["seed"]
     options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = plan["seed"]
+    if lenses_are_known:
+        options.mapper.bundle_adjustment.refine_focal_length = False
+        options.mapper.bundle_adjustment.refine_extra_params = False
     return list(pycolmap.global_mapping(work / "database.db", images, work, options).values())
 
 
@@ -113,6 +127,14 @@ def most_placed(models):
 
 
 print("mapping", flush=True)
+if lenses_are_known:
+    # Other photos of the same scene misled whoever placed them one by one; all at once, a few wrong pairs are outvoted.
+    best = max(all_at_once(), key=lambda model: model.num_reg_images(), default=None)
+    placed = {image.image_id: image for image in best.images.values() if image.has_pose} if best else {}
+    poses = [placed[i].cam_from_world().matrix().tolist() if i in placed else None for i in ids]
+    (work / "poses.json").write_text(json.dumps(poses))
+    print(f"{len(placed)} of {len(ids)} photos placed", flush=True)
+    sys.exit()
 models = one_by_one() if len(ids) <= ONE_BY_ONE else all_at_once()
 if most_placed(models) < PLACED * len(ids):
     print(f"another way, because {most_placed(models)} of {len(ids)} photos were placed", flush=True)

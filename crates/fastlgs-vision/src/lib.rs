@@ -12,6 +12,7 @@ pub mod crops;
 pub mod edges;
 pub mod encoder;
 pub mod exposure;
+pub mod frame;
 pub mod histogram;
 pub mod import;
 pub mod inpaint;

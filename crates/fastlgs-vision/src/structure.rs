@@ -7,7 +7,8 @@ use crate::matching::matches;
 use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{colmap, is_photo};
-use fastlgs_core::{fs, image_io};
+use fastlgs_core::{Camera, fs, image_io};
+use glam::Mat4;
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeSet;
@@ -18,7 +19,7 @@ use std::process::{Command, Stdio};
 /// One camera took all photos of a size; its lens has one radial term, which the photos then lose.
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
 /// Up to so many photos each is matched with each.
-const EXHAUSTIVE: usize = 80;
+const EXHAUSTIVE: usize = 120;
 /// Above, each is matched with so many that follow it, in the order of their names, and with those at distances of powers of two.
 const FOLLOWING: usize = 12;
 /// And so many photos, spread over all, each with each: they close loops.
@@ -152,17 +153,62 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + 
         let path_text = std::path::absolute(path).unwrap_or_else(|_| path.clone());
         json!({ "name": name(path), "path": path_text, "width": width, "height": height, "keypoints": points.positions.len() })
     };
+    let images = files.iter().zip(&photos).map(image).collect();
+    write_plan(work, images, &photos.iter().map(|p| &p.2).collect::<Vec<_>>(), &pairs, seed)
+}
+
+/// Leaves photos, key points and matches in the work folder as `reconstruct.py` reads them.
+fn write_plan(work: &Path, images: Vec<serde_json::Value>, points: &[&Keypoints], pairs: &[PairMatches], seed: u64) -> Result<()> {
     let plan = json!({
-        "images": files.iter().zip(&photos).map(image).collect::<Vec<_>>(),
+        "images": images,
         "pairs": pairs.iter().map(|m| json!({ "a": m.a, "b": m.b, "matches": m.pairs.len() })).collect::<Vec<_>>(),
         "seed": seed % (1 << 31),
         "camera_model": CAMERA_MODEL,
     });
     fs::write_json(&work.join("features.json"), &plan)?;
-    let points = photos.iter().flat_map(|p| &p.2.positions).flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
+    let points = points.iter().flat_map(|p| &p.positions).flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
     let matched = pairs.iter().flat_map(|m| &m.pairs).flat_map(|(i, j)| [*i as u32, *j as u32]);
     let bytes: Vec<u8> = points.chain(matched).flat_map(u32::to_le_bytes).collect();
     Ok(fs::write_atomic(&work.join("features.bin"), |file| file.write_all(&bytes))?)
+}
+
+/// Poses of photos whose lenses are known, found anew by what their key points show, in a frame and a unit of their own; nothing for photos that
+/// could not be placed. `photos` are their files, and `work` is an empty folder, which goes again.
+///
+/// # Errors
+/// When the tool fails.
+pub fn placed_anew(
+    python: &Path,
+    photos: &[PathBuf],
+    cameras: &[Camera],
+    points: &[Keypoints],
+    work: &Path,
+    seed: u64,
+    say: impl Fn(&str, &str) + Sync,
+) -> Result<Vec<Option<Mat4>>> {
+    let _ = std::fs::remove_dir_all(work);
+    std::fs::create_dir_all(work).map_err(fastlgs_core::Error::io(work))?;
+    say("matches", "");
+    let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&points[a], &points[b]) };
+    let pairs: Vec<PairMatches> = pairs(cameras.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
+    let image = |((path, camera), points): ((&PathBuf, &Camera), &Keypoints)| {
+        let path = std::path::absolute(path).unwrap_or_else(|_| path.clone());
+        json!({
+            "name": camera.name, "path": path, "width": camera.width, "height": camera.height, "keypoints": points.positions.len(),
+            "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
+        })
+    };
+    let images = photos.iter().zip(cameras).zip(points).map(image).collect();
+    write_plan(work, images, &points.iter().collect::<Vec<_>>(), &pairs, seed)?;
+    let script = work.join("reconstruct.py");
+    std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
+    run(Command::new(python).arg(&script).arg(work), "structure from motion", &say)?;
+    // Rows of [R t], the largest model's.
+    let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
+    let _ = std::fs::remove_dir_all(work);
+    let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
+    let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose).filter(|pose| pose.is_finite())).collect();
+    if found.len() == cameras.len() { Ok(found) } else { Err(Error::Invalid("structure from motion lost count of its photos".to_owned())) }
 }
 
 /// Which photos are matched, by their places in the order of names.

@@ -6,9 +6,11 @@ use crate::cache::{self, Cache};
 use crate::{Result, Run};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::structure::Tool;
 use fastlgs_vision::tracks::PairMatches;
-use fastlgs_vision::{bundle, pose_check, resection, structure};
-use std::path::Path;
+use fastlgs_vision::{bundle, frame, pose_check, resection, structure};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
 
 /// Structure from motion for photos without poses.
 pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
@@ -28,19 +30,77 @@ const CHECK_SIDE: u32 = 480;
 
 /// Moves groups of cameras that contradict the others. Poses come from all photos, held out or not, as in structure from motion.
 pub(super) fn check(photos: &mut [Known], folder: &SceneFolder, cache: &Cache, run: &Run) -> Result<pose_check::Report> {
-    let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
-    let given = serde_json::to_vec(&cameras)?;
+    let given: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
+    let told = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
     let seed = run.seed.to_le_bytes();
-    inputs.extend([given.as_slice(), &seed, keypoints::backend().as_bytes()]);
-    let (report, poses) = cache.get("poses", &cache::key(&inputs), || {
-        let small = photos.iter().zip(&cameras).any(|(p, c)| p.camera.width != c.width);
-        let points = if small { detect_small(folder, &cameras, run)? } else { photos.iter().map(|p| p.points.clone()).collect() };
-        let report = pose_check::repair(&mut cameras, &points, run.seed);
-        Ok((report, cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>()))
+    inputs.extend([told.as_slice(), &seed, keypoints::backend().as_bytes()]);
+    let key = cache::key(&inputs);
+    let points = || {
+        let small = photos.iter().zip(&given).any(|(p, c)| p.camera.width != c.width);
+        if small { detect_small(folder, &given, run) } else { Ok(photos.iter().map(|p| p.points.clone()).collect()) }
+    };
+    let poses = |cameras: &[Camera]| cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>();
+    let (mut report, mut mended) = cache.get("poses", &key, || {
+        let mut cameras = given.clone();
+        let report = pose_check::repair(&mut cameras, &points()?, run.seed);
+        Ok((report, poses(&cameras)))
     })?;
-    photos.iter_mut().zip(poses).for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
+    if doubted(&report) * DOUBTED >= given.len() && doubted(&report) > 0 {
+        if let Ok(Tool::Pycolmap(python)) = Tool::find(false) {
+            let anew = cache.get("poses anew", &key, || {
+                let found = anew(&python, &given, &points()?, &report, folder, run)?;
+                Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
+            })?;
+            (report, mended) = anew.unwrap_or((report, mended));
+        } else {
+            run.warn("many poses contradict the photos; with pycolmap ('fastlgs models install-offline') all would be placed anew");
+        }
+    }
+    photos.iter_mut().zip(mended).for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
     Ok(report)
+}
+
+/// One in so many photos whose poses are doubted is a reason to place all of them anew.
+const DOUBTED: usize = 10;
+
+/// How many poses were found wrong.
+fn doubted(report: &pose_check::Report) -> usize {
+    report.moved.len() + report.contradictory.len()
+}
+
+/// All photos placed anew with the lenses that are given, where many poses contradict the photos: what is wrong with many is seldom mended one by one.
+/// In the frame of the poses that were right, and only where fewer of the new poses contradict the photos than of the old ones.
+fn anew(
+    python: &Path,
+    given: &[Camera],
+    points: &[Keypoints],
+    checked: &pose_check::Report,
+    folder: &SceneFolder,
+    run: &Run,
+) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
+    let work = run.work("poses anew", 0);
+    let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
+    let say = |stage: &str, line: &str| work.note(&format!("{stage}: {line}"));
+    let found = match structure::placed_anew(python, &files, given, points, &folder.root.join("sfm.partial"), run.seed, say) {
+        Ok(found) => found,
+        Err(error) => {
+            run.warn(&format!("the photos could not be placed anew, and their poses are mended one by one: {error}"));
+            return Ok(None);
+        }
+    };
+    work.check()?;
+    let Some((mut cameras, mut moved)) = frame::kept(given, &found, run.seed) else { return Ok(None) };
+    let again = pose_check::repair(&mut cameras, points, run.seed);
+    let unplaced = (0..given.len()).filter(|&photo| found[photo].is_none());
+    let lost: BTreeSet<usize> = unplaced.chain(again.contradictory.iter().copied()).collect();
+    tracing::info!(doubted = doubted(checked), lost = lost.len(), moved = again.moved.len(), "photos were placed anew");
+    if lost.len() + again.moved.len() >= doubted(checked) {
+        return Ok(None);
+    }
+    moved.extend(again.moved);
+    let moved = moved.difference(&lost).copied().collect();
+    Ok(Some((cameras, pose_check::Report { moved, contradictory: lost.into_iter().collect() })))
 }
 
 /// Places photos that contradict the others by what their key points show.

@@ -48,7 +48,13 @@ pub fn codes(grid: &Grid) -> Codes {
 }
 
 /// The views of `cameras` as they are trained towards; `gain` tells how bright each photo is against the mean.
-pub fn targets(folder: &SceneFolder, cameras: &[Camera], codes: Option<&Codes>, background: &Background, gain: impl Fn(&str) -> [f32; 3]) -> Targets {
+pub fn targets(
+    folder: &SceneFolder,
+    cameras: &[Camera],
+    codes: Option<&Codes>,
+    background: &Background,
+    gain: impl Fn(&str) -> [f32; 3],
+) -> Targets {
     let gains = cameras.iter().map(|c| gain(&c.name)).collect();
     let (folder, views, codes, background) = (folder.clone(), cameras.to_vec(), codes.cloned(), *background);
     Targets::new(cameras.to_vec(), gains, move |id| match target(&folder, &views[id], codes.as_ref(), &background) {

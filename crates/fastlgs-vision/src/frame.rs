@@ -1,0 +1,90 @@
+//! Poses that were found anew, brought into the frame of those that were given: what else is known of the scene, and other photos of it, lie there.
+
+use crate::similarity::Similarity;
+use fastlgs_core::Camera;
+use fastlgs_core::camera::scene_extent;
+use fastlgs_core::rng::Rng;
+use glam::Mat4;
+use std::collections::BTreeSet;
+
+/// Trials of three cameras each.
+const TRIALS: usize = 2000;
+/// Distance, as a share of the scene's extent, up to which two poses of a camera are the same.
+const SAME: f32 = 0.02;
+/// Fewest cameras that have to agree on a frame.
+const FEW: usize = 4;
+
+/// The cameras of `given` with the poses that were `found` for them, in the frame on which most of both agree, and the photos whose cameras are elsewhere
+/// than they were. Those without a new pose stay. None where there is no such frame.
+pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<Camera>, BTreeSet<usize>)> {
+    let placed: Vec<(usize, Camera)> = found
+        .iter()
+        .enumerate()
+        .filter_map(|(photo, pose)| Some((photo, Camera { world_to_camera: (*pose)?, ..given[photo].clone() })))
+        .collect();
+    if placed.len() < FEW {
+        return None;
+    }
+    let near = SAME * scene_extent(given);
+    let agree = |s: &Similarity| -> Vec<usize> {
+        let same = |(_, (photo, camera)): &(usize, &(usize, Camera))| s.apply(camera.centre()).distance(given[*photo].centre()) < near;
+        placed.iter().enumerate().filter(same).map(|p| p.0).collect()
+    };
+    let between = |some: &[usize]| {
+        let pairs: Vec<_> = some.iter().map(|&k| (placed[k].1.centre(), given[placed[k].0].centre())).collect();
+        Similarity::between(&pairs)
+    };
+    let mut rng = Rng::new(seed, "frame");
+    let mut best = Vec::new();
+    for _ in 0..TRIALS {
+        let three: [usize; 3] = std::array::from_fn(|_| rng.below(placed.len()));
+        let some = between(&three).map(|s| agree(&s)).unwrap_or_default();
+        if some.len() > best.len() {
+            best = some;
+        }
+    }
+    let frame = between(&best).filter(|_| best.len() >= FEW)?;
+    let mut cameras = given.to_vec();
+    let mut moved = BTreeSet::new();
+    for (photo, mut camera) in placed {
+        frame.move_camera(&mut camera);
+        if camera.centre().distance(given[photo].centre()) >= near {
+            moved.insert(photo);
+        }
+        cameras[photo] = camera;
+    }
+    Some((cameras, moved))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::{Mat3, Vec3};
+
+    #[test]
+    fn the_frame_is_that_of_the_poses_that_were_right() {
+        let eye = |k: usize, angle: f32| {
+            let (sin, cos) = (0.3 * k as f32 + angle).sin_cos();
+            Camera::look_at(&k.to_string(), Vec3::new(4.0 * sin, 0.1 * (k % 5) as f32, 4.0 * cos), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
+        };
+        let truth: Vec<Camera> = (0..20).map(|k| eye(k, 0.0)).collect();
+        // The last nine were given on a wrong arc, consistent among themselves.
+        let given: Vec<Camera> = (0..20).map(|k| eye(k, if k < 11 { 0.0 } else { 1.0 })).collect();
+        let other = Similarity {
+            scale: 0.4,
+            rotation: Mat3::from_rotation_y(2.0) * Mat3::from_rotation_x(0.3),
+            translation: Vec3::new(5.0, 1.0, -2.0),
+        };
+        let elsewhere = |(k, camera): (usize, &Camera)| {
+            let mut camera = camera.clone();
+            other.move_camera(&mut camera);
+            (k != 4).then_some(camera.world_to_camera)
+        };
+        let found: Vec<Option<Mat4>> = truth.iter().enumerate().map(elsewhere).collect();
+        let (cameras, moved) = kept(&given, &found, 1).unwrap();
+        assert_eq!(moved, (11..20).collect());
+        assert!(cameras.iter().zip(&truth).all(|(c, t)| c.world_to_camera.abs_diff_eq(t.world_to_camera, 1e-3)));
+        assert_eq!(cameras[4], given[4], "what was not placed stays");
+        assert!(kept(&given, &vec![None; 20], 1).is_none());
+    }
+}
