@@ -208,6 +208,57 @@ fn photos_without_poses_are_placed() {
     assert!(median < 0.02 && worst < 0.3, "{off:?}");
 }
 
+/// What placed the photos took one side of the room for another: a third of the cameras, right among themselves, look from elsewhere.
+#[test]
+fn poses_of_which_many_are_wrong_are_found_anew() {
+    let Some(dir) = workshop() else { return };
+    let fox = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
+    if !fox.is_dir() {
+        println!("SKIPPED: {} is absent", fox.display());
+        return;
+    }
+    let (photos, exact, scene) = (dir.path().join("photos"), dir.path().join("exact"), dir.path().join("scene"));
+    for folder in ["images", "masks"] {
+        std::fs::create_dir_all(photos.join(folder)).expect("a folder");
+    }
+    for entry in std::fs::read_dir(fox.join("images")).expect("photos") {
+        let path = entry.expect("a photo").path();
+        let name = path.file_name().expect("a name").to_string_lossy().into_owned();
+        std::fs::copy(&path, photos.join("images").join(&name)).expect("a photo");
+        // Masks are no matter here.
+        let (width, height) = image::image_dimensions(&path).expect("a photo");
+        let halves = image::GrayImage::from_fn(width, height, |x, _| image::Luma([1 + u8::from(2 * x < width)]));
+        halves.save(photos.join("masks").join(format!("{name}.png"))).expect("masks");
+    }
+    let file = photos.join("transforms.json");
+    let truth = std::fs::read_to_string(fox.join("transforms.json")).expect("poses");
+    std::fs::write(&file, &truth).expect("poses");
+    json(&["preprocess", text(&photos), "-o", text(&exact), "--segmenter", "import", "--max-side", "480", "--poses", "keep"]);
+    let mut poses: Value = serde_json::from_str(&truth).expect("poses");
+    // About the axis y of the world.
+    let (sin, cos) = 0.7f64.sin_cos();
+    for frame in poses["frames"].as_array_mut().expect("frames").iter_mut().skip(34) {
+        let [x, y, z, last]: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).expect("a matrix");
+        let row = |a: f64, b: f64| -> [f64; 4] { std::array::from_fn(|k| a * x[k] + b * z[k]) };
+        frame["transform_matrix"] = serde_json::json!([row(cos, sin), y, row(-sin, cos), last]);
+    }
+    std::fs::write(&file, poses.to_string()).expect("poses");
+    let report = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--max-side", "480"]);
+    assert_eq!(report["cached"]["poses anew"], serde_json::json!([0, 1]), "{report}");
+    assert!((16..22).contains(&report["moved_cameras"].as_u64().expect("a number")), "{report}");
+    let cameras = |scene: &Path| fastlgs_core::SceneFolder::open(scene).and_then(|folder| folder.cameras()).expect("cameras");
+    let (exact, found) = (cameras(&exact), cameras(&scene));
+    let extent = fastlgs_core::camera::scene_extent(&exact);
+    // In the frame of those that were right, and in their unit.
+    let mut off: Vec<f32> = exact.iter().zip(&found).map(|(a, b)| a.centre().distance(b.centre()) / extent).collect();
+    off.sort_by(f32::total_cmp);
+    println!("cameras are off by {:.4} of the scene's extent, at most {:.4}", off[off.len() / 2], off[off.len() - 1]);
+    assert!(off[off.len() / 2] < 0.005 && off[off.len() - 2] < 0.03, "{off:?}");
+    let again = json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--max-side", "480"]);
+    assert_eq!(again["cached"]["poses anew"], serde_json::json!([1, 1]), "{again}");
+    assert!(cameras(&scene) == found && !scene.join("sfm.partial").exists());
+}
+
 /// A camera that goes around a table, and shakes for a moment.
 #[test]
 fn videos_become_photos() {
