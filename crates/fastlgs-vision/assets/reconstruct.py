@@ -107,6 +107,10 @@ pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
 def all_at_once():
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = options.mapper.random_seed = plan["seed"]
+    # More threads would sum in another order each time.
+    options.num_threads = options.mapper.num_threads = 1
+    for part in (options.mapper.bundle_adjustment.ceres, options.mapper.global_positioning):
+        part.solver_options.num_threads = 1
     options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = plan["seed"]
     if lenses_are_known:
         options.mapper.bundle_adjustment.refine_focal_length = False
@@ -117,7 +121,6 @@ def all_at_once():
 def one_by_one():
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = plan["seed"]
-    # More threads would sum in another order each time.
     options.num_threads = 1
     return list(pycolmap.incremental_mapping(work / "database.db", images, work, options).values())
 

@@ -173,7 +173,7 @@ fn write_plan(work: &Path, images: Vec<serde_json::Value>, points: &[&Keypoints]
 }
 
 /// Poses of photos whose lenses are known, found anew by what their key points show, in a frame and a unit of their own; nothing for photos that
-/// could not be placed. `photos` are their files, and `work` is an empty folder, which goes again.
+/// could not be placed. `photos` are their files; in the folder `work`, which is emptied, the tool keeps what it needs.
 ///
 /// # Errors
 /// When the tool fails.
@@ -205,7 +205,6 @@ pub fn placed_anew(
     run(Command::new(python).arg(&script).arg(work), "structure from motion", &say)?;
     // Rows of [R t], the largest model's.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
-    let _ = std::fs::remove_dir_all(work);
     let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
     let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose).filter(|pose| pose.is_finite())).collect();
     if found.len() == cameras.len() { Ok(found) } else { Err(Error::Invalid("structure from motion lost count of its photos".to_owned())) }

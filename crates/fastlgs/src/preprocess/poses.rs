@@ -3,7 +3,7 @@
 use super::config::{Adjusted, Poses, Sfm};
 use super::photos::Known;
 use crate::cache::{self, Cache};
-use crate::{Result, Run};
+use crate::{Error, Result, Run};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::structure::Tool;
@@ -51,8 +51,13 @@ pub(super) fn check(photos: &mut [Known], folder: &SceneFolder, cache: &Cache, r
             let anew = cache.get("poses anew", &key, || {
                 let found = anew(&python, &given, &points()?, &report, folder, run)?;
                 Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
-            })?;
-            (report, mended) = anew.unwrap_or((report, mended));
+            });
+            match anew {
+                Ok(anew) => (report, mended) = anew.unwrap_or((report, mended)),
+                Err(Error::Cancelled) => return Err(Error::Cancelled),
+                // What failed for now is tried again by the next run.
+                Err(error) => run.warn(&format!("the photos could not be placed anew, and their poses are mended one by one: {error}")),
+            }
         } else {
             run.warn("many poses contradict the photos; with pycolmap ('fastlgs models install-offline') all would be placed anew");
         }
@@ -82,14 +87,11 @@ fn anew(
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
     let say = |stage: &str, line: &str| work.note(&format!("{stage}: {line}"));
-    let found = match structure::placed_anew(python, &files, given, points, &folder.root.join("sfm.partial"), run.seed, say) {
-        Ok(found) => found,
-        Err(error) => {
-            run.warn(&format!("the photos could not be placed anew, and their poses are mended one by one: {error}"));
-            return Ok(None);
-        }
-    };
+    let partial = folder.root.join("sfm.partial");
+    let found = structure::placed_anew(python, &files, given, points, &partial, run.seed, say);
+    let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
+    let found = found?;
     let Some((mut cameras, mut moved)) = frame::kept(given, &found, run.seed) else { return Ok(None) };
     let again = pose_check::repair(&mut cameras, points, run.seed);
     let unplaced = (0..given.len()).filter(|&photo| found[photo].is_none());
