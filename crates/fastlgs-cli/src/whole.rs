@@ -11,11 +11,12 @@ pub const WHOLE: &str = "make";
 type Stage = (&'static str, u64);
 
 /// The stages before training, in their order. Those that a scene does not need are passed over.
-const PREPARING: [Stage; 8] = [
+const PREPARING: [Stage; 9] = [
     ("frames", 15),
     ("poses", 25),
     ("photos", 5),
     ("key points for the pose check", 3),
+    ("poses anew", 25),
     ("matches", 4),
     ("bundle adjustment", 2),
     ("masks", 60),

@@ -40,6 +40,9 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
     let focus = common_focus(&views.cameras);
     let mut out = Vec::with_capacity(count);
     for id in 0..views.len() {
+        if out.len() >= count * (id + 1) / views.len() {
+            continue;
+        }
         let Target { camera, image, .. } = views.get(id)?;
         let width = camera.width as usize;
         let counts = |p: &[usize; 2]| image.color[p[1] * width + p[0]].to_le_bytes()[3] == 255;

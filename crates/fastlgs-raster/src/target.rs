@@ -106,6 +106,14 @@ impl Targets {
         Ok(Target { camera: self.cameras[id].clone(), image: (self.read)(id)?, gain: self.gains[id] })
     }
 
+    /// Reads all pictures once, so that what is wrong with them is known before the work.
+    ///
+    /// # Errors
+    /// When a picture cannot be read.
+    pub fn check(&self) -> Result<()> {
+        (0..self.len()).into_par_iter().try_for_each(|id| (self.read)(id).map(drop))
+    }
+
     /// Some of the views.
     pub(crate) fn some(&self, ids: Vec<usize>) -> Self {
         let (cameras, gains) = ids.iter().map(|&id| (self.cameras[id].clone(), self.gains[id])).unzip();

@@ -109,8 +109,7 @@ def all_at_once():
     options.random_seed = options.mapper.random_seed = plan["seed"]
     # More threads would sum in another order each time.
     options.num_threads = options.mapper.num_threads = 1
-    for part in (options.mapper.bundle_adjustment.ceres, options.mapper.global_positioning):
-        part.solver_options.num_threads = 1
+    options.mapper.bundle_adjustment.ceres.solver_options.num_threads = 1
     options.mapper.rotation_averaging.random_seed = options.mapper.global_positioning.random_seed = plan["seed"]
     if lenses_are_known:
         options.mapper.bundle_adjustment.refine_focal_length = False
@@ -134,7 +133,8 @@ if lenses_are_known:
     # Other photos of the same scene misled whoever placed them one by one; all at once, a few wrong pairs are outvoted.
     best = max(all_at_once(), key=lambda model: model.num_reg_images(), default=None)
     placed = {image.image_id: image for image in best.images.values() if image.has_pose} if best else {}
-    poses = [placed[i].cam_from_world().matrix().tolist() if i in placed else None for i in ids]
+    poses = [placed[i].cam_from_world().matrix() if i in placed else None for i in ids]
+    poses = [pose.tolist() if pose is not None and numpy.isfinite(pose).all() else None for pose in poses]
     (work / "poses.json").write_text(json.dumps(poses))
     print(f"{len(placed)} of {len(ids)} photos placed", flush=True)
     sys.exit()

@@ -2,15 +2,17 @@
 
 use crate::similarity::Similarity;
 use fastlgs_core::Camera;
-use fastlgs_core::camera::scene_extent;
 use fastlgs_core::rng::Rng;
-use glam::Mat4;
+use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeSet;
 
 /// Trials of three cameras each.
 const TRIALS: usize = 2000;
-/// Distance, as a share of the scene's extent, up to which two poses of a camera are the same.
+/// Distance, as a share of that of half of the cameras from their middle, and angle in radians, up to which two poses of a camera are the same.
 const SAME: f32 = 0.02;
+const SAME_TURN: f32 = 0.05;
+/// Times that the frame is fitted again to all that agree with it.
+const FITS: usize = 3;
 /// Fewest cameras that have to agree on a frame.
 const FEW: usize = 4;
 
@@ -25,11 +27,14 @@ pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<
     if placed.len() < FEW {
         return None;
     }
-    let near = SAME * scene_extent(given);
-    let agree = |s: &Similarity| -> Vec<usize> {
-        let same = |(_, (photo, camera)): &(usize, &(usize, Camera))| s.apply(camera.centre()).distance(given[*photo].centre()) < near;
-        placed.iter().enumerate().filter(same).map(|p| p.0).collect()
+    let near = SAME * spread(given);
+    let same = |frame: &Similarity, (photo, camera): &(usize, Camera)| {
+        let mut camera = camera.clone();
+        frame.move_camera(&mut camera);
+        let turn = Quat::from_mat4(&camera.world_to_camera).angle_between(Quat::from_mat4(&given[*photo].world_to_camera));
+        camera.centre().distance(given[*photo].centre()) < near && turn < SAME_TURN
     };
+    let agree = |frame: &Similarity| (0..placed.len()).filter(|&k| same(frame, &placed[k])).collect::<Vec<usize>>();
     let between = |some: &[usize]| {
         let pairs: Vec<_> = some.iter().map(|&k| (placed[k].1.centre(), given[placed[k].0].centre())).collect();
         Similarity::between(&pairs)
@@ -43,23 +48,40 @@ pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<
             best = some;
         }
     }
-    let frame = between(&best).filter(|_| best.len() >= FEW)?;
+    let mut frame = between(&best)?;
+    for _ in 0..FITS {
+        best = agree(&frame);
+        if best.len() < FEW {
+            return None;
+        }
+        frame = between(&best)?;
+    }
     let mut cameras = given.to_vec();
     let mut moved = BTreeSet::new();
     for (photo, mut camera) in placed {
-        frame.move_camera(&mut camera);
-        if camera.centre().distance(given[photo].centre()) >= near {
+        if !same(&frame, &(photo, camera.clone())) {
             moved.insert(photo);
         }
+        frame.move_camera(&mut camera);
         cameras[photo] = camera;
     }
     Some((cameras, moved))
 }
 
+/// How far half of the cameras are from the middle of all; some may be anywhere.
+fn spread(cameras: &[Camera]) -> f32 {
+    let median = |mut values: Vec<f32>| {
+        values.sort_by(f32::total_cmp);
+        values[values.len() / 2]
+    };
+    let middle = Vec3::from_array([0, 1, 2].map(|k| median(cameras.iter().map(|c| c.centre()[k]).collect())));
+    median(cameras.iter().map(|c| c.centre().distance(middle)).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{Mat3, Vec3};
+    use glam::Mat3;
 
     #[test]
     fn the_frame_is_that_of_the_poses_that_were_right() {
@@ -68,8 +90,10 @@ mod tests {
             Camera::look_at(&k.to_string(), Vec3::new(4.0 * sin, 0.1 * (k % 5) as f32, 4.0 * cos), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
         };
         let truth: Vec<Camera> = (0..20).map(|k| eye(k, 0.0)).collect();
-        // The last nine were given on a wrong arc, consistent among themselves.
-        let given: Vec<Camera> = (0..20).map(|k| eye(k, if k < 11 { 0.0 } else { 1.0 })).collect();
+        // The last nine were given on a wrong arc, consistent among themselves; one was given far away, and one turned aside.
+        let mut given: Vec<Camera> = (0..20).map(|k| eye(k, if k < 11 { 0.0 } else { 1.0 })).collect();
+        given[1].world_to_camera.w_axis.x += 1000.0;
+        given[2].world_to_camera = Mat4::from_rotation_z(0.3) * given[2].world_to_camera;
         let other = Similarity {
             scale: 0.4,
             rotation: Mat3::from_rotation_y(2.0) * Mat3::from_rotation_x(0.3),
@@ -82,7 +106,7 @@ mod tests {
         };
         let found: Vec<Option<Mat4>> = truth.iter().enumerate().map(elsewhere).collect();
         let (cameras, moved) = kept(&given, &found, 1).unwrap();
-        assert_eq!(moved, (11..20).collect());
+        assert_eq!(moved, [1, 2].into_iter().chain(11..20).collect());
         assert!(cameras.iter().zip(&truth).all(|(c, t)| c.world_to_camera.abs_diff_eq(t.world_to_camera, 1e-3)));
         assert_eq!(cameras[4], given[4], "what was not placed stays");
         assert!(kept(&given, &vec![None; 20], 1).is_none());

@@ -206,7 +206,7 @@ pub fn placed_anew(
     // Rows of [R t], the largest model's.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
     let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
-    let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose).filter(|pose| pose.is_finite())).collect();
+    let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose)).collect();
     if found.len() == cameras.len() { Ok(found) } else { Err(Error::Invalid("structure from motion lost count of its photos".to_owned())) }
 }
 

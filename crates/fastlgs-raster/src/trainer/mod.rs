@@ -47,7 +47,7 @@ pub struct TrainReport {
     pub iterations: u32,
     /// Steps of this process.
     pub steps_here: u32,
-    /// Seconds of this process in steps and density control, after the first step (which compiles the kernels).
+    /// Seconds of this process in steps and density control, after the first step (which compiles the kernels); without those in which photos were read.
     pub seconds: f64,
     /// Steps a second in that time.
     pub iterations_per_second: f64,
@@ -274,6 +274,7 @@ impl Trainer {
                 // The driver compiles kernels in their first dispatch.
                 self.engine.losses()?;
                 started = Instant::now();
+                self.shown.reading = 0.0;
             }
             if self.course.config.looks(iteration) && !self.growth_is_over() {
                 self.watch()?;
@@ -294,7 +295,7 @@ impl Trainer {
                 let losses = self.engine.losses()?;
                 // For errors spread like a Gaussian, mean square = pi/2 x squared mean absolute error.
                 let psnr = -10.0 * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2).max(1e-12).log10();
-                let seconds = started.elapsed().as_secs_f64() - aside;
+                let seconds = started.elapsed().as_secs_f64() - aside - self.shown.reading;
                 let reporting = Instant::now();
                 report(&Progress { iteration, losses, psnr, gaussians: self.engine.len(), seconds }, self)?;
                 aside += reporting.elapsed().as_secs_f64();
@@ -304,7 +305,7 @@ impl Trainer {
             }
         }
         self.engine.losses()?;
-        let (seconds, steps) = (started.elapsed().as_secs_f64() - aside, self.course.iteration - first);
+        let (seconds, steps) = (started.elapsed().as_secs_f64() - aside - self.shown.reading, self.course.iteration - first);
         Ok(TrainReport {
             iterations: self.course.iteration,
             steps_here: steps,

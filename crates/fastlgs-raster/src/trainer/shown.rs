@@ -3,6 +3,7 @@
 use super::Trainer;
 use crate::Result;
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 /// Bytes of pictures that stay on the device.
 const ROOM: usize = 1 << 30;
@@ -15,11 +16,13 @@ pub(super) struct Shown {
     views: BTreeMap<usize, usize>,
     /// Bytes that may stay.
     pub room: usize,
+    /// Seconds in which pictures were read: what steps cost, a short run does not tell by them.
+    pub reading: f64,
 }
 
 impl Default for Shown {
     fn default() -> Self {
-        Self { coarse: false, views: BTreeMap::new(), room: ROOM }
+        Self { coarse: false, views: BTreeMap::new(), room: ROOM, reading: 0.0 }
     }
 }
 
@@ -32,10 +35,13 @@ impl Trainer {
             self.shown.coarse = coarse;
         }
         if !self.shown.views.contains_key(&id) {
+            let started = Instant::now();
             let image = self.targets.get(id)?.image;
             let image = if coarse { image.halved() } else { image };
-            self.shown.views.insert(id, image.bytes());
+            let bytes = image.bytes();
             self.engine.set_target(id, image)?;
+            self.shown.views.insert(id, bytes);
+            self.shown.reading += started.elapsed().as_secs_f64();
         }
         Ok(())
     }

@@ -67,7 +67,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     photos::warn_of_bad_photos(&known, run, &mut warnings);
     let mut checked = match config.poses {
         Poses::Keep => Default::default(),
-        Poses::Check | Poses::Refine => poses::check(&mut known, &folder, &cache, run)?,
+        Poses::Check | Poses::Refine => poses::check(&mut known, &folder, &cache, run, &mut warnings)?,
     };
     lap("pose_check");
     let matches = matches::match_photos(&known, &checked.contradictory, config.neighbours, &cache, run)?;

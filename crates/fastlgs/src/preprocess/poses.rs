@@ -9,6 +9,7 @@ use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::structure::Tool;
 use fastlgs_vision::tracks::PairMatches;
 use fastlgs_vision::{bundle, frame, pose_check, resection, structure};
+use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -29,37 +30,49 @@ pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
 const CHECK_SIDE: u32 = 480;
 
 /// Moves groups of cameras that contradict the others. Poses come from all photos, held out or not, as in structure from motion.
-pub(super) fn check(photos: &mut [Known], folder: &SceneFolder, cache: &Cache, run: &Run) -> Result<pose_check::Report> {
+pub(super) fn check(
+    photos: &mut [Known],
+    folder: &SceneFolder,
+    cache: &Cache,
+    run: &Run,
+    warnings: &mut Vec<String>,
+) -> Result<pose_check::Report> {
     let given: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
     let told = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
     let seed = run.seed.to_le_bytes();
     inputs.extend([told.as_slice(), &seed, keypoints::backend().as_bytes()]);
     let key = cache::key(&inputs);
-    let points = || {
-        let small = photos.iter().zip(&given).any(|(p, c)| p.camera.width != c.width);
-        if small { detect_small(folder, &given, run) } else { Ok(photos.iter().map(|p| p.points.clone()).collect()) }
+    let detected = OnceCell::new();
+    let points = || -> Result<&Vec<Keypoints>> {
+        if detected.get().is_none() {
+            let small = photos.iter().zip(&given).any(|(p, c)| p.camera.width != c.width);
+            let found = if small { detect_small(folder, &given, run)? } else { photos.iter().map(|p| p.points.clone()).collect() };
+            let _ = detected.set(found);
+        }
+        Ok(detected.get().expect("set above"))
     };
     let poses = |cameras: &[Camera]| cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>();
     let (mut report, mut mended) = cache.get("poses", &key, || {
         let mut cameras = given.clone();
-        let report = pose_check::repair(&mut cameras, &points()?, run.seed);
+        let report = pose_check::repair(&mut cameras, points()?, run.seed);
         Ok((report, poses(&cameras)))
     })?;
-    if doubted(&report) * DOUBTED >= given.len() && doubted(&report) > 0 {
-        if let Ok(Tool::Pycolmap(python)) = Tool::find(false) {
-            let anew = cache.get("poses anew", &key, || {
-                let found = anew(&python, &given, &points()?, &report, folder, run)?;
-                Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
-            });
-            match anew {
-                Ok(anew) => (report, mended) = anew.unwrap_or((report, mended)),
-                Err(Error::Cancelled) => return Err(Error::Cancelled),
-                // What failed for now is tried again by the next run.
-                Err(error) => run.warn(&format!("the photos could not be placed anew, and their poses are mended one by one: {error}")),
+    if doubted(&report) > 0 && doubted(&report) * DOUBTED >= given.len() {
+        let anew = cache.get("poses anew", &key, || {
+            let found = anew(&given, points()?, &report, folder, run)?;
+            Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
+        });
+        match anew {
+            Ok(anew) => (report, mended) = anew.unwrap_or((report, mended)),
+            // What fails is tried again by the next run; that the tool is missing, too.
+            Err(Error::Vision(error)) => {
+                let warning =
+                    format!("many poses contradict the photos, which could not be placed anew: {error}; they are mended one by one");
+                run.warn(&warning);
+                warnings.push(warning);
             }
-        } else {
-            run.warn("many poses contradict the photos; with pycolmap ('fastlgs models install-offline') all would be placed anew");
+            Err(error) => return Err(error),
         }
     }
     photos.iter_mut().zip(mended).for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
@@ -75,20 +88,20 @@ fn doubted(report: &pose_check::Report) -> usize {
 }
 
 /// All photos placed anew with the lenses that are given, where many poses contradict the photos: what is wrong with many is seldom mended one by one.
-/// In the frame of the poses that were right, and only where fewer of the new poses contradict the photos than of the old ones.
+/// In the frame of the poses that were right, and only where fewer of the new poses contradict the photos than of the old ones, and no more are lost.
 fn anew(
-    python: &Path,
     given: &[Camera],
     points: &[Keypoints],
     checked: &pose_check::Report,
     folder: &SceneFolder,
     run: &Run,
 ) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
+    let Tool::Pycolmap(python) = Tool::find(false)? else { return Ok(None) };
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
     let say = |stage: &str, line: &str| work.note(&format!("{stage}: {line}"));
     let partial = folder.root.join("sfm.partial");
-    let found = structure::placed_anew(python, &files, given, points, &partial, run.seed, say);
+    let found = structure::placed_anew(&python, &files, given, points, &partial, run.seed, say);
     let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
     let found = found?;
@@ -96,8 +109,10 @@ fn anew(
     let again = pose_check::repair(&mut cameras, points, run.seed);
     let unplaced = (0..given.len()).filter(|&photo| found[photo].is_none());
     let lost: BTreeSet<usize> = unplaced.chain(again.contradictory.iter().copied()).collect();
-    tracing::info!(doubted = doubted(checked), lost = lost.len(), moved = again.moved.len(), "photos were placed anew");
-    if lost.len() + again.moved.len() >= doubted(checked) {
+    let doubted_now = lost.iter().chain(&again.moved).collect::<BTreeSet<_>>().len();
+    tracing::info!(doubted = doubted(checked), doubted_now, lost = lost.len(), "photos were placed anew");
+    // What was mended is trained on, and what is lost is not.
+    if doubted_now >= doubted(checked) || lost.len() > checked.contradictory.len() {
         return Ok(None);
     }
     moved.extend(again.moved);

@@ -70,6 +70,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let light = preprocess::Brightness::of(&manifest);
     let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &config.background, |name| light.gain(name));
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &config.background, |_| [1.0; 3]);
+    held_out.check()?;
     let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
