@@ -208,7 +208,7 @@ fn photos_without_poses_are_placed() {
     assert!(median < 0.02 && worst < 0.3, "{off:?}");
 }
 
-/// What placed the photos took one side of the room for another: a third of the cameras, right among themselves, look from elsewhere.
+/// What placed the photos took one side of the room for another: two in five of the cameras, right among themselves, look from elsewhere.
 #[test]
 fn poses_of_which_many_are_wrong_are_found_anew() {
     let Some(dir) = workshop() else { return };

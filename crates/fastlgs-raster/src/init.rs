@@ -40,14 +40,15 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
     let focus = common_focus(&views.cameras);
     let mut out = Vec::with_capacity(count);
     for id in 0..views.len() {
-        if out.len() >= count * (id + 1) / views.len() {
+        let so_far = count * (id + 1) / views.len();
+        if out.len() == so_far {
             continue;
         }
         let Target { camera, image, .. } = views.get(id)?;
         let width = camera.width as usize;
         let counts = |p: &[usize; 2]| image.color[p[1] * width + p[0]].to_le_bytes()[3] == 255;
         let inverse = camera.world_to_camera.inverse();
-        while out.len() < count * (id + 1) / views.len() {
+        while out.len() < so_far {
             let mut pixel = [0; 2];
             for _ in 0..TRIES {
                 pixel = [camera.width, camera.height].map(|side| rng.below(side as usize));

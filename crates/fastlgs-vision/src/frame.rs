@@ -28,13 +28,17 @@ pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<
         return None;
     }
     let near = SAME * spread(given);
-    let same = |frame: &Similarity, (photo, camera): &(usize, Camera)| {
+    let moved_by = |frame: &Similarity, camera: &Camera| {
         let mut camera = camera.clone();
         frame.move_camera(&mut camera);
-        let turn = Quat::from_mat4(&camera.world_to_camera).angle_between(Quat::from_mat4(&given[*photo].world_to_camera));
-        camera.centre().distance(given[*photo].centre()) < near && turn < SAME_TURN
+        camera
     };
-    let agree = |frame: &Similarity| (0..placed.len()).filter(|&k| same(frame, &placed[k])).collect::<Vec<usize>>();
+    let same = |photo: usize, camera: &Camera| {
+        let turn = Quat::from_mat4(&camera.world_to_camera).angle_between(Quat::from_mat4(&given[photo].world_to_camera));
+        camera.centre().distance(given[photo].centre()) < near && turn < SAME_TURN
+    };
+    let agree =
+        |frame: &Similarity| -> Vec<usize> { (0..placed.len()).filter(|&k| same(placed[k].0, &moved_by(frame, &placed[k].1))).collect() };
     let between = |some: &[usize]| {
         let pairs: Vec<_> = some.iter().map(|&k| (placed[k].1.centre(), given[placed[k].0].centre())).collect();
         Similarity::between(&pairs)
@@ -58,12 +62,11 @@ pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<
     }
     let mut cameras = given.to_vec();
     let mut moved = BTreeSet::new();
-    for (photo, mut camera) in placed {
-        if !same(&frame, &(photo, camera.clone())) {
-            moved.insert(photo);
+    for (photo, camera) in &placed {
+        cameras[*photo] = moved_by(&frame, camera);
+        if !same(*photo, &cameras[*photo]) {
+            moved.insert(*photo);
         }
-        frame.move_camera(&mut camera);
-        cameras[photo] = camera;
     }
     Some((cameras, moved))
 }

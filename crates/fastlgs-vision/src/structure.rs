@@ -81,9 +81,7 @@ pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &st
         Tool::Colmap(program) => by_program(program, &images, &work, &models, files.len(), &say)?,
         Tool::Pycolmap(python) => {
             plan(&files, &work, seed, &say)?;
-            let script = work.join("reconstruct.py");
-            std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
-            run(Command::new(python).arg(&script).arg(&work), "structure from motion", &say)?;
+            by_script(python, &work, &say)?;
         }
     }
     let best = largest_model(&models).ok_or_else(|| {
@@ -95,6 +93,13 @@ pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &st
     std::fs::rename(best, &target).map_err(fastlgs_core::Error::io(&target))?;
     let _ = std::fs::remove_dir_all(&work);
     Ok(())
+}
+
+/// By pycolmap, from what was planned in the work folder.
+fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str)) -> Result<()> {
+    let script = work.join("reconstruct.py");
+    std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
+    run(Command::new(python).arg(&script).arg(work), "structure from motion", say)
 }
 
 /// Everything by COLMAP's own stages.
@@ -200,9 +205,7 @@ pub fn placed_anew(
     };
     let images = photos.iter().zip(cameras).zip(points).map(image).collect();
     write_plan(work, images, &points.iter().collect::<Vec<_>>(), &pairs, seed)?;
-    let script = work.join("reconstruct.py");
-    std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
-    run(Command::new(python).arg(&script).arg(work), "structure from motion", &say)?;
+    by_script(python, work, &say)?;
     // Rows of [R t], the largest model's.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
     let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();

@@ -57,10 +57,8 @@ pub fn targets(
 ) -> Targets {
     let gains = cameras.iter().map(|c| gain(&c.name)).collect();
     let (folder, views, codes, background) = (folder.clone(), cameras.to_vec(), codes.cloned(), *background);
-    Targets::new(cameras.to_vec(), gains, move |id| match target(&folder, &views[id], codes.as_ref(), &background) {
-        Ok(target) => Ok(target.image),
-        Err(error) => Err(fastlgs_raster::Error::Picture(Box::new(error))),
-    })
+    let read = move |id: usize| target(&folder, &views[id], codes.as_ref(), &background).map(|target| target.image);
+    Targets::new(cameras.to_vec(), gains, move |id| read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error))))
 }
 
 /// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count;
