@@ -167,25 +167,25 @@ fn a_growing_scene_can_be_watched() {
         "-q",
     ]);
     let began = Instant::now();
-    let (mut training, mut revisions, mut last) = (0, BTreeSet::new(), Value::Null);
-    loop {
-        let stage = served.json("/api/scene", None)["stage"].clone();
+    let mut revisions = BTreeSet::new();
+    let is_ready = || served.json("/api/scene", None)["stage"] == "ready";
+    while !is_ready() {
         let progress = served.json("/api/training", None);
-        if stage == "ready" {
-            break;
-        }
-        training += 1;
         revisions.insert(progress["revision"].as_u64());
         let (status, splats) = served.ask("/api/splats", None);
         assert!(status == 200 && splats.starts_with(b"FLGS"));
         if progress["finished"] == false {
-            assert!(served.refusal("/api/query", Some(r#"{"text":"cat"}"#), 409).contains("in training"));
+            // Between two questions a run may end and its objects be made, on a machine that is fast or busy.
+            let (status, said) = served.ask("/api/query", Some(r#"{"text":"cat"}"#));
+            let refused = status == 409 && String::from_utf8_lossy(&said).contains("in training");
+            assert!(refused || is_ready(), "{status}");
         }
-        last = progress;
         assert!(began.elapsed() < Duration::from_secs(300));
         std::thread::sleep(Duration::from_millis(300));
     }
-    assert!(training > 2 && revisions.len() > 1, "{training} looks, pictures {revisions:?}");
+    let last = served.json("/api/training", None);
+    revisions.insert(last["revision"].as_u64());
+    assert!(revisions.len() > 1, "pictures {revisions:?}");
     let curve = last["curve"].as_array().expect("a curve");
     assert_eq!(curve.last().expect("points")["iteration"], 400);
     assert_eq!(curve.iter().filter(|p| p["psnr_held_out"].is_number()).count(), 2);
