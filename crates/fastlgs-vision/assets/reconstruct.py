@@ -1,8 +1,9 @@
-"""Poses of photos from their matched key points, with pycolmap: FOLDER/features.json and .bin -> FOLDER/sparse/K (COLMAP's binary files).
+"""Poses of photos from their matched key points, with pycolmap: FOLDER/features.json and .bin -> FOLDER/sparse/0 (COLMAP's binary files).
 
 features.json: images (name, path of the photo, width, height, key points, and where the lens is known fx, fy, cx, cy), pairs (a, b, matches), seed,
 camera_model. features.bin holds, in that order, the key points of each image (x, y as 32-bit floats) and the matches of each pair (two 32-bit numbers
-each). Where lenses are known FOLDER/poses.json is all that is written: three rows of [R t] for each image of the largest model, null for others."""
+each). Where lenses are known FOLDER/poses.json is all that is written: three rows of [R t] for each image of the model that explains most, null for
+others."""
 
 import json
 import pathlib
@@ -11,10 +12,9 @@ import sys
 import numpy
 import pycolmap
 
-# Up to so many photos are placed one by one, which is more exact and, for so few, faster; more are placed all at once.
-ONE_BY_ONE = 150
-# Below this share of placed photos the other way is tried as well, and the larger result counts.
-PLACED = 0.9
+# Up to so many photos are placed one by one as well as all at once, and what explains more key points counts. More are placed all at once, and one by
+# one only where that leaves out more than a tenth.
+ONE_BY_ONE, PLACED = 150, 0.9
 # With so many photos of a lens, and so many points in each of them, its principal point and all four distortion terms of OpenCV's model are
 # found as well; fewer leave them open (with 33 points a photo the focal length was wrong by 5 %).
 WELL_SEEN, POINTS = 20, 200
@@ -102,6 +102,13 @@ verification.ransac.max_error = 2.0
 verification.ransac.max_num_trials = 2000
 pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
 
+if not lenses_are_known:
+    # A guessed focal length misleads whoever places photos by it; that of all pairs together is within a few pixels (Sweeney et al. 2015).
+    print("focal lengths", flush=True)
+    view_graph = pycolmap.ViewGraphCalibrationOptions()
+    view_graph.random_seed = plan["seed"]
+    if not pycolmap.calibrate_view_graph(work / "database.db", view_graph):
+        print("the pairs of photos do not tell the focal length", flush=True)
 
 
 def all_at_once():
@@ -124,24 +131,25 @@ def one_by_one():
     return list(pycolmap.incremental_mapping(work / "database.db", images, work, options).values())
 
 
-def most_placed(models):
-    return max((model.num_reg_images() for model in models), default=0)
+def explained(model):
+    return model.compute_num_observations()
 
 
 print("mapping", flush=True)
 if lenses_are_known:
     # Other photos of the same scene misled whoever placed them one by one; all at once, a few wrong pairs are outvoted.
-    best = max(all_at_once(), key=lambda model: model.num_reg_images(), default=None)
+    best = max(all_at_once(), key=explained, default=None)
     placed = {image.image_id: image for image in best.images.values() if image.has_pose} if best else {}
     poses = [placed[i].cam_from_world().matrix() if i in placed else None for i in ids]
     poses = [pose.tolist() if pose is not None and numpy.isfinite(pose).all() else None for pose in poses]
     (work / "poses.json").write_text(json.dumps(poses))
     print(f"{len(placed)} of {len(ids)} photos placed", flush=True)
     sys.exit()
-models = one_by_one() if len(ids) <= ONE_BY_ONE else all_at_once()
-if most_placed(models) < PLACED * len(ids):
-    print(f"another way, because {most_placed(models)} of {len(ids)} photos were placed", flush=True)
-    models += all_at_once() if len(ids) <= ONE_BY_ONE else one_by_one()
+models = all_at_once()
+if len(ids) <= ONE_BY_ONE or max((model.num_reg_images() for model in models), default=0) < PLACED * len(ids):
+    print("mapping in another way", flush=True)
+    models += one_by_one()
+best = max(models, key=explained, default=None)
 
 
 def calibrated(model):
@@ -167,15 +175,14 @@ def calibrated(model):
     return refined if better and refined.num_points3D() > model.num_points3D() / 2 else model
 
 
-most = most_placed(models)
+if best is None:
+    sys.exit()
 print("calibration", flush=True)
-for k, model in enumerate(models):
-    points = model.compute_num_observations() / max(model.num_reg_images(), 1)
-    if model.num_reg_images() == most and most >= WELL_SEEN * len(cameras) and points >= POINTS:
-        model = calibrated(model)
-    for image in model.images.values():
-        image.name = plan["images"][ids.index(image.image_id)]["name"]
-    folder = work / "sparse" / str(k)
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write(folder)
-    print(f"{model.num_reg_images()} of {len(ids)} photos placed, {model.num_points3D()} points", flush=True)
+if best.num_reg_images() >= WELL_SEEN * len(cameras) and explained(best) >= POINTS * best.num_reg_images():
+    best = calibrated(best)
+for image in best.images.values():
+    image.name = plan["images"][ids.index(image.image_id)]["name"]
+folder = work / "sparse" / "0"
+folder.mkdir(parents=True)
+best.write(folder)
+print(f"{best.num_reg_images()} of {len(ids)} photos placed, {best.num_points3D()} points", flush=True)

@@ -56,7 +56,8 @@ fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
     if descriptors.len() != found.keypoints.len() {
         return Err(crate::Error::Invalid("SIFT gave unequal numbers of key points and descriptors".to_owned()));
     }
-    let positions = found.keypoints.iter().map(|p| Vec2::new(p.x + 0.5, p.y + 0.5)).collect();
+    // It counts from a quarter of a pixel before the middle of the first one, as the test below shows.
+    let positions = found.keypoints.iter().map(|p| Vec2::new(p.x + 0.75, p.y + 0.75)).collect();
     Ok(Keypoints { positions, descriptors })
 }
 
@@ -114,6 +115,33 @@ mod tests {
         assert!(pairs.len() > 20, "{} matches", pairs.len());
         let right = pairs.iter().filter(|(i, j)| (ka.positions[*i] - kb.positions[*j] - Vec2::new(8.0, -5.0)).length() < 1.5).count();
         assert!(right * 10 >= pairs.len() * 8, "{right} of {}", pairs.len());
+    }
+
+    /// A blob lies where its key point says, on average: half a pixel of one's own would turn every camera.
+    #[test]
+    fn key_points_lie_where_blobs_are() {
+        let mut rng = fastlgs_core::rng::Rng::new(2, "blobs");
+        let mut off = |detect: fn(&GrayImage) -> Result<Keypoints>| {
+            let mut errors = Vec::new();
+            for _ in 0..60 {
+                // Positions count from the corner of the first pixel.
+                let (x, y, radius) = (rng.range(28.0, 36.0), rng.range(28.0, 36.0), rng.range(2.0, 5.0));
+                let at = |u: u32, v: u32| (u as f32 + 0.5 - x).powi(2) + (v as f32 + 0.5 - y).powi(2);
+                let photo =
+                    GrayImage::from_fn(64, 64, |u, v| image::Luma([(60.0 + 150.0 * (-at(u, v) / (2.0 * radius * radius)).exp()) as u8]));
+                let found = detect(&photo).unwrap();
+                errors.extend(found.positions.iter().map(|p| *p - Vec2::new(x, y)).filter(|e| e.length() < 1.0));
+            }
+            (errors.len(), errors.iter().sum::<Vec2>() / errors.len() as f32)
+        };
+        let mut check = |detect| {
+            let (count, mean) = off(detect);
+            assert!(count > 40 && mean.abs().max_element() < 0.05, "{count} blobs, off by {mean}");
+        };
+        #[cfg(feature = "opencv")]
+        check(detect_with_opencv);
+        #[cfg(feature = "rust-sift")]
+        check(detect_in_rust);
     }
 
     /// Both implementations tell the same of two neighbouring photos of fox.

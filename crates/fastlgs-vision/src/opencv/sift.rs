@@ -48,7 +48,8 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
         )
     })?;
     descriptors.truncate(count);
-    // OpenCV counts from the middle of the first pixel.
-    let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.5, y + 0.5)).collect();
+    // OpenCV counts from the middle of the first pixel, and looks at a picture of twice the size whose first pixel it takes to lie there too: it lies
+    // a quarter of a pixel before it.
+    let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.25, y + 0.25)).collect();
     Ok((positions, descriptors))
 }
