@@ -69,6 +69,11 @@ pub fn backend() -> &'static str {
     if cfg!(feature = "opencv") { "OpenCV" } else { "pure Rust" }
 }
 
+/// What kept key points depend on besides their photo: which SIFT found them, and a number that goes up when it finds other positions.
+pub fn version() -> &'static str {
+    if cfg!(feature = "opencv") { "OpenCV 2" } else { "pure Rust 2" }
+}
+
 /// Fundamental matrix: x_b^T F x_a = 0 for pixels of the same point.
 pub fn fundamental(a: &Camera, b: &Camera) -> Mat3 {
     let relative = b.world_to_camera * a.world_to_camera.inverse();

@@ -22,7 +22,7 @@ pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, 
     }
     let work = run.work("matches", chosen.len() as u64);
     let match_pair = |(a, b): (usize, usize)| {
-        let inputs = [&photos[a].key, &photos[b].key, keypoints::backend().as_bytes()];
+        let inputs = [&photos[a].key, &photos[b].key, keypoints::version().as_bytes()];
         let pairs = cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))?;
         work.advance()?;
         Ok::<_, Error>(PairMatches { a, b, pairs })

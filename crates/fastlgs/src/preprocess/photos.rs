@@ -87,7 +87,7 @@ fn fingerprint(camera: &Camera, pixels: &RgbImage) -> Key {
 /// What stays in memory of a photo.
 fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
     let key = fingerprint(&camera, &pixels);
-    let inputs = cache::key(&[&key, keypoints::backend().as_bytes()]);
+    let inputs = cache::key(&[&key, keypoints::version().as_bytes()]);
     let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
     let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
     let colors = points.positions.iter().map(color).collect();

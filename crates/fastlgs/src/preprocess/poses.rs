@@ -37,11 +37,13 @@ pub(super) fn check(
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<pose_check::Report> {
+    // What a run that was killed left.
+    let _ = std::fs::remove_dir_all(folder.root.join(PARTIAL));
     let given: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
     let told = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
     let seed = run.seed.to_le_bytes();
-    inputs.extend([told.as_slice(), &seed, keypoints::backend().as_bytes()]);
+    inputs.extend([told.as_slice(), &seed, keypoints::version().as_bytes()]);
     let key = cache::key(&inputs);
     let detected = OnceCell::new();
     let points = || -> Result<&Vec<Keypoints>> {
@@ -79,6 +81,8 @@ pub(super) fn check(
     Ok(report)
 }
 
+/// Where structure from motion keeps what it needs, in the scene's folder.
+const PARTIAL: &str = "sfm.partial";
 /// One in so many photos whose poses are doubted is a reason to place all of them anew.
 const DOUBTED: usize = 10;
 
@@ -100,7 +104,7 @@ fn anew(
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
     let say = |stage: &str, line: &str| work.note(&format!("{stage}: {line}"));
-    let partial = folder.root.join("sfm.partial");
+    let partial = folder.root.join(PARTIAL);
     let found = structure::placed_anew(&python, &files, given, points, &partial, run.seed, say);
     let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
