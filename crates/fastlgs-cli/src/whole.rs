@@ -13,7 +13,7 @@ type Stage = (&'static str, u64);
 /// The stages before training, in their order. Those that a scene does not need are passed over.
 const PREPARING: [Stage; 9] = [
     ("frames", 15),
-    ("poses", 25),
+    ("poses", 55),
     ("photos", 5),
     ("key points for the pose check", 3),
     ("poses anew", 25),

@@ -20,6 +20,8 @@ ONE_BY_ONE, PLACED = 150, 0.9
 WELL_SEEN, POINTS = 20, 200
 # Points with a larger error in pixels, or a smaller angle in degrees between their rays, are left out of that.
 MAX_ERROR, MIN_ANGLE = 2.0, 1.5
+# A lens whose focal length is not between these shares of the photo's longer side is none that there is, but for the longest.
+FOCAL = 0.3, 4.0
 # A principal point farther from the middle, as a share of the photo's size, is no lens that there is.
 MAX_OFFSET = 0.1
 
@@ -95,20 +97,46 @@ with open(work / "pairs.txt", "w") as listed:
         listed.write(f"{alias(pair['a'])} {alias(pair['b'])}\n")
 database.close()
 
-print("verification", flush=True)
-verification = pycolmap.TwoViewGeometryOptions()
-verification.ransac.random_seed = plan["seed"]
-verification.ransac.max_error = 2.0
-verification.ransac.max_num_trials = 2000
-pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
+def verify():
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = plan["seed"]
+    verification.ransac.max_error = 2.0
+    verification.ransac.max_num_trials = 2000
+    pycolmap.verify_matches(work / "database.db", work / "pairs.txt", verification)
 
-if not lenses_are_known:
-    # A guessed focal length misleads whoever places photos by it; that of all pairs together is within a few pixels (Sweeney et al. 2015).
+
+def calibrate():
+    """Focal lengths that no photo tells, by the fundamental matrices of all pairs together (Fetzer et al. 2020): a guess misleads whoever places by it."""
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed = plan["seed"]
+    options.reestimate_relative_pose = False
+    pycolmap.calibrate_view_graph(work / "database.db", options)
+    database = pycolmap.Database.open(work / "database.db")
+    told = 0
+    for camera, _ in cameras.values():
+        if camera.has_prior_focal_length:
+            continue
+        # Sums of several threads differ in their last digits.
+        focal = round(float(database.read_camera(camera.camera_id).params[0]), 1)
+        # A guess that no pair moved was not confirmed.
+        if FOCAL[0] < focal / max(camera.width, camera.height) < FOCAL[1] and abs(focal / camera.params[0] - 1.0) > 1e-3:
+            camera.params = [focal, *camera.params[1:]]
+            camera.has_prior_focal_length = True
+            told += 1
+            print(f"a focal length of {focal} pixels", flush=True)
+        database.update_camera(camera)
+    database.clear_two_view_geometries()
+    database.close()
+    verify()
+    if told == 0:
+        print("the pairs of photos tell no focal length", flush=True)
+
+
+print("verification", flush=True)
+verify()
+if not lenses_are_known and not all(camera.has_prior_focal_length for camera, _ in cameras.values()):
     print("focal lengths", flush=True)
-    view_graph = pycolmap.ViewGraphCalibrationOptions()
-    view_graph.random_seed = plan["seed"]
-    if not pycolmap.calibrate_view_graph(work / "database.db", view_graph):
-        print("the pairs of photos do not tell the focal length", flush=True)
+    calibrate()
 
 
 def all_at_once():
@@ -135,20 +163,32 @@ def explained(model):
     return model.compute_num_observations()
 
 
+def tried(way):
+    """What one way of placing gives; nothing where it fails, as the other may not."""
+    try:
+        models = [model for model in way() if model.num_reg_images()]
+        for model in models:
+            print(f"{way.__name__}: {model.num_reg_images()} photos, {explained(model)} key points explained", flush=True)
+        return models
+    except Exception as error:
+        print(f"{way.__name__} failed: {error}", flush=True)
+        return []
+
+
 print("mapping", flush=True)
 if lenses_are_known:
     # Other photos of the same scene misled whoever placed them one by one; all at once, a few wrong pairs are outvoted.
-    best = max(all_at_once(), key=explained, default=None)
+    best = max(tried(all_at_once), key=explained, default=None)
     placed = {image.image_id: image for image in best.images.values() if image.has_pose} if best else {}
     poses = [placed[i].cam_from_world().matrix() if i in placed else None for i in ids]
     poses = [pose.tolist() if pose is not None and numpy.isfinite(pose).all() else None for pose in poses]
     (work / "poses.json").write_text(json.dumps(poses))
     print(f"{len(placed)} of {len(ids)} photos placed", flush=True)
     sys.exit()
-models = all_at_once()
+models = tried(all_at_once)
 if len(ids) <= ONE_BY_ONE or max((model.num_reg_images() for model in models), default=0) < PLACED * len(ids):
     print("mapping in another way", flush=True)
-    models += one_by_one()
+    models += tried(one_by_one)
 best = max(models, key=explained, default=None)
 
 
@@ -170,8 +210,10 @@ def calibrated(model):
         offset = numpy.abs(camera.params[2:4] / numpy.array([camera.width, camera.height]) - 0.5)
         if not numpy.isfinite(camera.params).all() or offset.max() > MAX_OFFSET:
             return model
-    model.update_point_3d_errors()
-    better = refined.compute_mean_reprojection_error() < model.compute_mean_reprojection_error()
+    kept = pycolmap.Reconstruction(model)
+    pycolmap.ObservationManager(kept).filter_all_points3D(MAX_ERROR, MIN_ANGLE)
+    kept.update_point_3d_errors()
+    better = refined.compute_mean_reprojection_error() < kept.compute_mean_reprojection_error()
     return refined if better and refined.num_points3D() > model.num_points3D() / 2 else model
 
 

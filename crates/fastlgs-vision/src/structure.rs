@@ -1,6 +1,6 @@
 //! Poses for photos that come without: structure from motion by COLMAP (Schoenberger & Frahm 2016). pycolmap, which `models install-offline`
-//! installs, places key points that are found and matched here, all photos at once (GLOMAP, Pan et al. 2024); an installed `colmap` program does
-//! everything by itself.
+//! installs, places photos by key points that are found and matched here, all at once (GLOMAP, Pan et al. 2024) and one by one; an installed
+//! `colmap` program does everything by itself.
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
@@ -206,7 +206,7 @@ pub fn placed_anew(
     let images = photos.iter().zip(cameras).zip(points).map(image).collect();
     write_plan(work, images, &points.iter().collect::<Vec<_>>(), &pairs, seed)?;
     by_script(python, work, &say)?;
-    // Rows of [R t], the largest model's.
+    // Rows of [R t], of the model that explains most.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
     let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
     let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose)).collect();

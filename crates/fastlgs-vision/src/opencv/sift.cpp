@@ -6,7 +6,7 @@
 #include <cstdio>
 #include <vector>
 
-// Key points of a grey picture of `width` x `height` bytes: at most `capacity` positions (x, y of pixel centres from 0) and descriptors of 128
+// Key points of a grey picture of `width` x `height` bytes: at most `capacity` positions (x, y as OpenCV counts them) and descriptors of 128
 // bytes. Returns their number, or -1 with a reason in `reason`.
 extern "C" int fastlgs_opencv_sift(const uint8_t *pixels, int width, int height, int most, int capacity, float *positions,
                                    uint8_t *descriptors, char *reason, size_t reason_size) {

@@ -60,6 +60,8 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
     dataset.warnings.iter().for_each(|warning| run.warn(warning));
     let folder = SceneFolder::new(&config.output);
+    // What a run that was killed left.
+    let _ = std::fs::remove_dir_all(folder.root.join(poses::PARTIAL));
     let cache = Cache::new(&folder);
     let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
     lap("photos");

@@ -37,8 +37,6 @@ pub(super) fn check(
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<pose_check::Report> {
-    // What a run that was killed left.
-    let _ = std::fs::remove_dir_all(folder.root.join(PARTIAL));
     let given: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
     let told = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
@@ -82,7 +80,7 @@ pub(super) fn check(
 }
 
 /// Where structure from motion keeps what it needs, in the scene's folder.
-const PARTIAL: &str = "sfm.partial";
+pub(super) const PARTIAL: &str = "sfm.partial";
 /// One in so many photos whose poses are doubted is a reason to place all of them anew.
 const DOUBTED: usize = 10;
 
