@@ -8,7 +8,7 @@ use fastlgs_core::{Camera, Gaussians};
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::objects as nodes;
 use fastlgs_raster::budget::Removal;
-use fastlgs_raster::{Budget, Choice, View};
+use fastlgs_raster::{Budget, Choice, FEW_VIEWS, View};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -154,11 +154,8 @@ const FEATURE_WEIGHT: f32 = 0.2;
 /// where there are few pixels a Gaussian, as with 170,000 of them on 28 photos of 240x180, they learn the photos by heart.
 const PIXELS_A_GAUSSIAN: usize = 20;
 
-/// Where fewer views than these are trained on, colour has at most [`DEGREE_OF_FEW`]: each Gaussian is seen by some of them only, and nine
-/// numbers a channel learn what each sees by heart. Oracle mIoU at degrees 0, 1, 2: generated table of 20 views 0.966, 0.959, 0.883 (30.3, 29.5,
-/// 28.2 dB), fox of 18 views 0.77, 0.83, 0.81 at the same PSNR.
-const FEW_VIEWS: usize = 25;
-/// SH degree of few views.
+/// SH degree of [`FEW_VIEWS`]: each Gaussian is seen by some of them only, and nine numbers a channel learn what each sees by heart. Oracle mIoU at
+/// degrees 0, 1, 2: generated table of 20 views 0.966, 0.959, 0.883 (30.3, 29.5, 28.2 dB), fox of 18 views 0.77, 0.83, 0.81 at the same PSNR.
 const DEGREE_OF_FEW: u32 = 1;
 
 /// So many Gaussians; nothing for `auto`.
