@@ -16,7 +16,7 @@ import pycolmap
 # one only where that leaves out more than a tenth.
 ONE_BY_ONE, PLACED = 150, 0.9
 # With so many photos of a lens, and so many points in each of them, its principal point and all four distortion terms of OpenCV's model are
-# found as well; fewer leave them open (with 33 points a photo the focal length was wrong by 5 %).
+# found as well; fewer leave them open (with 33 points a photo the focal length was wrong by 5 %). Nor do fewer matches tell a focal length by pairs.
 WELL_SEEN, POINTS = 20, 200
 # Points with a larger error in pixels, or a smaller angle in degrees between their rays, are left out of that.
 MAX_ERROR, MIN_ANGLE = 2.0, 1.5
@@ -106,7 +106,13 @@ def verify():
 
 
 def calibrate():
-    """Focal lengths that no photo tells, by the fundamental matrices of all pairs together (Fetzer et al. 2020): a guess misleads whoever places by it."""
+    """Focal lengths that no photo tells, by the fundamental matrices of all pairs together (Fetzer et al. 2020). A guess misleads who places by it."""
+    database = pycolmap.Database.open(work / "database.db")
+    agreeing = sum(len(geometry.inlier_matches) for geometry in database.read_two_view_geometries()[1])
+    database.close()
+    if 2 * agreeing < POINTS * len(ids):
+        print(f"{agreeing} matches of {len(ids)} photos are too few to tell focal lengths", flush=True)
+        return
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed = plan["seed"]
     options.reestimate_relative_pose = False
