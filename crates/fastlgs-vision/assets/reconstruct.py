@@ -97,6 +97,7 @@ with open(work / "pairs.txt", "w") as listed:
         listed.write(f"{alias(pair['a'])} {alias(pair['b'])}\n")
 database.close()
 
+
 def verify():
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = plan["seed"]
@@ -118,7 +119,6 @@ def calibrate():
     options.reestimate_relative_pose = False
     pycolmap.calibrate_view_graph(work / "database.db", options)
     database = pycolmap.Database.open(work / "database.db")
-    told = 0
     for camera, _ in cameras.values():
         if camera.has_prior_focal_length:
             continue
@@ -128,14 +128,11 @@ def calibrate():
         if FOCAL[0] < focal / max(camera.width, camera.height) < FOCAL[1] and abs(focal / camera.params[0] - 1.0) > 1e-3:
             camera.params = [focal, *camera.params[1:]]
             camera.has_prior_focal_length = True
-            told += 1
             print(f"a focal length of {focal} pixels", flush=True)
         database.update_camera(camera)
     database.clear_two_view_geometries()
     database.close()
     verify()
-    if told == 0:
-        print("the pairs of photos tell no focal length", flush=True)
 
 
 print("verification", flush=True)
@@ -169,6 +166,9 @@ def explained(model):
     return model.compute_num_observations()
 
 
+failures = []
+
+
 def tried(way):
     """What one way of placing gives; nothing where it fails, as the other may not."""
     try:
@@ -177,14 +177,15 @@ def tried(way):
             print(f"{way.__name__}: {model.num_reg_images()} photos, {explained(model)} key points explained", flush=True)
         return models
     except Exception as error:
-        print(f"{way.__name__} failed: {error}", flush=True)
+        failures.append(f"{way.__name__} failed: {error}")
+        print(failures[-1], flush=True)
         return []
 
 
 print("mapping", flush=True)
 if lenses_are_known:
     # Other photos of the same scene misled whoever placed them one by one; all at once, a few wrong pairs are outvoted.
-    best = max(tried(all_at_once), key=explained, default=None)
+    best = max(all_at_once(), key=explained, default=None)
     placed = {image.image_id: image for image in best.images.values() if image.has_pose} if best else {}
     poses = [placed[i].cam_from_world().matrix() if i in placed else None for i in ids]
     poses = [pose.tolist() if pose is not None and numpy.isfinite(pose).all() else None for pose in poses]
@@ -224,7 +225,7 @@ def calibrated(model):
 
 
 if best is None:
-    sys.exit()
+    sys.exit("; ".join(failures) or 0)
 print("calibration", flush=True)
 if best.num_reg_images() >= WELL_SEEN * len(cameras) and explained(best) >= POINTS * best.num_reg_images():
     best = calibrated(best)
