@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs what is missing and runs the tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
-# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages. Before a release; about an hour on two cores.
+# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages, the originals of SAM and CLIP. Before a release; about an hour on two cores.
 set -euo pipefail
 cd "$(dirname "$0")"
 ./setup.sh --tests
@@ -35,5 +35,6 @@ python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- -
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
     # Both kinds of key points, against each other.
     cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output
+    tests/reference.sh
 fi
 lap "tests"

@@ -132,7 +132,7 @@ impl ClipText {
     }
 
     /// L2-normalised embeddings of whole sentences.
-    fn sentences(&self, sentences: &[String]) -> Result<Vec<Vec<f32>>> {
+    pub(crate) fn sentences(&self, sentences: &[String]) -> Result<Vec<Vec<f32>>> {
         let mut out = Vec::with_capacity(sentences.len());
         let fixed = self.model.input(&[&self.ids]).and_then(|s| s.shape[0]);
         for batch in sentences.chunks(fixed.map_or(BATCH, |_| 1)) {

@@ -27,6 +27,8 @@ pub mod photo_quality;
 pub mod places;
 pub mod pose_check;
 pub mod pull;
+#[cfg(test)]
+mod reference;
 pub mod regions;
 pub mod resection;
 #[cfg(test)]

@@ -83,7 +83,9 @@ fn of_crop(exports: &Exports, photo: &RgbImage, crop: [u32; 4], config: &Config,
             found.extend(own.into_iter().filter_map(|candidate| placed(candidate, photo, crop)));
         }
         // What repeats a better one goes as it comes in, so that memory hardly grows with the prompts.
-        found = without_copies(found);
+        if config.box_nms < 1.0 {
+            found = without_copies(found);
+        }
     }
     Ok(thinned(found, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| c.predicted_iou))
 }

@@ -1,8 +1,8 @@
 //! Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) from ONNX exports: `exports` asks the models, `generation` asks about
 //! the whole photo, `windows` keeps what they answer.
 
-mod exports;
-mod generation;
+pub(crate) mod exports;
+pub(crate) mod generation;
 mod windows;
 
 use crate::Result;
