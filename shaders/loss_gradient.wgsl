@@ -1,6 +1,6 @@
 // Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for the loss and the exposure.
 //
-// rows     [3][padded rows / 2][quads]  from ssim_backward_rows
+// rows     [3][padded rows][quads]    from ssim_backward_rows
 // gradient [6][padded rows][quads]    dL/d frame
 // sums     [4][6][tile rows][quads]   sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
 #import columns
@@ -29,7 +29,7 @@ fn add(totals: ptr<function, Totals>, quad: u32, row: u32, by_mean: vec4<f32>, b
     let weight = select(vec4<f32>(0.0), shown(quad, row), t.counts);
     let y = select(x, t.value, t.counts);
     let d_ssim = by_mean + 2.0 * x * by_square + y * by_product;
-    let value = weight * (plane.weight_l1 * sign(x - y) - plane.weight_ssim * d_ssim);
+    let value = weight * plane.scale * ((1.0 - plane.lambda) * sign(x - y) - plane.lambda * d_ssim);
     gradient[at] = plane.gain * value;
     (*totals).error += weight * abs(x - y);
     (*totals).gain = fma(value, rendered, (*totals).gain);

@@ -1,7 +1,4 @@
 // Blurs the three partial derivatives of SSIM along rows (the window is its own transpose).
-//
-// partials [3][padded rows / 2][quads]  from ssim_rows
-// rows     [3][padded rows / 2][quads]
 #import rows
 #import flat
 
@@ -18,13 +15,13 @@ fn load(base: u32, quad: i32) -> vec4<f32> {
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let id = flat_group(group, groups) * 64u + lane;
     let runs = plane.quads / 2u;
-    if id >= runs * (plane.rows / 2u) {
+    if id >= runs * plane.rows {
         return;
     }
     let row = id / runs;
     let quad = 2u * (id % runs);
     for (var map = 0u; map < 3u; map++) {
-        let base = (map * (plane.rows / 2u) + row) * plane.quads;
+        let base = (map * plane.rows + row) * plane.quads;
         let out = blurred_row(array<vec4<f32>, 6>(
 #each K 6
             load(base, i32(quad) + $K - 2),

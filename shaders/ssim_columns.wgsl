@@ -1,44 +1,32 @@
-// Blurs x, y, x^2, y^2 and x y along columns, into every second row: the first half of SSIM's window.
+// Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments of x.
 //
-// frame   [..][padded rows][quads]     rendered x
-// targets [2][padded rows][quads]      8-bit y of colour and feature; where a pixel does not count, y := x
-// moments [5][padded rows / 2][quads]
-#import window
+// rows     [5][padded rows][quads]  from ssim_rows
+// partials [3][padded rows][quads]  d SSIM / d (mean x, mean x^2, mean x y)
+// sums     [6][tile rows][quads]    sum of SSIM over eight rows, for the loss
+#import columns
 #import flat
 
 @group(0) @binding(0) var<uniform> plane: Plane;
-@group(0) @binding(1) var<storage, read> frame: array<vec4<f32>>;
-@group(0) @binding(2) var<storage, read> targets: array<vec4<u32>>;
-@group(0) @binding(3) var<storage, read_write> moments: array<vec4<f32>>;
+@group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
+@group(0) @binding(2) var<storage, read_write> partials: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read_write> sums: array<vec4<f32>>;
 
-struct Pair {
-    x: vec4<f32>,
-    y: vec4<f32>,
-}
-
-// Loading in any case and choosing afterwards avoids branches.
-fn load(quad: u32, j: i32) -> Pair {
-    let row = u32(clamp(j, 0, i32(plane.rows) - 1));
+// SSIM of four pixels from their five local moments; stores its derivatives.
+fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, xx: vec4<f32>, yy: vec4<f32>, xy: vec4<f32>) -> vec4<f32> {
+    let a = 2.0 * mx * my + 0.0001;
+    let b = 2.0 * (xy - mx * my) + 0.0009;
+    let c = mx * mx + my * my + 0.0001;
+    let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
+    let weight = shown(quad, row);
+    let inverse = 1.0 / (c * d);
+    let value = a * b * inverse;
+    let size = plane.rows * plane.quads;
     let place = row * plane.quads + quad;
-    let x = exposed(frame[plane.channel * plane.rows * plane.quads + place], quad, row);
-    let y = wanted(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
-    let in_picture = j >= 0 && j < i32(plane.rows);
-    return Pair(select(vec4<f32>(0.0), x, in_picture), select(vec4<f32>(0.0), select(x, y.value, y.counts), in_picture));
-}
-
-// Writes every second row of a map from 17 rows.
-fn store(map: u32, quad: u32, first: u32, a: array<vec4<f32>, 17>) {
-    let place = (map * (plane.rows / 2u) + first / 2u) * plane.quads + quad;
-#each K 4
-    moments[place + $Ku * plane.quads] = window(
-        a[2u * $Ku + 5u],
-        a[2u * $Ku + 4u] + a[2u * $Ku + 6u],
-        a[2u * $Ku + 3u] + a[2u * $Ku + 7u],
-        a[2u * $Ku + 2u] + a[2u * $Ku + 8u],
-        a[2u * $Ku + 1u] + a[2u * $Ku + 9u],
-        a[2u * $Ku] + a[2u * $Ku + 10u],
-    );
-#end
+    // sigma terms depend on the mean too: b and d lose 2 mx my and mx^2.
+    partials[place] = weight * (2.0 * my * (b - a) * inverse - 2.0 * mx * value * (d - c) * inverse);
+    partials[size + place] = -weight * value / d;
+    partials[2u * size + place] = weight * 2.0 * a * inverse;
+    return weight * value;
 }
 
 @compute @workgroup_size(64)
@@ -50,32 +38,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let quad = id % plane.quads;
     let first = 8u * (id / plane.quads);
-#each K 17
-    let p$K = load(quad, i32(first + plane.phase) + $K - 5);
+    let mx = blurred(0u, quad, i32(first));
+    let my = blurred(1u, quad, i32(first));
+    let xx = blurred(2u, quad, i32(first));
+    let yy = blurred(3u, quad, i32(first));
+    let xy = blurred(4u, quad, i32(first));
+    var total = vec4<f32>(0.0);
+#each K 8
+    total += ssim(quad, first + $Ku, mx[$K], my[$K], xx[$K], yy[$K], xy[$K]);
 #end
-    store(0u, quad, first, array<vec4<f32>, 17>(
-#each K 17
-        p$K.x,
-#end
-    ));
-    store(1u, quad, first, array<vec4<f32>, 17>(
-#each K 17
-        p$K.y,
-#end
-    ));
-    store(2u, quad, first, array<vec4<f32>, 17>(
-#each K 17
-        p$K.x * p$K.x,
-#end
-    ));
-    store(3u, quad, first, array<vec4<f32>, 17>(
-#each K 17
-        p$K.y * p$K.y,
-#end
-    ));
-    store(4u, quad, first, array<vec4<f32>, 17>(
-#each K 17
-        p$K.x * p$K.y,
-#end
-    ));
+    sums[plane.channel * runs * plane.quads + id] = total;
 }

@@ -8,16 +8,16 @@ struct Plane {
     rows: u32,
     // Channel of the picture.
     channel: u32,
-    // Windows of SSIM lie around pixels of rows phase, phase + 2, ...
-    phase: u32,
-    // Weight of the difference at one pixel, and of 1 - SSIM in one window.
-    weight_l1: f32,
-    weight_ssim: f32,
+    // Weight of this channel's loss / number of its pixels.
+    scale: f32,
+    // The paper's lambda: share of D-SSIM against L1.
+    lambda: f32,
     // Exposure of the view: what is compared is gain * rendered + offset.
     gain: f32,
     offset: f32,
     unused0: u32,
     unused1: u32,
+    unused2: u32,
 }
 
 // One output from the middle input and the sums of the pairs beside it, from near to far.

@@ -163,7 +163,7 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
     let degree = views[0].sh_degree;
     let frozen = Step::new(1, 14..BASE_CHANNELS, &zero);
     let step = Step::new(1, 0..channels(degree), &zero);
-    let options = |channels: Channels| StepOptions { channels, lambda: 0.2, phase: 0, feature_weight: 1.0, exposure: Exposure::default() };
+    let options = |channels: Channels| StepOptions { channels, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
     // As `train --feature-mode train` steps.
     let full = options(Channels::Coupled);
     let target =

@@ -96,8 +96,6 @@ pub struct StepOptions {
     pub channels: Channels,
     /// Share of D-SSIM (the paper's lambda).
     pub lambda: f32,
-    /// Even: windows of SSIM lie around pixels of even rows; odd: of odd ones. Half of them cost half, and drawn anew at each step they ask for the same.
-    pub phase: u32,
     /// Weight of the feature loss.
     pub feature_weight: f32,
     /// Exposure of the view.
@@ -229,55 +227,44 @@ pub struct Memory {
     pub views: u64,
 }
 
-/// Windows of SSIM in one channel of a picture: the first row of them, 0 or 1, and how many there are.
-fn windows(view: &View, options: &StepOptions) -> (u32, f64) {
-    let [w, h] = view.size;
-    // A picture of one row has no odd ones.
-    let phase = if h > 1 { options.phase % 2 } else { 0 };
-    (phase, f64::from(w) * f64::from((h - phase).div_ceil(2)))
-}
-
 /// Loss planes of a step: colour channels 0..3 and feature channels 3..6, as far as they are trained.
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
     let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
-    let (phase, windows) = windows(view, options);
-    let per_window = 1.0 / (3.0 * windows as f32);
     let trained = |c: &usize| if *c < 3 { options.channels.color() } else { options.channels.feature() };
     (0..6usize)
         .filter(trained)
-        .map(|channel| (channel, if channel < 3 { 1.0 } else { options.feature_weight }))
-        .map(|(channel, weight)| Plane {
+        .map(|channel| Plane {
             size: view.size,
             quads: 2 * view.tiles[0],
             rows: RUN as u32 * view.tiles[1],
             channel: channel as u32,
-            phase,
-            weight_l1: weight * (1.0 - options.lambda) * per_pixel,
-            weight_ssim: weight * options.lambda * per_window,
+            scale: if channel < 3 { per_pixel } else { options.feature_weight * per_pixel },
+            lambda: options.lambda,
             gain: if channel < 3 { options.exposure.gain[channel] } else { 1.0 },
             offset: if channel < 3 { options.exposure.offset[channel] } else { 0.0 },
-            unused: [0; 2],
+            unused: [0; 3],
         })
         .collect()
 }
 
-/// Losses from the sums of `shaders/ssim_rows.wgsl`, of six channels, and of `shaders/loss_gradient.wgsl`, of four kinds of them.
-pub(crate) fn losses_of(view: &View, options: &StepOptions, ssim: &[f32], sums: &[f32]) -> Losses {
-    let sum = |sums: &[f32], part: usize, parts: usize| -> f64 {
-        let length = sums.len() / parts;
-        sums[part * length..(part + 1) * length].iter().map(|v| f64::from(*v)).sum()
+/// Losses from the sums of `shaders/ssim_columns.wgsl` and `shaders/loss_gradient.wgsl`.
+pub(crate) fn losses_of(view: &View, channels: Channels, ssim: &[f32], sums: &[f32]) -> Losses {
+    let per_channel = (view.tiles[1] * view.tiles[0] * RUN as u32) as usize;
+    let sum = |sums: &[f32], plane: usize| -> f64 {
+        let part = &sums[plane * per_channel..(plane + 1) * per_channel];
+        part.iter().map(|v| f64::from(*v)).sum()
     };
-    let mean = |from: usize| (from..from + 3).map(|p| sum(sums, p, 24)).sum::<f64>() / (3.0 * view.pixels() as f64);
-    let (color, feature) = (options.channels.color(), options.channels.feature());
-    let three = |from: usize| if color { [0, 1, 2].map(|c| sum(sums, from + c, 24)) } else { [0.0; 3] };
+    let mean = |sums: &[f32], from: usize| (from..from + 3).map(|p| sum(sums, p)).sum::<f64>() / (3.0 * view.pixels() as f64);
+    let (color, feature) = (channels.color(), channels.feature());
+    let three = |from: usize| if color { [0, 1, 2].map(|c| sum(sums, from + c)) } else { [0.0; 3] };
     let trained = |c: usize| if c < 3 { color } else { feature };
     Losses {
-        color_l1: if color { mean(0) } else { 0.0 },
-        color_ssim: if color { (0..3).map(|p| sum(ssim, p, 6)).sum::<f64>() / (3.0 * windows(view, options).1) } else { 0.0 },
-        feature_l1: if feature { mean(3) } else { 0.0 },
+        color_l1: if color { mean(sums, 0) } else { 0.0 },
+        color_ssim: if color { mean(ssim, 0) } else { 0.0 },
+        feature_l1: if feature { mean(sums, 3) } else { 0.0 },
         by_gain: three(6),
         by_offset: three(12),
-        by_background: std::array::from_fn(|c| if trained(c) { sum(sums, 18 + c, 24) } else { 0.0 }),
+        by_background: std::array::from_fn(|c| if trained(c) { sum(sums, 18 + c) } else { 0.0 }),
     }
 }
 

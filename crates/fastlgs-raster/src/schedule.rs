@@ -2,7 +2,6 @@
 
 use crate::view::Rates;
 use fastlgs_core::gaussians::BASE_CHANNELS;
-use fastlgs_core::rng::Rng;
 use serde::{Deserialize, Serialize};
 
 /// How the number of Gaussians is controlled.
@@ -163,11 +162,6 @@ impl TrainConfig {
     /// Whether a step is done at half the resolution.
     pub(crate) fn coarse(&self, iteration: u32) -> bool {
         iteration < self.step_at(self.coarse_until)
-    }
-
-    /// Which rows of windows a step compares: a draw of its own, so that a run that goes on from a checkpoint draws what it would have drawn.
-    pub(crate) fn phase(&self, iteration: u32) -> u32 {
-        Rng::new(self.seed ^ u64::from(iteration) << 32, "rows of windows").next_u64() as u32 & 1
     }
 
     /// Steps between two rounds of density control.

@@ -133,7 +133,7 @@ fn measure(engine: &mut dyn Engine) -> Result<f64> {
     let view = View::new(&camera, scene.len(), 0);
     let gray = vec![pack([128; 3], true); view.pixels()];
     engine.set_target(0, TargetImage { size: view.size, color: gray.clone(), feature: gray })?;
-    let options = StepOptions { channels: Channels::Both, lambda: 0.2, phase: 0, feature_weight: 1.0, exposure: Exposure::default() };
+    let options = StepOptions { channels: Channels::Both, lambda: 0.2, feature_weight: 1.0, exposure: Exposure::default() };
     let still = Step::new(1, 0..BASE_CHANNELS, &[0.0; BASE_CHANNELS + 1]);
     let mut fastest = f64::INFINITY;
     for round in 0..=STEPS {

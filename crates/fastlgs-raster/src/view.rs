@@ -209,18 +209,16 @@ pub struct Plane {
     pub rows: u32,
     /// Channel of the frame.
     pub channel: u32,
-    /// Windows of SSIM lie around pixels of rows `phase`, `phase` + 2, ...
-    pub phase: u32,
-    /// Weight of the difference at one pixel.
-    pub weight_l1: f32,
-    /// Weight of 1 - SSIM in one window.
-    pub weight_ssim: f32,
+    /// Loss weight of one pixel of this channel.
+    pub scale: f32,
+    /// Share of D-SSIM.
+    pub lambda: f32,
     /// Exposure of the view: factor.
     pub gain: f32,
     /// Exposure of the view: summand.
     pub offset: f32,
     /// Padding to 16 bytes.
-    pub unused: [u32; 2],
+    pub unused: [u32; 3],
 }
 
 /// Uniform of sorting and scanning; `shaders/shared/chunks.wgsl`.

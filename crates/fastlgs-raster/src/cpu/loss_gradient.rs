@@ -1,14 +1,6 @@
+use super::ssim_columns::blur_column;
 use super::{RUN, shown_target};
 use crate::view::Plane;
-use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
-
-/// Blurs one map of `rows`, which hold every second row, along its column at (i, j).
-fn blur_column(plane: &Plane, rows: &[f32], map: usize, i: usize, j: usize) -> f32 {
-    let window = ssim_window();
-    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
-    let taps = (plane.phase as usize..h).step_by(2).enumerate().filter(|(_, k)| k.abs_diff(j) <= SSIM_RADIUS);
-    taps.map(|(row, k)| window[k + SSIM_RADIUS - j] * rows[(map * h / 2 + row) * w + i]).sum()
-}
 
 /// Twin of `shaders/loss_gradient.wgsl`.
 pub fn loss_gradient(plane: &Plane, frame: &[f32], targets: &[u32], rows: &[f32], gradient: &mut [f32], sums: &mut [f32]) {
@@ -23,7 +15,7 @@ pub fn loss_gradient(plane: &Plane, frame: &[f32], targets: &[u32], rows: &[f32]
             let p = shown_target(plane, frame, targets, i, j);
             let sign = if p.x == p.y { 0.0 } else { (p.x - p.y).signum() };
             let d_ssim = by_mean + 2.0 * p.x * by_square + p.y * by_product;
-            let value = p.weight * (plane.weight_l1 * sign - plane.weight_ssim * d_ssim);
+            let value = p.weight * plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim);
             let at = channel * w * h + j * w + i;
             gradient[at] = plane.gain * value;
             let transmittance = frame[6 * w * h + j * w + i];

@@ -38,8 +38,8 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         ("blend_ids", [ranges, sorted, gaussians, splats, ids, shares]) => {
             blend_ids(&view(), ranges, sorted, gaussians, read(splats), ids, shares);
         }
-        ("ssim_columns", [frame, targets, moments]) => ssim_columns(&plane(), read(frame), targets, write(moments)),
-        ("ssim_rows", [moments, partials, sums]) => ssim_rows(&plane(), read(moments), write(partials), write(sums)),
+        ("ssim_rows", [frame, targets, rows]) => ssim_rows(&plane(), read(frame), targets, write(rows)),
+        ("ssim_columns", [rows, partials, sums]) => ssim_columns(&plane(), read(rows), write(partials), write(sums)),
         ("ssim_backward_rows", [partials, rows]) => ssim_backward_rows(&plane(), read(partials), write(rows)),
         ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
             loss_gradient(&plane(), read(frame), targets, read(rows), write(gradient), write(sums));

@@ -1,10 +1,14 @@
-use super::ssim_rows::blur_row;
 use crate::view::Plane;
+use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
 /// Twin of `shaders/ssim_backward_rows.wgsl`.
 pub fn ssim_backward_rows(plane: &Plane, partials: &[f32], rows: &mut [f32]) {
-    let (w, h) = (4 * plane.quads as usize, plane.rows as usize / 2);
-    for (row, out) in partials.chunks_exact(w).zip(rows.chunks_exact_mut(w)).take(3 * h) {
-        out.iter_mut().enumerate().for_each(|(i, out)| *out = blur_row(row, i));
+    let window = ssim_window();
+    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
+    for j in 0..3 * h {
+        for i in 0..w {
+            let taps = i.saturating_sub(SSIM_RADIUS)..=(i + SSIM_RADIUS).min(w - 1);
+            rows[j * w + i] = taps.map(|k| window[k + SSIM_RADIUS - i] * partials[j * w + k]).sum();
+        }
     }
 }

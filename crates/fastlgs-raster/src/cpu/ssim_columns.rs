@@ -1,24 +1,35 @@
-use super::shown_target;
+use super::{RUN, shown_plane};
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
-/// Twin of `shaders/ssim_columns.wgsl`.
-pub fn ssim_columns(plane: &Plane, frame: &[f32], targets: &[u32], moments: &mut [f32]) {
+/// Blurs one map of `rows` along its column at (i, j).
+pub(super) fn blur_column(plane: &Plane, rows: &[f32], map: usize, i: usize, j: usize) -> f32 {
     let window = ssim_window();
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
-    for (row, j) in (plane.phase as usize..h).step_by(2).enumerate() {
+    let taps = j.saturating_sub(SSIM_RADIUS)..=(j + SSIM_RADIUS).min(h - 1);
+    taps.map(|k| window[k + SSIM_RADIUS - j] * rows[(map * h + k) * w + i]).sum()
+}
+
+/// Twin of `shaders/ssim_columns.wgsl`.
+pub fn ssim_columns(plane: &Plane, rows: &[f32], partials: &mut [f32], sums: &mut [f32]) {
+    let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
+    let runs = h / RUN;
+    let base = plane.channel as usize * runs * w;
+    sums[base..base + runs * w].fill(0.0);
+    for j in 0..h {
         for i in 0..w {
-            let mut sums = [0.0f32; 5];
-            for k in j.saturating_sub(SSIM_RADIUS)..=(j + SSIM_RADIUS).min(h - 1) {
-                let p = shown_target(plane, frame, targets, i, k);
-                let weight = window[k + SSIM_RADIUS - j];
-                for (sum, value) in sums.iter_mut().zip([p.x, p.y, p.x * p.x, p.y * p.y, p.x * p.y]) {
-                    *sum += weight * value;
-                }
-            }
-            for (m, sum) in sums.into_iter().enumerate() {
-                moments[(m * h / 2 + row) * w + i] = sum;
-            }
+            let [mx, my, xx, yy, xy] = [0, 1, 2, 3, 4].map(|m| blur_column(plane, rows, m, i, j));
+            let a = 2.0 * mx * my + 0.0001;
+            let b = 2.0 * (xy - mx * my) + 0.0009;
+            let c = mx * mx + my * my + 0.0001;
+            let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
+            let ssim = a * b / (c * d);
+            let weight = shown_plane(plane, i, j);
+            sums[base + (j / RUN) * w + i] += weight * ssim;
+            let at = j * w + i;
+            partials[at] = weight * ((2.0 * my * (b - a)) / (c * d) - 2.0 * mx * ssim * (d - c) / (c * d));
+            partials[w * h + at] = -weight * ssim / d;
+            partials[2 * w * h + at] = weight * 2.0 * a / (c * d);
         }
     }
 }

@@ -38,7 +38,7 @@ pub struct GpuEngine {
     loss: Option<Loss>,
     slots: Slots,
     targets: HashMap<usize, ([u32; 2], Buffer)>,
-    last: Option<(View, StepOptions)>,
+    last: Option<(View, Channels)>,
     /// This many first passes of every frame run as their CPU twins, to find a wrong one; `FASTLGS_PASSES_ON_CPU` sets it.
     pub passes_on_cpu: usize,
 }
@@ -213,7 +213,7 @@ impl Engine for GpuEngine {
         self.slots.record(&self.gpu, blending, &mut r, channels, &lists, g, &picture.frame, &loss.gradient)?;
         adam(&self.kernels.training, &mut r, g, step)?;
         r.submit();
-        self.last = Some((view, *options));
+        self.last = Some((view, channels));
         Ok(())
     }
 
@@ -229,7 +229,7 @@ impl Engine for GpuEngine {
 
     fn losses(&self) -> Result<Losses> {
         match (&self.last, &self.loss) {
-            (Some((view, options)), Some(loss)) => loss.read(&self.gpu, view, options),
+            (Some((view, channels)), Some(loss)) => loss.read(&self.gpu, view, *channels),
             _ => Ok(Losses::default()),
         }
     }

@@ -1,6 +1,7 @@
 //! The frame, and on it the loss with its gradient.
 
 use super::kernels::{GROUP, Training};
+use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::engine::{Losses, Memory, StepOptions, losses_of, planes};
 use crate::pass::Recorder;
@@ -25,18 +26,12 @@ impl Picture {
     }
 }
 
-/// Sums that the loss leaves of a channel: one for each column of a tile; SSIM leaves twice as many.
-fn sums_of(view: &View) -> usize {
-    RUN * view.tile_count() as usize
-}
-
 /// Buffers of the loss.
 pub struct Loss {
     size: [u32; 2],
     pub gradient: Buffer,
-    moments: Buffer,
-    partials: Buffer,
     rows: Buffer,
+    partials: Buffer,
     ssim_sums: Buffer,
     sums: Buffer,
 }
@@ -48,14 +43,13 @@ impl Loss {
             return Ok(loss);
         }
         let pixels = view.padded_pixels() as u64;
-        let sums = 24 * sums_of(view) as u64;
+        let sums = 24 * u64::from(RUN as u32 * view.tile_count());
         Ok(Self {
             size: view.size,
             gradient: gpu.storage("the frame's gradient", 24 * pixels)?,
-            moments: gpu.storage("SSIM moments", 10 * pixels)?,
-            partials: gpu.storage("SSIM partials", 6 * pixels)?,
-            rows: gpu.storage("SSIM rows", 6 * pixels)?,
-            ssim_sums: gpu.storage("SSIM sums", 2 * sums)?,
+            rows: gpu.storage("SSIM rows", 20 * pixels)?,
+            partials: gpu.storage("SSIM partials", 12 * pixels)?,
+            ssim_sums: gpu.storage("SSIM sums", sums)?,
             sums: gpu.storage("loss sums", 4 * sums)?,
         })
     }
@@ -70,12 +64,12 @@ impl Loss {
         frame: &Buffer,
         targets: &Buffer,
     ) -> Result<()> {
-        let Self { gradient, moments, partials, rows, ssim_sums, sums, .. } = self;
+        let Self { gradient, rows, partials, ssim_sums, sums, .. } = self;
         for plane in planes(view, options) {
-            let row_groups = (plane.quads / 2 * plane.rows / 2).div_ceil(GROUP);
+            let row_groups = (plane.quads / 2 * plane.rows).div_ceil(GROUP);
             let column_groups = (plane.rows / 8 * plane.quads).div_ceil(GROUP);
-            r.run(&passes.ssim_columns, &plane, SsimColumnsBuffers { frame, targets, moments }, column_groups)?;
-            r.run(&passes.ssim_rows, &plane, SsimRowsBuffers { moments, partials, sums: ssim_sums }, row_groups)?;
+            r.run(&passes.ssim_rows, &plane, SsimRowsBuffers { frame, targets, rows }, row_groups)?;
+            r.run(&passes.ssim_columns, &plane, SsimColumnsBuffers { rows, partials, sums: ssim_sums }, column_groups)?;
             r.run(&passes.ssim_backward_rows, &plane, SsimBackwardRowsBuffers { partials, rows }, row_groups)?;
             r.run(&passes.loss_gradient, &plane, LossGradientBuffers { frame, targets, rows, gradient, sums }, column_groups)?;
         }
@@ -83,14 +77,14 @@ impl Loss {
     }
 
     /// What the last recorded loss was.
-    pub fn read(&self, gpu: &Gpu, view: &View, options: &StepOptions) -> Result<Losses> {
-        let sums = 6 * sums_of(view);
-        Ok(losses_of(view, options, &gpu.read(&self.ssim_sums, 2 * sums)?, &gpu.read(&self.sums, 4 * sums)?))
+    pub fn read(&self, gpu: &Gpu, view: &View, channels: Channels) -> Result<Losses> {
+        let sums = 6 * RUN * view.tile_count() as usize;
+        Ok(losses_of(view, channels, &gpu.read(&self.ssim_sums, sums)?, &gpu.read(&self.sums, 4 * sums)?))
     }
 
     /// Adds what it takes.
     pub fn count(&self, memory: &mut Memory) {
-        let own = [&self.gradient, &self.moments, &self.partials, &self.rows, &self.ssim_sums, &self.sums];
+        let own = [&self.gradient, &self.rows, &self.partials, &self.ssim_sums, &self.sums];
         memory.frame += own.iter().map(|b| b.size()).sum::<u64>();
     }
 }

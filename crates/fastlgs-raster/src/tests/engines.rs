@@ -6,9 +6,9 @@ use crate::{Channels, CpuEngine, Engine, Exposure, GpuEngine, StepOptions};
 use crate::{Step, View};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 
-fn options(channels: Channels, phase: u32) -> StepOptions {
+fn options(channels: Channels) -> StepOptions {
     let exposure = Exposure { gain: [1.1, 0.9, 1.0], offset: [0.02, 0.0, -0.03] };
-    StepOptions { channels, lambda: 0.2, phase, feature_weight: 0.7, exposure }
+    StepOptions { channels, lambda: 0.2, feature_weight: 0.7, exposure }
 }
 
 /// Frame and gradients of one step with learning rates of zero.
@@ -17,7 +17,7 @@ fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, 
     engine.set_target(0, target(size.0, size.1)).unwrap();
     let frame = engine.render(view, channels).unwrap();
     let all = 0..channels_of(state.sh_degree);
-    engine.step(view, 0, &options(channels, state.sh_degree), &Step::new(1, all, &[0.0; BASE_CHANNELS + 1])).unwrap();
+    engine.step(view, 0, &options(channels), &Step::new(1, all, &[0.0; BASE_CHANNELS + 1])).unwrap();
     let n = (size.0 * size.1) as usize;
     let shown = if channels.color() { 0..3 * n } else { 3 * n..6 * n };
     (frame.data[shown].to_vec(), engine.gradients().unwrap(), engine.losses().unwrap())
@@ -109,7 +109,7 @@ fn frozen_geometry_keeps_its_lists_and_learns_features() {
         let mut errors = Vec::new();
         for t in 1..=20 {
             let step = Step::new(t, 14..BASE_CHANNELS, &[0.02; BASE_CHANNELS + 1]);
-            engine.step(view, 0, &options(Channels::Feature, 0), &step).unwrap();
+            engine.step(view, 0, &options(Channels::Feature), &step).unwrap();
             errors.push(engine.losses().unwrap().feature_l1);
         }
         assert!(errors[19] < 0.9 * errors[0], "{}: {errors:?}", engine.name());
@@ -128,7 +128,7 @@ fn the_gpu_repeats_itself_to_the_byte() {
         engine.set_target(0, target(96, 64)).unwrap();
         for t in 1..=5 {
             let step = Step::new(t, 0..channels_of(2), &[1e-3; BASE_CHANNELS + 1]);
-            engine.step(View::new(&camera(96, 64), 2000, 2), 0, &options(Channels::Coupled, 1), &step).unwrap();
+            engine.step(View::new(&camera(96, 64), 2000, 2), 0, &options(Channels::Coupled), &step).unwrap();
             engine.perturb(t, 0.01).unwrap();
         }
         engine.state().unwrap().params.iter().map(|v| v.to_bits()).collect::<Vec<_>>()

@@ -18,8 +18,6 @@ struct Around {
     background: [f64; 6],
     gain: [f64; 3],
     offset: [f64; 3],
-    /// First row with windows of SSIM.
-    phase: usize,
 }
 
 /// A projected Gaussian.
@@ -114,7 +112,7 @@ fn harmonics(d: DVec3) -> [f64; 15] {
     ]
 }
 
-/// (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the weighted one of the feature; windows of SSIM lie around every second row.
+/// (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the weighted one of the feature.
 fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
     let (w, h) = SIZE;
     let n = w * h;
@@ -138,9 +136,7 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
             let y = |p: usize| target[c * n + p];
             let l1 = (0..n).map(|p| (x(p) - y(p)).abs()).sum::<f64>();
             let mut ssim = 0.0;
-            let rows = (around.phase..h).step_by(2);
-            let windows = (rows.len() * w) as f64;
-            for (j, i) in rows.flat_map(|j| (0..w).map(move |i| (j, i))) {
+            for (j, i) in (0..h).flat_map(|j| (0..w).map(move |i| (j, i))) {
                 let (mx, my) = (blurred(&x, i, j), blurred(&y, i, j));
                 let xx = blurred(&|p| x(p) * x(p), i, j) - mx * mx;
                 let yy = blurred(&|p| y(p) * y(p), i, j) - my * my;
@@ -148,7 +144,7 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
                 ssim += (2.0 * mx * my + 1e-4) * (2.0 * xy + 9e-4) / ((mx * mx + my * my + 1e-4) * (xx + yy + 9e-4));
             }
             let weight = if c < 3 { 1.0 } else { FEATURE_WEIGHT };
-            weight * ((1.0 - LAMBDA) * l1 + LAMBDA * n as f64 * (1.0 - ssim / windows)) / (3 * n) as f64
+            weight * ((1.0 - LAMBDA) * l1 + LAMBDA * (n as f64 - ssim)) / (3 * n) as f64
         })
         .sum()
 }
@@ -171,12 +167,7 @@ fn scene(sh_degree: u32) -> Gaussians {
 fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     let scene = scene(sh_degree);
     let n = scene.len();
-    let around = Around {
-        background: [0.1, 0.3, 0.2, 0.6, 0.5, 0.4],
-        gain: [1.1, 0.95, 1.0],
-        offset: [0.02, -0.01, 0.03],
-        phase: sh_degree as usize % 2,
-    };
+    let around = Around { background: [0.1, 0.3, 0.2, 0.6, 0.5, 0.4], gain: [1.1, 0.95, 1.0], offset: [0.02, -0.01, 0.03] };
     let [r, g, b, x, y, z] = around.background.map(|v| v as f32);
     let view = View {
         antialias,
@@ -193,8 +184,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     engine.set_state(&State::of(&scene)).unwrap();
     engine.set_target(0, target).unwrap();
     let exposure = Exposure { gain: around.gain.map(|v| v as f32), offset: around.offset.map(|v| v as f32) };
-    let (lambda, feature_weight, phase) = (LAMBDA as f32, FEATURE_WEIGHT as f32, around.phase as u32);
-    let options = StepOptions { channels: Channels::Coupled, lambda, phase, feature_weight, exposure };
+    let options = StepOptions { channels: Channels::Coupled, lambda: LAMBDA as f32, feature_weight: FEATURE_WEIGHT as f32, exposure };
     engine.step(view, 0, &options, &Step::new(1, 0..channels_of(sh_degree), &[0.0; BASE_CHANNELS + 1])).unwrap();
     let (gradients, losses) = (engine.gradients().unwrap(), engine.losses().unwrap());
 

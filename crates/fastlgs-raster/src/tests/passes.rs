@@ -278,26 +278,15 @@ fn blending_ids() {
 #[test]
 fn loss() {
     let Some(gpu) = gpu() else { return };
-    for (w, h, phase) in [(17u32, 13u32, 1), (64, 50, 0), (131, 77, 1), (1440, 1080, 0)] {
+    for (w, h) in [(17u32, 13u32), (64, 50), (131, 77), (1440, 1080)] {
         let view = View::new(&camera(w, h), 1, 0);
         let n = view.padded_pixels();
         let mut rng = Rng::new(4, "loss");
         let frame: Vec<u32> = (0..8 * n).map(|_| rng.uniform().to_bits()).collect();
         let targets: Vec<u32> = (0..2 * n).map(|i| rng.next_u64() as u32 | if i % 31 == 0 { 0 } else { 0x8000_0000 }).collect();
         let (quads, rows) = (2 * view.tiles[0], 8 * view.tiles[1]);
-        let plane = Plane {
-            size: view.size,
-            quads,
-            rows,
-            channel: 2,
-            phase,
-            weight_l1: 0.4,
-            weight_ssim: 0.1,
-            gain: 1.1,
-            offset: -0.05,
-            unused: [0; 2],
-        };
-        let (row_groups, column_groups) = ((quads / 2 * rows / 2).div_ceil(64), (rows / 8 * quads).div_ceil(64));
+        let plane = Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
+        let (row_groups, column_groups) = ((quads / 2 * rows).div_ceil(64), (rows / 8 * quads).div_ceil(64));
         let sums = zeros(24 * (rows / 8 * quads * 4) as usize);
         let run = |shader: &'static Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, &plane, buffers, groups);
@@ -306,11 +295,9 @@ fn loss() {
             }
             twin
         };
-        let zeros_of = |maps: usize| zeros(maps * n / 2);
-        let blurred = run(shaders::SsimColumns::SHADER, &[&frame, &targets, &zeros_of(5)], column_groups, &[(2, 1e-4)]);
-        let ssim_sums = zeros(6 * (rows / 2 * quads / 2 * 4) as usize);
-        let ssim = run(shaders::SsimRows::SHADER, &[&blurred[2], &zeros_of(3), &ssim_sums], row_groups, &[(1, 1e-2), (2, 1e-3)]);
-        let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &zeros_of(3)], row_groups, &[(1, 1e-3)]);
+        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(5 * n)], row_groups, &[(2, 1e-4)]);
+        let ssim = run(shaders::SsimColumns::SHADER, &[&blurred[2], &zeros(3 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
+        let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
         run(shaders::LossGradient::SHADER, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
     }
 }

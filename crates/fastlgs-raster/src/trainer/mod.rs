@@ -150,7 +150,6 @@ impl Trainer {
         let options = StepOptions {
             channels: config.channels,
             lambda: config.lambda,
-            phase: config.phase(iteration),
             feature_weight: config.feature_weight,
             exposure: self.exposure(id),
         };
