@@ -1,6 +1,7 @@
 // Noise of MCMC (Kheradmand et al. 2024, eq. 9): moves the means of faint Gaussians along their covariance.
 // Works on one page; shared/channels.wgsl.
 #import channels
+#import random
 #import rotation
 #import flat
 
@@ -16,19 +17,6 @@ struct Perturb {
 
 @group(0) @binding(0) var<uniform> job: Perturb;
 @group(0) @binding(1) var<storage, read_write> params: array<f32>;
-
-// PCG3D (Jarzynski & Olano 2020): three random words from three.
-fn pcg3d(seed: vec3<u32>) -> vec3<u32> {
-    var v = seed * 1664525u + 1013904223u;
-    v.x += v.y * v.z;
-    v.y += v.z * v.x;
-    v.z += v.x * v.y;
-    v ^= v >> vec3<u32>(16u);
-    v.x += v.y * v.z;
-    v.y += v.z * v.x;
-    v.z += v.x * v.y;
-    return v;
-}
 
 // Uniform in (0, 1).
 fn uniforms(words: vec3<u32>) -> vec3<f32> {

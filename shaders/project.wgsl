@@ -12,6 +12,7 @@
 #import covariance
 #import flat
 #import footprint
+#import random
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> params: array<f32>;
@@ -54,6 +55,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let g = view.first + i;
     depths[g] = 0xffffffu;
     touched[g] = 0u;
+    if pcg3d(vec3<u32>(g, view.draw, 0u)).x < view.dropped {
+        return;
+    }
     let mean = param3(MEAN, i);
     let t = (view.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
     let s = exp(param3(LOG_SCALE, i));

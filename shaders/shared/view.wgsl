@@ -26,8 +26,9 @@ struct View {
     depth_as_feature: u32,
     // A tile is finished once less than this passes through each of its pixels.
     finished: f32,
-    unused0: u32,
-    unused1: u32,
+    // A step leaves out each Gaussian with the probability dropped / 2^32, by a draw of its own for each `draw`.
+    dropped: u32,
+    draw: u32,
 }
 
 // Tile edge in pixels. Pictures on the device are padded to whole tiles; what is outside the picture is zero.
@@ -40,6 +41,11 @@ const DILATION: f32 = 0.3;
 // A Gaussian is drawn from a depth on of so many times its own size, the length of its three scales: nearer, it would fill the picture, and its
 // projection would no longer be one. In units of the scene any bound would be right for some scenes only.
 const NEAR: f32 = 0.5;
+
+// Factor on the opacities of those that are not left out, which makes up for the others.
+fn kept_gain(view: View) -> f32 {
+    return 1.0 / (1.0 - f32(view.dropped) / 4294967296.0);
+}
 
 // Place of four neighbouring pixels of a row in the planes of a padded picture.
 fn quad_at(channel: u32, x: u32, y: u32, view: View) -> u32 {

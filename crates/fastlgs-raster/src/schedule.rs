@@ -1,5 +1,6 @@
 //! What changes in the course of a training run: learning rates, colour degree, resolution, density control.
 
+use crate::floaters::FEW_VIEWS;
 use crate::view::Rates;
 use fastlgs_core::gaussians::BASE_CHANNELS;
 use serde::{Deserialize, Serialize};
@@ -125,6 +126,8 @@ const SCALE_WEIGHT: f32 = 0.01 / 3.0;
 /// a fixed price that suits bright photos takes from dark ones what they show. It stands for opacity resets, from which runs of a few thousand steps
 /// would not recover, and ends with the first removal: what no photo asks for fades, and goes.
 const OPACITY_PRICE: f32 = 0.04;
+/// Share of the Gaussians that the last step leaves out where photos are few (DropGaussian).
+const LEFT_OUT: f32 = 0.2;
 /// Noise scale of MCMC against the means' learning rate.
 const NOISE: f32 = 5e5;
 
@@ -162,6 +165,12 @@ impl TrainConfig {
     /// Whether a step is done at half the resolution.
     pub(crate) fn coarse(&self, iteration: u32) -> bool {
         iteration < self.step_at(self.coarse_until)
+    }
+
+    /// Share of the Gaussians that a step leaves out: with few photos, more and more of them, so that what only hides behind others for a photo
+    /// gets its light as well, and none learns its photos by heart (DropGaussian, Park et al. 2025).
+    pub(crate) fn left_out(&self, iteration: u32, views: usize) -> f32 {
+        if views < FEW_VIEWS && self.channels.color() { LEFT_OUT * self.progress(iteration) } else { 0.0 }
     }
 
     /// Steps between two rounds of density control.

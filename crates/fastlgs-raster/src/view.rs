@@ -52,8 +52,10 @@ pub struct View {
     pub depth_as_feature: u32,
     /// Transmittance below which a pixel needs no more Gaussians.
     pub finished: f32,
-    /// Padding to 16 bytes.
-    pub unused: [u32; 2],
+    /// A step leaves out each Gaussian with the probability `dropped` / 2^32.
+    pub dropped: u32,
+    /// Number of the draw that says which.
+    pub draw: u32,
 }
 
 impl View {
@@ -78,7 +80,8 @@ impl View {
             antialias: 0,
             depth_as_feature: 0,
             finished: TRANSMITTANCE_MIN,
-            unused: [0; 2],
+            dropped: 0,
+            draw: 0,
         }
     }
 
@@ -86,6 +89,17 @@ impl View {
     #[must_use]
     pub fn trained(self) -> Self {
         Self { finished: TRANSMITTANCE_TRAINED, ..self }
+    }
+
+    /// The same without a share of the Gaussians, drawn for step `draw`.
+    #[must_use]
+    pub fn without(self, share: f32, draw: u32) -> Self {
+        Self { dropped: (f64::from(share) * 4_294_967_296.0) as u32, draw, ..self }
+    }
+
+    /// Factor on the opacities of those that are not left out, which makes up for the others.
+    pub(crate) fn kept_gain(&self) -> f32 {
+        1.0 / (1.0 - self.dropped as f32 / 4_294_967_296.0)
     }
 
     /// Pixels of the frame.

@@ -1,4 +1,4 @@
-use super::covariance;
+use super::{covariance, pcg3d};
 use crate::view::{Perturb, stride};
 use fastlgs_core::gaussians::sigmoid;
 use glam::{UVec3, Vec3};
@@ -21,20 +21,6 @@ pub(crate) fn perturb_one(job: &Perturb, i: u32, param: impl Fn(usize) -> f32) -
     let r = covariance::rotation(&param).1;
     let s = Vec3::new(param(3), param(4), param(5)).map(f32::exp);
     job.amount * faint * (r * (s * s * (r.transpose() * normal)))
-}
-
-/// Three random words from three (Jarzynski & Olano 2020).
-fn pcg3d(seed: UVec3) -> UVec3 {
-    let step = |v: &mut UVec3| {
-        v.x = v.x.wrapping_add(v.y.wrapping_mul(v.z));
-        v.y = v.y.wrapping_add(v.z.wrapping_mul(v.x));
-        v.z = v.z.wrapping_add(v.x.wrapping_mul(v.y));
-    };
-    let mut v = seed.map(|s| s.wrapping_mul(1_664_525).wrapping_add(1_013_904_223));
-    step(&mut v);
-    v ^= v >> 16u32;
-    step(&mut v);
-    v
 }
 
 /// Uniform in (0, 1).

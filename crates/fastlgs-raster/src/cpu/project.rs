@@ -1,10 +1,10 @@
 use super::footprint::{Footprint, span};
 use super::harmonics::basis;
-use super::{ALPHA_MAX, ALPHA_MIN, NEAR, Splat, covariance};
+use super::{ALPHA_MAX, ALPHA_MIN, NEAR, Splat, covariance, pcg3d};
 use crate::View;
 use crate::view::{TILE, stride};
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
-use glam::{Mat4, Vec2, Vec3};
+use glam::{Mat4, UVec3, Vec2, Vec3};
 
 /// One Gaussian in the image.
 #[derive(Clone, Copy)]
@@ -23,7 +23,7 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
     for i in 0..page {
         let g = first + i;
         (depths[g], touched[g]) = (NOT_DRAWN, 0);
-        let Some(p) = project_one(view, |c| params[c * stride(page) + i]) else { continue };
+        let Some(p) = project_one(view, g as u32, |c| params[c * stride(page) + i]) else { continue };
         let [top, bottom] = [p.footprint[1][2], p.footprint[1][3]].map(|row| row as u32);
         let tiles = (top..bottom).map(|row| span(&p.footprint, row, view.tiles[0]).len() as u32).sum();
         if tiles > 0 {
@@ -32,9 +32,12 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
     }
 }
 
-/// Projects the Gaussian whose channels `param` gives; nothing where it is not drawn, other than for touching no tile.
+/// Projects Gaussian `g`, whose channels `param` gives; nothing where it is not drawn, other than for touching no tile.
 #[inline(always)]
-pub(crate) fn project_one(view: &View, param: impl Fn(usize) -> f32) -> Option<Projected> {
+pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> Option<Projected> {
+    if view.dropped > 0 && pcg3d(UVec3::new(g, view.draw, 0)).x < view.dropped {
+        return None;
+    }
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));
     let mean = param3(0);
     let t = Mat4::from_cols_array(&view.world_to_camera).transform_point3(mean);

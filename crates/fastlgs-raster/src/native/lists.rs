@@ -98,19 +98,23 @@ fn project(view: &View, params: &[f32]) -> Vec<Projected> {
     let nothing = Projected { splat: [[0.0; 4]; 3], depth: NOT_DRAWN, footprint: [[0.0; 4]; 2] };
     let mut projected = vec![nothing; view.gaussians as usize];
     let width = (params.len() / projected.len().max(1)).max(1);
-    projected.par_chunks_mut(BLOCK).zip(params.par_chunks(BLOCK * width)).for_each(|(out, params)| project_block(view, width, params, out));
+    projected
+        .par_chunks_mut(BLOCK)
+        .zip(params.par_chunks(BLOCK * width))
+        .enumerate()
+        .for_each(|(block, (out, params))| project_block(view, (block * BLOCK) as u32, width, params, out));
     projected
 }
 
 vectorised! {
-    /// Projects some Gaussians; `out` holds what is not drawn.
-    fn project_block(view: &View, width: usize, params: &[f32], out: &mut [Projected]) = project_block_body
+    /// Projects some Gaussians, from number `first` on; `out` holds what is not drawn.
+    fn project_block(view: &View, first: u32, width: usize, params: &[f32], out: &mut [Projected]) = project_block_body
 }
 
 #[inline(always)]
-fn project_block_body<const FMA: bool>(view: &View, width: usize, params: &[f32], out: &mut [Projected]) {
-    for (params, out) in params.chunks_exact(width).zip(out) {
-        if let Some(drawn) = cpu::project_one(view, |c| params[c]) {
+fn project_block_body<const FMA: bool>(view: &View, first: u32, width: usize, params: &[f32], out: &mut [Projected]) {
+    for (g, (params, out)) in (first..).zip(params.chunks_exact(width).zip(out)) {
+        if let Some(drawn) = cpu::project_one(view, g, |c| params[c]) {
             *out = drawn;
         }
     }

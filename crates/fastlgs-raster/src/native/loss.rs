@@ -10,10 +10,9 @@ use rayon::prelude::*;
 /// Intermediate pictures of the loss, kept between steps.
 #[derive(Default)]
 pub struct Scratch {
-    /// Row-blurred x, y, x^2, y^2, x y: `[h][5][w]`.
-    rows: Vec<f32>,
-    /// Derivatives of SSIM by its moments, and then blurred along rows: `[h][3][w]`.
-    partials: Vec<f32>,
+    /// What is compared, x and y, and the weights of pixels: `[h][3][w]`.
+    compared: Vec<f32>,
+    /// Derivatives of SSIM by its moments, blurred along rows: `[h][3][w]`.
     blurred: Vec<f32>,
 }
 
@@ -42,44 +41,46 @@ fn blur_row(window: &Window, padded: &[f32], out: &mut [f32]) {
     blur(window, &std::array::from_fn(|k| &padded[k..k + out.len()]), out);
 }
 
-/// Blurs `lines` maps along columns into `out`, for row `j` of `rows` `[h][lines * w]`.
-fn blur_columns(window: &Window, rows: &[f32], line: usize, h: usize, j: usize, out: &mut [f32]) {
-    let inside = |k: usize| Some((j + k).wrapping_sub(SSIM_RADIUS)).filter(|row| *row < h);
-    let row = |k: usize| {
-        let row = inside(k).unwrap_or(j);
-        &rows[row * line..(row + 1) * line]
-    };
-    // Beyond the picture there are zeros.
-    let window = std::array::from_fn(|k| inside(k).map_or(0.0, |_| window[k]));
-    blur(&window, &std::array::from_fn(row), out);
+/// For each tap of the window around row `j` its weight, and the row, of `rows` of `line` floats. Beyond the picture there are zeros.
+fn taps<'a>(window: &Window, rows: &'a [f32], line: usize, j: usize) -> (Window, [&'a [f32]; 2 * SSIM_RADIUS + 1]) {
+    let held = |k: usize| (j + k).checked_sub(SSIM_RADIUS).and_then(|row| rows.get(row * line..(row + 1) * line));
+    let taps: [_; 2 * SSIM_RADIUS + 1] = std::array::from_fn(held);
+    let own = &rows[j * line..(j + 1) * line];
+    (std::array::from_fn(|k| taps[k].map_or(0.0, |_| window[k])), taps.map(|row| row.unwrap_or(own)))
 }
 
-/// What is compared in a row: x, y and the weight of each pixel.
-#[derive(Default)]
-struct Compared {
-    x: Vec<f32>,
-    y: Vec<f32>,
-    weight: Vec<f32>,
+vectorised! {
+    /// Weighted sums of x, y, x^2, y^2 and x y over rows that hold x and then y, into five lines of `out` from place SSIM_RADIUS on.
+    fn moments(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) = moments_body
 }
 
-impl Compared {
-    /// Row `j` of a plane.
-    fn load(&mut self, plane: &Plane, frame: &Picture<8>, targets: &[u32], j: usize) {
-        let [w, h] = plane.size.map(|s| s as usize);
-        let channel = plane.channel as usize;
-        [&mut self.x, &mut self.y, &mut self.weight].into_iter().for_each(|row| row.resize(w, 0.0));
-        compare(plane, &frame.row(channel, j)[..w], &targets[(channel / 3 * h + j) * w..][..w], self);
+#[inline(always)]
+fn moments_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) {
+    let (x, y) = (rows.map(|row| &row[..w]), rows.map(|row| &row[w..2 * w]));
+    let mut lines = out.chunks_exact_mut(w + 2 * SSIM_RADIUS).map(|line| &mut line[SSIM_RADIUS..SSIM_RADIUS + w]);
+    let [mx, my, xx, yy, xy] = std::array::from_fn(|_| lines.next().expect("five lines"));
+    for i in 0..w {
+        let mut sums = [0.0; 5];
+        for k in 0..window.len() {
+            let (x, y) = (x[k][i], y[k][i]);
+            let (wx, wy) = (window[k] * x, window[k] * y);
+            sums = [sums[0] + wx, sums[1] + wy, madd::<FMA>(wx, x, sums[2]), madd::<FMA>(wy, y, sums[3]), madd::<FMA>(wx, y, sums[4])];
+        }
+        [mx[i], my[i], xx[i], yy[i], xy[i]] = sums;
     }
 }
 
 vectorised! {
-    fn compare(plane: &Plane, rendered: &[f32], packed: &[u32], out: &mut Compared) = compare_body
+    /// x, y and the weights of a row of pixels `[3][w]`.
+    fn compare(plane: &Plane, rendered: &[f32], packed: &[u32], out: &mut [f32]) = compare_body
 }
 
 #[inline(always)]
-fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32], out: &mut Compared) {
+fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32], out: &mut [f32]) {
     let (shift, w) = (8 * (plane.channel % 3), rendered.len());
-    let (x, y, weight) = (&mut out.x[..w], &mut out.y[..w], &mut out.weight[..w]);
+    let (x, rest) = out.split_at_mut(w);
+    let (y, weight) = rest.split_at_mut(w);
+    let (packed, weight) = (&packed[..w], &mut weight[..w]);
     for i in 0..w {
         x[i] = plane.gain * rendered[i] + plane.offset;
         let counts = packed[i] >= 0x8000_0000;
@@ -104,72 +105,46 @@ fn sum_of(count: usize, value: impl Fn(usize) -> f32) -> f32 {
 impl Scratch {
     /// Floats held.
     pub fn words(&self) -> usize {
-        self.rows.len() + self.partials.len() + self.blurred.len()
+        self.compared.len() + self.blurred.len()
     }
 
     /// Writes dL/d frame of one channel into `gradient` and adds to `losses`; `targets` is `[2][h][w]`, not padded.
     pub fn plane(&mut self, plane: &Plane, frame: &Picture<8>, targets: &[u32], gradient: &mut Picture<6>, losses: &mut Losses) {
         let [w, h] = plane.size.map(|s| s as usize);
-        let window = ssim_window();
-        self.rows.resize(5 * w * h, 0.0);
-        self.partials.resize(3 * w * h, 0.0);
-        self.blurred.resize(3 * w * h, 0.0);
-        self.rows.par_chunks_exact_mut(5 * w).enumerate().for_each_init(Compared::default, |compared, (j, out)| {
-            compared.load(plane, frame, targets, j);
-            let Compared { x, y, .. } = compared;
-            let mut padded = vec![0.0; w + 2 * SSIM_RADIUS];
-            for (m, out) in out.chunks_exact_mut(w).enumerate() {
-                let (a, b) = match m {
-                    0 => (&*x, None),
-                    1 => (&*y, None),
-                    2 => (&*x, Some(&*x)),
-                    3 => (&*y, Some(&*y)),
-                    _ => (&*x, Some(&*y)),
-                };
-                let middle = &mut padded[SSIM_RADIUS..SSIM_RADIUS + w];
-                middle.copy_from_slice(a);
-                if let Some(b) = b {
-                    middle.iter_mut().zip(b).for_each(|(p, b)| *p *= b);
-                }
-                blur_row(&window, &padded, out);
-            }
-        });
-        let rows = &self.rows;
-        let ssim: Vec<f64> = self
-            .partials
-            .par_chunks_exact_mut(3 * w)
-            .enumerate()
-            .map_init(Vec::new, |moments, (j, out)| {
-                moments.resize(5 * w, 0.0);
-                blur_columns(&window, rows, 5 * w, h, j, moments);
-                let mut ssim = 0.0;
-                derivatives(moments, out, &mut ssim);
-                ssim
-            })
-            .collect();
-        let partials = &self.partials;
-        self.blurred.par_chunks_exact_mut(3 * w).zip(partials.par_chunks_exact(3 * w)).for_each(|(out, row)| {
-            let mut padded = vec![0.0; w + 2 * SSIM_RADIUS];
-            for (out, row) in out.chunks_exact_mut(w).zip(row.chunks_exact(w)) {
-                padded[SSIM_RADIUS..SSIM_RADIUS + w].copy_from_slice(row);
-                blur_row(&window, &padded, out);
-            }
-        });
-        let blurred = &self.blurred;
         let channel = plane.channel as usize;
+        let window = ssim_window();
+        self.compared.resize(3 * w * h, 0.0);
+        self.compared.par_chunks_exact_mut(3 * w).enumerate().for_each(|(j, out)| {
+            compare(plane, &frame.row(channel, j)[..w], &targets[(channel / 3 * h + j) * w..][..w], out);
+        });
+        let compared = &self.compared;
+        self.blurred.resize(3 * w * h, 0.0);
+        let per_row = self.blurred.par_chunks_exact_mut(3 * w).enumerate();
+        let ssim: Vec<f64> = per_row
+            .map_init(
+                || Moments::new(w),
+                |moments, (row, out)| {
+                    let (weights, rows) = taps(&window, compared, 3 * w, row);
+                    moments.ssim(&window, &weights, &rows, out)
+                },
+            )
+            .collect();
+        let blurred = &self.blurred;
         let sums: Vec<[f64; 4]> = gradient
             .rows_mut()
             .take(h)
             .enumerate()
-            .map_init(Default::default, |(compared, by): &mut (Compared, Vec<f32>), (j, row)| {
-                by.resize(3 * w, 0.0);
-                blur_columns(&window, blurred, 3 * w, h, j, by);
-                compared.load(plane, frame, targets, j);
-                let light = [channel, 6].map(|c| &frame.row(c, j)[..w]);
-                let mut sums = [0.0; 4];
-                gradients(plane, compared, by, light, &mut row[channel * frame.width..][..w], &mut sums);
-                sums
-            })
+            .map_init(
+                || vec![0.0; 3 * w],
+                |by, (j, row)| {
+                    let (weights, rows) = taps(&window, blurred, 3 * w, j);
+                    blur(&weights, &rows, by);
+                    let light = [channel, 6].map(|c| &frame.row(c, j)[..w]);
+                    let mut sums = [0.0; 4];
+                    gradients(plane, &compared[3 * w * j..][..3 * w], by, light, &mut row[channel * frame.width..][..w], &mut sums);
+                    sums
+                },
+            )
             .collect();
         let total = |k: usize| sums.iter().map(|s| s[k]).sum::<f64>();
         let per_value = 1.0 / (3 * w * h) as f64;
@@ -181,6 +156,38 @@ impl Scratch {
         } else {
             losses.feature_l1 += total(0) * per_value;
         }
+    }
+}
+
+/// Room for a row of windows: lines with SSIM_RADIUS zeros on both sides, and without.
+struct Moments {
+    padded: Vec<f32>,
+    moments: Vec<f32>,
+    partials: Vec<f32>,
+}
+
+impl Moments {
+    fn new(w: usize) -> Self {
+        Self { padded: vec![0.0; 5 * (w + 2 * SSIM_RADIUS)], moments: vec![0.0; 5 * w], partials: vec![0.0; 3 * w] }
+    }
+
+    /// The sum of SSIM over a row of windows; its derivatives by the moments, blurred along the row, into `out` `[3][w]`.
+    fn ssim(&mut self, window: &Window, weights: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) -> f64 {
+        let w = out.len() / 3;
+        let Self { padded, moments: blurred, partials } = self;
+        moments(weights, rows, w, padded);
+        let lines = |padded: &mut [f32], out: &mut [f32]| {
+            let lines = padded.chunks_exact(w + 2 * SSIM_RADIUS).zip(out.chunks_exact_mut(w));
+            lines.for_each(|(line, out)| blur_row(window, line, out));
+        };
+        lines(padded, blurred);
+        let mut ssim = 0.0;
+        derivatives(blurred, partials, &mut ssim);
+        for (line, row) in padded.chunks_exact_mut(w + 2 * SSIM_RADIUS).zip(partials.chunks_exact(w)) {
+            line[SSIM_RADIUS..SSIM_RADIUS + w].copy_from_slice(row);
+        }
+        lines(padded, out);
+        ssim
     }
 }
 
@@ -214,21 +221,14 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
 vectorised! {
     /// dL/d frame of a row into `out`, and sums of |x - y| and of dL/d gain, offset and background. `by` `[3][w]`: SSIM by its moments, blurred;
     /// `light`: what was rendered, and transmittance.
-    fn gradients(plane: &Plane, compared: &Compared, by: &[f32], light: [&[f32]; 2], out: &mut [f32], sums: &mut [f64; 4]) = gradients_body
+    fn gradients(plane: &Plane, compared: &[f32], by: &[f32], light: [&[f32]; 2], out: &mut [f32], sums: &mut [f64; 4]) = gradients_body
 }
 
 #[inline(always)]
-fn gradients_body<const FMA: bool>(
-    plane: &Plane,
-    compared: &Compared,
-    by: &[f32],
-    light: [&[f32]; 2],
-    out: &mut [f32],
-    sums: &mut [f64; 4],
-) {
+fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], light: [&[f32]; 2], out: &mut [f32], sums: &mut [f64; 4]) {
     let w = out.len();
-    let Compared { x, y, weight } = compared;
-    let (x, y, weight, [rendered, transmittance]) = (&x[..w], &y[..w], &weight[..w], light.map(|row| &row[..w]));
+    let [x, y, weight] = [0, 1, 2].map(|m| &compared[m * w..(m + 1) * w]);
+    let [rendered, transmittance] = light.map(|row| &row[..w]);
     let [by_mean, by_square, by_product] = [0, 1, 2].map(|m| &by[m * w..(m + 1) * w]);
     for i in 0..w {
         let sign = if x[i] > y[i] { 1.0 } else { 0.0 } - if x[i] < y[i] { 1.0 } else { 0.0 };

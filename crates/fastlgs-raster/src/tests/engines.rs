@@ -38,6 +38,7 @@ fn gpu_and_cpu_agree() {
             background_feature: [0.3, 0.2, 0.1, 0.0],
             ..View::new(&camera(w, h), scene.len(), degree)
         };
+        let view = if k == 1 { view.without(0.25, 7) } else { view };
         for channels in CHANNELS.into_iter().take(if n > 100_000 { 1 } else { 4 }) {
             let what = format!("{n} Gaussians at {w}x{h}, {channels:?}");
             let a = once(&mut device, view, channels, &state, (w, h));
@@ -156,4 +157,28 @@ fn gpu_and_cpu_agree_on_objects() {
         assert!(off as f64 <= 0.002 * view.pixels() as f64, "{off} of {} pixels differ", view.pixels());
         assert!((1..4).all(|id| both[0].contains(&Some(id))));
     }
+}
+
+#[test]
+fn a_step_leaves_out_its_share_and_the_picture_stays_about_as_opaque() {
+    let scene = cloud(20_000, 3, 0, true);
+    let view = View::new(&camera(96, 64), scene.len(), 0);
+    let mut cpu = CpuEngine::new();
+    cpu.set_state(&State::of(&scene)).unwrap();
+    let mut drawn = |view: View| {
+        cpu.set_state(&State::of(&scene)).unwrap();
+        cpu.set_target(0, target(96, 64)).unwrap();
+        cpu.step(view, 0, &options(Channels::Color), &Step::new(1, 0..1, &[0.0; BASE_CHANNELS + 1])).unwrap();
+        cpu.stats().unwrap()[scene.len()..].iter().map(|drawn| *drawn > 0.0).collect::<Vec<bool>>()
+    };
+    let [all, some, others] = [view, view.without(0.2, 1), view.without(0.2, 2)].map(&mut drawn);
+    let count = |drawn: &[bool]| drawn.iter().filter(|d| **d).count() as f64;
+    assert!((count(&some) / count(&all) - 0.8).abs() < 0.02, "{} of {}", count(&some), count(&all));
+    assert_ne!(some, others, "each step draws anew");
+    let mut through = |view: View| {
+        let frame = cpu.render(view, Channels::Color).unwrap();
+        frame.channels(6, 7).iter().map(|t| f64::from(*t)).sum::<f64>() / view.pixels() as f64
+    };
+    let (whole, thinned) = (through(view), through(view.without(0.2, 1)));
+    assert!((whole - thinned).abs() < 0.02, "{whole} of the light passes through all, {thinned} through what is left");
 }

@@ -160,7 +160,8 @@ impl Trainer {
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);
-        self.engine.step(self.view(&camera, degree).trained(), id, &options, &step)?;
+        let left_out = config.left_out(iteration, self.targets.len());
+        self.engine.step(self.view(&camera, degree).trained().without(left_out, iteration), id, &options, &step)?;
         self.make_room(id);
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
