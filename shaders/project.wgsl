@@ -55,7 +55,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let g = view.first + i;
     depths[g] = 0xffffffu;
     touched[g] = 0u;
-    if pcg3d(vec3<u32>(g, view.draw, 0u)).x < view.dropped {
+    if pcg3d(vec3<u32>(g, view.draw, 2u)).x < view.dropped {
         return;
     }
     let mean = param3(MEAN, i);

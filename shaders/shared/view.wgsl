@@ -42,7 +42,7 @@ const DILATION: f32 = 0.3;
 // projection would no longer be one. In units of the scene any bound would be right for some scenes only.
 const NEAR: f32 = 0.5;
 
-// Factor on the opacities of those that are not left out, which makes up for the others.
+// Factor on the opacities of those that are not left out, which makes up for the others as far as ALPHA_MAX allows.
 fn kept_gain(view: View) -> f32 {
     return 1.0 / (1.0 - f32(view.dropped) / 4294967296.0);
 }

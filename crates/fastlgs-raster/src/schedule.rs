@@ -173,6 +173,11 @@ impl TrainConfig {
         if views < FEW_VIEWS && self.channels.color() { LEFT_OUT * self.progress(iteration) } else { 0.0 }
     }
 
+    /// Number of a step's draw.
+    pub(crate) fn draw(&self, iteration: u32) -> u32 {
+        iteration ^ (self.seed as u32).wrapping_mul(0x9e37_79b9)
+    }
+
     /// Steps between two rounds of density control.
     fn between_rounds(&self) -> u32 {
         let growing = self.step_at(self.density_until()).saturating_sub(self.step_at(REFINE_FROM));
@@ -260,6 +265,11 @@ mod tests {
             (0..=iterations).filter(|i| config.refines(*i)).count()
         };
         assert_eq!([1000, 2000, 7000, 30_000].map(rounds), [15, 17, 25, 106]);
+        let few = |views: usize, iteration: u32| config.left_out(iteration, views);
+        assert_eq!([few(24, 0), few(24, 4000), few(24, 8000), few(25, 8000)], [0.0, 0.1, 0.2, 0.0]);
+        let frozen = TrainConfig { channels: crate::Channels::Feature, ..config.clone() };
+        assert_eq!(frozen.left_out(8000, 24), 0.0, "lists that are kept hold all");
+        assert_ne!(config.draw(5), TrainConfig { seed: 1, ..config.clone() }.draw(5));
         assert!(config.looks(500) && !config.looks(400));
         assert!(!config.resets_opacity(3000), "too late to recover");
         let long = TrainConfig { iterations: 30_000, ..config.clone() };

@@ -91,13 +91,13 @@ impl View {
         Self { finished: TRANSMITTANCE_TRAINED, ..self }
     }
 
-    /// The same without a share of the Gaussians, drawn for step `draw`.
+    /// The same without a share of the Gaussians, at most 0.9, by draw number `draw`.
     #[must_use]
     pub fn without(self, share: f32, draw: u32) -> Self {
-        Self { dropped: (f64::from(share) * 4_294_967_296.0) as u32, draw, ..self }
+        Self { dropped: (f64::from(share.clamp(0.0, 0.9)) * 4_294_967_296.0) as u32, draw, ..self }
     }
 
-    /// Factor on the opacities of those that are not left out, which makes up for the others.
+    /// Factor on the opacities of those that are not left out, which makes up for the others as far as the largest alpha allows.
     pub(crate) fn kept_gain(&self) -> f32 {
         1.0 / (1.0 - self.dropped as f32 / 4_294_967_296.0)
     }

@@ -35,7 +35,7 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
 /// Projects Gaussian `g`, whose channels `param` gives; nothing where it is not drawn, other than for touching no tile.
 #[inline(always)]
 pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> Option<Projected> {
-    if view.dropped > 0 && pcg3d(UVec3::new(g, view.draw, 0)).x < view.dropped {
+    if view.dropped > 0 && pcg3d(UVec3::new(g, view.draw, 2)).x < view.dropped {
         return None;
     }
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));

@@ -201,6 +201,8 @@ impl Engine for GpuEngine {
         let channels = options.channels;
         let mut on_cpu = self.passes_on_cpu;
         let frozen = (channels == Channels::Feature).then_some(id);
+        // Lists that are kept hold all Gaussians.
+        let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
         let lists = self.forward(view, channels, frozen, &mut on_cpu)?;
         let view = lists.view;
         self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view)?);

@@ -318,6 +318,8 @@ impl Engine for CpuEngine {
             target.color.resize(2 * view.pixels(), 0);
         }
         let frozen = (channels == Channels::Feature).then_some(id);
+        // Lists that are kept hold all Gaussians.
+        let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
         self.forward(&view, channels, frozen)?;
         self.timed("loss", |s| {
             s.gradient.prepare(&view);

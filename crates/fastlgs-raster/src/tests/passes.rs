@@ -120,6 +120,7 @@ fn project() {
         let scene = cloud(n, seed as u64, sh_degree, true);
         let n = scene.len();
         let view = View { antialias: seed as u32 % 2, ..View::new(&camera(w, h), n, sh_degree) };
+        let view = if seed % 2 == 1 { view.without(0.25, 7) } else { view };
         let params = page(&scene.to_channels(), n);
         let blank = zeros(12 * n);
         let buffers = [&params[..], &blank, &blank[..n], &blank[..8 * n], &blank[..n]];

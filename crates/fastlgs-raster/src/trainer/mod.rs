@@ -30,7 +30,7 @@ use std::time::Instant;
 pub struct Progress {
     /// Steps done.
     pub iteration: u32,
-    /// Losses of the last measured step.
+    /// Losses of the last measured step: where photos are few, of a picture without the Gaussians that it left out.
     pub losses: Losses,
     /// PSNR of the last measured training view in dB, estimated from its absolute error.
     pub psnr: f64,
@@ -161,7 +161,7 @@ impl Trainer {
         let mut step = Step::new(iteration + 1, trained, &rates);
         [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);
         let left_out = config.left_out(iteration, self.targets.len());
-        self.engine.step(self.view(&camera, degree).trained().without(left_out, iteration), id, &options, &step)?;
+        self.engine.step(self.view(&camera, degree).trained().without(left_out, config.draw(iteration)), id, &options, &step)?;
         self.make_room(id);
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
             self.engine.perturb(iteration, amount)?;
