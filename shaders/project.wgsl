@@ -76,7 +76,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cxy = cov.y;
     let cyy = cov.z;
     let det = cxx * cyy - cxy * cxy;
-    let opacity = compensation(cov, view) / (1.0 + exp(-param(OPACITY, i)));
+    let opacity = kept_gain(view) * compensation(cov, view) / (1.0 + exp(-param(OPACITY, i)));
     if !(opacity >= ALPHA_MIN) {
         return;
     }

@@ -145,7 +145,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cov = dilated(a_x, a_y);
     // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
-    let clamped = opacity * compensation(cov, view) / kept_gain(view) >= ALPHA_MAX;
+    let clamped = opacity * compensation(cov, view) >= ALPHA_MAX;
     let unclamped_opacity = select(1.0, 0.0, clamped && sum1.y < 0.0);
     put(OPACITY, i, sum1.y * (1.0 - opacity) * unclamped_opacity);
     if view.antialias == 1u && determinant_share(cov) > 1e-6 {

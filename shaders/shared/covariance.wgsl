@@ -36,7 +36,7 @@ fn determinant_share(cov: vec3<f32>) -> f32 {
     return max(((cov.x - DILATION) * (cov.z - DILATION) - cov.y * cov.y) / det, 1e-6);
 }
 
-// Factor on the opacity that keeps a dilated Gaussian as bright as it was, and the picture without those that a step leaves out.
+// Factor on the opacity that keeps a dilated Gaussian as bright as it was.
 fn compensation(cov: vec3<f32>, view: View) -> f32 {
-    return kept_gain(view) * select(1.0, sqrt(determinant_share(cov)), view.antialias == 1u);
+    return select(1.0, sqrt(determinant_share(cov)), view.antialias == 1u);
 }

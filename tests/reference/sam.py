@@ -29,7 +29,7 @@ def photo():
     return picture
 
 
-def lively(decoder, points, hyper, upscaling, score):
+def lively(points, hyper, upscaling, score):
     """Random weights give masks that no logit decides and that all prompts share: makes them larger, and smooth."""
     with torch.no_grad():
         for layer in hyper:
@@ -41,7 +41,6 @@ def lively(decoder, points, hyper, upscaling, score):
             embedding.weight.mul_(3)
         score.weight.mul_(3)
         score.bias.add_(0.8)
-    return decoder
 
 
 def save(folder, picture, points, low, scores):
@@ -61,7 +60,6 @@ def authors(folder, picture, points):
     prompts = PromptEncoder(256, (64, 64), (1024, 1024), 16)
     decoder = MaskDecoder(transformer_dim=256, transformer=TwoWayTransformer(2, 256, 8, 512))
     lively(
-        decoder,
         prompts.point_embeddings,
         [mlp.layers[-1] for mlp in decoder.output_hypernetworks_mlps],
         [decoder.output_upscaling[k] for k in (0, 3)],
@@ -114,7 +112,6 @@ def transformers(folder, picture, points):
     sam = SamModel(SamConfig(vision_config=vision.to_dict())).eval()
     head = sam.mask_decoder
     lively(
-        head,
         sam.prompt_encoder.point_embed,
         [mlp.proj_out for mlp in head.output_hypernetworks_mlps],
         [head.upscale_conv1, head.upscale_conv2],

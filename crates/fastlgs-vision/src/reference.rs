@@ -5,7 +5,7 @@ use crate::encoder::Encoder;
 use crate::masks::BitMask;
 use crate::sam::exports::Exports;
 use crate::sam::{Config, generation};
-use fastlgs_core::{LabelMap, fs, image_io};
+use fastlgs_core::{LabelMap, fs, image_io, npy};
 use std::path::{Path, PathBuf};
 
 /// The folder of one architecture; nothing where the files were not made.
@@ -19,13 +19,8 @@ fn folder(which: &str) -> Option<PathBuf> {
 
 /// Numbers and shape of a file as numpy writes it.
 fn numbers(path: &Path) -> (Vec<f32>, Vec<usize>) {
-    let file = npyz::NpyFile::new(std::io::Cursor::new(fs::read(path).unwrap())).unwrap();
-    let shape = file.shape().iter().map(|s| *s as usize).collect();
-    let values = match file.dtype() {
-        npyz::DType::Plain(t) if t.size_field() == 1 => file.into_vec::<u8>().unwrap().into_iter().map(f32::from).collect(),
-        _ => file.into_vec::<f32>().unwrap(),
-    };
-    (values, shape)
+    let file = npy::read(path).unwrap();
+    (file.values.into_iter().map(|v| v as f32).collect(), file.shape)
 }
 
 fn largest_difference(a: &[f32], b: &[f32]) -> f32 {

@@ -42,7 +42,7 @@ pub fn determinant_share(cov: Vec3) -> f32 {
     (((cov.x - DILATION) * (cov.z - DILATION) - cov.y * cov.y) / det).max(1e-6)
 }
 
-/// Factor on the opacity that keeps a dilated Gaussian as bright as it was, and the picture without those that a step leaves out.
+/// Factor on the opacity that keeps a dilated Gaussian as bright as it was.
 pub fn compensation(cov: Vec3, view: &View) -> f32 {
-    view.kept_gain() * if view.antialias == 1 { determinant_share(cov).sqrt() } else { 1.0 }
+    if view.antialias == 1 { determinant_share(cov).sqrt() } else { 1.0 }
 }

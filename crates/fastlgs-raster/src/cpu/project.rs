@@ -51,7 +51,7 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
     let cov = covariance::dilated(ax, ay);
     let (cxx, cxy, cyy) = (cov.x, cov.y, cov.z);
     let det = cxx * cyy - cxy * cxy;
-    let opacity = covariance::compensation(cov, view) * sigmoid(param(10));
+    let opacity = view.kept_gain() * covariance::compensation(cov, view) * sigmoid(param(10));
     if opacity.is_nan() || opacity < ALPHA_MIN {
         return None;
     }
