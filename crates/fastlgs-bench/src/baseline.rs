@@ -56,7 +56,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         "raw" => PerPixel::raw(&scene, run)?,
         "lerf" => PerPixel::lerf(&scene, run)?,
         "langsplat" => PerPixel::langsplat(&scene, run)?,
-        code => PerPixel::of_codes(&scene, lattice(grid.objects.len(), code[4..].parse().context("a dimension")?, run.seed)),
+        code => PerPixel::of_codes(&scene, &grid, lattice(grid.objects.len(), code[4..].parse().context("a dimension")?, run.seed)),
     };
     let seconds = started.elapsed().as_secs_f64();
     let bytes: usize = field.layers.iter().map(|v| 4 * v.len()).sum();
@@ -167,11 +167,9 @@ impl PerPixel {
     }
 
     /// Each Gaussian has its object's code; those of none the origin, which is no code.
-    fn of_codes(scene: &Session, codes: Vectors) -> Self {
-        let own = |g: usize, axis: usize| match scene.gaussians.object_ids[g] {
-            0 => 0.0,
-            id => codes[[usize::from(id) - 1, axis]],
-        };
+    fn of_codes(scene: &Session, grid: &Grid, codes: Vectors) -> Self {
+        let own =
+            |g: usize, axis: usize| grid.chain(scene.gaussians.object_ids[g]).next().map_or(0.0, |id| codes[[usize::from(id) - 1, axis]]);
         let layer = Vectors::from_shape_fn((scene.gaussians.len(), codes.ncols()), |(g, axis)| own(g, axis));
         Self { layers: vec![layer], meaning: Meaning::Object(codes) }
     }

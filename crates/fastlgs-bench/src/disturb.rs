@@ -2,9 +2,10 @@
 
 use anyhow::{Context, Result};
 use fastlgs_core::labels::{self, LabelledView};
+use fastlgs_core::mask_list::{Mask, RunLengths};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::view_of;
-use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder, fs, image_io};
+use fastlgs_core::{Camera, MaskList, SceneFolder, fs, image_io};
 use fastlgs_grid::Grid;
 use glam::{Mat4, Quat, Vec2, Vec3, Vec4};
 use image::codecs::jpeg::JpegEncoder;
@@ -197,59 +198,69 @@ fn scale_channels(pixels: &mut RgbImage, gains: [f32; 3]) {
 pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed masks");
     for camera in scene.manifest()?.training(&scene.cameras()?) {
-        let masks = scene.masks(&camera)?;
-        let levels = Level::ALL.map(|level| changed_masks(&masks.painted(level), change, &mut rng));
-        MaskList::of_levels(&levels).save(&scene.masks_path(&camera.name))?;
+        changed_masks(&scene.masks(&camera)?, change, &mut rng).save(&scene.masks_path(&camera.name))?;
     }
     Ok(())
 }
 
-/// The changed masks, numbered anew; their numbers mean nothing.
-fn changed_masks(map: &LabelMap, change: Masks, rng: &mut Rng) -> LabelMap {
-    let (mut out, names) = map.dense();
-    let before = out.clone();
-    let some = |share: f32, rng: &mut Rng| some_of(names.len(), share, rng, |k| k > 0);
-    let (w, h) = (map.width as usize, map.height as usize);
+/// The changed masks, which may overlap as before; those of which nothing is left go.
+fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
+    let (w, h) = (list.width as usize, list.height as usize);
+    let drawn = |runs: &RunLengths| {
+        let mut inside = vec![false; w * h];
+        runs.places(list.width, list.height).for_each(|p| inside[p] = true);
+        inside
+    };
+    let runs = |inside: &[bool]| RunLengths::of(list.width, list.height, |x, y| inside[y as usize * w + x as usize]);
+    let some = |share: f32, rng: &mut Rng| some_of(list.masks.len(), share, rng, |_| true);
+    let mut out = list.clone();
     match change {
-        Masks::Eroded(pixels) => {
-            let at = |x: isize, y: isize| before.at(x.clamp(0, w as isize - 1) as u32, y.clamp(0, h as isize - 1) as u32);
-            let r = pixels as isize;
-            for (p, label) in out.labels.iter_mut().enumerate() {
-                let (x, y) = ((p % w) as isize, (p / w) as isize);
-                if (-r..=r).any(|d| at(x + d, y) != *label || at(x, y + d) != *label) {
-                    *label = 0;
-                }
-            }
-        }
+        Masks::Eroded(pixels) => out.masks.iter_mut().for_each(|mask| {
+            let inside = drawn(&mask.runs);
+            mask.runs = runs(&(0..w * h).map(|p| reach(p, w, h, pixels as isize).all(|q| inside[q])).collect::<Vec<_>>());
+        }),
         Masks::Dropped(share) => {
             let dropped = some(share, rng);
-            out.labels.iter_mut().filter(|l| dropped.contains(&usize::from(**l))).for_each(|l| *l = 0);
+            out.masks = out.masks.into_iter().enumerate().filter(|(k, _)| !dropped.contains(k)).map(|m| m.1).collect();
         }
         Masks::Merged(share) => {
-            let contacts = before.contacts();
             for own in some(share, rng) {
-                let own = own as u16;
-                let other = |&(a, b): &(u16, u16)| if a == own { Some(b) } else { (b == own).then_some(a) };
-                let beside: Vec<u16> = contacts.iter().filter_map(other).collect();
+                let mut inside = drawn(&out.masks[own].runs);
+                let around: Vec<bool> = (0..w * h).map(|p| reach(p, w, h, 1).any(|q| inside[q])).collect();
+                let lies_beside = |other: &&Mask| {
+                    let both = other.runs.places(list.width, list.height);
+                    let (touching, common) = both.fold((false, false), |(t, c), p| (t || around[p], c || inside[p]));
+                    other.level == list.masks[own].level && touching && !common
+                };
+                let beside: Vec<&Mask> = list.masks.iter().filter(lies_beside).collect();
                 if !beside.is_empty() {
-                    let other = beside[rng.below(beside.len())];
-                    out.labels.iter_mut().filter(|l| **l == own).for_each(|l| *l = other);
+                    beside[rng.below(beside.len())].runs.places(list.width, list.height).for_each(|p| inside[p] = true);
+                    out.masks[own].runs = runs(&inside);
                 }
             }
         }
         Masks::Split(share) => {
-            for (number, own) in some(share, rng).into_iter().enumerate() {
-                let inside: Vec<usize> = (0..out.labels.len()).filter(|p| usize::from(out.labels[*p]) == own).collect();
-                let place = |p: &usize| Vec2::new((p % w) as f32, (p / w) as f32);
-                let middle = inside.iter().map(place).sum::<Vec2>() / inside.len() as f32;
+            for own in some(share, rng) {
+                let inside = drawn(&list.masks[own].runs);
+                let place = |p: usize| Vec2::new((p % w) as f32, (p / w) as f32);
+                let middle = list.places(&list.masks[own]).map(place).sum::<Vec2>() / list.masks[own].runs.area() as f32;
                 let across = Vec2::from_angle(std::f32::consts::TAU * rng.uniform());
-                for p in inside.into_iter().filter(|p| across.dot(place(p) - middle) > 0.0) {
-                    out.labels[p] = (names.len() + number) as u16;
-                }
+                let half =
+                    |side: bool| runs(&(0..w * h).map(|p| inside[p] && (across.dot(place(p) - middle) > 0.0) == side).collect::<Vec<_>>());
+                out.masks[own].runs = half(false);
+                out.masks.push(Mask { runs: half(true), ..list.masks[own].clone() });
             }
         }
     }
+    out.masks.retain(|mask| mask.runs.area() > 0);
     out
+}
+
+/// The places that lie in the same row or column, so many pixels away at most.
+fn reach(place: usize, w: usize, h: usize, pixels: isize) -> impl Iterator<Item = usize> {
+    let (x, y) = ((place % w) as isize, (place / w) as isize);
+    let at = move |x: isize, y: isize| y.clamp(0, h as isize - 1) as usize * w + x.clamp(0, w as isize - 1) as usize;
+    (-pixels..=pixels).flat_map(move |d| [at(x + d, y), at(x, y + d)])
 }
 
 /// Adds noise of this length, as a share of their own, to all embeddings of a scene's objects.
@@ -268,31 +279,27 @@ pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::Level;
 
-    fn map() -> LabelMap {
-        // Four columns of two pixels each: none, 5, 9, 7.
-        LabelMap { width: 8, height: 4, labels: (0..32).map(|p| [0, 5, 9, 7][p % 8 / 2]).collect() }
+    /// Columns 2..4, 4..6 and 6..8 of eight, and the first two of these in one.
+    fn list() -> MaskList {
+        let columns = |from: u32, to: u32| Mask::new(Level::Whole, RunLengths::of(8, 4, |x, _| (from..to).contains(&x)));
+        let both = Mask { level: Level::Part, ..columns(2, 6) };
+        MaskList { masks: vec![columns(2, 4), columns(4, 6), columns(6, 8), both], ..MaskList::new(8, 4) }
     }
 
-    fn labels(map: &LabelMap) -> BTreeSet<u16> {
-        map.labels.iter().copied().collect()
+    fn areas(change: Masks) -> Vec<usize> {
+        changed_masks(&list(), change, &mut Rng::new(0, "test")).masks.iter().map(|m| m.runs.area()).collect()
     }
 
     #[test]
     fn masks_are_changed_as_their_names_say() {
-        let mut rng = Rng::new(0, "test");
-        let before = map().dense().0;
-        let kept = |m: &LabelMap| m.labels.iter().zip(&before.labels).all(|(l, b)| *l == 0 || l == b);
-        let dropped = changed_masks(&map(), Masks::Dropped(0.34), &mut rng);
-        assert!(labels(&dropped).len() == 3 && kept(&dropped), "one of three is gone, and none stays none");
-        assert_eq!(labels(&changed_masks(&map(), Masks::Split(1.0), &mut rng)).len(), 7);
-        assert_eq!(labels(&changed_masks(&map(), Masks::Merged(0.34), &mut rng)).len(), 3);
-        let eroded = changed_masks(&map(), Masks::Eroded(1), &mut rng);
-        assert!(kept(&eroded));
-        assert_eq!(eroded.labels.iter().filter(|l| **l > 0).count(), 4, "only the outer side of the last column has no neighbour");
-        for change in [Masks::Split(0.5), Masks::Merged(0.5)] {
-            let zero = |m: &LabelMap| m.labels.iter().map(|l| *l == 0).collect::<Vec<_>>();
-            assert_eq!(zero(&changed_masks(&map(), change, &mut rng)), zero(&map()), "{change:?}");
-        }
+        assert_eq!(areas(Masks::Eroded(1)), [4, 8], "only the last column has a side at the border, and the wide one a middle");
+        assert_eq!(areas(Masks::Dropped(0.5)).len(), 2);
+        let split = areas(Masks::Split(1.0));
+        assert_eq!((split.len(), split.iter().sum::<usize>()), (8, 40));
+        let merged = areas(Masks::Merged(1.0));
+        assert_eq!((merged.len(), merged[3]), (4, 16), "nothing of its level lies beside it");
+        assert!(merged[..3].iter().all(|area| *area == 16), "{merged:?}");
     }
 }

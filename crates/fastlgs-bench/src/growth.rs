@@ -77,7 +77,7 @@ fn measured([photos, masks, gaussians]: [usize; 3], run: &Run) -> Result<Value> 
     Ok(json!({
         "photos": photos, "masks_per_photo": found as f64 / photos as f64, "gaussians": scene.len(),
         "seconds": seconds,
-        "nodes": mapped.summary.nodes, "objects": mapped.chosen.nodes.len(), "things": 3 * tiles * tiles,
+        "sets": mapped.summary.sets, "objects": mapped.chosen.support.len(), "things": 3 * tiles * tiles,
         "paper_masks": seen.len(), "paper_seconds": started.elapsed().as_secs_f64(), "paper_objects": matched.count,
         "paper_comparisons": matched.comparisons,
     }))

@@ -4,7 +4,6 @@ use crate::undistort::Distortion;
 use crate::{Camera, Error, Result, fs, image_io};
 use glam::Vec2;
 use image::{DynamicImage, ImageBuffer, ImageReader, Luma};
-use std::collections::BTreeSet;
 use std::io::Cursor;
 use std::path::Path;
 
@@ -94,14 +93,6 @@ impl LabelMap {
         }
         let labels = own.labels.iter().zip(&theirs.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
         (Self { labels, ..*self }, pairs)
-    }
-
-    /// Pairs of labels (a < b, neither 0) of pixels beside or below each other.
-    pub fn contacts(&self) -> BTreeSet<(u16, u16)> {
-        let (w, n) = (self.width as usize, self.labels.len());
-        let beside = |p: usize| [(p % w + 1 < w).then_some(p + 1), (p + w < n).then_some(p + w)].into_iter().flatten();
-        let pairs = (0..n).flat_map(|p| beside(p).map(move |q| (self.labels[p].min(self.labels[q]), self.labels[p].max(self.labels[q]))));
-        pairs.filter(|(a, b)| *a > 0 && a != b).collect()
     }
 
     /// The same map at another size, nearest neighbour.
@@ -215,7 +206,6 @@ mod tests {
         let map = |labels: &[u16]| LabelMap { width: 3, height: 2, labels: labels.to_vec() };
         let (joint, pairs) = map(&[9, 9, 0, 9, 4, 4]).joint(&map(&[1, 2, 2, 1, 2, 2]));
         assert_eq!((joint.labels, pairs), (vec![2, 3, 0, 2, 1, 1], vec![(0, 2), (4, 2), (9, 1), (9, 2)]));
-        assert_eq!(map(&[1, 1, 0, 2, 3, 3]).contacts(), BTreeSet::from([(1, 2), (1, 3), (2, 3)]));
     }
 
     #[test]

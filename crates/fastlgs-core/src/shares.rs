@@ -1,5 +1,8 @@
 //! Which objects the pixels of a rendered view show, and how much of each.
 
+use std::borrow::Cow;
+use std::cmp::Reverse;
+
 /// Ids that a pixel keeps.
 pub const KEPT: usize = 4;
 
@@ -32,23 +35,25 @@ impl Shares {
         self.pixels.iter().map(most).collect()
     }
 
-    /// At each pixel the smallest of nested sets that has most of the weight, where the ids' own sets are `of` and `above` gives the next larger
-    /// set, which must compare as greater. [`Self::mask`] of a set is where this finds it or one within it.
-    pub fn smallest<'a, S: Copy + Ord>(
-        &'a self,
-        of: impl Fn(u16) -> Option<S> + 'a,
-        above: impl Fn(S) -> Option<S> + 'a,
-    ) -> impl Iterator<Item = Option<S>> + 'a {
+    /// At each pixel the sets that have most of its weight, as each id's list in `sets` has them, which must fall; they fall too. [`Self::mask`] of
+    /// the ids in a set is where this names it.
+    pub fn held<'a, S: Copy + Ord>(&'a self, sets: &'a [Vec<S>]) -> impl Iterator<Item = Cow<'a, [S]>> {
+        let of = |id: u16| sets.get(usize::from(id)).map_or(&[][..], Vec::as_slice);
         self.pixels.iter().map(move |pixel| {
-            let mut sets: [Option<S>; KEPT] = pixel.map(|share| Some(unpack(share)).filter(|s| s.1 > 0).and_then(|s| of(s.0)));
-            loop {
-                let least = sets.iter().flatten().min().copied()?;
-                let within = |k: &usize| sets[*k] == Some(least);
-                if is_most((0..KEPT).filter(within).map(|k| unpack(pixel[k]).1).sum(), pixel) {
-                    return Some(least);
-                }
-                sets.iter_mut().filter(|s| **s == Some(least)).for_each(|s| *s = above(least));
+            let parts = pixel.map(unpack);
+            if let Some(alone) = parts.iter().find(|s| is_most(s.1, pixel)) {
+                return Cow::Borrowed(of(alone.0));
             }
+            let mut sums: Vec<(S, u32)> = Vec::new();
+            for (set, weight) in parts.iter().flat_map(|s| of(s.0).iter().map(|set| (*set, s.1))) {
+                match sums.iter_mut().find(|sum| sum.0 == set) {
+                    Some(sum) => sum.1 += weight,
+                    None => sums.push((set, weight)),
+                }
+            }
+            sums.retain(|sum| is_most(sum.1, pixel));
+            sums.sort_unstable_by_key(|sum| Reverse(sum.0));
+            Cow::Owned(sums.into_iter().map(|sum| sum.0).collect())
         })
     }
 }
@@ -74,25 +79,24 @@ mod tests {
     }
 
     #[test]
-    fn the_smallest_set_with_most_of_the_weight_is_found() {
+    fn sets_that_overlap_are_found_where_they_have_most_of_the_weight() {
         let shares = |list: &[(u16, f32)]| -> [u32; KEPT] { std::array::from_fn(|k| list.get(k).map_or(0, |s| pack(s.0, s.1))) };
-        // 1 and 2 lie in 3, which lies in 5 with 4.
-        let above = |set: u16| [0, 3, 3, 5, 5, 0][usize::from(set)];
-        let above = |set: u16| Some(above(set)).filter(|s| *s > 0);
+        // Set 7 overlaps 8, and both lie in 3.
+        let sets: [Vec<u16>; 5] = [vec![], vec![7, 3], vec![8, 3], vec![8, 7, 3], vec![3]];
         let pixels = vec![
             shares(&[(1, 0.7), (2, 0.3)]),
             shares(&[(1, 0.4), (2, 0.4), (4, 0.2)]),
-            shares(&[(4, 0.4), (1, 0.3), (0, 0.3)]),
+            shares(&[(3, 0.4), (2, 0.3), (0, 0.3)]),
             shares(&[(1, 0.3), (0, 0.5)]),
             shares(&[(1, 0.4)]),
+            shares(&[(9, 1.0)]),
         ];
-        let shares = Shares { width: 5, height: 1, pixels };
-        let found: Vec<Option<u16>> = shares.smallest(|id| Some(id).filter(|id| *id > 0), above).collect();
-        assert_eq!(found, [Some(1), Some(3), Some(5), None, None]);
-        let within = |set: u16| move |id: u16| std::iter::successors(Some(id), |id| above(*id)).any(|s| s == set);
-        for set in 1..=5 {
-            let members: Vec<bool> = (0..=5).map(within(set)).collect();
-            assert_eq!(shares.mask(&members), found.iter().map(|f| f.is_some_and(within(set))).collect::<Vec<_>>(), "{set}");
+        let shares = Shares { width: 6, height: 1, pixels };
+        let found: Vec<Vec<u16>> = shares.held(&sets).map(Cow::into_owned).collect();
+        assert_eq!(found, [vec![7, 3], vec![3], vec![8, 3], vec![], vec![], vec![]]);
+        for set in [3, 7, 8] {
+            let members: Vec<bool> = sets.iter().map(|of| of.contains(&set)).collect();
+            assert_eq!(shares.mask(&members), found.iter().map(|f| f.contains(&set)).collect::<Vec<_>>(), "{set}");
         }
     }
 }

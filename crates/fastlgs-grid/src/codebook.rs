@@ -103,7 +103,7 @@ mod tests {
             areas: Vec::new(),
             views: 1,
         };
-        Grid { objects: codes.iter().enumerate().map(object).collect() }
+        Grid { objects: codes.iter().enumerate().map(object).collect(), ..Grid::default() }
     }
 
     #[test]

@@ -4,16 +4,6 @@ use crate::decision::decide;
 use crate::grid::Grid;
 use crate::query::Hit;
 use fastlgs_core::{LabelMap, Shares};
-use std::cmp::Reverse;
-
-/// At each pixel the smallest object that has most of its weight; 0 for none. What contains an object, its `parent`, has a lower number.
-pub fn smallest_objects(shares: &Shares, parent: impl Fn(u16) -> u16) -> LabelMap {
-    let object = |id: u16| Some(Reverse(id)).filter(|_| id > 0);
-    // A damaged file might go in circles.
-    let above = |id: Reverse<u16>| object(parent(id.0)).filter(|above| *above > id);
-    let labels = shares.smallest(object, above).map(|id| id.map_or(0, |id| id.0)).collect();
-    LabelMap { width: shares.width, height: shares.height, labels }
-}
 
 /// What a rendered view tells about objects.
 pub enum Field {
@@ -33,11 +23,43 @@ pub enum Field {
 }
 
 impl Field {
+    /// The objects that have most of each pixel, from small to large, row by row.
+    pub fn each(&self, grid: &Grid, mut tell: impl FnMut(&[u16])) {
+        let lists = grid.lists();
+        match self {
+            Self::Shares(shares) => shares.held(&lists).for_each(|objects| tell(&objects)),
+            Self::Features { width, height, values, tau_ac } => {
+                decide(grid, *width, *height, values, *tau_ac).labels.iter().for_each(|id| tell(&lists[usize::from(*id)]));
+            }
+        }
+    }
+
+    /// The objects that have most of a pixel, from small to large.
+    pub fn at(&self, grid: &Grid, x: u32, y: u32) -> Vec<u16> {
+        let (wanted, mut place) = (y * self.size().0 + x, 0);
+        let mut found = Vec::new();
+        self.each(grid, |objects| {
+            if place == wanted {
+                found = objects.to_vec();
+            }
+            place += 1;
+        });
+        found
+    }
+
     /// The smallest object that has most of each pixel; 0 for none.
     pub fn owners(&self, grid: &Grid) -> LabelMap {
+        let (width, height) = self.size();
+        let mut labels = Vec::with_capacity((width * height) as usize);
+        self.each(grid, |objects| labels.push(objects.first().copied().unwrap_or(0)));
+        LabelMap { width, height, labels }
+    }
+
+    /// Pixels along x and y.
+    fn size(&self) -> (u32, u32) {
         match self {
-            Self::Shares(shares) => smallest_objects(shares, |id| grid.chain(id).nth(1).unwrap_or(0)),
-            Self::Features { width, height, values, tau_ac } => decide(grid, *width, *height, values, *tau_ac),
+            Self::Shares(shares) => (shares.width, shares.height),
+            Self::Features { width, height, .. } => (*width, *height),
         }
     }
 
@@ -55,9 +77,9 @@ impl Field {
     pub fn relevancy(&self, grid: &Grid, ranked: &[Hit]) -> Vec<f32> {
         let mut own = vec![0.0f32; grid.objects.len() + 1];
         ranked.iter().for_each(|h| own[usize::from(h.id)] = h.score);
-        let highest = |id| grid.chain(id).fold(0.0, |score: f32, above| score.max(own[usize::from(above)]));
-        let score: Vec<f32> = (0..=grid.objects.len() as u16).map(highest).collect();
-        self.owners(grid).labels.iter().map(|id| score.get(usize::from(*id)).copied().unwrap_or(0.0)).collect()
+        let mut relevancy = Vec::new();
+        self.each(grid, |objects| relevancy.push(objects.iter().map(|id| own[usize::from(*id)]).fold(0.0, f32::max)));
+        relevancy
     }
 }
 

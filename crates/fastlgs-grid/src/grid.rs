@@ -2,6 +2,7 @@
 
 use crate::Result;
 use crate::mapping::Mask;
+use crate::overlaps::Overlaps;
 use fastlgs_core::scene_folder::{parse_tensors, save_tensors};
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
@@ -32,6 +33,10 @@ pub struct Object {
 pub struct Grid {
     /// In order of id.
     pub objects: Vec<Object>,
+    /// What the Gaussians' ids above those of the objects stand for.
+    pub overlaps: Overlaps,
+    /// By id that Gaussians can have: the pixels that those of this id show in all views together, in pictures; empty where nobody knows.
+    pub shown: Vec<f32>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -73,36 +78,72 @@ impl Grid {
                 }
             })
             .collect();
-        Self { objects }
+        Self { objects, ..Self::default() }
     }
 
-    /// The objects that contain an object, from small to large, itself first.
+    /// The objects that contain an object, from small to large, itself first; those that a Gaussian of this id lies in.
     pub fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
         let known = |id: &u16| (1..=self.objects.len()).contains(&usize::from(*id));
+        let list = usize::from(id).checked_sub(self.objects.len() + 1).and_then(|k| self.overlaps.0.get(k));
         // A damaged file might go in circles: no chain is longer than there are objects.
         let up = move |id: &u16| Some(self.objects[usize::from(*id) - 1].parent).filter(known);
-        std::iter::successors(Some(id).filter(known), up).take(self.objects.len())
+        list.into_iter().flatten().copied().chain(std::iter::successors(Some(id).filter(known), up).take(self.objects.len()))
     }
 
-    /// Sums over each object and all that lies in it. What contains an object has a lower number.
-    pub fn with_parts(&self, values: &[f32]) -> Vec<f32> {
-        let mut sums = values.to_vec();
-        for k in (0..sums.len()).rev() {
-            // A damaged file might go in circles.
-            if let Some(above) = usize::from(self.objects[k].parent).checked_sub(1).filter(|above| *above < k) {
-                sums[above] += sums[k];
+    /// [`Self::chain`] of each id that Gaussians can have, 0 included.
+    pub fn lists(&self) -> Vec<Vec<u16>> {
+        (0..=self.highest()).map(|id| self.chain(id).collect()).collect()
+    }
+
+    /// The highest id that Gaussians can have.
+    pub fn highest(&self) -> u16 {
+        (self.objects.len() + self.overlaps.0.len()) as u16
+    }
+
+    /// How much of the scene's surface the Gaussians of each id show, in all views together.
+    pub fn surface(&self) -> Vec<f32> {
+        if self.shown.len() == self.lists().len() {
+            return self.shown.clone();
+        }
+        // What objects show without those inside them, as far as they were measured.
+        let seen = |object: &Object| object.areas.iter().sum::<f32>() / object.areas.len().max(1) as f32 * object.views as f32;
+        let mut own: Vec<f32> = std::iter::once(0.0).chain(self.objects.iter().map(seen)).collect();
+        for object in self.objects.iter().filter(|o| o.parent > 0) {
+            if let Some(above) = own.get_mut(usize::from(object.parent)) {
+                *above -= seen(object);
             }
         }
-        sums
+        own.resize(usize::from(self.highest()) + 1, 0.0);
+        own.into_iter().map(|share| share.max(0.0)).collect()
     }
 
-    /// For each id 0..=K whether the object belongs to one of `targets`: is one, or lies inside one.
+    /// Whether an object and each other one, by number from 1 on, lie in each other: one is a part of the other, or most of the smaller lies in both.
+    pub fn related(&self, id: u16) -> Vec<bool> {
+        let (lists, surface) = (self.lists(), self.surface());
+        let mut sums = vec![[0.0f32; 2]; self.objects.len() + 1];
+        for (list, shown) in lists.iter().zip(&surface) {
+            let common = list.contains(&id);
+            list.iter().for_each(|other| {
+                let [all, shared] = &mut sums[usize::from(*other)];
+                *all += shown;
+                *shared += if common { *shown } else { 0.0 };
+            });
+        }
+        let own = sums.get(usize::from(id)).map_or(0.0, |sum| sum[0]);
+        let is_related = |object: &Object| {
+            let [all, shared] = sums[usize::from(object.id)];
+            2.0 * shared > all.min(own) || self.chain(id).any(|a| a == object.id) || self.chain(object.id).any(|a| a == id)
+        };
+        self.objects.iter().map(is_related).collect()
+    }
+
+    /// For each id that Gaussians can have whether they belong to one of `targets`.
     pub fn members(&self, targets: &[u16]) -> Vec<bool> {
         let inside = |id: u16| self.chain(id).any(|above| targets.contains(&above));
-        (0..=self.objects.len() as u16).map(inside).collect()
+        (0..=self.highest()).map(inside).collect()
     }
 
-    /// The grid without some objects and all that lies in them, and the new number of each old one 0..=K; 0 for those that are gone.
+    /// The grid without some objects and all that lies in them, and the new number of each old id; 0 where nothing is left.
     pub fn without(&self, removed: &[u16]) -> (Self, Vec<u16>) {
         let gone = self.members(removed);
         let mut left = 0;
@@ -110,16 +151,23 @@ impl Grid {
             left += u16::from(!gone);
             if *gone { 0 } else { left }
         };
-        let ids: Vec<u16> = std::iter::once(0).chain(gone[1..].iter().map(number)).collect();
-        let renumbered =
-            |o: &Object| Object { id: ids[usize::from(o.id)], parent: ids.get(usize::from(o.parent)).copied().unwrap_or(0), ..o.clone() };
-        let objects = self.objects.iter().filter(|o| ids[usize::from(o.id)] > 0).map(renumbered).collect();
-        (Self { objects }, ids)
+        let of_object: Vec<u16> = std::iter::once(0).chain(gone[1..=self.objects.len()].iter().map(number)).collect();
+        let new = |id: u16| of_object.get(usize::from(id)).copied().unwrap_or(0);
+        let objects: Vec<Object> =
+            self.objects.iter().filter(|o| new(o.id) > 0).map(|o| Object { id: new(o.id), parent: new(o.parent), ..o.clone() }).collect();
+        let parents: Vec<u16> = objects.iter().map(|o| o.parent).collect();
+        let lists: Vec<Vec<u16>> = self.lists().iter().map(|list| list.iter().map(|id| new(*id)).filter(|id| *id > 0).collect()).collect();
+        let surface = self.surface();
+        let (overlaps, ids) = Overlaps::of(lists, &parents, &surface);
+        let mut left = Self { objects, overlaps, shown: Vec::new() };
+        left.shown = vec![0.0; usize::from(left.highest()) + 1];
+        ids.iter().zip(surface).for_each(|(id, shown)| left.shown[usize::from(*id)] += shown);
+        (left, ids)
     }
 
-    /// Code of an object; zero for object 0 and unknown ones.
+    /// Code of an object, or of the smallest one that a Gaussian of this id lies in; zero where there is none.
     pub fn code_of(&self, id: u16) -> Vec3 {
-        self.objects.get(usize::from(id).wrapping_sub(1)).map_or(Vec3::ZERO, |o| o.code)
+        self.chain(id).next().map_or(Vec3::ZERO, |id| self.objects[usize::from(id) - 1].code)
     }
 
     /// Gives every Gaussian its object's code as feature.
@@ -148,10 +196,15 @@ impl Grid {
             areas.extend(&o.areas);
         }
         let n = areas.len();
-        save_tensors(
-            &folder.root.join("grid.safetensors"),
-            &[("embeddings", vec![n, dimension], &embeddings), ("areas", vec![n], &areas)],
-        )?;
+        // Each list of objects ends with 0.
+        let overlaps: Vec<f32> = self.overlaps.0.iter().flat_map(|list| list.iter().chain(&[0])).map(|id| f32::from(*id)).collect();
+        let tensors = [
+            ("embeddings", vec![n, dimension], embeddings.as_slice()),
+            ("areas", vec![n], &areas),
+            ("overlaps", vec![overlaps.len()], &overlaps),
+            ("shown", vec![self.shown.len()], &self.shown),
+        ];
+        save_tensors(&folder.root.join("grid.safetensors"), &tensors)?;
         Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
     }
 
@@ -195,6 +248,16 @@ impl Grid {
                 })
             })
             .collect::<Result<Vec<_>, Error>>()?;
-        Ok(Self { objects })
+        // Grids that earlier versions wrote have neither.
+        let values = |name: &str| tensors.get(name).map_or(&[][..], |t| t.1.as_slice());
+        let overlaps = values("overlaps");
+        let known = |id: &f32| id.fract() == 0.0 && (0.0..=objects.len() as f32).contains(id);
+        let are_lists = overlaps.iter().all(known) && overlaps.last().is_none_or(|id| *id == 0.0);
+        let lists = overlaps.split_inclusive(|id| *id == 0.0).map(|list| list[..list.len() - 1].iter().map(|id| *id as u16).collect());
+        let grid = Self { objects, overlaps: Overlaps(lists.collect()), shown: values("shown").to_vec() };
+        if !are_lists || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
+            return Err(Error::format(&path, "its overlaps name objects that grid.json lacks; train the scene again").into());
+        }
+        Ok(grid)
     }
 }

@@ -1,5 +1,5 @@
 //! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`consensus`], [`election`],
-//! [`tree`], [`support`] and [`objects`]), objects get low-dimensional codes ([`codes`]) and keep all their embeddings ([`grid`]), and a text
+//! [`support`] and [`objects`]), objects get low-dimensional codes ([`codes`]) and keep all their embeddings ([`grid`]), and a text
 //! finds its object ([`relevancy`], [`query`]).
 
 pub mod calibration;
@@ -14,11 +14,11 @@ pub mod grid;
 pub mod library;
 pub mod mapping;
 pub mod objects;
+pub mod overlaps;
 pub mod query;
 pub mod relevancy;
 pub mod sightings;
 pub mod support;
-pub mod tree;
 
 pub use grid::{Grid, Object};
 

@@ -333,7 +333,7 @@ mod tests {
                     Object { id, parent: 0, support, code: glam::Vec3::ZERO, views: embeddings.len(), embeddings, areas }
                 };
                 let objects = (1..=objects).map(object).collect();
-                (Entry { path: format!("scene{k}"), stamp: "1".into() }, Grid { objects })
+                (Entry { path: format!("scene{k}"), stamp: "1".into() }, Grid { objects, ..Grid::default() })
             })
             .collect()
     }

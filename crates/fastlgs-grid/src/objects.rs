@@ -1,163 +1,189 @@
-//! Global mapping, last step: the nodes of the tree that the photos' masks support become the objects.
+//! Global mapping, last step: the sets that the photos' masks support become the objects, which may overlap.
 
+use crate::consensus::Proposal;
+use crate::overlaps::Overlaps;
+use crate::sightings::Sightings;
 use crate::support::Support;
-use crate::tree::{Node, Tree};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
-/// When a node is an object.
+/// When a set is an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
     /// Fewest views that must show it.
     pub min_views: usize,
     /// Smallest object, as the share of a view's pixels that so many views must show. Further photos from afar make nothing smaller.
     pub min_share: f32,
-    /// Least support by masks.
+    /// Least support by masks: their IoU, as where masks propose a set.
     pub min_support: f32,
-    /// Of a node and one below it that has more than this share of its pixels, only the better supported one is an object.
+    /// Of sets whose IoU is more than this only the best supported one is an object, and what has more than this share in a larger one is a part of it.
     pub same: f32,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { min_views: 3, min_share: 0.0005, min_support: 0.4, same: 0.7 }
+        Self { min_views: 3, min_share: 0.0005, min_support: 0.5, same: 0.7 }
     }
 }
 
-/// The nodes that are objects.
+/// The sets that are objects.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Chosen {
-    /// By node: its object, else the next one above it; 0 for none.
-    object_of: Vec<u16>,
-    /// Object that contains object k + 1; 0 for none.
+    /// By Gaussian: the number of the objects that it lies in, see [`Overlaps`]; 0 for none.
+    pub ids: Vec<u16>,
+    /// Object that object k + 1 is a part of, the smallest such; 0 for none.
     pub parents: Vec<u16>,
-    /// Node of each object.
-    pub nodes: Vec<Node>,
-    /// Nodes that are no objects: too few views, too small, no masks of their shape, the same as another.
+    /// The numbers above those of the objects.
+    pub overlaps: Overlaps,
+    /// By number, 0 included: the pixels that its Gaussians show in all views together, in views.
+    pub shown: Vec<f32>,
+    /// What the views show of each object.
+    pub support: Vec<Support>,
+    /// Sets that are no objects: too few views, too small, no masks of their shape, the same as another.
     pub dropped: [usize; 4],
 }
 
 impl Chosen {
-    /// Object that a node is or lies in; 0 for none.
-    pub fn object(&self, node: Node) -> u16 {
-        self.object_of[node.place()]
+    /// For each number the objects that it stands for, from small to large.
+    pub fn lists(&self) -> Vec<Vec<u16>> {
+        self.overlaps.lists(&self.parents)
     }
 
-    /// An object and all that contain it, from small to large.
-    fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
-        std::iter::successors(Some(id), |id| Some(self.parents[usize::from(*id) - 1]).filter(|p| *p > 0))
-    }
-
-    /// Objects none of which lies in another one of the same layer: by the number of objects around them.
+    /// Objects none of which shares Gaussians with another one of the same layer.
     pub fn layers(&self) -> Vec<BTreeSet<u16>> {
+        let mut beside: Vec<BTreeSet<u16>> = vec![BTreeSet::new(); self.parents.len() + 1];
+        for list in self.lists() {
+            list.iter().for_each(|id| beside[usize::from(*id)].extend(&list));
+        }
         let mut layers: Vec<BTreeSet<u16>> = Vec::new();
         for id in 1..=self.parents.len() as u16 {
-            let depth = self.chain(id).skip(1).count();
-            layers.resize(layers.len().max(depth + 1), BTreeSet::new());
-            layers[depth].insert(id);
+            let place = layers.iter().position(|layer| layer.is_disjoint(&beside[usize::from(id)])).unwrap_or(layers.len());
+            layers.resize(layers.len().max(place + 1), BTreeSet::new());
+            layers[place].insert(id);
         }
         layers
     }
-
-    /// For each id 0..=K the object of `layer` that it is or lies in, where `wanted`; 0 for none.
-    pub fn ancestors_on(&self, layer: &BTreeSet<u16>, wanted: impl Fn(u16) -> bool) -> Vec<u16> {
-        let on_layer = |id: u16| self.chain(id).find(|a| layer.contains(a)).filter(|a| wanted(*a));
-        std::iter::once(0).chain((1..=self.parents.len() as u16).map(|id| on_layer(id).unwrap_or(0))).collect()
-    }
 }
 
-/// Chooses the objects among the nodes and numbers them, 1..=K, by falling size, so that none precedes what contains it.
-pub fn choose(tree: &Tree, support: &[Support], pixels: usize, config: &Config) -> Chosen {
+/// Chooses the objects among the sets and numbers them, 1..=K, by falling size.
+///
+/// Masks of neighbouring things cut their common border now here, now there, and what one photo takes for one thing another joins to the next: sets
+/// overlap, and none of them has to give way. A Gaussian lies in all objects that hold it.
+pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>, pixels: usize, config: &Config) -> Chosen {
     let mut chosen = Chosen::default();
-    let mut kept: BTreeSet<Node> = BTreeSet::new();
-    let of = |node: Node| &support[node.place()];
-    for (place, s) in support.iter().enumerate() {
+    let mut left: Vec<(Proposal, Support)> = Vec::new();
+    for (set, s) in sets.into_iter().zip(support) {
         let small = (s.reached_by(config.min_views) as f32) < config.min_share * pixels as f32;
         match [s.areas.len() < config.min_views, small, s.iou < config.min_support].iter().position(|bad| *bad) {
             Some(reason) => chosen.dropped[reason] += 1,
-            None => {
-                kept.insert(Node(place as u32));
-            }
+            None => left.push((set, s)),
         }
     }
-    // The best supported first: what is nearly the same set as one that stays, above or below it, goes.
-    let alike = |below: Node, above: Node| of(below).pixels() > config.same * of(above).pixels();
-    let mut order: Vec<Node> = kept.iter().copied().collect();
-    order.sort_by(|a, b| of(*b).iou.total_cmp(&of(*a).iou).then(a.cmp(b)));
-    let mut stays: BTreeSet<Node> = BTreeSet::new();
-    let mut holds_its_like: BTreeSet<Node> = BTreeSet::new();
-    for node in order {
-        let mut around = tree.upwards(node).skip(1).take_while(|whole| alike(node, *whole));
-        if holds_its_like.contains(&node) || around.any(|whole| stays.contains(&whole)) {
+    left.sort_by(|(a, of_a), (b, of_b)| {
+        of_b.iou.total_cmp(&of_a.iou).then_with(|| a.masks.iter().map(|f| f.mask).cmp(b.masks.iter().map(|f| f.mask)))
+    });
+
+    let weights: Vec<f32> = (0..sightings.gaussians() as u32).map(|g| sightings.weight(g)).collect();
+    let weight = |set: &[u32]| -> f32 { set.iter().map(|g| weights[*g as usize]).sum() };
+    let mut kept = Holders::new(weights.len());
+    let mut objects: Vec<(f32, Proposal, Support)> = Vec::new();
+    for (set, support) in left {
+        let size = weight(&set.set);
+        let alike =
+            kept.common(&set.set, &weights).into_iter().any(|(other, common)| common > config.same * (size + objects[other].0 - common));
+        if alike || objects.len() == usize::from(u16::MAX) - 1 {
             chosen.dropped[3] += 1;
             continue;
         }
-        stays.insert(node);
-        holds_its_like.extend(tree.upwards(node).skip(1).take_while(|whole| alike(node, *whole)));
+        kept.add(objects.len(), &set.set);
+        objects.push((size, set, support));
     }
-    let mut kept = stays;
-    let above = |kept: &BTreeSet<Node>, node: Node| tree.upwards(node).skip(1).find(|n| kept.contains(n));
-    let mut nodes: Vec<Node> = kept.iter().copied().collect();
-    nodes.sort_by(|a, b| of(*b).pixels().total_cmp(&of(*a).pixels()).then(b.cmp(a)));
-    for beyond in nodes.drain(nodes.len().min(usize::from(u16::MAX))..) {
-        kept.remove(&beyond);
-        chosen.dropped[1] += 1;
+    objects.sort_by(|a, b| b.0.total_cmp(&a.0));
+
+    let mut holders = Holders::new(weights.len());
+    for (place, (size, set, _)) in objects.iter().enumerate() {
+        let around = holders
+            .common(&set.set, &weights)
+            .into_iter()
+            .filter(|(_, common)| *common > config.same * size)
+            .map(|(other, _)| other as u16 + 1);
+        chosen.parents.push(around.max().unwrap_or(0));
+        holders.add(place, &set.set);
     }
-    let ids: BTreeMap<Node, u16> = nodes.iter().copied().zip(1..=u16::MAX).collect();
-    let id = |node: Option<Node>| node.map_or(0, |n| ids[&n]);
-    let all = (0..support.len() as u32).map(Node);
-    chosen.object_of = all.map(|n| ids.get(&n).copied().unwrap_or_else(|| id(above(&kept, n)))).collect();
-    chosen.parents = nodes.iter().map(|n| id(above(&kept, *n))).collect();
-    chosen.nodes = nodes;
+    let lists = holders.of.into_iter().map(|objects| objects.into_iter().rev().map(|place| place as u16 + 1).collect());
+    (chosen.overlaps, chosen.ids) = Overlaps::of(lists.collect(), &chosen.parents, &weights);
+    chosen.shown = vec![0.0; 1 + chosen.parents.len() + chosen.overlaps.0.len()];
+    chosen.ids.iter().zip(&weights).for_each(|(id, weight)| chosen.shown[usize::from(*id)] += weight / pixels as f32);
+    chosen.support = objects.into_iter().map(|o| o.2).collect();
     chosen
+}
+
+/// Which sets hold each Gaussian, in the order in which they were added.
+struct Holders {
+    of: Vec<Vec<u32>>,
+    sums: Vec<f32>,
+}
+
+impl Holders {
+    fn new(gaussians: usize) -> Self {
+        Self { of: vec![Vec::new(); gaussians], sums: Vec::new() }
+    }
+
+    fn add(&mut self, place: usize, set: &[u32]) {
+        set.iter().for_each(|g| self.of[*g as usize].push(place as u32));
+        self.sums.resize(place + 1, 0.0);
+    }
+
+    /// The sets that share Gaussians with this one, and the weight of these.
+    fn common(&mut self, set: &[u32], weights: &[f32]) -> Vec<(usize, f32)> {
+        let mut met = BTreeSet::new();
+        for g in set {
+            for other in &self.of[*g as usize] {
+                met.insert(*other as usize);
+                self.sums[*other as usize] += weights[*g as usize];
+            }
+        }
+        met.into_iter().map(|other| (other, std::mem::take(&mut self.sums[other]))).collect()
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sightings::Sighting;
 
-    fn tree(parents: &[Option<u32>]) -> Tree {
-        Tree { parents: parents.iter().map(|p| p.map(Node)).collect(), of: Vec::new() }
-    }
-
-    fn shown(area: u32, iou: f32) -> Support {
-        Support { iou, areas: (0..4).map(|v| (area, v)).collect() }
+    /// The objects that sets of 20 Gaussians become, each of 100 pixels in four views of 10,000, with these supports.
+    fn chosen(sets: &[(std::ops::Range<u32>, f32)], config: &Config) -> Chosen {
+        let seen = (0..20).map(|g| Sighting::new(g, 0, 400.0)).collect();
+        let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
+        let proposals = sets.iter().map(|(set, _)| Proposal { set: set.clone().collect(), masks: Vec::new() }).collect();
+        let support =
+            |(set, iou): &(std::ops::Range<u32>, f32)| Support { iou: *iou, areas: (0..4).map(|v| (100 * set.len() as u32, v)).collect() };
+        choose(&Sightings::new(20, vec![seen], &[table]), proposals, sets.iter().map(support).collect(), 10_000, config)
     }
 
     #[test]
-    fn supported_nodes_are_objects_by_falling_size() {
-        // 0 lies in 1, 1 and 2 in 3; 4 stands alone.
-        let tree = tree(&[Some(1), Some(3), Some(3), None, None]);
-        let support = [shown(100, 0.9), shown(400, 0.8), shown(300, 0.2), shown(900, 0.7), shown(500, 1.0)];
-        let chosen = choose(&tree, &support, 10_000, &Config::default());
-        assert_eq!(chosen.nodes, [3, 4, 1, 0].map(Node));
-        assert_eq!(chosen.parents, [0, 0, 1, 3]);
-        assert_eq!([0, 1, 2, 3, 4].map(|n| chosen.object(Node(n))), [4, 3, 1, 1, 2]);
-        assert_eq!(chosen.dropped, [0, 0, 1, 0]);
-        assert_eq!(choose(&tree, &support, 10_000, &Config { min_views: 5, ..Config::default() }).dropped, [5, 0, 0, 0]);
+    fn supported_sets_are_objects_by_falling_size_and_may_overlap() {
+        // A part that reaches out of its whole, another of which too little is supported, a neighbour that overlaps the whole.
+        let found = chosen(&[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)], &Config::default());
+        assert_eq!((found.parents.as_slice(), found.dropped), (&[0, 0, 1][..], [0, 0, 1, 0]));
+        let lists = found.lists();
+        let of: Vec<&[u16]> = found.ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
+        let all: [(&[u16], usize); 7] = [(&[], 1), (&[3], 1), (&[3, 1], 3), (&[1], 5), (&[2, 1], 2), (&[2], 4), (&[], 4)];
+        assert_eq!(of, all.iter().flat_map(|(list, count)| vec![*list; *count]).collect::<Vec<_>>());
+        assert_eq!(found.layers(), [BTreeSet::from([1]), BTreeSet::from([2, 3])]);
+        assert_eq!(chosen(&[(0..5, 0.9)], &Config { min_views: 5, ..Config::default() }).dropped, [1, 0, 0, 0]);
     }
 
     #[test]
     fn glimpses_from_afar_make_nothing_smaller() {
         let near = |areas: &[u32]| Support { iou: 1.0, areas: areas.iter().copied().zip(0..).collect() };
-        let config = Config { min_share: 0.01, ..Config::default() };
-        let objects = |areas: &[u32]| choose(&tree(&[None]), &[near(areas)], 10_000, &config).nodes.len();
-        assert_eq!((objects(&[100, 120, 110]), objects(&[100, 120, 110, 1, 1, 1, 1, 1]), objects(&[100, 120, 90])), (1, 1, 0));
-    }
-
-    #[test]
-    fn layers_hold_no_object_inside_another() {
-        // 2 and 3 lie in 1, 4 in 2.
-        let chosen = Chosen { parents: vec![0, 1, 1, 2, 0], ..Chosen::default() };
-        let layers = chosen.layers();
-        assert_eq!(layers, [BTreeSet::from([1, 5]), BTreeSet::from([2, 3]), BTreeSet::from([4])]);
-        assert_eq!(chosen.ancestors_on(&layers[0], |_| true), [0, 1, 1, 1, 1, 5]);
-        assert_eq!(chosen.ancestors_on(&layers[1], |id| id != 3), [0, 0, 2, 0, 2, 0]);
+        assert_eq!((near(&[100, 120, 110, 1, 1]).reached_by(3), near(&[100, 120, 90]).reached_by(3)), (100, 90));
+        assert_eq!(chosen(&[(0..1, 1.0)], &Config { min_share: 0.02, ..Config::default() }).dropped, [0, 1, 0, 0]);
     }
 
     #[test]
     fn of_two_that_are_nearly_the_same_the_better_one_stays() {
-        let support = [shown(400, 0.4), shown(950, 0.9), shown(1000, 0.8)];
-        let chosen = choose(&tree(&[Some(1), Some(2), None]), &support, 10_000, &Config::default());
-        assert_eq!((chosen.nodes, chosen.parents), ([1, 0].map(Node).to_vec(), vec![0, 1]));
+        let found = chosen(&[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)], &Config::default());
+        assert_eq!((found.support.iter().map(|s| s.iou).collect::<Vec<_>>(), found.dropped), (vec![0.9, 0.6], [0, 0, 0, 1]));
     }
 }

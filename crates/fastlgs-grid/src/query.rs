@@ -53,8 +53,8 @@ const LEAST: f32 = 1e-6;
 
 /// What a text says for each object.
 ///
-/// Of many objects whose cosines are noisy some are like any text. A place belongs to an object, to parts of it and to what it is a part of, and
-/// all of them were embedded: the mean over them is less noisy ([`places`]). An object is as like the text as its places are; which one is meant
+/// Of many objects whose cosines are noisy some are like any text. A place lies in several objects, parts and what they are parts of, and all of
+/// them were embedded: the mean over them is less noisy ([`places`]). An object is as like the text as its places are; which one is meant
 /// is told by how much it stands out by that from half of the scene's surface, and by how much surface there is: a small fragment stands out by
 /// chance. How much size counts, and how far an object's own embeddings are believed, follows from how well the encoder tells things apart.
 ///
@@ -62,23 +62,25 @@ const LEAST: f32 = 1e-6;
 ///
 /// What no view shows or what is nearer to a negative is not meant; the very object that was shown as an example is meant beyond doubt.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
-    let Surface { shares, bare, total } = &Surface::of(grid);
     let calibration = &query.calibration;
+    let (lists, surface) = (grid.lists(), grid.surface());
     let cosines: Vec<Option<f32>> = grid.objects.iter().map(|object| mean_cosine(object, query)).collect();
-    let around = |object: &Object| mean_of(grid.chain(object.id).filter_map(|above| cosines[usize::from(above) - 1])).map_or(-1.0, |m| m.0);
-    let (around, margins): (Vec<f32>, _) = (grid.objects.iter().map(around).collect(), places(grid, query));
-    let sums = grid.with_parts(&around.iter().zip(bare).map(|(place, share)| place * share).collect::<Vec<_>>());
+    let of_place = |list: &Vec<u16>| mean_of(list.iter().filter_map(|id| cosines[usize::from(*id) - 1])).map_or(-1.0, |m| m.0);
+    let around: Vec<f32> = lists.iter().map(of_place).collect();
+    let (shares, margins) = (sums(grid, &lists, &surface), places(grid, query));
+    let all_over = sums(grid, &lists, &around.iter().zip(&surface).map(|(place, share)| place * share).collect::<Vec<_>>());
+    let total = surface[1..].iter().sum::<f32>().max(LEAST);
     let anything = |object: &Object| mean_over_views(object, |e| query.canonical(e));
-    let anything: f32 = grid.objects.iter().zip(shares).map(|(object, share)| share * anything(object)).sum();
+    let anything: f32 = grid.objects.iter().zip(&shares).map(|(object, share)| share * anything(object)).sum();
     // Where most of the scene is what is meant, it stands out from "anything" at least.
-    let usual = median(&around, bare, *total).min(anything / shares.iter().sum::<f32>().max(LEAST));
+    let usual = median(&around[1..], &surface[1..], total).min(anything / shares.iter().sum::<f32>().max(LEAST));
     let of_object = |(k, object): (usize, &Object)| {
         let cosine = cosines[k].filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e)));
         let Some(cosine) = cosine else { return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 } };
         if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
             return Evidence { rank: f32::INFINITY, likeness: f32::INFINITY, score: 1.0, error: 0.0 };
         }
-        let all_over = if shares[k] > 0.0 { sums[k] / shares[k] } else { around[k] };
+        let all_over = if shares[k] > 0.0 { all_over[k] / shares[k] } else { around[k + 1] };
         let likeness = calibration.trust() * cosine + (1.0 - calibration.trust()) * all_over;
         let excess = (likeness - usual).max(LEAST);
         let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
@@ -92,19 +94,47 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     grid.objects.iter().enumerate().map(of_object).collect()
 }
 
-/// By how much each object's own places, which none of its parts shows, are more like what is meant than like anything: what the object's own
-/// embeddings say, as far as they are believed, and else the mean of it and all that it lies in. A mean of many varies less than one alone, so that
-/// it is stretched to vary as much: else things that lie in nothing would be found where those in deep trees are not.
+/// Sums over the places of each object.
+fn sums(grid: &Grid, lists: &[Vec<u16>], values: &[f32]) -> Vec<f32> {
+    let mut sums = vec![0.0; grid.objects.len()];
+    for (list, value) in lists.iter().zip(values) {
+        list.iter().for_each(|id| sums[usize::from(*id) - 1] += value);
+    }
+    sums
+}
+
+/// By how much each object's own places, which lie in none that is smaller, are more like what is meant than like anything: what the object's own
+/// embeddings say, as far as they are believed, and else the mean of all that a place lies in. A mean of many varies less than one alone, so that
+/// it is stretched to vary as much: else things that lie in nothing would be found where those that lie in many are not.
 pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
     let calibration = &query.calibration;
+    let (lists, surface) = (grid.lists(), grid.surface());
     let margins: Vec<Option<f32>> = grid.objects.iter().map(|object| margin(object, query)).collect();
     let trust = calibration.trust();
-    let of_object = |(object, own): (&Object, &Option<f32>)| {
-        let Some((mean, count)) = mean_of(grid.chain(object.id).filter_map(|above| margins[usize::from(above) - 1])) else { return -1.0 };
-        let around = calibration.wrong + (mean - calibration.wrong) / calibration.spread_of_mean(count);
-        trust * own.unwrap_or(around) + (1.0 - trust) * around
+    let of_place = |list: &Vec<u16>| {
+        let (mean, count) = mean_of(list.iter().filter_map(|id| margins[usize::from(*id) - 1]))?;
+        Some(calibration.wrong + (mean - calibration.wrong) / calibration.spread_of_mean(count))
     };
-    grid.objects.iter().zip(&margins).map(of_object).collect()
+    let around: Vec<Option<f32>> = lists.iter().map(of_place).collect();
+    let mut own = vec![[0.0f32; 2]; grid.objects.len()];
+    let mode = std::env::var("PLACES").unwrap_or_default();
+    for ((list, shown), place) in lists.iter().zip(&surface).zip(&around) {
+        let Some(place) = place else { continue };
+        let ids = match mode.as_str() {
+            "all" => &list[..],
+            _ => &list[..1],
+        };
+        for id in ids {
+            let sum = &mut own[usize::from(*id) - 1];
+            *sum = [sum[0] + shown * place, sum[1] + shown];
+        }
+    }
+    let of_object = |(k, [sum, shown]): (usize, &[f32; 2])| {
+        let around = if *shown > 0.0 { Some(sum / shown) } else { around[k + 1] };
+        let Some(around) = around else { return -1.0 };
+        trust * margins[k].unwrap_or(around) + (1.0 - trust) * around
+    };
+    own.iter().enumerate().map(of_object).collect()
 }
 
 /// The mean of some values and their number; nothing where there are none.
@@ -123,30 +153,6 @@ fn median(values: &[f32], weights: &[f32], total: f32) -> f32 {
         below >= 0.5 * total
     });
     half.map_or(0.0, |k| values[k])
-}
-
-/// How much of the scene's surface each object shows in all its views together.
-struct Surface {
-    /// With all its parts.
-    shares: Vec<f32>,
-    /// Without them.
-    bare: Vec<f32>,
-    /// Of all objects.
-    total: f32,
-}
-
-impl Surface {
-    fn of(grid: &Grid) -> Self {
-        let seen = |object: &Object| object.areas.iter().sum::<f32>() / object.areas.len().max(1) as f32 * object.views as f32;
-        let mut bare: Vec<f32> = grid.objects.iter().map(seen).collect();
-        for object in &grid.objects {
-            if let Some(above) = bare.get_mut(usize::from(object.parent).wrapping_sub(1)) {
-                *above -= seen(object);
-            }
-        }
-        bare.iter_mut().for_each(|share| *share = share.max(0.0));
-        Self { shares: grid.with_parts(&bare), total: bare.iter().sum::<f32>().max(LEAST), bare }
-    }
 }
 
 /// The mean over an object's views, weighted by area; 0 where there are none.
@@ -207,9 +213,9 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
-        let nested = |other: &Hit| grid.chain(hit.id).any(|a| a == other.id) || grid.chain(other.id).any(|a| a == hit.id);
         let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
-        if alike && hit.score >= config.min_score() && !chosen.iter().any(nested) {
+        let lies_in = |related: Vec<bool>| chosen.iter().any(|other| related[usize::from(other.id) - 1]);
+        if alike && hit.score >= config.min_score() && !lies_in(grid.related(hit.id)) {
             chosen.push(*hit);
         }
     }
@@ -251,7 +257,7 @@ pub(crate) mod tests {
             areas: vec![0.1],
             views: 1,
         };
-        Grid { objects: vec![object(1, 0, [1.0, 0.0]), object(2, 1, [0.8, 0.6]), object(3, 0, [0.0, 1.0])] }
+        Grid { objects: vec![object(1, 0, [1.0, 0.0]), object(2, 1, [0.8, 0.6]), object(3, 0, [0.0, 1.0])], ..Grid::default() }
     }
 
     fn ids(hits: &[Hit]) -> Vec<u16> {
@@ -299,7 +305,7 @@ pub(crate) mod tests {
         let thing = |id, parent, area, cosine: f32| known(id, parent, area, vec![[cosine, 0.0]; 3]);
         let parts = (2..6).map(|id| thing(id, 1, 0.04, 0.62));
         let wall = [thing(6, 0, 0.6, 0.35), thing(7, 6, 0.01, 0.8)];
-        let grid = Grid { objects: std::iter::once(thing(1, 0, 0.2, 0.6)).chain(parts).chain(wall).collect() };
+        let grid = Grid { objects: std::iter::once(thing(1, 0, 0.2, 0.6)).chain(parts).chain(wall).collect(), ..Grid::default() };
         assert_eq!(rank(&grid, &query([1.0, 0.0]))[0].id, 1);
         // An encoder that tells things apart is believed.
         let sure = Calibration { separation: 6.0, ..Calibration::OFFLINE };
@@ -325,7 +331,7 @@ pub(crate) mod tests {
             let (first, other) = (objects[0].embeddings.clone(), objects[place].embeddings.clone());
             (objects[0].embeddings, objects[place].embeddings) = (other, first);
             objects[place].support = 0.5;
-            Grid { objects }
+            Grid { objects, ..Grid::default() }
         };
         let query = TextQuery { canonical: vec![vec![0.0, 1.0]], ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
         let (mut ours, mut cosines) = (0, 0);
@@ -355,12 +361,12 @@ pub(crate) mod tests {
         let seen = |recognised: usize| {
             let view = |k: usize| if k < recognised { vec![1.0, 0.0] } else { vec![0.0, 1.0] };
             let object = Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() };
-            rank(&Grid { objects: vec![object] }, &query([1.0, 0.0]))[0].score
+            rank(&Grid { objects: vec![object], ..Grid::default() }, &query([1.0, 0.0]))[0].score
         };
         assert!(seen(1) < 0.05, "{}", seen(1));
         assert!(seen(4) > 0.9, "recognised from most sides: {}", seen(4));
         let unseen = Object { embeddings: Vec::new(), areas: Vec::new(), ..grid().objects[0].clone() };
-        assert_eq!(rank(&Grid { objects: vec![unseen] }, &query([1.0, 0.0]))[0].score, 0.0);
+        assert_eq!(rank(&Grid { objects: vec![unseen], ..Grid::default() }, &query([1.0, 0.0]))[0].score, 0.0);
     }
 
     #[test]

@@ -98,6 +98,17 @@ pub struct Fit {
     pub iou: f32,
 }
 
+/// What a view shows of a set of Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Shown {
+    /// The view.
+    pub view: u32,
+    /// Pixels of the Gaussians there.
+    pub pixels: f32,
+    /// The mask that fits them best, if one holds any of them at all.
+    pub best: Option<Fit>,
+}
+
 /// Sums that one search after the other uses; all zero between them.
 pub struct Scratch {
     gaussians: Vec<f32>,
@@ -213,6 +224,11 @@ impl<'a> Sightings<'a> {
 
     /// Of each view that shows these Gaussians the mask that fits them best, if one holds any of them at all.
     pub fn best_fits(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
+        self.shown(set, scratch).into_iter().filter_map(|shown| shown.best).collect()
+    }
+
+    /// What the views show of these Gaussians, rising by view.
+    pub fn shown(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Shown> {
         let mut atoms = Vec::new();
         for vote in set.iter().flat_map(|g| self.votes_of(*g)) {
             let atom = self.first_atom[usize::from(vote.view)] + u32::from(vote.atom);
@@ -232,11 +248,12 @@ impl<'a> Sightings<'a> {
             let common = std::mem::take(&mut scratch.masks[mask as usize]);
             let view = self.view_of(mask);
             let iou = common / (shown[view] + self.pixels[mask as usize] - common);
-            if shown[view] >= MIN_PIXELS && best[view].is_none_or(|fit| iou > fit.iou) {
+            if best[view].is_none_or(|fit| iou > fit.iou) {
                 best[view] = Some(Fit { mask, iou });
             }
         }
-        best.into_iter().flatten().collect()
+        let views = (0..).zip(shown).zip(best).map(|((view, pixels), best)| Shown { view, pixels, best });
+        views.filter(|shown| shown.pixels >= MIN_PIXELS).collect()
     }
 }
 

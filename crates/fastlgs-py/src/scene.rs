@@ -245,8 +245,14 @@ impl Scene {
         }
     }
 
+    /// For each of the Gaussians' object_ids, 0 included, the objects that it stands for, from small to large.
+    #[getter]
+    fn object_lists(&self, py: Python<'_>) -> PyResult<Vec<Vec<u16>>> {
+        self.with(py, |opened| Ok(opened.grid.lists()))
+    }
+
     /// All Gaussians as arrays: means and scales (n, 3) in units of the scene, rotations (n, 4) as (w, x, y, z), opacities (n), sh (n, k, 3),
-    /// features (n, 3) and object_ids (n).
+    /// features (n, 3) and object_ids (n), places in object_lists.
     #[getter]
     fn gaussians<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let scene = self.with(py, |opened| Ok(opened.session.gaussians.clone()))?;

@@ -141,6 +141,7 @@ impl Desk {
             "antialias": self.scene.trained.antialias,
             "background": self.scene.trained.background,
             "objects": self.grid.objects.len(),
+            "overlaps": self.grid.overlaps.0,
             "gaussians": self.gaussians(),
             "min_score": QueryConfig::default().min_score(),
             "support_share": query::SUPPORT_SHARE,

@@ -80,17 +80,17 @@ impl Thumbnails {
         let mut best: Vec<Option<Best>> = vec![None; grid.objects.len() + 1];
         let mut views = Vec::new();
         for (view, camera) in cameras.iter().enumerate() {
-            let owners = scene.field(camera, None)?.owners(grid);
             let mut here: BTreeMap<u16, Best> = BTreeMap::new();
-            for (p, id) in (0u32..).zip(&owners.labels) {
-                let (x, y) = (p % owners.width, p / owners.width);
-                for id in grid.chain(*id) {
-                    let own = here.entry(id).or_insert(Best { view, pixels: 0, bounds: [x, y, x, y] });
+            let mut pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+            scene.field(camera, None)?.each(grid, |objects| {
+                let (x, y) = pixels.next().unwrap_or_default();
+                for id in objects {
+                    let own = here.entry(*id).or_insert(Best { view, pixels: 0, bounds: [x, y, x, y] });
                     let b = own.bounds;
                     own.pixels += 1;
                     own.bounds = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
                 }
-            }
+            });
             for (id, own) in here {
                 let known = &mut best[usize::from(id)];
                 if known.is_none_or(|known| known.pixels < own.pixels) {

@@ -40,7 +40,7 @@ function say(text, absent = false) {
 // Shows the state: in the picture, in the lists, and on the buttons.
 function update() {
   const { selected, hidden, only, scores, text } = state;
-  stage.setObjects({ selected, hidden, only, scores, text, list: objects.list, members: objects.chain });
+  stage.setObjects({ selected, hidden, only, scores, text, list: objects.colored(), members: objects.chain });
   const options = { selected, hidden, minScore: scene.min_score, choose: (id) => select([id]) };
   const rows = state.ranked ?? objects.parts(0).map((id) => ({ id }));
   $("list-title").textContent = state.ranked ? `Most relevant to "${state.text}"` : "Objects";
@@ -306,7 +306,7 @@ function listen() {
 
 async function ready() {
   scene = Object.assign(stage.scene, await getJson("/api/scene"));
-  objects = new Objects(await getJson("/api/objects"), scene.support_share);
+  objects = new Objects(await getJson("/api/objects"), scene.overlaps ?? [], scene.support_share);
   recent.taught(await getJson("/api/names"));
   $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
     + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, `

@@ -3,8 +3,10 @@
 import { getBlob } from "./server.js";
 
 export class Objects {
-  constructor(list, supportShare) {
+  constructor(list, overlaps, supportShare) {
     this.list = list;
+    // What the ids of Gaussians above those of the objects stand for, from small to large.
+    this.overlaps = overlaps;
     this.supportShare = supportShare;
     this.byId = new Map(list.map((o) => [o.id, o]));
     this.children = new Map();
@@ -15,11 +17,19 @@ export class Objects {
     this.chain = this.chain.bind(this);
   }
 
-  // An object and what contains it, from small to large.
+  // An object and what contains it, from small to large; those that a Gaussian of this id lies in.
   chain(id) {
+    if (id > this.list.length) return this.overlaps[id - this.list.length - 1] ?? [];
     const chain = [];
     for (let own = this.byId.get(id); own && !chain.includes(own.id); own = this.byId.get(own.parent)) chain.push(own.id);
     return chain;
+  }
+
+  // All ids that Gaussians have, with the color of the smallest object that each stands for.
+  colored() {
+    const color = (id) => this.byId.get(this.chain(id)[0]).color;
+    const rest = this.overlaps.map((_, k) => ({ id: this.list.length + 1 + k, color: color(this.list.length + 1 + k) }));
+    return [...this.list, ...rest];
   }
 
   // Whether the middle of an object lies in the picture.

@@ -131,8 +131,8 @@ impl Known {
 
     /// Things that neither contain another one nor lie in it.
     fn others(&self, of: u16) -> impl Iterator<Item = &Object> {
-        let nested = move |id: u16| self.grid.chain(id).any(|a| a == of) || self.grid.chain(of).any(|a| a == id);
-        self.objects().map(|o| o.0).filter(move |o| !nested(o.id))
+        let related = self.grid.related(of);
+        self.objects().map(|o| o.0).filter(move |o| !related[usize::from(o.id) - 1])
     }
 }
 
@@ -157,9 +157,9 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
             let (iou, _, id) = best_object(&grid, &field, &view.mask(label, camera.width, camera.height));
             let Some(own) = seen().find(|o| o.id == id && iou >= SAME) else { continue };
             let query = scene.text_query(&label.category)?;
-            let nested = |other: u16| grid.chain(other).any(|a| a == id) || grid.chain(id).any(|a| a == other);
+            let related = grid.related(id);
             samples.right.extend(query::mean_cosine(own, &query));
-            samples.wrong.extend(seen().filter(|o| !nested(o.id)).filter_map(|other| query::mean_cosine(other, &query)));
+            samples.wrong.extend(seen().filter(|o| !related[usize::from(o.id) - 1]).filter_map(|other| query::mean_cosine(other, &query)));
         }
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));

@@ -3,24 +3,25 @@
 use crate::error::{Context, bail};
 use crate::{Result, Run, eyes, masks};
 use fastlgs_core::mask_list::{Atoms, Table};
+use fastlgs_core::shares::{KEPT, unpack};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
-use fastlgs_grid::field::smallest_objects;
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
-use fastlgs_grid::objects::{self as nodes, Chosen};
+use fastlgs_grid::objects::{self as chosen, Chosen};
 use fastlgs_grid::sightings::{Sighting, Sightings};
-use fastlgs_grid::support::{Shown, Support, support};
-use fastlgs_grid::tree::Tree;
+use fastlgs_grid::support::support;
 use fastlgs_grid::{Grid, codes, consensus, election, evidence};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::borrow::Cow;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Constants of global mapping.
 pub struct Config {
-    /// When a node of the tree is an object.
-    pub objects: nodes::Config,
+    /// When a set that masks elected is an object.
+    pub objects: chosen::Config,
     /// Whether the scene was trained with the 2-D Mip filter, which changes what Gaussians weigh.
     pub antialias: bool,
 }
@@ -54,8 +55,8 @@ pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     let grid = Grid::load(folder).with_context(advice)?;
     for camera in training {
         let highest = folder.objects(&camera.name).with_context(advice)?.max();
-        if usize::from(highest) > grid.objects.len() {
-            let (path, count) = (folder.objects_path(&camera.name), grid.objects.len());
+        if highest > grid.highest() {
+            let (path, count) = (folder.objects_path(&camera.name), grid.highest());
             bail!("{}: it shows object {highest} of {count}; train the scene again with --mapping global or paper", path.display());
         }
     }
@@ -83,16 +84,14 @@ pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], gr
 
 /// What global mapping makes of masks, before its objects are embedded.
 pub struct Mapped {
-    /// The objects, as nodes of a tree.
+    /// The objects.
     pub chosen: Chosen,
-    /// What the views show of every node.
-    pub support: Vec<Support>,
     /// What was found, and what was not.
     pub summary: Summary,
 }
 
-/// Global mapping up to the objects: masks propose sets of Gaussians and elect some of them, these are nested, and the nodes that masks support
-/// become the objects, whose numbers the Gaussians get. The folder needs masks and cameras.
+/// Global mapping up to the objects: masks propose sets of Gaussians and elect some of them, and those that masks support become the objects, whose
+/// numbers the Gaussians get. The folder needs masks and cameras.
 pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
     // Photos may differ in size.
     let pixels = training.iter().map(|c| (c.width * c.height) as usize).sum::<usize>() / training.len();
@@ -111,29 +110,15 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     told("proposals", proposals.len());
     let elected = election::elected(proposals, config.objects.min_views);
     told("elected", elected.len());
-    let tree = Tree::nest(&sightings, &elected);
-    told("nodes", tree.parents.len());
-    let (owners, labels) = tree.labels();
-    told("labels", owners.len());
-
-    let mut engine = fastlgs_raster::open_engine(run.device)?;
-    engine.set_state(&State::of(scene))?;
-    let mut shown = Vec::new();
-    let work = run.work("objects", training.len() as u64);
-    for camera in training {
-        let shares = engine.render_ids(frame(scene, camera, config.antialias), &labels)?;
-        let own = |label: u16| usize::from(label).checked_sub(1).map(|k| owners[k]);
-        shown.push(Shown::of(shares.smallest(own, |node| tree.parents[node.place()]), &atoms(folder, camera)?.map));
-        work.advance()?;
-    }
-    let support = support(&tree, &shown, &tables);
-    let chosen = nodes::choose(&tree, &support, pixels, &config.objects);
-    told("objects", chosen.nodes.len());
-    let object_of_label: Vec<u16> = std::iter::once(0).chain(owners.iter().map(|node| chosen.object(*node))).collect();
-    scene.object_ids = labels.iter().map(|label| object_of_label[usize::from(*label)]).collect();
+    let support = support(&sightings, &elected);
+    told("support", support.len());
+    let sets = elected.len();
+    let chosen = chosen::choose(&sightings, elected, support, pixels, &config.objects);
+    told("objects", chosen.support.len());
+    scene.object_ids.clone_from(&chosen.ids);
     let [few_views, small, unsupported, same] = chosen.dropped;
-    let summary = Summary { masks, megabytes, nodes: tree.parents.len(), few_views, small, unsupported, same };
-    Ok(Mapped { chosen, support, summary })
+    let summary = Summary { masks, megabytes, sets, overlaps: chosen.overlaps.0.len(), few_views, small, unsupported, same };
+    Ok(Mapped { chosen, summary })
 }
 
 /// Global mapping: the objects of [`map`], each embedded as the views show it.
@@ -144,41 +129,58 @@ pub fn by_consensus(
     config: &Config,
     run: &Run,
 ) -> Result<(Grid, Summary)> {
-    let Mapped { chosen, support, summary } = map(scene, folder, training, config, run)?;
-    write_maps(scene, folder, training, &chosen, config.antialias, run)?;
-    let areas: Vec<&[(u32, u32)]> = chosen.nodes.iter().map(|n| support[n.place()].areas.as_slice()).collect();
-    let (found, of_found) = embed(folder, training, &chosen, &best_views(&areas), run)?;
-    let mut grid = Grid::build(&found, &of_found, codes::lattice(chosen.nodes.len(), run.seed));
-    for (object, (parent, node)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.nodes)) {
-        let support = &support[node.place()];
+    let Mapped { chosen, summary } = map(scene, folder, training, config, run)?;
+    let lists = chosen.lists();
+    write_maps(scene, folder, training, &lists, config.antialias, run)?;
+    let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
+    let (found, of_found) = embed(folder, training, &chosen.layers(), &lists, &best_views(&areas), run)?;
+    let mut grid = Grid::build(&found, &of_found, codes::lattice(chosen.support.len(), run.seed));
+    for (object, (parent, support)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.support)) {
         (object.parent, object.support, object.views) = (*parent, support.iou, support.areas.len());
     }
+    (grid.overlaps, grid.shown) = (chosen.overlaps, chosen.shown);
     grid.set_codes(scene);
     Ok((grid, summary))
 }
 
-/// Writes the object maps of all views: at each pixel the smallest object that shows there.
-fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], chosen: &Chosen, antialias: bool, run: &Run) -> Result<()> {
+/// Writes the object maps of all views: at each pixel the id of the smallest object that shows there, and of those that stand for it the heaviest.
+fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], lists: &[Vec<u16>], antialias: bool, run: &Run) -> Result<()> {
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
-        smallest_objects(&shares, |id| chosen.parents[usize::from(id) - 1]).save(&folder.objects_path(&camera.name))?;
+        let heaviest = |(objects, pixel): (Cow<[u16]>, &[u32; KEPT])| {
+            let own = objects.first()?;
+            let ids = pixel.iter().map(|share| unpack(*share)).filter(|s| lists[usize::from(s.0)].contains(own));
+            ids.max_by_key(|(id, weight)| (*weight, Reverse(*id))).map(|s| s.0)
+        };
+        let labels = shares.held(lists).zip(&shares.pixels).map(|pixel| heaviest(pixel).unwrap_or(0)).collect();
+        LabelMap { width: shares.width, height: shares.height, labels }.save(&folder.objects_path(&camera.name))?;
     }
     Ok(())
 }
 
 /// Embeds every object as its best views show it.
-fn embed(folder: &SceneFolder, training: &[Camera], chosen: &Chosen, shown: &[Vec<usize>], run: &Run) -> Result<(Vec<Mask>, Vec<u16>)> {
+fn embed(
+    folder: &SceneFolder,
+    training: &[Camera],
+    layers: &[BTreeSet<u16>],
+    lists: &[Vec<u16>],
+    shown: &[Vec<usize>],
+    run: &Run,
+) -> Result<(Vec<Mask>, Vec<u16>)> {
     let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
-    let layers = chosen.layers();
     let work = run.work("embeddings", training.len() as u64);
     let (mut found, mut object_of, mut impressions) = (Vec::new(), Vec::new(), Vec::new());
     for (view, camera) in training.iter().enumerate() {
         let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
-        for layer in &layers {
-            let on_layer = chosen.ancestors_on(layer, |id| shown[usize::from(id) - 1].contains(&view));
+        for layer in layers {
+            let wanted = |id: &&u16| layer.contains(id) && shown[usize::from(**id) - 1].contains(&view);
+            let on_layer: Vec<u16> = lists.iter().map(|list| list.iter().find(wanted).copied().unwrap_or(0)).collect();
+            if on_layer.iter().all(|id| *id == 0) {
+                continue;
+            }
             let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
             let masks = masks::described(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
             object_of.extend(masks.iter().map(|m| m.label));
@@ -218,7 +220,7 @@ pub fn seconds_of_embedding(folder: &SceneFolder, training: &[Camera]) -> Result
     Ok(seconds * OBJECTS_A_MASK * EMBEDDED_VIEWS as f64 * masks as f64 / training.len() as f64)
 }
 
-/// What global mapping found, and why nodes of the tree are no objects.
+/// What global mapping found, and why sets are no objects.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Summary {
@@ -226,15 +228,17 @@ pub struct Summary {
     pub masks: usize,
     /// Memory that the pairs of Gaussians and masks' atoms took: what grows most.
     pub megabytes: u32,
-    /// Sets of Gaussians that the masks speak of.
-    pub nodes: usize,
-    /// Nodes that too few views show.
+    /// Sets of Gaussians that the masks elected.
+    pub sets: usize,
+    /// Ways in which objects overlap that no tree of them has.
+    pub overlaps: usize,
+    /// Sets that too few views show.
     pub few_views: usize,
-    /// Nodes that are too small.
+    /// Sets that are too small.
     pub small: usize,
-    /// Nodes that no masks support.
+    /// Sets that no masks support.
     pub unsupported: usize,
-    /// Nodes that are the same as another.
+    /// Sets that are the same as another.
     pub same: usize,
 }
 

@@ -123,6 +123,9 @@ class Scene:
     def render(self, view: Optional[View] = None, what: Literal["color", "depth", "feature", "objects"] = "color") -> NDArray[Any]:
         """color uint8 (h, w, 3), depth float32 (h, w) in units of the scene, feature float32 (h, w, 3), objects uint16 (h, w)."""
     @property
+    def object_lists(self) -> List[List[int]]:
+        """For each of the Gaussians' object_ids, 0 included, the objects that it stands for, from small to large: objects may overlap."""
+    @property
     def gaussians(self) -> Dict[str, NDArray[Any]]:
         """means, scales (n, 3), rotations (n, 4) as (w, x, y, z), opacities (n), sh (n, k, 3), features (n, 3), object_ids (n)."""
     def select(self, ids: Sequence[int]) -> NDArray[np.uint32]:

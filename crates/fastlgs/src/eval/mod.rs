@@ -321,12 +321,11 @@ fn score_label(
     let (oracle, found, id) = best_object(grid, field, &truth);
     sums.oracle_boundary.push(metrics::boundary_iou(&found, &truth, w, h, band));
     sums.ranks.entry(label.category.clone()).or_default().push(ranked.iter().position(|h| h.id == id).map_or(ranked.len(), |k| k) + 1);
-    let related = |hit: &Hit| grid.chain(hit.id).any(|a| a == id) || grid.chain(id).any(|a| a == hit.id);
     let outcome = match targets.first() {
         None => Outcome::Refused,
         _ if iou >= 0.5 * oracle && iou > 0.0 => Outcome::Right,
         Some(first) if first.id == id => Outcome::WrongMask,
-        Some(first) if related(first) => Outcome::WrongLevel,
+        Some(first) if id > 0 && grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
         Some(_) => Outcome::WrongObject,
     };
     *sums.outcomes.entry(outcome).or_default() += 1;
@@ -346,16 +345,15 @@ pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool
     tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()], 0))
 }
 
-/// The objects that come nearest to a mask by their owned pixels: one of them is the best.
+/// The objects that come nearest to a mask by their pixels: one of them is the best.
 fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
     const MOST: usize = 5;
-    let owners = field.owners(grid).labels;
     let mut counts = vec![[0usize; 2]; grid.objects.len() + 1];
-    for (owner, inside) in owners.iter().zip(truth) {
-        for id in grid.chain(*owner) {
-            counts[usize::from(id)][usize::from(*inside)] += 1;
-        }
-    }
+    let mut inside = truth.iter().map(|inside| usize::from(*inside));
+    field.each(grid, |objects| {
+        let inside = inside.next().unwrap_or(0);
+        objects.iter().for_each(|id| counts[usize::from(*id)][inside] += 1);
+    });
     let all = truth.iter().filter(|t| **t).count();
     let iou = |id: &u16| {
         let [outside, inside] = counts[usize::from(*id)];

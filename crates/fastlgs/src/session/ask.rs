@@ -103,7 +103,7 @@ impl Meaning {
                 if *x >= camera.width || *y >= camera.height {
                     bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
                 }
-                let nested: Vec<u16> = grid.chain(field.owners(grid).at(*x, *y)).collect();
+                let nested = field.at(grid, *x, *y);
                 let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
                 let targets = query::best_supported(grid, &nested).map(hit).into_iter().collect();
                 Ok(Found { ranked: nested.into_iter().map(hit).collect(), targets })

@@ -6,7 +6,7 @@ use crate::progress::TrainStep;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_grid::mapping::PaperConfig;
-use fastlgs_grid::objects as nodes;
+use fastlgs_grid::objects as chosen;
 use fastlgs_raster::budget::Removal;
 use fastlgs_raster::{Budget, Choice, FEW_VIEWS, View};
 use serde::{Deserialize, Serialize};
@@ -242,10 +242,10 @@ pub struct Config {
     #[cfg_attr(feature = "clap", arg(long, value_enum, value_delimiter = ',', default_value = "keypoints,color"))]
     pub cues: Vec<Cue>,
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = nodes::Config::default().min_support))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
     /// Global mapping: smallest object, as the share of a photo's pixels that three views must show.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = nodes::Config::default().min_share))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_share))]
     pub min_share: f32,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
@@ -260,7 +260,7 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        let (paper, objects) = (PaperConfig::default(), nodes::Config::default());
+        let (paper, objects) = (PaperConfig::default(), chosen::Config::default());
         Self {
             scene: PathBuf::new(),
             preset: Preset::default(),
@@ -328,7 +328,7 @@ impl Config {
     pub(super) fn global(&self) -> objects::Config {
         objects::Config {
             antialias: self.antialias,
-            objects: nodes::Config { min_support: self.support, min_share: self.min_share, ..nodes::Config::default() },
+            objects: chosen::Config { min_support: self.support, min_share: self.min_share, ..chosen::Config::default() },
         }
     }
 }
