@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # SAM and CLIP with random weights against their authors' programs: makes ONNX exports and what the originals answer, and compares. Needs PyPI, a
 # gigabyte for PyTorch, and some minutes; test.sh --all runs it. Python 3.8 to 3.10, which that PyTorch takes, by name or whole path as REFERENCE_PYTHON.
+# SAM 2 takes another five gigabytes, for a later PyTorch and all that this brings: only where REFERENCE_SAM2 names a Python 3.10 to 3.12 for it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${REFERENCE_PYTHON:-}
@@ -23,4 +24,17 @@ fi
 merges=${FASTLGS_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/fastlgs}/offline/bpe_simple_vocab_16e6.txt.gz
 "$venv/bin/python" -W ignore tests/reference/sam.py "$out" > /dev/null
 "$venv/bin/python" -W ignore tests/reference/clip.py "$out" "$merges" > /dev/null
+if [ -n "${REFERENCE_SAM2:-}" ]; then
+    venv=target/reference/venv-sam2
+    if [ ! -f "$venv/ready" ]; then
+        rm -rf "$venv"
+        "$REFERENCE_SAM2" -m venv "$venv"
+        "$venv/bin/pip" install --quiet 'setuptools<80' wheel torch==2.5.1 torchvision==0.20.1 hydra-core iopath tqdm onnx==1.17.0 pillow
+        SAM2_BUILD_CUDA=0 "$venv/bin/pip" install --quiet --no-build-isolation --no-deps sam2==1.1.0
+        touch "$venv/ready"
+    fi
+    "$venv/bin/python" -W ignore tests/reference/sam_two.py "$out" > /dev/null
+else
+    echo "SKIPPED: SAM 2; name a Python 3.10 to 3.12 for it: REFERENCE_SAM2=FILE tests/reference.sh"
+fi
 FASTLGS_REFERENCE=$out cargo test --release --locked -p fastlgs-vision --no-default-features --features load-ort,opencv reference:: -- --nocapture

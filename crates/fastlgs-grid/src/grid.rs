@@ -102,7 +102,7 @@ impl Grid {
 
     /// How much of the scene's surface the Gaussians of each id show, in all views together.
     pub fn surface(&self) -> Vec<f32> {
-        if self.shown.len() == self.lists().len() {
+        if self.shown.len() == usize::from(self.highest()) + 1 {
             return self.shown.clone();
         }
         // What objects show without those inside them, as far as they were measured.

@@ -117,14 +117,8 @@ pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
     };
     let around: Vec<Option<f32>> = lists.iter().map(of_place).collect();
     let mut own = vec![[0.0f32; 2]; grid.objects.len()];
-    let mode = std::env::var("PLACES").unwrap_or_default();
     for ((list, shown), place) in lists.iter().zip(&surface).zip(&around) {
-        let Some(place) = place else { continue };
-        let ids = match mode.as_str() {
-            "all" => &list[..],
-            _ => &list[..1],
-        };
-        for id in ids {
+        if let (Some(id), Some(place)) = (list.first(), place) {
             let sum = &mut own[usize::from(*id) - 1];
             *sum = [sum[0] + shown * place, sum[1] + shown];
         }

@@ -3,7 +3,8 @@
 use crate::runtime::{Array, Model};
 use crate::{Error, Result};
 use fastlgs_core::image_io;
-use image::RgbImage;
+use image::imageops::{self, FilterType};
+use image::{DynamicImage, ImageBuffer, Pixel, RgbImage};
 use std::path::Path;
 
 /// Longer side of the picture that the models were trained on.
@@ -127,8 +128,15 @@ impl Exports {
             }
             [_, Some(3), rows, _] => {
                 let side = rows.unwrap_or(SIDE);
-                let small = if self.stretched() { image_io::resize(picture, side as u32, side as u32) } else { scaled(picture, side) };
-                (planar(&small, MEAN, DEVIATION, Some(side)), size_of(&small))
+                if self.stretched() {
+                    // In floats, as the authors of SAM 2 do it; those of SAM stretch in bytes.
+                    let exact = DynamicImage::ImageRgb8(picture.clone()).into_rgb32f();
+                    let small = imageops::resize(&exact, side as u32, side as u32, FilterType::Triangle);
+                    (planar(&small, MEAN.map(|v| v / 255.0), DEVIATION.map(|v| v / 255.0), Some(side)), [side as f32; 2])
+                } else {
+                    let small = scaled(picture, side);
+                    (planar(&small, MEAN, DEVIATION, Some(side)), size_of(&small))
+                }
             }
             shape => return Err(self.encoder.refuse(format!("its input '{}' has shape {shape:?}, not that of a picture", slot.name))),
         };
@@ -239,13 +247,18 @@ fn scaled(picture: &RgbImage, side: usize) -> RgbImage {
 }
 
 /// `[1][3][rows][columns]`, normalised; padded with zeros to the right and below where a side is given.
-fn planar(picture: &RgbImage, mean: [f32; 3], deviation: [f32; 3], side: Option<usize>) -> Array {
+fn planar<S: Copy + Into<f32>, P: Pixel<Subpixel = S>>(
+    picture: &ImageBuffer<P, Vec<S>>,
+    mean: [f32; 3],
+    deviation: [f32; 3],
+    side: Option<usize>,
+) -> Array {
     let (w, h) = (picture.width() as usize, picture.height() as usize);
     let (columns, rows) = side.map_or((w, h), |s| (s, s));
     let mut values = vec![0.0; 3 * rows * columns];
     for (x, y, pixel) in picture.enumerate_pixels() {
         for k in 0..3 {
-            values[(k * rows + y as usize) * columns + x as usize] = (f32::from(pixel[k]) - mean[k]) / deviation[k];
+            values[(k * rows + y as usize) * columns + x as usize] = (pixel.channels()[k].into() - mean[k]) / deviation[k];
         }
     }
     Array::new([1, 3, rows, columns], values)

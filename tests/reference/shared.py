@@ -1,0 +1,39 @@
+"""What both Segment Anythings are asked about, and how random weights are made to answer."""
+
+import numpy as np
+import torch
+from PIL import Image
+
+FILTERS = {"points_per_side": 6, "predicted_iou": 0.8, "stability": 0.75, "crop_layers": 1}
+POINTS = np.array([[250.0, 300.0], [770.0, 510.0], [50.0, 50.0], [970.0, 710.0], [512.0, 384.0]])
+
+
+def photo():
+    """Waves of colour, and two things with borders; as long as SAM takes them, so that nothing is rounded on the way."""
+    y, x = np.mgrid[0:768, 0:1024]
+    waves = [127 + 100 * np.sin(x / 100), 127 + 100 * np.sin(y / 90 + 1), 127 + 100 * np.sin((x + y) / 150)]
+    picture = np.stack(waves, -1).astype(np.uint8)
+    picture[200:500, 130:450] = [220, 30, 30]
+    picture[380:660, 640:920] = [20, 40, 220]
+    return picture
+
+
+def lively(points, hyper, upscaling, score):
+    """Random weights give masks that no logit decides and that all prompts share: makes them larger, and smooth."""
+    with torch.no_grad():
+        for layer in hyper:
+            layer.weight.mul_(150)
+            layer.bias.mul_(150)
+        for layer in upscaling:
+            layer.weight.copy_(layer.weight[:, :, :1, :1].expand_as(layer.weight))
+        for embedding in points:
+            embedding.weight.mul_(3)
+        score.weight.mul_(3)
+        score.bias.add_(0.8)
+
+
+def save(folder, picture, points, low, scores):
+    Image.fromarray(picture).save(folder / "photo.png")
+    np.save(folder / "points.npy", points.astype(np.float32))
+    np.save(folder / "low.npy", low.numpy())
+    np.save(folder / "scores.npy", scores.numpy())
