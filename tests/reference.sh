@@ -26,15 +26,17 @@ merges=${FASTLGS_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/fastlgs}/offline/bpe_sim
 "$venv/bin/python" -W ignore tests/reference/clip.py "$out" "$merges" > /dev/null
 if [ -n "${REFERENCE_SAM2:-}" ]; then
     venv=target/reference/venv-sam2
-    if [ ! -f "$venv/ready" ]; then
+    ready=$venv/ready-$(cksum < tests/reference.sh | cut -d' ' -f1)
+    if [ ! -f "$ready" ]; then
         rm -rf "$venv"
         "$REFERENCE_SAM2" -m venv "$venv"
         "$venv/bin/pip" install --quiet 'setuptools<80' wheel torch==2.5.1 torchvision==0.20.1 hydra-core iopath tqdm onnx==1.17.0 pillow
         SAM2_BUILD_CUDA=0 "$venv/bin/pip" install --quiet --no-build-isolation --no-deps sam2==1.1.0
-        touch "$venv/ready"
+        touch "$ready"
     fi
     "$venv/bin/python" -W ignore tests/reference/sam_two.py "$out" > /dev/null
 else
+    rm -rf "$out/sam2"
     echo "SKIPPED: SAM 2; name a Python 3.10 to 3.12 for it: REFERENCE_SAM2=FILE tests/reference.sh"
 fi
 FASTLGS_REFERENCE=$out cargo test --release --locked -p fastlgs-vision --no-default-features --features load-ort,opencv reference:: -- --nocapture

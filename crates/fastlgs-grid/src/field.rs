@@ -2,8 +2,17 @@
 
 use crate::decision::decide;
 use crate::grid::Grid;
+use crate::overlaps::standing_for;
 use crate::query::Hit;
+use fastlgs_core::shares::{KEPT, unpack};
 use fastlgs_core::{LabelMap, Shares};
+
+/// At each pixel the id that stands for the objects which have most of it; `lists` are those of all ids.
+pub fn ids(shares: &Shares, lists: &[Vec<u16>]) -> LabelMap {
+    let found = |pixel: &[u32; KEPT]| pixel.map(unpack).into_iter().filter(|s| s.1 > 0).map(|(id, weight)| (id, weight as f32));
+    let labels = shares.held(lists).zip(&shares.pixels).map(|(objects, pixel)| standing_for(&objects, found(pixel), lists)).collect();
+    LabelMap { width: shares.width, height: shares.height, labels }
+}
 
 /// What a rendered view tells about objects.
 pub enum Field {
@@ -45,6 +54,14 @@ impl Field {
             place += 1;
         });
         found
+    }
+
+    /// At each pixel the id that stands for the objects which have most of it.
+    pub fn ids(&self, grid: &Grid) -> LabelMap {
+        match self {
+            Self::Shares(shares) => ids(shares, &grid.lists()),
+            Self::Features { width, height, values, tau_ac } => decide(grid, *width, *height, values, *tau_ac),
+        }
     }
 
     /// The smallest object that has most of each pixel; 0 for none.

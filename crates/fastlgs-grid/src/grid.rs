@@ -53,6 +53,9 @@ struct Row {
     count: usize,
 }
 
+/// Share of an object that lies in another one of which it is a part.
+pub const PART: f32 = 0.7;
+
 /// Support of objects in grids that earlier versions wrote.
 fn full() -> f32 {
     1.0
@@ -117,24 +120,38 @@ impl Grid {
         own.into_iter().map(|share| share.max(0.0)).collect()
     }
 
-    /// Whether an object and each other one, by number from 1 on, lie in each other: one is a part of the other, or most of the smaller lies in both.
-    pub fn related(&self, id: u16) -> Vec<bool> {
-        let (lists, surface) = (self.lists(), self.surface());
-        let mut sums = vec![[0.0f32; 2]; self.objects.len() + 1];
-        for (list, shown) in lists.iter().zip(&surface) {
-            let common = list.contains(&id);
-            list.iter().for_each(|other| {
-                let [all, shared] = &mut sums[usize::from(*other)];
+    /// By object: how much of the scene's surface it shows, and how much of that lies in one of `targets`.
+    fn common(&self, targets: &[u16]) -> Vec<[f32; 2]> {
+        let mut sums = vec![[0.0f32; 2]; self.objects.len()];
+        for (list, shown) in self.lists().iter().zip(self.surface()) {
+            let common = list.iter().any(|id| targets.contains(id));
+            list.iter().for_each(|id| {
+                let [all, shared] = &mut sums[usize::from(*id) - 1];
                 *all += shown;
-                *shared += if common { *shown } else { 0.0 };
+                *shared += if common { shown } else { 0.0 };
             });
         }
-        let own = sums.get(usize::from(id)).map_or(0.0, |sum| sum[0]);
-        let is_related = |object: &Object| {
-            let [all, shared] = sums[usize::from(object.id)];
-            2.0 * shared > all.min(own) || self.chain(id).any(|a| a == object.id) || self.chain(object.id).any(|a| a == id)
+        sums
+    }
+
+    /// By object: whether it is one of `targets` or a part of them: most of it lies in them.
+    pub fn parts(&self, targets: &[u16]) -> Vec<bool> {
+        let in_chain = |id: u16| self.chain(id).any(|above| targets.contains(&above));
+        let is_part = |([all, common], object): ([f32; 2], &Object)| {
+            targets.contains(&object.id) || if all > 0.0 { common > PART * all } else { in_chain(object.id) }
         };
-        self.objects.iter().map(is_related).collect()
+        self.common(targets).into_iter().zip(&self.objects).map(is_part).collect()
+    }
+
+    /// By object: whether it and this one are of one place: most of the smaller lies in both.
+    pub fn related(&self, id: u16) -> Vec<bool> {
+        let sums = self.common(&[id]);
+        let own = usize::from(id).checked_sub(1).and_then(|k| sums.get(k)).map_or(0.0, |sum| sum[0]);
+        let in_chain = |other: u16| self.chain(id).any(|a| a == other) || self.chain(other).any(|a| a == id);
+        let is_related = |([all, common], object): (&[f32; 2], &Object)| {
+            if all.min(own) > 0.0 { 2.0 * common > all.min(own) } else { in_chain(object.id) }
+        };
+        sums.iter().zip(&self.objects).map(is_related).collect()
     }
 
     /// For each id that Gaussians can have whether they belong to one of `targets`.
@@ -143,22 +160,23 @@ impl Grid {
         (0..=self.highest()).map(inside).collect()
     }
 
-    /// The grid without some objects and all that lies in them, and the new number of each old id; 0 where nothing is left.
+    /// The grid without some objects and their parts, and the new number of each old id; 0 where nothing is left.
     pub fn without(&self, removed: &[u16]) -> (Self, Vec<u16>) {
-        let gone = self.members(removed);
         let mut left = 0;
-        let number = |gone: &bool| {
+        let number = |gone: bool| {
             left += u16::from(!gone);
-            if *gone { 0 } else { left }
+            if gone { 0 } else { left }
         };
-        let of_object: Vec<u16> = std::iter::once(0).chain(gone[1..=self.objects.len()].iter().map(number)).collect();
-        let new = |id: u16| of_object.get(usize::from(id)).copied().unwrap_or(0);
-        let objects: Vec<Object> =
-            self.objects.iter().filter(|o| new(o.id) > 0).map(|o| Object { id: new(o.id), parent: new(o.parent), ..o.clone() }).collect();
+        let numbers: Vec<u16> = self.parts(removed).into_iter().map(number).collect();
+        let new = |id: u16| usize::from(id).checked_sub(1).and_then(|k| numbers.get(k)).copied().unwrap_or(0);
+        // The next one around it that stays.
+        let parent = |o: &Object| self.chain(o.id).skip(1).map(new).find(|above| *above > 0).unwrap_or(0);
+        let renumbered = |o: &Object| Object { id: new(o.id), parent: parent(o), ..o.clone() };
+        let objects: Vec<Object> = self.objects.iter().filter(|o| new(o.id) > 0).map(renumbered).collect();
         let parents: Vec<u16> = objects.iter().map(|o| o.parent).collect();
         let lists: Vec<Vec<u16>> = self.lists().iter().map(|list| list.iter().map(|id| new(*id)).filter(|id| *id > 0).collect()).collect();
         let surface = self.surface();
-        let (overlaps, ids) = Overlaps::of(lists, &parents, &surface);
+        let (overlaps, ids) = Overlaps::of(&lists, &parents, &surface, 1.0);
         let mut left = Self { objects, overlaps, shown: Vec::new() };
         left.shown = vec![0.0; usize::from(left.highest()) + 1];
         ids.iter().zip(surface).for_each(|(id, shown)| left.shown[usize::from(*id)] += shown);
@@ -252,11 +270,16 @@ impl Grid {
         let values = |name: &str| tensors.get(name).map_or(&[][..], |t| t.1.as_slice());
         let overlaps = values("overlaps");
         let known = |id: &f32| id.fract() == 0.0 && (0.0..=objects.len() as f32).contains(id);
-        let are_lists = overlaps.iter().all(known) && overlaps.last().is_none_or(|id| *id == 0.0);
-        let lists = overlaps.split_inclusive(|id| *id == 0.0).map(|list| list[..list.len() - 1].iter().map(|id| *id as u16).collect());
-        let grid = Self { objects, overlaps: Overlaps(lists.collect()), shown: values("shown").to_vec() };
+        let falls = |list: &[f32]| list.len() > 1 && list.last() == Some(&0.0) && list.is_sorted_by(|a, b| a > b);
+        let are_lists = overlaps.iter().all(known) && overlaps.split_inclusive(|id| *id == 0.0).all(falls);
+        let lists = overlaps.split(|id| *id == 0.0).filter(|list| !list.is_empty());
+        let lists = lists.map(|list| list.iter().map(|id| *id as u16).collect()).collect();
+        let grid = Self { objects, overlaps: Overlaps(lists), shown: values("shown").to_vec() };
         if !are_lists || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
-            return Err(Error::format(&path, "its overlaps name objects that grid.json lacks; train the scene again").into());
+            return Err(Error::format(&path, "its overlaps are no lists of the objects in grid.json; train the scene again").into());
+        }
+        if grid.objects.iter().zip(1..=u16::MAX).any(|(object, id)| object.id != id) || !grid.shown.iter().all(|shown| *shown >= 0.0) {
+            return Err(Error::format(root.join("grid.json"), "its objects are not numbered 1, 2, ...; train the scene again").into());
         }
         Ok(grid)
     }

@@ -1,7 +1,7 @@
 //! Global mapping, last step: the sets that the photos' masks support become the objects, which may overlap.
 
 use crate::consensus::Proposal;
-use crate::overlaps::Overlaps;
+use crate::overlaps::{self, Overlaps};
 use crate::sightings::Sightings;
 use crate::support::Support;
 use std::collections::BTreeSet;
@@ -109,8 +109,9 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
         chosen.parents.push(around.max().unwrap_or(0));
         holders.add(place, &set.set);
     }
-    let lists = holders.of.into_iter().map(|objects| objects.into_iter().rev().map(|place| place as u16 + 1).collect());
-    (chosen.overlaps, chosen.ids) = Overlaps::of(lists.collect(), &chosen.parents, &weights);
+    let list = |objects: Vec<u32>| objects.into_iter().rev().map(|place| place as u16 + 1).collect();
+    let lists: Vec<Vec<u16>> = holders.of.into_iter().map(list).collect();
+    (chosen.overlaps, chosen.ids) = Overlaps::of(&lists, &chosen.parents, &weights, overlaps::KEPT);
     chosen.shown = vec![0.0; 1 + chosen.parents.len() + chosen.overlaps.0.len()];
     chosen.ids.iter().zip(&weights).for_each(|(id, weight)| chosen.shown[usize::from(*id)] += weight / pixels as f32);
     chosen.support = objects.into_iter().map(|o| o.2).collect();
@@ -135,13 +136,18 @@ impl Holders {
 
     /// The sets that share Gaussians with this one, and the weight of these.
     fn common(&mut self, set: &[u32], weights: &[f32]) -> Vec<(usize, f32)> {
-        let mut met = BTreeSet::new();
+        let mut met = Vec::new();
         for g in set {
             for other in &self.of[*g as usize] {
-                met.insert(*other as usize);
-                self.sums[*other as usize] += weights[*g as usize];
+                let sum = &mut self.sums[*other as usize];
+                if *sum == 0.0 {
+                    met.push(*other as usize);
+                }
+                *sum += weights[*g as usize];
             }
         }
+        met.sort_unstable();
+        met.dedup();
         met.into_iter().map(|other| (other, std::mem::take(&mut self.sums[other]))).collect()
     }
 }

@@ -9,35 +9,70 @@ use std::collections::BTreeMap;
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overlaps(pub Vec<Vec<u16>>);
 
+/// Share of the weight whose lists are kept as they are: at borders a few Gaussians each have a list of their own.
+pub const KEPT: f32 = 0.98;
+
 impl Overlaps {
-    /// The number of each list of objects, which fall; `parents` by object. Numbers have 16 bits: where more are needed, the lists of least weight
-    /// are taken for their smallest object and what is above it.
-    pub fn of(lists: Vec<Vec<u16>>, parents: &[u16], weights: &[f32]) -> (Self, Vec<u16>) {
+    /// The number of each list of objects, which fall; `parents` by object. The lists of most weight are kept, as many as make up this share of
+    /// it and 16 bits can number, and the others are taken for the one that has most in common with them.
+    pub fn of(lists: &[Vec<u16>], parents: &[u16], weights: &[f32], share: f32) -> (Self, Vec<u16>) {
         let mut found: BTreeMap<&[u16], f32> = BTreeMap::new();
-        for (list, weight) in lists.iter().zip(weights).filter(|(list, _)| **list != nested(list, parents)) {
-            *found.entry(list).or_default() += weight;
-        }
+        lists.iter().zip(weights).filter(|(list, _)| !list.is_empty()).for_each(|(list, weight)| *found.entry(list).or_default() += weight);
         let mut order: Vec<(&[u16], f32)> = found.into_iter().collect();
         order.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(b.0)));
-        order.truncate(usize::from(u16::MAX) - parents.len());
-        let number: BTreeMap<&[u16], u16> = order.iter().map(|o| o.0).zip(1 + parents.len() as u16..).collect();
-        let of = |list: &Vec<u16>| number.get(list.as_slice()).copied().unwrap_or_else(|| list.first().copied().unwrap_or(0));
-        let ids = lists.iter().map(of).collect();
-        (Self(order.into_iter().map(|o| o.0.to_vec()).collect()), ids)
+        let all: f32 = order.iter().map(|o| o.1).sum();
+
+        let chains: Vec<Vec<u16>> = (1..=parents.len() as u16).map(|id| nested(id, parents)).collect();
+        let mut number: BTreeMap<&[u16], u16> = chains.iter().map(Vec::as_slice).zip(1..).collect();
+        let (mut kept, mut sum) = (Vec::new(), 0.0);
+        for (list, weight) in &order {
+            let next = parents.len() + kept.len() + 1;
+            if sum <= share * all && next <= usize::from(u16::MAX) && !number.contains_key(list) {
+                number.insert(list, next as u16);
+                kept.push(list.to_vec());
+            }
+            sum += weight;
+        }
+
+        let mut holders: Vec<Vec<(&[u16], u16)>> = vec![Vec::new(); parents.len() + 1];
+        for (list, number) in &number {
+            list.iter().for_each(|id| holders[usize::from(*id)].push((list, *number)));
+        }
+        // Among those that hold its smallest object.
+        let nearest = |list: &[u16]| {
+            let alike = |other: &[u16]| {
+                let common = list.iter().filter(|id| other.contains(id)).count();
+                common as f32 / (list.len() + other.len() - common) as f32
+            };
+            let others = holders[usize::from(list[0])].iter().map(|(other, number)| (alike(other), *number));
+            others.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))).map_or(0, |other| other.1)
+        };
+        let of_list: BTreeMap<&[u16], u16> =
+            order.iter().map(|(list, _)| (*list, number.get(list).copied().unwrap_or_else(|| nearest(list)))).collect();
+        let ids = lists.iter().map(|list| of_list.get(list.as_slice()).copied().unwrap_or(0)).collect();
+        (Self(kept), ids)
     }
 
     /// For each number, 0 included, the objects that it stands for, from small to large.
     pub fn lists(&self, parents: &[u16]) -> Vec<Vec<u16>> {
-        let objects = (0..=parents.len() as u16).map(|id| nested(&[id], parents));
+        let objects = (0..=parents.len() as u16).map(|id| nested(id, parents));
         objects.chain(self.0.iter().cloned()).collect()
     }
 }
 
-/// The first object of a list and all above it; nothing for object 0.
-fn nested(list: &[u16], parents: &[u16]) -> Vec<u16> {
-    let first = list.first().copied().filter(|id| *id > 0);
+/// The number that stands for objects of a place, which fall: of the numbers found there, with their weights, the heaviest for these very objects, else
+/// for one of which they are the smallest; else the smallest itself.
+pub fn standing_for(objects: &[u16], found: impl Iterator<Item = (u16, f32)>, lists: &[Vec<u16>]) -> u16 {
+    let Some(smallest) = objects.first() else { return 0 };
+    let list = |id: u16| lists.get(usize::from(id)).map_or(&[][..], Vec::as_slice);
+    let fitting = found.filter(|(id, _)| list(*id).first() == Some(smallest)).map(|(id, weight)| (list(id) == objects, weight, id));
+    fitting.max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(b.2.cmp(&a.2))).map_or(*smallest, |best| best.2)
+}
+
+/// An object and all above it; nothing for object 0.
+fn nested(id: u16, parents: &[u16]) -> Vec<u16> {
     let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|above| (1..*id).contains(above));
-    std::iter::successors(first, up).collect()
+    std::iter::successors(Some(id).filter(|id| *id > 0), up).collect()
 }
 
 #[cfg(test)]
@@ -49,9 +84,27 @@ mod tests {
         // 2 and 3 lie in 1; some of 3 lies in 2 as well, and some of 2 reaches out of 1.
         let parents = [0, 1, 1];
         let lists = vec![vec![], vec![1], vec![2, 1], vec![3, 2, 1], vec![2], vec![3, 1], vec![2]];
-        let (overlaps, ids) = Overlaps::of(lists.clone(), &parents, &[1.0; 7]);
+        let (overlaps, ids) = Overlaps::of(&lists, &parents, &[1.0; 7], 1.0);
         assert_eq!((ids.as_slice(), &overlaps), (&[0, 1, 2, 5, 4, 3, 4][..], &Overlaps(vec![vec![2], vec![3, 2, 1]])));
         let all = overlaps.lists(&parents);
         assert_eq!(ids.iter().map(|id| all[usize::from(*id)].clone()).collect::<Vec<_>>(), lists);
+    }
+
+    #[test]
+    fn rare_lists_are_taken_for_what_is_nearest() {
+        let parents = [0, 0, 0];
+        let lists = vec![vec![3, 2, 1], vec![3, 2], vec![3, 1], vec![3], vec![2, 1]];
+        let (overlaps, ids) = Overlaps::of(&lists, &parents, &[1.0, 50.0, 0.5, 50.0, 0.1], 0.98);
+        assert_eq!((overlaps.0, ids), (vec![vec![3, 2]], vec![4, 4, 3, 3, 2]));
+    }
+
+    #[test]
+    fn a_place_keeps_a_number_for_its_own_objects() {
+        let lists = [vec![], vec![1], vec![2, 1], vec![3, 2], vec![3, 1]];
+        let number = |objects: &[u16], found: &[(u16, f32)]| standing_for(objects, found.iter().copied(), &lists);
+        assert_eq!(number(&[2, 1], &[(3, 9.0), (2, 1.0)]), 2, "3 lies in a smaller object");
+        assert_eq!(number(&[3, 1], &[(3, 9.0), (4, 1.0)]), 4);
+        assert_eq!(number(&[3, 2, 1], &[(3, 2.0), (4, 1.0)]), 3);
+        assert_eq!((number(&[1], &[(3, 2.0), (2, 1.0)]), number(&[], &[(3, 2.0)])), (1, 0));
     }
 }

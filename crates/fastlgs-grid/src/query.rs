@@ -67,7 +67,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let cosines: Vec<Option<f32>> = grid.objects.iter().map(|object| mean_cosine(object, query)).collect();
     let of_place = |list: &Vec<u16>| mean_of(list.iter().filter_map(|id| cosines[usize::from(*id) - 1])).map_or(-1.0, |m| m.0);
     let around: Vec<f32> = lists.iter().map(of_place).collect();
-    let (shares, margins) = (sums(grid, &lists, &surface), places(grid, query));
+    let (shares, margins) = (sums(grid, &lists, &surface), margins_of_places(grid, &lists, &surface, query));
     let all_over = sums(grid, &lists, &around.iter().zip(&surface).map(|(place, share)| place * share).collect::<Vec<_>>());
     let total = surface[1..].iter().sum::<f32>().max(LEAST);
     let anything = |object: &Object| mean_over_views(object, |e| query.canonical(e));
@@ -107,8 +107,11 @@ fn sums(grid: &Grid, lists: &[Vec<u16>], values: &[f32]) -> Vec<f32> {
 /// embeddings say, as far as they are believed, and else the mean of all that a place lies in. A mean of many varies less than one alone, so that
 /// it is stretched to vary as much: else things that lie in nothing would be found where those that lie in many are not.
 pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
+    margins_of_places(grid, &grid.lists(), &grid.surface(), query)
+}
+
+fn margins_of_places(grid: &Grid, lists: &[Vec<u16>], surface: &[f32], query: &TextQuery) -> Vec<f32> {
     let calibration = &query.calibration;
-    let (lists, surface) = (grid.lists(), grid.surface());
     let margins: Vec<Option<f32>> = grid.objects.iter().map(|object| margin(object, query)).collect();
     let trust = calibration.trust();
     let of_place = |list: &Vec<u16>| {
@@ -117,7 +120,7 @@ pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
     };
     let around: Vec<Option<f32>> = lists.iter().map(of_place).collect();
     let mut own = vec![[0.0f32; 2]; grid.objects.len()];
-    for ((list, shown), place) in lists.iter().zip(&surface).zip(&around) {
+    for ((list, shown), place) in lists.iter().zip(surface).zip(&around) {
         if let (Some(id), Some(place)) = (list.first(), place) {
             let sum = &mut own[usize::from(*id) - 1];
             *sum = [sum[0] + shown * place, sum[1] + shown];
@@ -202,24 +205,26 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     let Some(best) = ranked.first().filter(|_| best_score(ranked) >= config.min_score()) else { return Vec::new() };
     let first = of(best);
     let mut chosen = vec![*best];
+    let mut taken = grid.related(best.id);
     for hit in &ranked[1..] {
         let own = of(hit);
         if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
         let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
-        let lies_in = |related: Vec<bool>| chosen.iter().any(|other| related[usize::from(other.id) - 1]);
-        if alike && hit.score >= config.min_score() && !lies_in(grid.related(hit.id)) {
+        if alike && hit.score >= config.min_score() && !taken[usize::from(hit.id) - 1] {
             chosen.push(*hit);
+            taken.iter_mut().zip(grid.related(hit.id)).for_each(|(taken, related)| *taken |= related);
         }
     }
     chosen
 }
 
-/// The part of the `targets` that is meant, going down their trees; nothing where no part is found.
+/// The part of the `targets` that is meant, among all that lies in them; nothing where no part is found.
 pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Option<Found> {
-    let inside = |id: u16| grid.chain(id).skip(1).any(|above| targets.iter().any(|t| t.id == above));
-    let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside(h.id)).collect();
+    let whole: Vec<u16> = targets.iter().map(|t| t.id).collect();
+    let inside = grid.parts(&whole);
+    let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside[usize::from(h.id) - 1] && !whole.contains(&h.id)).collect();
     let parts = select(grid, &below, query, config);
     (!parts.is_empty()).then_some(Found { ranked: below, targets: parts })
 }

@@ -14,11 +14,6 @@ pub struct Support {
 }
 
 impl Support {
-    /// Sum of the pixels of all views.
-    pub fn pixels(&self) -> f32 {
-        self.areas.iter().map(|a| a.0 as f32).sum()
-    }
-
     /// The pixels that so many views show at least; 0 where fewer show it.
     pub fn reached_by(&self, count: usize) -> u32 {
         let mut areas: Vec<u32> = self.areas.iter().map(|a| a.0).collect();
@@ -57,7 +52,7 @@ mod tests {
         let sets = [0..2, 1..2, 0..4, 4..5, 0..5].map(|set| Proposal { set: set.collect(), masks: Vec::new() });
         let found = support(&sightings, &sets);
         assert_eq!(found.iter().map(|s| s.iou).collect::<Vec<_>>(), [1.0, 0.5, 1.0, 0.0, 0.8]);
-        assert_eq!((found[2].areas.clone(), found[2].pixels()), (vec![(400, 0), (400, 1), (400, 2)], 1200.0));
+        assert_eq!(found[2].areas, [(400, 0), (400, 1), (400, 2)]);
         assert_eq!((found[2].reached_by(3), found[2].reached_by(4)), (400, 0));
     }
 }

@@ -40,7 +40,7 @@ function say(text, absent = false) {
 // Shows the state: in the picture, in the lists, and on the buttons.
 function update() {
   const { selected, hidden, only, scores, text } = state;
-  stage.setObjects({ selected, hidden, only, scores, text, list: objects.colored(), members: objects.chain });
+  stage.setObjects({ selected, hidden, only, scores, text, list: objects.colored, members: objects.chain });
   const options = { selected, hidden, minScore: scene.min_score, choose: (id) => select([id]) };
   const rows = state.ranked ?? objects.parts(0).map((id) => ({ id }));
   $("list-title").textContent = state.ranked ? `Most relevant to "${state.text}"` : "Objects";

@@ -15,6 +15,8 @@ export class Objects {
     for (const ids of this.children.values()) ids.sort(bySize);
     this.pictures = new Map();
     this.chain = this.chain.bind(this);
+    // All ids that Gaussians have, with the color of the smallest object that each stands for.
+    this.colored = list.concat(overlaps.map(([smallest], k) => ({ id: list.length + 1 + k, color: this.byId.get(smallest).color })));
   }
 
   // An object and what contains it, from small to large; those that a Gaussian of this id lies in.
@@ -23,13 +25,6 @@ export class Objects {
     const chain = [];
     for (let own = this.byId.get(id); own && !chain.includes(own.id); own = this.byId.get(own.parent)) chain.push(own.id);
     return chain;
-  }
-
-  // All ids that Gaussians have, with the color of the smallest object that each stands for.
-  colored() {
-    const color = (id) => this.byId.get(this.chain(id)[0]).color;
-    const rest = this.overlaps.map((_, k) => ({ id: this.list.length + 1 + k, color: color(this.list.length + 1 + k) }));
-    return [...this.list, ...rest];
   }
 
   // Whether the middle of an object lies in the picture.

@@ -3,18 +3,16 @@
 use crate::error::{Context, bail};
 use crate::{Result, Run, eyes, masks};
 use fastlgs_core::mask_list::{Atoms, Table};
-use fastlgs_core::shares::{KEPT, unpack};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as chosen, Chosen};
 use fastlgs_grid::sightings::{Sighting, Sightings};
 use fastlgs_grid::support::support;
-use fastlgs_grid::{Grid, codes, consensus, election, evidence};
+use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
 use serde::{Deserialize, Serialize};
-use std::borrow::Cow;
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -68,15 +66,24 @@ fn frame(scene: &Gaussians, camera: &Camera, antialias: bool) -> View {
     View { antialias: u32::from(antialias), ..View::new(camera, scene.len(), 0) }
 }
 
-/// Gives every Gaussian the object of the views' object maps that most of its blending weight falls on, and that object's code.
+/// Gives every Gaussian the objects of the views' object maps that most of its blending weight falls on, and the smallest one's code.
 pub fn lift(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], grid: &Grid, antialias: bool) -> Result<()> {
+    let lists = grid.lists();
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
     for camera in training {
         for vote in lift::votes(scene, &frame(scene, camera, antialias), &folder.objects(&camera.name)?) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }
     }
-    let most = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).map_or(0, |(id, _)| *id);
+    let most = |found: &BTreeMap<u16, f32>| {
+        let mut sums: BTreeMap<Reverse<u16>, f32> = BTreeMap::new();
+        for (id, weight) in found {
+            lists[usize::from(*id)].iter().for_each(|object| *sums.entry(Reverse(*object)).or_default() += weight);
+        }
+        let all: f32 = found.values().sum();
+        let objects: Vec<u16> = sums.into_iter().filter(|(_, sum)| 2.0 * sum > all).map(|(object, _)| object.0).collect();
+        overlaps::standing_for(&objects, found.iter().map(|(id, weight)| (*id, *weight)), &lists)
+    };
     scene.object_ids = weights.iter().map(most).collect();
     grid.set_codes(scene);
     Ok(())
@@ -143,19 +150,13 @@ pub fn by_consensus(
     Ok((grid, summary))
 }
 
-/// Writes the object maps of all views: at each pixel the id of the smallest object that shows there, and of those that stand for it the heaviest.
+/// Writes the object maps of all views: at each pixel the id that stands for the objects there.
 fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], lists: &[Vec<u16>], antialias: bool, run: &Run) -> Result<()> {
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
-        let heaviest = |(objects, pixel): (Cow<[u16]>, &[u32; KEPT])| {
-            let own = objects.first()?;
-            let ids = pixel.iter().map(|share| unpack(*share)).filter(|s| lists[usize::from(s.0)].contains(own));
-            ids.max_by_key(|(id, weight)| (*weight, Reverse(*id))).map(|s| s.0)
-        };
-        let labels = shares.held(lists).zip(&shares.pixels).map(|pixel| heaviest(pixel).unwrap_or(0)).collect();
-        LabelMap { width: shares.width, height: shares.height, labels }.save(&folder.objects_path(&camera.name))?;
+        field::ids(&shares, lists).save(&folder.objects_path(&camera.name))?;
     }
     Ok(())
 }
@@ -176,11 +177,11 @@ fn embed(
         let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
         for layer in layers {
-            let wanted = |id: &&u16| layer.contains(id) && shown[usize::from(**id) - 1].contains(&view);
-            let on_layer: Vec<u16> = lists.iter().map(|list| list.iter().find(wanted).copied().unwrap_or(0)).collect();
-            if on_layer.iter().all(|id| *id == 0) {
+            let wanted: BTreeSet<u16> = layer.iter().copied().filter(|id| shown[usize::from(*id) - 1].contains(&view)).collect();
+            if wanted.is_empty() {
                 continue;
             }
+            let on_layer: Vec<u16> = lists.iter().map(|list| list.iter().find(|id| wanted.contains(id)).copied().unwrap_or(0)).collect();
             let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
             let masks = masks::described(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
             object_of.extend(masks.iter().map(|m| m.label));

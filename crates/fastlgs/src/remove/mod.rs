@@ -125,7 +125,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
 
     let (left_over, ids) = grid.without(&objects);
     for id in &mut session.gaussians.object_ids {
-        *id = ids[usize::from(*id)];
+        *id = ids.get(usize::from(*id)).copied().unwrap_or(0);
     }
     let what = config.text.clone().unwrap_or_else(|| format!("object {}", objects[0]));
     folder::write(&config.output, &mut session, &left_over, &hidden, &what)?;
@@ -187,7 +187,7 @@ fn fill(
         Membrane::span(&mut inverse, &gap, width);
         let mut colors = session.render(camera)?.channels(0, 3).to_vec();
         inpainter.fill(&mut colors, &gap, camera.width)?;
-        let ids = membrane::continued(&session.field(camera, None)?.owners(grid).labels, &gap, width);
+        let ids = membrane::continued(&session.field(camera, None)?.ids(grid).labels, &gap, width);
         let to_world = camera.world_to_camera.inverse();
         let mut scene = session.gaussians.clone();
         for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {

@@ -39,12 +39,12 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     Ok(first)
 }
 
-/// Codes of objects as pictures have them, the first object's first.
+/// The code of each id that object maps show, 0 included, as pictures have it.
 type Codes = Arc<Vec<[u8; 3]>>;
 
 /// The codes that views are trained towards.
 pub fn codes(grid: &Grid) -> Codes {
-    Arc::new(grid.objects.iter().map(|object| object.code.to_array().map(|v| (v * 255.0).round() as u8)).collect())
+    Arc::new((0..=grid.highest()).map(|id| grid.code_of(id).to_array().map(|v| (v * 255.0).round() as u8)).collect())
 }
 
 /// The views of `cameras` as they are trained towards; `gain` tells how bright each photo is against the mean.
@@ -84,7 +84,7 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, back
     });
     let color = color.collect();
     // What no mask covers is trained towards nothing.
-    let code = |codes: &Codes, id: u16| codes.get(usize::from(id).wrapping_sub(1)).copied().unwrap_or_default();
+    let code = |codes: &Codes, id: u16| codes.get(usize::from(id)).copied().unwrap_or_default();
     let feature = match codes {
         None => Vec::new(),
         Some(codes) => {
