@@ -1,8 +1,9 @@
-//! What must hold for any input: round trips, identities of the measures, invariants of label maps and of the object tree.
+//! What must hold for any input: round trips, identities of the measures, invariants of label maps and of objects.
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::gaussians::rest_len;
-use fastlgs_core::{Camera, Gaussians, LabelMap, metrics, ply, sog, spz};
+use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, metrics, ply, sog, spz};
+use fastlgs_grid::overlaps::Overlaps;
 use fastlgs_grid::{Grid, codes, grid::Object};
 use glam::{Quat, Vec3};
 use proptest::prelude::*;
@@ -176,6 +177,41 @@ proptest! {
             prop_assert_eq!(members[usize::from(other)], grid.chain(other).any(|a| a == id));
         }
         prop_assert!(!members[0]);
+    }
+
+    #[test]
+    fn objects_that_overlap_keep_their_lists(parents in tree(), raw in prop::collection::vec((any::<u32>(), 1u8..20), 1..40), pick in any::<u16>()) {
+        let count = parents.len() as u16;
+        let lists: Vec<Vec<u16>> = raw.iter().map(|(bits, _)| (1..=count).rev().filter(|id| bits >> id & 1 > 0).collect()).collect();
+        let weights: Vec<f32> = raw.iter().map(|r| f32::from(r.1)).collect();
+        let (overlaps, ids) = Overlaps::of(&lists, &parents, &weights, 1.0);
+        let mut grid = Grid { overlaps, ..grid(&parents) };
+        grid.shown = vec![0.0; usize::from(grid.highest()) + 1];
+        ids.iter().zip(&weights).for_each(|(id, weight)| grid.shown[usize::from(*id)] += weight);
+        for (id, list) in ids.iter().zip(&lists) {
+            prop_assert_eq!(&grid.chain(*id).collect::<Vec<_>>(), list);
+        }
+        let dir = tempfile::tempdir().expect("a folder");
+        let folder = SceneFolder::new(dir.path());
+        grid.save(&folder).expect("it can be written");
+        prop_assert_eq!(&Grid::load(&folder).expect("it can be read"), &grid);
+
+        let own = pick % count + 1;
+        let (members, related) = (grid.members(&[own]), grid.related(own));
+        for (id, list) in ids.iter().zip(&lists) {
+            prop_assert_eq!(members[usize::from(*id)], list.contains(&own));
+        }
+        for other in 1..=count {
+            prop_assert_eq!(related[usize::from(other) - 1], grid.related(other)[usize::from(own) - 1], "{} and {}", own, other);
+        }
+        let gone = grid.parts(&[own]);
+        let (left, new) = grid.without(&[own]);
+        let stay: Vec<u16> = (1..=count).filter(|id| !gone[usize::from(*id) - 1]).collect();
+        for (id, list) in ids.iter().zip(&lists) {
+            let after: Vec<u16> = left.chain(new[usize::from(*id)]).map(|id| stay[usize::from(id) - 1]).collect();
+            prop_assert_eq!(after, list.iter().copied().filter(|id| stay.contains(id)).collect::<Vec<_>>());
+        }
+        prop_assert_eq!(left.shown.iter().sum::<f32>(), grid.shown.iter().sum::<f32>());
     }
 
     #[test]

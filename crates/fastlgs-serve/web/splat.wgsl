@@ -3,7 +3,7 @@
 //
 // splats   [n][2 + ceil(rest / 4)] texels of four u32, row by row (src/serve/splats.rs):
 //          (mean.xyz, log-scales xy) (log-scale z and opacity, colour, rotation, rotation and object id) (SH coefficients ...)
-// objects  [512][256] texels: rows 0..256 the state of object id = 256 row + column: relevancy, selected, hidden;
+// objects  [512][256] texels: rows 0..256 the state of the Gaussians' id = 256 row + column (an object, or a list of objects): relevancy, selected, hidden;
 //          rows 256.. its colour
 #import view
 #import rotation

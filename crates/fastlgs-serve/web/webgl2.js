@@ -97,7 +97,7 @@ export async function openWebGl2(canvas, evenSlow) {
       gl.blitFramebuffer(...all, ...all, gl.COLOR_BUFFER_BIT, gl.NEAREST);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     },
-    // The object id at a pixel of the canvas.
+    // The Gaussians' id at a pixel of the canvas, which stands for the objects there.
     async pick(frame, x, y) {
       bind(ids, gl.RGBA8, frame);
       gl.disable(gl.BLEND);

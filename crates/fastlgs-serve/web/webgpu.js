@@ -101,7 +101,7 @@ export async function openWebGpu(canvas, evenSlow) {
       last.end();
       device.queue.submit([encoder.finish()]);
     },
-    // The object id at a pixel of the canvas.
+    // The Gaussians' id at a pixel of the canvas, which stands for the objects there.
     async pick(frame, x, y) {
       device.queue.writeBuffer(uniform, 0, packFrame({ ...frame, mode: "ids", splats }));
       const target = device.createTexture({

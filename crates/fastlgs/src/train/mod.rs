@@ -124,6 +124,9 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let mut summary = None;
     let grid = match known {
         Some(found) if by_descent => {
+            if !found.overlaps.0.is_empty() {
+                run.warn("a feature tells one object of those that overlap at a place: the smallest, and what contains it; --feature-mode lift keeps them all");
+            }
             nearest_codes(&mut scene, &found);
             found
         }
