@@ -154,9 +154,11 @@ pub fn by_consensus(
 fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], lists: &[Vec<u16>], antialias: bool, run: &Run) -> Result<()> {
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
+    let work = run.work("objects", training.len() as u64);
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
         field::ids(&shares, lists).save(&folder.objects_path(&camera.name))?;
+        work.advance()?;
     }
     Ok(())
 }
