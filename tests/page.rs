@@ -336,8 +336,9 @@ fn a_large_scene_is_seen_soon() {
     fastlgs_core::ply::write(&folder.ply_path(), &many).expect("a file");
     let served = Served::start(&["serve", text(&large), "--bind", "0", "--device", "cpu"]);
     for (way, flags) in [("pictures", &[][..]), ("webgl2", &["--enable-unsafe-swiftshader"][..])] {
-        let browser = Browser::open(window().0, window().1, flags);
+        // A new browser each time, which has kept nothing.
         let seen = || {
+            let browser = Browser::open(window().0, window().1, flags);
             browser.go(&format!("{}/?renderer={way}", served.url));
             browser.wait_for("window.fastlgs?.stage.firstPicture");
             browser.run("return fastlgs.stage.firstPicture;").as_f64().expect("milliseconds")
