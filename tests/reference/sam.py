@@ -7,14 +7,12 @@ scores.npy (n, masks); for the authors' also what their generator of masks makes
 predicted IoU, stability), with filters.json.
 """
 
-import json
 import pathlib
 import sys
 from functools import partial
 
-import numpy as np
 import torch
-from shared import FILTERS, POINTS, lively, photo, save
+from shared import FILTERS, POINTS, lively, photo, save, save_found
 
 
 def authors(folder, picture, points):
@@ -56,20 +54,7 @@ def authors(folder, picture, points):
         low, scores = sam.mask_decoder.predict_masks(predictor.features, sam.prompt_encoder.get_dense_pe(), sparse, dense)
     save(folder, picture, points, low, scores)
 
-    # Suppression is left out: of boxes that are all alike it would leave what small differences decide.
-    generator = SamAutomaticMaskGenerator(
-        sam,
-        points_per_side=FILTERS["points_per_side"],
-        pred_iou_thresh=FILTERS["predicted_iou"],
-        stability_score_thresh=FILTERS["stability"],
-        crop_n_layers=FILTERS["crop_layers"],
-        box_nms_thresh=1.0,
-        crop_nms_thresh=1.0,
-    )
-    found = generator.generate(picture)
-    np.save(folder / "masks.npy", np.stack([mask["segmentation"] for mask in found]).astype(np.uint8))
-    np.save(folder / "told.npy", np.array([[mask["predicted_iou"], mask["stability_score"]] for mask in found], np.float32))
-    (folder / "filters.json").write_text(json.dumps(FILTERS))
+    save_found(folder, picture, partial(SamAutomaticMaskGenerator, sam), FILTERS)
 
 
 def transformers(folder, picture, points):

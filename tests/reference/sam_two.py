@@ -5,13 +5,12 @@
 writes OUT/sam2/ with the files that sam.py writes for the first one; masks are those of prompts that may mean several things.
 """
 
-import json
 import pathlib
 import sys
+from functools import partial
 
-import numpy as np
 import torch
-from shared import FILTERS, POINTS, lively, photo, save
+from shared import FILTERS, POINTS, lively, photo, save, save_found
 
 from sam2.automatic_mask_generator import SAM2AutomaticMaskGenerator
 from sam2.build_sam import build_sam2
@@ -110,19 +109,7 @@ def main():
         )
     save(folder, picture, POINTS, low, scores)
 
-    generator = SAM2AutomaticMaskGenerator(
-        sam,
-        points_per_side=FILTERS["points_per_side"],
-        pred_iou_thresh=FILTERS["predicted_iou"],
-        stability_score_thresh=FILTERS["stability"],
-        crop_n_layers=FILTERS["crop_layers"],
-        box_nms_thresh=1.0,
-        crop_nms_thresh=1.0,
-    )
-    found = generator.generate(picture)
-    np.save(folder / "masks.npy", np.stack([mask["segmentation"] for mask in found]).astype(np.uint8))
-    np.save(folder / "told.npy", np.array([[mask["predicted_iou"], mask["stability_score"]] for mask in found], np.float32))
-    (folder / "filters.json").write_text(json.dumps(FILTERS))
+    save_found(folder, picture, partial(SAM2AutomaticMaskGenerator, sam), FILTERS)
 
 
 main()

@@ -1,5 +1,7 @@
 """What both Segment Anythings are asked about, and how random weights are made to answer."""
 
+import json
+
 import numpy as np
 import torch
 from PIL import Image
@@ -37,3 +39,19 @@ def save(folder, picture, points, low, scores):
     np.save(folder / "points.npy", points.astype(np.float32))
     np.save(folder / "low.npy", low.numpy())
     np.save(folder / "scores.npy", scores.numpy())
+
+
+def save_found(folder, picture, generator_with, filters):
+    """What an original's generator of masks finds. Suppression is left out: of boxes that are all alike it would leave what small differences decide."""
+    generator = generator_with(
+        points_per_side=filters["points_per_side"],
+        pred_iou_thresh=filters["predicted_iou"],
+        stability_score_thresh=filters["stability"],
+        crop_n_layers=filters["crop_layers"],
+        box_nms_thresh=1.0,
+        crop_nms_thresh=1.0,
+    )
+    found = generator.generate(picture)
+    np.save(folder / "masks.npy", np.stack([mask["segmentation"] for mask in found]).astype(np.uint8))
+    np.save(folder / "told.npy", np.array([[mask["predicted_iou"], mask["stability_score"]] for mask in found], np.float32))
+    (folder / "filters.json").write_text(json.dumps(filters))

@@ -177,10 +177,8 @@ impl Grid {
         let lists: Vec<Vec<u16>> = self.lists().iter().map(|list| list.iter().map(|id| new(*id)).filter(|id| *id > 0).collect()).collect();
         let surface = self.surface();
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &surface, 1.0);
-        let mut left = Self { objects, overlaps, shown: Vec::new() };
-        left.shown = vec![0.0; usize::from(left.highest()) + 1];
-        ids.iter().zip(surface).for_each(|(id, shown)| left.shown[usize::from(*id)] += shown);
-        (left, ids)
+        let shown = overlaps.sums(objects.len(), &ids, &surface);
+        (Self { objects, overlaps, shown }, ids)
     }
 
     /// Code of an object, or of the smallest one that a Gaussian of this id lies in; zero where there is none.
@@ -275,10 +273,11 @@ impl Grid {
         let lists = overlaps.split(|id| *id == 0.0).filter(|list| !list.is_empty());
         let lists = lists.map(|list| list.iter().map(|id| *id as u16).collect()).collect();
         let grid = Self { objects, overlaps: Overlaps(lists), shown: values("shown").to_vec() };
-        if !are_lists || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
-            return Err(Error::format(&path, "its overlaps are no lists of the objects in grid.json; train the scene again").into());
+        let are_counts = grid.shown.iter().all(|shown| *shown >= 0.0);
+        if !are_lists || !are_counts || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
+            return Err(Error::format(&path, "its overlaps do not fit the objects in grid.json; train the scene again").into());
         }
-        if grid.objects.iter().zip(1..=u16::MAX).any(|(object, id)| object.id != id) || !grid.shown.iter().all(|shown| *shown >= 0.0) {
+        if grid.objects.iter().zip(1..=u16::MAX).any(|(object, id)| object.id != id) {
             return Err(Error::format(root.join("grid.json"), "its objects are not numbered 1, 2, ...; train the scene again").into());
         }
         Ok(grid)

@@ -1,6 +1,7 @@
 //! Global mapping, last step: the sets that the photos' masks support become the objects, which may overlap.
 
 use crate::consensus::Proposal;
+use crate::grid::PART;
 use crate::overlaps::{self, Overlaps};
 use crate::sightings::Sightings;
 use crate::support::Support;
@@ -15,7 +16,7 @@ pub struct Config {
     pub min_share: f32,
     /// Least support by masks: their IoU, as where masks propose a set.
     pub min_support: f32,
-    /// Of sets whose IoU is more than this only the best supported one is an object, and what has more than this share in a larger one is a part of it.
+    /// Of sets whose IoU is more than this only the best supported one is an object.
     pub same: f32,
 }
 
@@ -101,19 +102,16 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
 
     let mut holders = Holders::new(weights.len());
     for (place, (size, set, _)) in objects.iter().enumerate() {
-        let around = holders
-            .common(&set.set, &weights)
-            .into_iter()
-            .filter(|(_, common)| *common > config.same * size)
-            .map(|(other, _)| other as u16 + 1);
+        let around =
+            holders.common(&set.set, &weights).into_iter().filter(|(_, common)| *common > PART * size).map(|(other, _)| other as u16 + 1);
         chosen.parents.push(around.max().unwrap_or(0));
         holders.add(place, &set.set);
     }
     let list = |objects: Vec<u32>| objects.into_iter().rev().map(|place| place as u16 + 1).collect();
     let lists: Vec<Vec<u16>> = holders.of.into_iter().map(list).collect();
-    (chosen.overlaps, chosen.ids) = Overlaps::of(&lists, &chosen.parents, &weights, overlaps::KEPT);
-    chosen.shown = vec![0.0; 1 + chosen.parents.len() + chosen.overlaps.0.len()];
-    chosen.ids.iter().zip(&weights).for_each(|(id, weight)| chosen.shown[usize::from(*id)] += weight / pixels as f32);
+    (chosen.overlaps, chosen.ids) = Overlaps::of(&lists, &chosen.parents, &weights, overlaps::LISTED);
+    let shown: Vec<f32> = weights.iter().map(|weight| weight / pixels as f32).collect();
+    chosen.shown = chosen.overlaps.sums(chosen.parents.len(), &chosen.ids, &shown);
     chosen.support = objects.into_iter().map(|o| o.2).collect();
     chosen
 }

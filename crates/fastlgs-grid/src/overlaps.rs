@@ -1,7 +1,7 @@
 //! Numbers for Gaussians that lie in several objects.
 //!
-//! Objects are numbered 1..=K by falling size, and object k stands for itself and all above it by its parents: so far a Gaussian's number is the
-//! smallest object that it lies in. Objects that masks draw overlap as well. Where they do, the numbers above K each stand for a list of objects.
+//! Objects are numbered 1..=K by falling size, and object k stands for itself and all above it by its parents. Where objects
+//! overlap in other ways, the numbers above K each stand for a list of them.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 pub struct Overlaps(pub Vec<Vec<u16>>);
 
 /// Share of the weight whose lists are kept as they are: at borders a few Gaussians each have a list of their own.
-pub const KEPT: f32 = 0.98;
+pub const LISTED: f32 = 0.98;
 
 impl Overlaps {
     /// The number of each list of objects, which fall; `parents` by object. The lists of most weight are kept, as many as make up this share of
@@ -51,6 +51,13 @@ impl Overlaps {
             order.iter().map(|(list, _)| (*list, number.get(list).copied().unwrap_or_else(|| nearest(list)))).collect();
         let ids = lists.iter().map(|list| of_list.get(list.as_slice()).copied().unwrap_or(0)).collect();
         (Self(kept), ids)
+    }
+
+    /// By number, 0 included, the sum of the `values` of what has it; there are so many objects.
+    pub fn sums(&self, objects: usize, ids: &[u16], values: &[f32]) -> Vec<f32> {
+        let mut sums = vec![0.0; 1 + objects + self.0.len()];
+        ids.iter().zip(values).for_each(|(id, value)| sums[usize::from(*id)] += value);
+        sums
     }
 
     /// For each number, 0 included, the objects that it stands for, from small to large.

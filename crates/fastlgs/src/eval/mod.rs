@@ -325,7 +325,7 @@ fn score_label(
         None => Outcome::Refused,
         _ if iou >= 0.5 * oracle && iou > 0.0 => Outcome::Right,
         Some(first) if first.id == id => Outcome::WrongMask,
-        Some(first) if id > 0 && grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
+        Some(first) if grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
         Some(_) => Outcome::WrongObject,
     };
     *sums.outcomes.entry(outcome).or_default() += 1;
