@@ -7,7 +7,7 @@ use crate::table;
 use anyhow::{Context, Result, bail};
 use fastlgs::calibrations::Calibrations;
 use fastlgs::{Run, Session, calibrate, eval};
-use fastlgs_core::labels;
+use fastlgs_core::{labels, metrics};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -37,21 +37,24 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         work.advance()?;
     }
     let mut rows = Vec::new();
+    let (mut present, mut absent) = (Vec::new(), Vec::new());
     for (place, (root, folder)) in args.scenes.iter().zip(&args.labels).enumerate() {
         let others = |left_out: Option<usize>| samples.iter().enumerate().filter(move |(k, _)| Some(*k) != left_out).map(|s| s.1);
         let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
             let mut scene = Session::open(root, run.device)?;
             let own = Calibrations::of(&scene.manifest);
             let measured = measured(others(left_out), own.texts.anything);
-            let [texts, colored] = measured.with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
-            scene.calibrations = Some(Calibrations { texts, colored, ..own });
+            let texts = measured.with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
+            scene.calibrations = Some(Calibrations { texts, ..own });
             let config = eval::Config { scene: root.clone(), labels: Some(folder.clone()), ..eval::Config::default() };
             let report = eval::eval_session(scene, &config)?;
             work.advance()?;
             Ok((texts, report))
         };
         let (texts, left_out) = judged(Some(place))?;
-        let (_, seen) = judged(None)?;
+        let (of_all, seen) = judged(None)?;
+        present.extend(left_out.present_scores.values());
+        absent.extend(left_out.absent_scores.values());
         rows.push(json!({
             "scene": root.file_name().unwrap_or(root.as_os_str()).to_string_lossy(),
             "labels": left_out.labels_scored,
@@ -66,6 +69,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             "auroc": left_out.absent_auroc,
             "outcomes_left_out": left_out.outcomes,
             "calibration_left_out": texts,
+            "calibration_seen": of_all,
         }));
     }
     let mean = |column: &str| rows.iter().map(|row| table::number(row, column)).sum::<f64>() / rows.len() as f64;
@@ -73,7 +77,22 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     if let Some(folder) = &args.output {
         table::write(folder, "names", &COLUMNS, &rows, "")?;
     }
-    Ok(json!({ "rows": rows, "miou_left_out": left_out, "miou_seen": seen, "gap": seen - left_out }))
+    Ok(json!({
+        "rows": rows,
+        "miou_left_out": left_out,
+        "miou_seen": seen,
+        "gap": seen - left_out,
+        "auroc_pooled": metrics::auroc(&present, &absent),
+        "found_at_5_percent": found_at(0.05, &present, absent),
+    }))
+}
+
+/// Share of the names of what is there that score higher than all but a share of the absent ones.
+fn found_at(false_alarms: f64, present: &[f64], mut absent: Vec<f64>) -> f64 {
+    absent.sort_by(f64::total_cmp);
+    let allowed = (false_alarms * absent.len() as f64) as usize;
+    let threshold = absent.iter().rev().nth(allowed).copied().unwrap_or(0.0);
+    present.iter().filter(|score| **score > threshold).count() as f64 / present.len().max(1) as f64
 }
 
 /// Columns of the table.
@@ -93,16 +112,9 @@ fn rejected(report: &eval::Report) -> f64 {
     report.absent_rejected as f64 / report.absent_texts.max(1) as f64
 }
 
-/// What follows from the samples of some scenes, for texts and for those that name a colour.
-fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>, anything: f32) -> Option<[Calibration; 2]> {
+/// What follows from the samples of some scenes.
+fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>, anything: f32) -> Option<Calibration> {
     let mut all = Samples::default();
-    for scene in scenes {
-        all.right.extend(&scene.right);
-        all.wrong.extend(&scene.wrong);
-        all.margins.extend(&scene.margins);
-        all.absent.extend(&scene.absent);
-        all.colored.extend(&scene.colored);
-    }
-    let texts = Calibration::measured(&all, anything)?;
-    Some([texts, texts.judged_by(&all.colored)?])
+    scenes.for_each(|scene| all.extend(scene));
+    Calibration::measured(&all, anything)
 }

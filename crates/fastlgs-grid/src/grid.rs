@@ -120,6 +120,13 @@ impl Grid {
         own.into_iter().map(|share| share.max(0.0)).collect()
     }
 
+    /// By object: what share of the scene's surface is its own, without regard to what else lies there.
+    pub fn shares(&self) -> Vec<f32> {
+        let surface = self.surface();
+        let total = surface.iter().skip(1).sum::<f32>().max(f32::MIN_POSITIVE);
+        self.common(&[]).into_iter().map(|[shown, _]| shown / total).collect()
+    }
+
     /// By object: how much of the scene's surface it shows, and how much of that lies in one of `targets`.
     fn common(&self, targets: &[u16]) -> Vec<[f32; 2]> {
         let mut sums = vec![[0.0f32; 2]; self.objects.len()];

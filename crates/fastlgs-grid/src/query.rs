@@ -38,9 +38,9 @@ pub struct Hit {
 /// What a text says for an object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// What objects are ranked by: the higher, the likelier this one is meant.
+    /// Log-odds that this one is meant: the likeness, and how much there is of it.
     pub rank: f32,
-    /// What the rank is without the object's size: how like the text it is.
+    /// Log-odds by the text alone.
     pub likeness: f32,
     /// Share of absent names that no object of a scene is as like as this one is like the text.
     pub score: f32,
@@ -48,114 +48,46 @@ pub struct Evidence {
     pub error: f32,
 }
 
-/// Least share of the scene that an object counts for, and least excess of likeness.
-const LEAST: f32 = 1e-6;
-
 /// What a text says for each object.
 ///
-/// Of many objects whose cosines are noisy some are like any text. A place lies in several objects, parts and what they are parts of, and all of
-/// them were embedded: the mean over them is less noisy ([`places`]). An object is as like the text as its places are; which one is meant
-/// is told by how much it stands out by that from half of the scene's surface, and by how much surface there is: a small fragment stands out by
-/// chance. How much size counts, and how far an object's own embeddings are believed, follows from how well the encoder tells things apart.
-///
-/// Whether the text names anything at all is told by the place that exceeds "anything" most.
+/// By Bayes: what the object's cosine is worth (see [`crate::calibration::Calibration`]), and before any text was heard names go to things
+/// by how much of the scene's surface these are, so that small fragments, of which there are many, need more likeness; what has less than an equal
+/// part of the scene is not the less likely for it. Whether the text names anything at all is told by the likeness alone: by the object that exceeds
+/// "anything" most.
 ///
 /// What no view shows or what is nearer to a negative is not meant; the very object that was shown as an example is meant beyond doubt.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let calibration = &query.calibration;
-    let (lists, surface) = (grid.lists(), grid.surface());
-    let cosines: Vec<Option<f32>> = grid.objects.iter().map(|object| mean_cosine(object, query)).collect();
-    let of_place = |list: &Vec<u16>| mean_of(list.iter().filter_map(|id| cosines[usize::from(*id) - 1])).map_or(-1.0, |m| m.0);
-    let around: Vec<f32> = lists.iter().map(of_place).collect();
-    let (shares, margins) = (sums(grid, &lists, &surface), margins_of_places(grid, &lists, &surface, query));
-    let all_over = sums(grid, &lists, &around.iter().zip(&surface).map(|(place, share)| place * share).collect::<Vec<_>>());
-    let total = surface[1..].iter().sum::<f32>().max(LEAST);
-    let anything = |object: &Object| mean_over_views(object, |e| query.canonical(e));
-    let anything: f32 = grid.objects.iter().zip(&shares).map(|(object, share)| share * anything(object)).sum();
-    // Where most of the scene is what is meant, it stands out from "anything" at least.
-    let usual = median(&around[1..], &surface[1..], total).min(anything / shares.iter().sum::<f32>().max(LEAST));
-    let of_object = |(k, object): (usize, &Object)| {
-        let cosine = cosines[k].filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e)));
-        let Some(cosine) = cosine else { return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 } };
+    let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
+    let of_object = |(object, share): (&Object, f32)| {
+        let Some(cosine) = mean_cosine(object, query).filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e))) else {
+            return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
+        };
         if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
             return Evidence { rank: f32::INFINITY, likeness: f32::INFINITY, score: 1.0, error: 0.0 };
         }
-        let all_over = if shares[k] > 0.0 { all_over[k] / shares[k] } else { around[k + 1] };
-        let likeness = calibration.trust() * cosine + (1.0 - calibration.trust()) * all_over;
-        let excess = (likeness - usual).max(LEAST);
+        let likeness = calibration.temperature * cosine;
         let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
+        let anything = mean_over_views(object, |e| query.canonical(e));
         Evidence {
-            rank: excess.ln() + calibration.size_exponent() * (shares[k] / total).max(LEAST).ln(),
-            likeness: excess.ln(),
-            score: calibration.confidence(calibration.temperature * margins[k]),
-            error: variance.sqrt() / excess,
+            rank: likeness + share.max(equal).ln(),
+            likeness,
+            score: calibration.confidence(likeness - calibration.temperature * anything),
+            error: calibration.temperature * variance.sqrt(),
         }
     };
-    grid.objects.iter().enumerate().map(of_object).collect()
+    grid.objects.iter().zip(shares).map(of_object).collect()
 }
 
-/// Sums over the places of each object.
-fn sums(grid: &Grid, lists: &[Vec<u16>], values: &[f32]) -> Vec<f32> {
-    let mut sums = vec![0.0; grid.objects.len()];
-    for (list, value) in lists.iter().zip(values) {
-        list.iter().for_each(|id| sums[usize::from(*id) - 1] += value);
-    }
-    sums
-}
-
-/// By how much each object's own places, which lie in none that is smaller, are more like what is meant than like anything: what the object's own
-/// embeddings say, as far as they are believed, and else the mean of all that a place lies in. A mean of many varies less than one alone, so that
-/// it is stretched to vary as much: else things that lie in nothing would be found where those that lie in many are not.
-pub fn places(grid: &Grid, query: &TextQuery) -> Vec<f32> {
-    margins_of_places(grid, &grid.lists(), &grid.surface(), query)
-}
-
-fn margins_of_places(grid: &Grid, lists: &[Vec<u16>], surface: &[f32], query: &TextQuery) -> Vec<f32> {
-    let calibration = &query.calibration;
-    let margins: Vec<Option<f32>> = grid.objects.iter().map(|object| margin(object, query)).collect();
-    let trust = calibration.trust();
-    let of_place = |list: &Vec<u16>| {
-        let (mean, count) = mean_of(list.iter().filter_map(|id| margins[usize::from(*id) - 1]))?;
-        Some(calibration.wrong + (mean - calibration.wrong) / calibration.spread_of_mean(count))
-    };
-    let around: Vec<Option<f32>> = lists.iter().map(of_place).collect();
-    let mut own = vec![[0.0f32; 2]; grid.objects.len()];
-    for ((list, shown), place) in lists.iter().zip(surface).zip(&around) {
-        if let (Some(id), Some(place)) = (list.first(), place) {
-            let sum = &mut own[usize::from(*id) - 1];
-            *sum = [sum[0] + shown * place, sum[1] + shown];
-        }
-    }
-    let of_object = |(k, [sum, shown]): (usize, &[f32; 2])| {
-        let around = if *shown > 0.0 { Some(sum / shown) } else { around[k + 1] };
-        let Some(around) = around else { return -1.0 };
-        trust * margins[k].unwrap_or(around) + (1.0 - trust) * around
-    };
-    own.iter().enumerate().map(of_object).collect()
-}
-
-/// The mean of some values and their number; nothing where there are none.
-fn mean_of(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
-    let (sum, count) = values.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0));
-    (count > 0.0).then(|| (sum / count, count))
-}
-
-/// The value that half of the weight lies below.
-fn median(values: &[f32], weights: &[f32], total: f32) -> f32 {
-    let mut order: Vec<usize> = (0..values.len()).collect();
-    order.sort_by(|a, b| values[*a].total_cmp(&values[*b]));
-    let mut below = 0.0;
-    let half = order.into_iter().find(|k| {
-        below += weights[*k];
-        below >= 0.5 * total
-    });
-    half.map_or(0.0, |k| values[k])
+/// By how much the object that is most like what is meant is more so than like anything; nothing where no view shows one.
+pub fn best_margin(grid: &Grid, query: &TextQuery) -> Option<f32> {
+    grid.objects.iter().filter_map(|object| margin(object, query)).max_by(f32::total_cmp)
 }
 
 /// The mean over an object's views, weighted by area; 0 where there are none.
 fn mean_over_views(object: &Object, of: impl Fn(&[f32]) -> f32) -> f32 {
     let total: f32 = object.areas.iter().sum();
-    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total.max(LEAST) * of(e)).sum()
+    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total.max(f32::MIN_POSITIVE) * of(e)).sum()
 }
 
 /// Whether any view tells what an object looks like.
@@ -300,15 +232,16 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn what_is_like_the_text_all_over_is_meant_and_not_a_fragment_that_looks_so() {
-        let thing = |id, parent, area, cosine: f32| known(id, parent, area, vec![[cosine, 0.0]; 3]);
-        let parts = (2..6).map(|id| thing(id, 1, 0.04, 0.62));
-        let wall = [thing(6, 0, 0.6, 0.35), thing(7, 6, 0.01, 0.8)];
-        let grid = Grid { objects: std::iter::once(thing(1, 0, 0.2, 0.6)).chain(parts).chain(wall).collect(), ..Grid::default() };
-        assert_eq!(rank(&grid, &query([1.0, 0.0]))[0].id, 1);
-        // An encoder that tells things apart is believed.
-        let sure = Calibration { separation: 6.0, ..Calibration::OFFLINE };
-        assert_eq!(rank(&grid, &TextQuery { calibration: sure, ..query([1.0, 0.0]) })[0].id, 7);
+    fn a_fragment_needs_more_likeness_than_a_large_thing() {
+        let thing = |id, area, cosine: f32| known(id, 0, area, vec![[cosine, 0.0]; 3]);
+        let first = |fragment: f32| {
+            let others = (3..40).map(|id| thing(id, 0.01, 0.1));
+            let grid =
+                Grid { objects: [thing(1, 0.2, 0.6), thing(2, 0.01, fragment)].into_iter().chain(others).collect(), ..Grid::default() };
+            rank(&grid, &query([1.0, 0.0]))[0].id
+        };
+        // A thirteenth of the size (an equal part of the scene, if less) is worth 2.6 of log-odds, 0.13 of cosine.
+        assert_eq!((first(0.72), first(0.76)), (1, 2));
     }
 
     #[test]
@@ -334,7 +267,7 @@ pub(crate) mod tests {
         };
         let query = TextQuery { canonical: vec![vec![0.0, 1.0]], ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
         let (mut ours, mut cosines) = (0, 0);
-        const TEXTS: i32 = 1000;
+        const TEXTS: i32 = 4000;
         for _ in 0..TEXTS {
             let grid = scene();
             let own = |o: &&Object| mean_cosine(o, &query).unwrap();
@@ -382,9 +315,6 @@ pub(crate) mod tests {
     #[test]
     fn parts_are_looked_for_inside_their_object() {
         let targets = [Hit { id: 1, score: 0.9 }];
-        // An encoder that tells a part by itself.
-        let calibration = Calibration { separation: 4.0, ..Calibration::OFFLINE };
-        let query = |text| TextQuery { calibration, ..query(text) };
         let ask = |text| part(&grid(), &targets, &query(text), &QueryConfig::default()).map(|found| ids(&found.targets));
         assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "3 is nearer but lies elsewhere");
         assert_eq!(ask([0.0, -1.0]), None, "no such part");

@@ -78,13 +78,11 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
         Ok(TextQuery { canonical: canonical.clone(), anything, ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP) })
     };
     let there = |name: &str| known.iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
-    // With a colour before it, too: a colour that is there makes nothing else be there.
-    let absent = ABSENT.into_iter().filter(|name| !there(name)).zip(COLORS.into_iter().cycle());
-    let absent: Vec<String> = absent.flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")]).collect();
+    let absent = absent_where(there);
     let blind = || format!("{}: the encoder tells the generated things not apart by their names; is it CLIP?", image_tower.display());
     let of_texts = Calibration::measured(&by_names(&known, &absent, query)?, anything).with_context(blind)?;
     let of_pictures = Calibration::measured(&by_examples(&known), anything).with_context(blind)?;
-    let calibrations = Calibrations { texts: of_texts, colored: of_texts, pictures: of_pictures };
+    let calibrations = Calibrations { texts: of_texts, pictures: of_pictures };
     let files = eyes.files()?;
     let sum = |role: &str| files.get(role).map(|f| f.sha256.clone()).unwrap_or_default();
     let kept = beside(&image_tower);
@@ -136,11 +134,6 @@ impl Known {
     }
 }
 
-/// By how much the likest place of a scene exceeds "anything".
-fn best(grid: &Grid, query: &TextQuery) -> Option<f32> {
-    query::places(grid, query).into_iter().max_by(f32::total_cmp)
-}
-
 /// Samples of a trained scene whose labels say what is in it: what `bench names` measures from other scenes.
 ///
 /// # Errors
@@ -158,50 +151,43 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
             let Some(own) = seen().find(|o| o.id == id && iou >= SAME) else { continue };
             let query = scene.text_query(&label.category)?;
             let related = grid.related(id);
-            samples.right.extend(query::mean_cosine(own, &query));
-            samples.wrong.extend(seen().filter(|o| !related[usize::from(o.id) - 1]).filter_map(|other| query::mean_cosine(other, &query)));
+            tell(&mut samples, &query, own, seen().filter(|o| !related[usize::from(o.id) - 1]));
         }
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
-    let absent: Vec<&str> = ABSENT.into_iter().filter(|name| !there(name)).collect();
-    for name in &absent {
-        let query = scene.text_query(name)?;
-        samples.margins.extend(seen().filter_map(|o| query::margin(o, &query)));
+    for text in absent_where(there) {
+        samples.absent.extend(query::best_margin(&grid, &scene.text_query(&text)?));
     }
-    // Judged with what is known so far, as they will be when it is applied.
-    let known = |text: &str| -> Result<Option<f32>> {
-        let query = scene.text_query(text)?;
-        Ok(best(&grid, &TextQuery { calibration: query.calibration.so_far(&samples), ..query }))
-    };
-    let (mut plain, mut colored) = (Vec::new(), Vec::new());
-    for name in absent {
-        plain.extend(known(name)?);
-        for color in COLORS {
-            colored.extend(known(&format!("{color} {name}"))?);
-        }
-    }
-    Ok(Samples { absent: plain, colored, ..samples })
+    Ok(samples)
+}
+
+/// Names of absent things, by themselves and with a colour: a colour that is there makes nothing else be there.
+fn absent_where(there: impl Fn(&str) -> bool) -> Vec<String> {
+    let absent = ABSENT.into_iter().filter(|name| !there(name)).zip(COLORS.into_iter().cycle());
+    absent.flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")]).collect()
 }
 
 /// IoU with a label from which an object is what it names.
 const SAME: f64 = 0.5;
+
+/// Adds what is asked for, as it is like the thing that is meant and like others.
+fn tell<'a>(samples: &mut Samples, query: &TextQuery, own: &Object, others: impl Iterator<Item = &'a Object>) {
+    if let Some(cosine) = query::mean_cosine(own, query) {
+        samples.tell(cosine, &others.filter_map(|other| query::mean_cosine(other, query)).collect::<Vec<_>>());
+    }
+}
 
 /// Samples of things with their own names, with those of others, and of scenes with names of absent things.
 fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<TextQuery>) -> Result<Samples> {
     let mut samples = Samples::default();
     for scene in known {
         for (object, name) in scene.objects() {
-            let query = query(name)?;
-            samples.right.extend(query::mean_cosine(object, &query));
-            samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
+            tell(&mut samples, &query(name)?, object, scene.others(object.id));
         }
     }
-    let mut queries = absent.iter().map(|name| query(name)).collect::<Result<Vec<_>>>()?;
-    let objects = || known.iter().flat_map(Known::objects).map(|o| o.0);
-    samples.margins = queries.iter().flat_map(|query| objects().filter_map(|o| query::margin(o, query))).collect();
-    for query in &mut queries {
-        query.calibration = query.calibration.so_far(&samples);
-        samples.absent.extend(known.iter().filter_map(|scene| best(&scene.grid, query)));
+    for name in absent {
+        let query = query(name)?;
+        samples.absent.extend(known.iter().filter_map(|scene| query::best_margin(&scene.grid, &query)));
     }
     Ok(samples)
 }
@@ -215,22 +201,15 @@ fn by_examples<'a>(known: &'a [Known]) -> Samples {
         for (object, _) in several(scene) {
             let query = shown(object);
             let rest = Object { embeddings: object.embeddings[1..].to_vec(), areas: object.areas[1..].to_vec(), ..object.clone() };
-            samples.right.extend(query::mean_cosine(&rest, &query));
-            samples.wrong.extend(scene.others(object.id).filter_map(|other| query::mean_cosine(other, &query)));
+            tell(&mut samples, &query, &rest, scene.others(object.id));
         }
     }
-    let mut elsewhere = Vec::new();
     for scene in known {
         for (object, name) in several(scene) {
             let lack = |other: &&Known| other.things.iter().all(|t| t.name != name);
-            elsewhere.extend(known.iter().filter(lack).map(|other| (shown(object), other)));
+            let best = known.iter().filter(lack).filter_map(|other| query::best_margin(&other.grid, &shown(object)));
+            samples.absent.extend(best);
         }
-    }
-    let of_pair = |(query, other): &(TextQuery, &Known)| other.objects().filter_map(|(o, _)| query::margin(o, query)).collect::<Vec<_>>();
-    samples.margins = elsewhere.iter().flat_map(of_pair).collect();
-    for (query, other) in &mut elsewhere {
-        query.calibration = query.calibration.so_far(&samples);
-        samples.absent.extend(best(&other.grid, query));
     }
     samples
 }

@@ -12,15 +12,8 @@ use std::path::{Path, PathBuf};
 pub struct Calibrations {
     /// Of masks with texts.
     pub texts: Calibration,
-    /// Of masks with texts that name a colour or a material, which only the offline encoder measures by itself.
-    #[serde(default = "colored")]
-    pub colored: Calibration,
     /// Of masks with pictures and with things that were shown.
     pub pictures: Calibration,
-}
-
-fn colored() -> Calibration {
-    Calibration::OFFLINE_COLORED
 }
 
 /// A measurement as it is kept beside the model, with the files that it holds for.
@@ -38,15 +31,10 @@ pub fn beside(image_tower: &Path) -> PathBuf {
 
 impl Calibrations {
     /// The offline encoder's.
-    pub const OFFLINE: Self =
-        Self { texts: Calibration::OFFLINE, colored: Calibration::OFFLINE_COLORED, pictures: Calibration::OFFLINE_PICTURES };
+    pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
 
     /// What is assumed of a CLIP that was not measured: pictures about as far from each other as with the offline encoder.
-    pub const CLIP: Self = Self {
-        texts: Calibration::CLIP,
-        colored: Calibration::CLIP,
-        pictures: Calibration { measured: false, ..Calibration::OFFLINE_PICTURES },
-    };
+    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration { measured: false, ..Calibration::OFFLINE_PICTURES } };
 
     /// Those of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {

@@ -95,6 +95,8 @@ pub struct Report {
     pub absent_colored_rejected: Option<f64>,
     /// The absent text that scored highest.
     pub absent_best: Option<Absent>,
+    /// Best score of each absent text.
+    pub absent_scores: BTreeMap<String, f64>,
     /// Best score of each label's text.
     pub present_scores: BTreeMap<String, f64>,
     /// PSNR of the held-out views in dB.
@@ -216,8 +218,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
     let rejected = |absent: &[(String, f64)]| absent.iter().filter(|a| a.1 < f64::from(query.min_score())).count();
     let colored = colored_absent_scores(&absent, &scene, &grid)?;
     let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
-    let absent_scores: Vec<f64> = absent.iter().map(|a| a.1).collect();
-    let auroc = metrics::auroc(&sums.present, &absent_scores);
+    let auroc = metrics::auroc(&sums.present, &absent.iter().map(|a| a.1).collect::<Vec<_>>());
     let camera = &scene.cameras[0];
     Ok(Report {
         scene: config.scene.clone(),
@@ -242,6 +243,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         absent_texts: absent.len(),
         absent_rejected: rejected(&absent),
         absent_colored_rejected: (!colored.is_empty()).then(|| rejected(&colored) as f64 / colored.len() as f64),
+        absent_scores: absent.iter().cloned().collect(),
         absent_best: loudest.map(|(text, score)| Absent { text: text.clone(), score: *score }),
         present_scores: sums.labels.iter().cloned().zip(sums.present.iter().copied()).collect(),
         psnr: color.map(|c| c.psnr),

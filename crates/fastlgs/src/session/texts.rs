@@ -112,10 +112,8 @@ impl Texts {
 
     /// A text with its embedding.
     fn worded(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
-        let advantage = self.encoder.advantage(text);
-        // Only the offline encoder gives one, for what it measures by itself.
-        let calibration = if advantage > 0.0 { self.calibrations.colored } else { self.calibrations.texts };
-        let anything = calibration.anything + advantage;
+        let calibration = self.calibrations.texts;
+        let anything = calibration.anything + self.encoder.advantage(text);
         TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(vec![embedding], calibration) }
     }
 }
