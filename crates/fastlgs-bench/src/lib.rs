@@ -14,6 +14,7 @@ mod size;
 mod speed;
 mod stability;
 mod table;
+mod teach;
 mod trial;
 mod vision;
 mod ways;
@@ -48,6 +49,8 @@ enum What {
     Growth(growth::Args),
     /// What texts give on scenes that nothing was chosen on, and how much more where they were seen.
     Names(names::Args),
+    /// Whether what is taught by a click in one view is found by its name in other views and scenes.
+    Teach(teach::Args),
     /// The other benches' results and sample pictures in one HTML file.
     Report(report::Args),
     /// Masks and embeddings alone, on labelled photos.
@@ -68,6 +71,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         What::Paper(args) => paper::run(args, run),
         What::Growth(args) => growth::run(args, run),
         What::Names(args) => names::run(args, run),
+        What::Teach(args) => teach::run(args, run),
         What::Report(args) => report::run(args, run),
         What::Vision(args) => vision::run(args, run),
     }

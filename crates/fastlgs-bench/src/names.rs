@@ -4,41 +4,63 @@
 //! all of them. The gap between the two says how much the figures owe to having seen the scene.
 
 use crate::table;
+use crate::trial::name;
 use anyhow::{Context, Result, bail};
 use fastlgs::calibrations::Calibrations;
 use fastlgs::{Run, Session, calibrate, eval};
 use fastlgs_core::{labels, metrics};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use serde_json::{Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
 pub struct Args {
-    /// Trained scene folders of one encoder, two at least.
-    #[arg(required = true, num_args = 2..)]
-    scenes: Vec<PathBuf>,
-    /// Their folders of labels, in the same order.
-    #[arg(long, required = true, value_delimiter = ',')]
-    labels: Vec<PathBuf>,
+    #[command(flatten)]
+    labelled: Labelled,
     /// Folder for the table (names.md, names.csv, names.json).
     #[arg(short, long)]
     output: Option<PathBuf>,
 }
 
-pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    if args.scenes.len() != args.labels.len() {
-        bail!("{} scenes and {} folders of labels: name one for each scene", args.scenes.len(), args.labels.len());
+/// Scenes with their labels.
+#[derive(clap::Args)]
+pub struct Labelled {
+    /// Trained scene folders of one encoder.
+    #[arg(required = true)]
+    scenes: Vec<PathBuf>,
+    /// Their folders of labels, in the same order.
+    #[arg(long, required = true, value_delimiter = ',')]
+    labels: Vec<PathBuf>,
+}
+
+impl Labelled {
+    /// Each scene with its folder of labels.
+    ///
+    /// # Errors
+    /// Another number of folders than of scenes.
+    pub fn pairs(&self) -> Result<Vec<(&Path, &Path)>> {
+        if self.scenes.len() != self.labels.len() {
+            bail!("{} scenes and {} folders of labels: name one for each scene", self.scenes.len(), self.labels.len());
+        }
+        Ok(self.scenes.iter().zip(&self.labels).map(|(scene, labels)| (scene.as_path(), labels.as_path())).collect())
     }
-    let work = run.work("names", 3 * args.scenes.len() as u64);
+}
+
+pub fn run(args: &Args, run: &Run) -> Result<Value> {
+    let scenes = args.labelled.pairs()?;
+    if scenes.len() < 2 {
+        bail!("one scene leaves none to measure on: name two at least");
+    }
+    let work = run.work("names", 3 * scenes.len() as u64);
     let mut samples = Vec::new();
-    for (root, folder) in args.scenes.iter().zip(&args.labels) {
+    for (root, folder) in &scenes {
         samples.push(calibrate::samples_of(&mut Session::open(root, run.device)?, &labels::load(folder, None)?)?);
         work.advance()?;
     }
     let mut rows = Vec::new();
     let (mut present, mut absent) = (Vec::new(), Vec::new());
-    for (place, (root, folder)) in args.scenes.iter().zip(&args.labels).enumerate() {
+    for (place, (root, folder)) in scenes.iter().copied().enumerate() {
         let others = |left_out: Option<usize>| samples.iter().enumerate().filter(move |(k, _)| Some(*k) != left_out).map(|s| s.1);
         let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
             let mut scene = Session::open(root, run.device)?;
@@ -46,7 +68,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             let measured = measured(others(left_out), own.texts.anything);
             let texts = measured.with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
             scene.calibrations = Some(Calibrations { texts, ..own });
-            let config = eval::Config { scene: root.clone(), labels: Some(folder.clone()), ..eval::Config::default() };
+            let config = eval::Config { scene: root.into(), labels: Some(folder.into()), ..eval::Config::default() };
             let report = eval::eval_session(scene, &config)?;
             work.advance()?;
             Ok((texts, report))
@@ -56,7 +78,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         present.extend(left_out.present_scores.values());
         absent.extend(left_out.absent_scores.values());
         rows.push(json!({
-            "scene": root.file_name().unwrap_or(root.as_os_str()).to_string_lossy(),
+            "scene": name(root),
             "labels": left_out.labels_scored,
             "objects": left_out.objects,
             "oracle_miou": left_out.oracle_miou,

@@ -5,7 +5,7 @@
 //! compares the text with the short ones of all objects, and with the whole ones of those that come nearest.
 
 use crate::grid::{Grid, Object};
-use crate::query::{self, Hit};
+use crate::query;
 use crate::relevancy::TextQuery;
 use crate::{Error, Result};
 use fastlgs_core::{Error as CoreError, fs};
@@ -70,8 +70,10 @@ pub struct Library {
 pub struct Found {
     /// Index into [`Library::scenes`].
     pub scene: usize,
-    /// The object and its score.
-    pub hit: Hit,
+    /// The object.
+    pub object: u16,
+    /// By how much it is more like what is asked for than like anything.
+    pub margin: f32,
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f32 {
@@ -232,19 +234,19 @@ impl Library {
                 format!("the library's embeddings have {} numbers, the text's {length}: they are of different encoders", self.dimension);
             return Err(Error::Core(CoreError::Invalid(reason)));
         }
-        let mut best: BTreeMap<usize, (f32, Found)> = BTreeMap::new();
+        let mut best: BTreeMap<usize, Found> = BTreeMap::new();
         for (row, object) in self.in_full(&self.nearest(&query.meant))? {
             let Some(margin) = query::margin(&object, query) else { continue };
-            let hit = Hit { id: row.id, score: query.calibration.confidence(query.calibration.temperature * margin) };
-            let own = (margin, Found { scene: row.scene as usize, hit });
-            let of_scene = best.entry(own.1.scene).or_insert(own);
-            if margin > of_scene.0 {
+            let own = Found { scene: row.scene as usize, object: row.id, margin };
+            let of_scene = best.entry(own.scene).or_insert(own);
+            if margin > of_scene.margin {
                 *of_scene = own;
             }
         }
-        let mut found: Vec<(f32, Found)> = best.into_values().collect();
-        found.sort_by(|(a, x), (b, y)| b.total_cmp(a).then(x.scene.cmp(&y.scene)));
-        Ok(found.into_iter().map(|f| f.1).take(scenes).collect())
+        let mut found: Vec<Found> = best.into_values().collect();
+        found.sort_by(|a, b| b.margin.total_cmp(&a.margin).then(a.scene.cmp(&b.scene)));
+        found.truncate(scenes);
+        Ok(found)
     }
 
     /// The objects whose short embeddings come nearest to what is meant, in the order of the file.
@@ -355,18 +357,17 @@ mod tests {
         let (mut same, mut asked) = (0, 0);
         for concept in concepts.iter().take(50) {
             let query = TextQuery::new(vec![concept.clone()], Calibration::OFFLINE);
-            let mut exact: Vec<(f32, f32, usize, Hit)> = Vec::new();
+            let mut exact: Vec<Found> = Vec::new();
             for (k, (_, grid)) in scenes.iter().enumerate() {
                 let own = |object: &Object| (query::margin(object, &query).unwrap(), object.id);
                 let (margin, id) = grid.objects.iter().map(own).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
-                let score = Calibration::OFFLINE.confidence(Calibration::OFFLINE.temperature * margin);
-                exact.push((margin, score, k, Hit { id, score }));
+                exact.push(Found { scene: k, object: id, margin });
             }
-            exact.sort_by(|a, b| b.0.total_cmp(&a.0));
-            for (found, (_, score, scene, hit)) in library.search(&query, 5).unwrap().iter().zip(&exact) {
+            exact.sort_by(|a, b| b.margin.total_cmp(&a.margin));
+            for (found, own) in library.search(&query, 5).unwrap().iter().zip(&exact) {
                 asked += 1;
-                same += u32::from(found.scene == *scene && found.hit.id == hit.id);
-                assert!((found.hit.score - score).abs() < 0.02 || found.scene != *scene, "{found:?} {score}");
+                same += u32::from(found.scene == own.scene && found.object == own.object);
+                assert!((found.margin - own.margin).abs() < 0.002 || found.scene != own.scene, "{found:?} {own:?}");
             }
         }
         // Embeddings are rounded: what is nearly level may change places.

@@ -1,5 +1,6 @@
 //! From a text to objects (paper, querying features).
 
+use crate::calibration::Best;
 use crate::grid::{Grid, Object};
 use crate::relevancy::TextQuery;
 use serde::{Deserialize, Serialize};
@@ -38,9 +39,9 @@ pub struct Hit {
 /// What a text says for an object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// Log-odds that this one is meant: the likeness, and how much there is of it.
+    /// Log-odds that this one is meant, up to a constant of the text: the likeness, and how much there is of it.
     pub rank: f32,
-    /// Log-odds by the text alone.
+    /// The same by the text alone.
     pub likeness: f32,
     /// Share of absent names that no object of a scene is as like as this one is like the text.
     pub score: f32,
@@ -51,14 +52,16 @@ pub struct Evidence {
 /// What a text says for each object.
 ///
 /// By Bayes: what the object's cosine is worth (see [`crate::calibration::Calibration`]), and before any text was heard names go to things
-/// by how much of the scene's surface these are, so that small fragments, of which there are many, need more likeness; what has less than an equal
-/// part of the scene is not the less likely for it. Whether the text names anything at all is told by the likeness alone: by the object that exceeds
+/// by how much of the scene's surface these are, so that small fragments, of which there are many, need more likeness; or, where that is more
+/// than half, by how much they are not, because a name tells something from the rest. What has less than an equal part of the scene is not the
+/// less likely for it. Whether the text names anything at all is told by the likeness alone: by the object that exceeds
 /// "anything" most.
 ///
 /// What no view shows or what is nearer to a negative is not meant; the very object that was shown as an example is meant beyond doubt.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let calibration = &query.calibration;
     let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
+    let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
     let of_object = |(object, share): (&Object, f32)| {
         let Some(cosine) = mean_cosine(object, query).filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e))) else {
             return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
@@ -70,18 +73,22 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
         let anything = mean_over_views(object, |e| query.canonical(e));
         Evidence {
-            rank: likeness + share.max(equal).ln(),
+            rank: likeness + share.min(1.0 - share).max(equal).ln(),
             likeness,
-            score: calibration.confidence(likeness - calibration.temperature * anything),
+            score: calibration.confidence(cosine - anything, seen),
             error: calibration.temperature * variance.sqrt(),
         }
     };
     grid.objects.iter().zip(shares).map(of_object).collect()
 }
 
-/// By how much the object that is most like what is meant is more so than like anything; nothing where no view shows one.
-pub fn best_margin(grid: &Grid, query: &TextQuery) -> Option<f32> {
-    grid.objects.iter().filter_map(|object| margin(object, query)).max_by(f32::total_cmp)
+/// By how much the object that is most like what is meant is more so than like anything; nothing where views show fewer than two.
+pub fn best(grid: &Grid, query: &TextQuery) -> Option<Best> {
+    let margins: Vec<f32> = grid.objects.iter().filter_map(|object| margin(object, query)).collect();
+    // Every second one: neighbours in number are of like size.
+    let half = |first: usize| margins.iter().skip(first).step_by(2).copied().max_by(f32::total_cmp);
+    let (even, odd) = (half(0)?, half(1)?);
+    Some(Best { margin: even.max(odd), of_halves: 0.5 * (even + odd), objects: margins.len() })
 }
 
 /// The mean over an object's views, weighted by area; 0 where there are none.
@@ -114,11 +121,13 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
 }
 
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
-pub const SUPPORT_SHARE: f32 = 0.86;
+pub const SUPPORT_SHARE: f32 = 0.98;
 
-/// Of objects that lie in each other, from small to large: the largest whose support comes near the best.
+/// Of objects that lie in each other, from small to large: the largest whose support comes near the best. Views agree easily on what fills them, so
+/// that support counts by how much of the scene an object is not: all of it is no thing.
 pub fn best_supported(grid: &Grid, nested: &[u16]) -> Option<u16> {
-    let support = |id: &u16| grid.objects[usize::from(*id) - 1].support;
+    let shares = grid.shares();
+    let support = |id: &u16| grid.objects[usize::from(*id) - 1].support * (1.0 - shares[usize::from(*id) - 1]);
     let best = nested.iter().map(support).fold(0.0, f32::max);
     nested.iter().rev().find(|id| support(id) >= SUPPORT_SHARE * best).copied()
 }
@@ -134,13 +143,14 @@ pub fn best_score(ranked: &[Hit]) -> f32 {
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
-    let Some(best) = ranked.first().filter(|_| best_score(ranked) >= config.min_score()) else { return Vec::new() };
+    let meant = |hit: &Hit| of(hit).rank > f32::NEG_INFINITY;
+    let Some(best) = ranked.first().filter(|hit| meant(hit) && best_score(ranked) >= config.min_score()) else { return Vec::new() };
     let first = of(best);
     let mut chosen = vec![*best];
     let mut taken = grid.related(best.id);
     for hit in &ranked[1..] {
         let own = of(hit);
-        if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
+        if chosen.len() >= config.top_k || !meant(hit) || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
         let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
@@ -218,11 +228,13 @@ pub(crate) mod tests {
     #[test]
     fn of_things_that_are_as_like_the_text_the_larger_is_meant() {
         let mut grid = grid();
-        grid.objects[1].embeddings = vec![vec![0.999, 0.045]];
-        grid.objects[2].embeddings = vec![vec![0.999, 0.045]];
-        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [1]);
-        grid.objects[2].areas = vec![0.3];
-        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [3]);
+        grid.objects.iter_mut().for_each(|object| object.embeddings = vec![vec![0.999, 0.045]]);
+        grid.objects.push(known(4, 0, 0.5, vec![[0.0, 1.0]]));
+        // What the objects show without what lies in them; the last is half of the scene.
+        for (places, id) in [([0.1, 0.2, 0.1, 0.15, 0.55], 1), ([0.1, 0.1, 0.05, 0.3, 0.55], 3)] {
+            grid.shown = places.to_vec();
+            assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default())[0], id, "{:?}", grid.shares());
+        }
     }
 
     /// An object of which `cosine` is known, and how like a canonical phrase it is.
@@ -240,8 +252,8 @@ pub(crate) mod tests {
                 Grid { objects: [thing(1, 0.2, 0.6), thing(2, 0.01, fragment)].into_iter().chain(others).collect(), ..Grid::default() };
             rank(&grid, &query([1.0, 0.0]))[0].id
         };
-        // A thirteenth of the size (an equal part of the scene, if less) is worth 2.6 of log-odds, 0.13 of cosine.
-        assert_eq!((first(0.72), first(0.76)), (1, 2));
+        // A thirteenth of the size (an equal part of the scene, if less) is worth 2.6 of log-odds, some 0.12 of cosine.
+        assert_eq!((first(0.68), first(0.78)), (1, 2));
     }
 
     #[test]
@@ -277,6 +289,25 @@ pub(crate) mod tests {
         }
         println!("first by cosine {cosines}, by rank {ours} of {TEXTS}");
         assert!(ours + TEXTS / 50 >= cosines, "first by cosine {cosines}, by rank {ours} of {TEXTS}");
+    }
+
+    #[test]
+    fn a_click_means_a_thing_and_not_all_there_is() {
+        // 1 is the whole scene, on which all views agree; 2 a thing in it; 3 a part of that, on which they agree less.
+        let object = |id: u16, parent: u16, support: f32| Object { support, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
+        let objects = vec![object(1, 0, 1.0), object(2, 1, 0.9), object(3, 2, 0.7)];
+        let grid = Grid { objects, shown: vec![0.0, 0.8, 0.15, 0.05], ..Grid::default() };
+        assert_eq!(best_supported(&grid, &[3, 2, 1]), Some(2));
+        assert_eq!(best_supported(&grid, &[1]), Some(1), "where there is nothing else");
+        assert_eq!(best_supported(&grid, &[]), None);
+    }
+
+    #[test]
+    fn nothing_is_meant_where_all_is_ruled_out() {
+        let config = QueryConfig { false_alarms: 1.0, ..QueryConfig::default() };
+        let mut query = query([0.6, 0.8]);
+        query.negatives.extend([vec![1.0, 0.0], vec![0.0, 1.0], vec![0.8, 0.6]]);
+        assert!(select(&grid(), &rank(&grid(), &query), &query, &config).is_empty());
     }
 
     #[test]

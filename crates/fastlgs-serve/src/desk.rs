@@ -161,12 +161,14 @@ impl Desk {
                 own[usize::from(above)].push(i);
             }
         }
+        let shares = self.grid.shares();
         let row = |o: &Object| {
             let own = &own[usize::from(o.id)];
             json!({
                 "id": o.id,
                 "parent": o.parent,
                 "support": o.support,
+                "share": shares[usize::from(o.id) - 1],
                 "views": o.views,
                 "gaussians": own.len(),
                 "bbox3d": selection::robust_box(&self.scene.gaussians, own),

@@ -41,7 +41,7 @@ export class Objects {
   // Of things that lie in each other, the largest whose support comes near the best (fastlgs_grid::query::best_supported).
   meant(id) {
     const chain = this.chain(id);
-    const support = (id) => this.byId.get(id).support;
+    const support = (id) => this.byId.get(id).support * (1 - this.byId.get(id).share);
     const best = Math.max(...chain.map(support));
     return chain.findLast((id) => support(id) >= this.supportShare * best);
   }

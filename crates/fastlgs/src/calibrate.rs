@@ -156,7 +156,7 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
     }
     let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
     for text in absent_where(there) {
-        samples.absent.extend(query::best_margin(&grid, &scene.text_query(&text)?));
+        samples.absent.extend(query::best(&grid, &scene.text_query(&text)?));
     }
     Ok(samples)
 }
@@ -187,7 +187,7 @@ fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<T
     }
     for name in absent {
         let query = query(name)?;
-        samples.absent.extend(known.iter().filter_map(|scene| query::best_margin(&scene.grid, &query)));
+        samples.absent.extend(known.iter().filter_map(|scene| query::best(&scene.grid, &query)));
     }
     Ok(samples)
 }
@@ -196,6 +196,8 @@ fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<T
 fn by_examples<'a>(known: &'a [Known]) -> Samples {
     let mut samples = Samples::default();
     let shown = |object: &Object| TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
+    // As a lesson keeps it: all that was embedded.
+    let whole = |object: &Object| TextQuery::of_examples(object.embeddings.clone(), Calibration::CLIP);
     let several = |scene: &'a Known| scene.objects().filter(|(object, _)| object.embeddings.len() > 1);
     for scene in known {
         for (object, _) in several(scene) {
@@ -207,7 +209,7 @@ fn by_examples<'a>(known: &'a [Known]) -> Samples {
     for scene in known {
         for (object, name) in several(scene) {
             let lack = |other: &&Known| other.things.iter().all(|t| t.name != name);
-            let best = known.iter().filter(lack).filter_map(|other| query::best_margin(&other.grid, &shown(object)));
+            let best = known.iter().filter(lack).filter_map(|other| query::best(&other.grid, &whole(object)));
             samples.absent.extend(best);
         }
     }

@@ -42,7 +42,15 @@ impl Calibrations {
             return Self::OFFLINE;
         }
         let (image, text) = (manifest.models.get("clip_image"), manifest.models.get("clip_text"));
-        let kept: Option<Kept> = image.and_then(|image| fs::read_json(&beside(&image.path)).ok());
+        let path = image.map(|image| beside(&image.path)).filter(|path| path.is_file());
+        // What another version measured was measured for other rules.
+        let kept: Option<Kept> = path.and_then(|path| {
+            let kept = fs::read_json(&path);
+            if kept.is_err() {
+                tracing::warn!("{}: it is of another version and does not count; run 'fastlgs models calibrate' again", path.display());
+            }
+            kept.ok()
+        });
         let same = |kept: &Kept| [image, text].iter().zip(&kept.sha256).all(|(file, sum)| file.is_some_and(|f| f.sha256 == *sum));
         kept.filter(same).map_or(Self::CLIP, |kept| kept.calibrations)
     }

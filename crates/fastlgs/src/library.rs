@@ -64,7 +64,7 @@ pub struct Row {
     pub scene: String,
     /// Its best object.
     pub object: u16,
-    /// That object's score.
+    /// Score of the object that is most like what is asked for, by which the scene has it or not.
     pub score: f32,
     /// How well the views' masks fit it.
     pub support: f32,
@@ -139,7 +139,7 @@ impl Search {
             let scene = self.index.scenes[f.scene].path.clone();
             let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
             let ranked = query::rank(&grid, &query);
-            let (object, score) = (ranked.first().map_or(f.hit.id, |hit| hit.id), query::best_score(&ranked));
+            let (object, score) = (ranked.first().map_or(f.object, |hit| hit.id), query::best_score(&ranked));
             Ok(Row { scene, object, score, support: grid.objects[usize::from(object) - 1].support, found: score >= least })
         };
         let mut rows = best.iter().map(row).collect::<Result<Vec<Row>>>()?;

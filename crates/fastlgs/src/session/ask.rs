@@ -72,7 +72,7 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
     let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let embedding =
         embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    Ok(TextQuery::of_examples(vec![embedding], Calibrations::of(&session.manifest).pictures))
+    Ok(TextQuery::of_examples(vec![embedding], session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures))
 }
 
 impl Meaning {
