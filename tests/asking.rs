@@ -33,7 +33,7 @@ fn exact_masks_give_exact_answers() {
 #[test]
 fn absent_things_are_not_found() {
     let Some(f) = fixture() else { return };
-    let output = fastlgs(&["query", text(&f.scene), "bicycle", "--json", "-"]);
+    let output = fastlgs(&["query", text(&f.scene), "pizza", "--json", "-"]);
     assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stdout));
     let answer: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(answer["found"], false);

@@ -181,9 +181,9 @@ fn a_text_lights_up_its_object_in_the_browser() {
     }
     let Some(scene) = room() else { return };
     let served = Served::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
-    page_works(&served, "webgpu", &WEBGPU, "cat", "bicycle");
-    page_works(&served, "pictures", &[], "cat", "bicycle");
-    let browser = page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "cat", "bicycle");
+    page_works(&served, "webgpu", &WEBGPU, "cat", "pizza");
+    page_works(&served, "pictures", &[], "cat", "pizza");
+    let browser = page_works(&served, "webgl2", &["--enable-unsafe-swiftshader"], "cat", "pizza");
     type_text(&browser, "cat");
     browser.run("await fastlgs.stage.settle();");
     std::thread::sleep(Duration::from_millis(500));

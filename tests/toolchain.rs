@@ -383,11 +383,11 @@ fn examples_run() {
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/find.py");
     let python =
-        Command::new("python3").arg(script).args([text(&room), "cat", "bicycle"]).env("FASTLGS", env!("CARGO_BIN_EXE_fastlgs")).output();
+        Command::new("python3").arg(script).args([text(&room), "cat", "pizza"]).env("FASTLGS", env!("CARGO_BIN_EXE_fastlgs")).output();
     let python = python.expect("python3");
     let said = String::from_utf8_lossy(&python.stdout).into_owned();
     assert!(python.status.success(), "{}", String::from_utf8_lossy(&python.stderr));
-    assert!(said.contains("cat: object") && said.contains("bicycle: not found"), "{said}");
+    assert!(said.contains("cat: object") && said.contains("pizza: not found"), "{said}");
 }
 
 /// The workflow over two scenes. FASTLGS_SNAKEMAKE names the program.

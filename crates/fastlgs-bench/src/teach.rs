@@ -168,6 +168,6 @@ mod tests {
         let diamond: Vec<bool> = (0..30).map(|p| at(p % 6, p / 6)).collect();
         assert_eq!(deepest(&diamond, 6), [3, 2]);
         // The border of the photo is one, too.
-        assert_eq!(deepest(&[true; 15], 5), [2, 1]);
+        assert_eq!(deepest(&[true; 25], 5), [2, 2]);
     }
 }
