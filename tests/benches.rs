@@ -57,7 +57,7 @@ fn quick_suite() {
     assert!(matching > embeddings && matching > 0.8 && all > 0.45 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
     written(out, &["paper.md", "paper.csv", "paper.json"]);
 
-    let size = bench("size", &[]);
+    let size = bench("size", &["--iterations", "400"]);
     let verdict = &size["auto"][0];
     println!("size: {verdict}");
     assert!(number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 1.0, "{verdict}");
