@@ -21,7 +21,7 @@ pub struct Args {
     /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table is disturbed.
     scenes: Vec<PathBuf>,
     /// Kinds of generated scenes that are tried as they are, separated by commas; `none` for none.
-    #[arg(long, value_delimiter = ',', default_value = "table,twins,nested,thin,mirror,glass,dark,sparse,long,big")]
+    #[arg(long, value_delimiter = ',', default_value = "table,twins,nested,containers,thin,mirror,glass,dark,sparse,long,big")]
     kinds: Vec<String>,
     /// Disturbances that are tried, as the table calls them, separated by commas; all by default.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
@@ -139,7 +139,10 @@ fn cases() -> Vec<Case> {
 fn kind_bound(kind: Kind) -> f64 {
     match kind {
         Kind::Dark => 0.9,
-        Kind::Thin | Kind::Glass | Kind::Long => 0.85,
+        Kind::Thin | Kind::Glass | Kind::Long | Kind::Nested => 0.85,
+        Kind::Containers => 0.9,
+        // Things of 15 pixels.
+        Kind::Big => 0.5,
         _ => 0.8,
     }
 }
@@ -219,12 +222,7 @@ struct Bench<'a> {
 impl Bench<'_> {
     /// A generated scene, preprocessed.
     fn generated(&self, kind: Kind, name: &str) -> Result<PathBuf> {
-        let (views, size) = match kind {
-            _ if self.args.quick => trial::QUICK,
-            // Each of its thousand things is embedded in each photo.
-            Kind::Big => (24, "480x360"),
-            _ => (kind.views(), "480x360"),
-        };
+        let (views, size) = if self.args.quick { trial::QUICK } else { (kind.views(), "480x360") };
         trial::generated(self.run, self.work, name, views, size)
     }
 

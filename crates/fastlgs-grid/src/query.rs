@@ -132,29 +132,30 @@ pub fn best_supported(grid: &Grid, nested: &[u16]) -> Option<u16> {
     nested.iter().rev().find(|id| support(id) >= SUPPORT_SHARE * best).copied()
 }
 
-/// Score of the object that is most like the text, which need not be the likeliest one to be meant: what decides whether it is found.
+/// Score of the object that is most like the text: what decides whether it is found.
 pub fn best_score(ranked: &[Hit]) -> f32 {
     ranked.iter().map(|hit| hit.score).fold(0.0, f32::max)
 }
 
-/// The target objects; empty means "not found". The likeliest one, and those elsewhere that are found and cannot be told from it: by no more than
+/// The target objects; empty means "not found". Of those that are found, the likeliest one, and those elsewhere that cannot be told from it: by no more than
 /// the errors of both, and not by their size either. A large thing may be meant rather than a small one that is more like the text, but does not
 /// become another of its kind by being large.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
-    let meant = |hit: &Hit| of(hit).rank > f32::NEG_INFINITY;
-    let Some(best) = ranked.first().filter(|hit| meant(hit) && best_score(ranked) >= config.min_score()) else { return Vec::new() };
+    let found = |hit: &&Hit| of(hit).rank > f32::NEG_INFINITY && hit.score >= config.min_score();
+    let mut found = ranked.iter().filter(found);
+    let Some(best) = found.next() else { return Vec::new() };
     let first = of(best);
     let mut chosen = vec![*best];
     let mut taken = grid.related(best.id);
-    for hit in &ranked[1..] {
+    for hit in found {
         let own = of(hit);
-        if chosen.len() >= config.top_k || !meant(hit) || first.rank - own.rank > own.error.hypot(first.error) {
+        if chosen.len() >= config.top_k || first.rank - own.rank > own.error.hypot(first.error) {
             break;
         }
         let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
-        if alike && hit.score >= config.min_score() && !taken[usize::from(hit.id) - 1] {
+        if alike && !taken[usize::from(hit.id) - 1] {
             chosen.push(*hit);
             taken.iter_mut().zip(grid.related(hit.id)).for_each(|(taken, related)| *taken |= related);
         }

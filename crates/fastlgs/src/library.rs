@@ -139,7 +139,8 @@ impl Search {
             let scene = self.index.scenes[f.scene].path.clone();
             let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
             let ranked = query::rank(&grid, &query);
-            let (object, score) = (ranked.first().map_or(f.object, |hit| hit.id), query::best_score(&ranked));
+            let likeliest = ranked.iter().find(|hit| hit.score >= least).or(ranked.first());
+            let (object, score) = (likeliest.map_or(f.object, |hit| hit.id), query::best_score(&ranked));
             Ok(Row { scene, object, score, support: grid.objects[usize::from(object) - 1].support, found: score >= least })
         };
         let mut rows = best.iter().map(row).collect::<Result<Vec<Row>>>()?;
