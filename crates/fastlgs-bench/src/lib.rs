@@ -6,6 +6,7 @@ mod chart;
 mod command;
 mod disturb;
 mod growth;
+mod labelled;
 mod names;
 mod paper;
 mod plot;

@@ -3,6 +3,7 @@
 //! What a cosine is worth and how high absent names score is measured on all scenes but one and applied to that one; and, to compare, measured on
 //! all of them. The gap between the two says how much the figures owe to having seen the scene.
 
+use crate::labelled::Labelled;
 use crate::table;
 use crate::trial::name;
 use anyhow::{Context, Result, bail};
@@ -11,7 +12,7 @@ use fastlgs::{Run, Session, calibrate, eval};
 use fastlgs_core::{labels, metrics};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
@@ -21,30 +22,6 @@ pub struct Args {
     /// Folder for the table (names.md, names.csv, names.json).
     #[arg(short, long)]
     output: Option<PathBuf>,
-}
-
-/// Scenes with their labels.
-#[derive(clap::Args)]
-pub struct Labelled {
-    /// Trained scene folders of one encoder.
-    #[arg(required = true)]
-    scenes: Vec<PathBuf>,
-    /// Their folders of labels, in the same order.
-    #[arg(long, required = true, value_delimiter = ',')]
-    labels: Vec<PathBuf>,
-}
-
-impl Labelled {
-    /// Each scene with its folder of labels.
-    ///
-    /// # Errors
-    /// Another number of folders than of scenes.
-    pub fn pairs(&self) -> Result<Vec<(&Path, &Path)>> {
-        if self.scenes.len() != self.labels.len() {
-            bail!("{} scenes and {} folders of labels: name one for each scene", self.scenes.len(), self.labels.len());
-        }
-        Ok(self.scenes.iter().zip(&self.labels).map(|(scene, labels)| (scene.as_path(), labels.as_path())).collect())
-    }
 }
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {

@@ -3,14 +3,14 @@
 //! The click is the pixel of a label that lies deepest in it, and the name is asked for wherever that label is. What is found is compared with the
 //! best object there is. The user's own names stay as they are.
 
-use crate::names::Labelled;
+use crate::labelled::Labelled;
 use crate::table;
 use anyhow::Result;
 use fastlgs::calibrations::Calibrations;
 use fastlgs::eval::best_object;
 use fastlgs::session::ask::{Ask, Meaning};
 use fastlgs::{Run, Session};
-use fastlgs_core::labels::LabelledView;
+use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -36,7 +36,14 @@ pub struct Args {
 struct Seen {
     camera: Camera,
     field: Field,
-    labels: Vec<(String, Vec<bool>)>,
+    labels: Vec<Taught>,
+}
+
+/// A label of a view: its name, its pixels, and the IoU of the object that fits it best.
+struct Taught {
+    name: String,
+    mask: Vec<bool>,
+    best: f64,
 }
 
 /// A scene with its labelled views.
@@ -63,7 +70,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut rows = Vec::new();
     for school in &schools {
         for lesson in &school.seen {
-            for (name, mask) in &lesson.labels {
+            for Taught { name, mask, .. } in &lesson.labels {
                 let object = school.clicked(lesson, mask, &config)?;
                 for asked in &schools {
                     rows.extend(asked.exam(school, &lesson.camera.name, name, object, &config)?);
@@ -96,7 +103,11 @@ impl School {
         for view in views {
             let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
             let field = scene.field(&camera, None)?;
-            let labels = view.labels.iter().map(|l| (l.category.clone(), view.mask(l, camera.width, camera.height))).collect();
+            let taught = |label: &Label| {
+                let mask = view.mask(label, camera.width, camera.height);
+                Taught { name: label.category.clone(), best: best_object(&grid, &field, &mask).0, mask }
+            };
+            let labels = view.labels.iter().map(taught).collect();
             seen.push(Seen { camera, field, labels });
         }
         Ok(Self { name: crate::trial::name(root), scene, grid, seen })
@@ -114,16 +125,15 @@ impl School {
         let mut rows = Vec::new();
         let shown = object.map(|id| teacher.grid.objects[usize::from(id) - 1].embeddings.clone()).filter(|shown| !shown.is_empty());
         for view in &self.seen {
-            for (_, truth) in view.labels.iter().filter(|(label, _)| label == name) {
+            for label in view.labels.iter().filter(|label| label.name == name) {
                 let iou = match &shown {
                     None => 0.0,
                     Some(shown) => {
                         let query = TextQuery::of_examples(shown.clone(), Calibrations::of(&self.scene.manifest).pictures);
                         let found = Meaning::Embedded(Box::new(query), None).find(&self.grid, &view.field, &view.camera, config)?;
-                        metrics::iou(&view.field.mask(&self.grid, &found.targets), truth)
+                        metrics::iou(&view.field.mask(&self.grid, &found.targets), &label.mask)
                     }
                 };
-                let (best, ..) = best_object(&self.grid, &view.field, truth);
                 rows.push(json!({
                     "label": name,
                     "taught_in": teacher.name,
@@ -131,7 +141,7 @@ impl School {
                     "asked_in": self.name,
                     "object": object,
                     "iou": iou,
-                    "share_of_best": iou / best.max(f64::MIN_POSITIVE),
+                    "share_of_best": iou / label.best.max(f64::MIN_POSITIVE),
                 }));
             }
         }
