@@ -61,7 +61,7 @@ pub fn train(r: &fastlgs::train::Report) -> String {
         format!("{held_out} on photos that were kept aside")
     };
     let dropped = r.mapping_summary.as_ref().map(|s| {
-        let left_out = s.few_views + s.small + s.unsupported + s.same;
+        let left_out = s.few_views + s.unsupported + s.same;
         format!(", of {} masks; {left_out} candidates had too little behind them", thousands(s.masks))
     });
     table(&[

@@ -131,11 +131,25 @@ pub fn localised(relevancy: &[f32], width: u32, height: u32, boxes: &[[f64; 4]])
         let k = k.rem_euclid(period);
         k.min(period - k) as usize
     };
+    // The window moves on by one: what enters is added, what leaves taken away.
+    let moved = |k: usize, n: usize| (mirrored(k as isize + 14, n), mirrored(k as isize - 15, n));
     let mut rows = vec![0.0f64; w * h];
-    for p in 0..w * h {
-        rows[p] = (-14..=14).map(|d| f64::from(relevancy[p / w * w + mirrored((p % w) as isize + d, w)])).sum();
+    for (row, values) in rows.chunks_exact_mut(w).zip(relevancy.chunks_exact(w)) {
+        let mut sum: f64 = (-15..14).map(|d| f64::from(values[mirrored(d, w)])).sum();
+        for (x, out) in row.iter_mut().enumerate() {
+            let (enters, leaves) = moved(x, w);
+            sum += f64::from(values[enters]) - f64::from(values[leaves]);
+            *out = sum;
+        }
     }
-    let values: Vec<f64> = (0..w * h).map(|p| (-14..=14).map(|d| rows[mirrored((p / w) as isize + d, h) * w + p % w]).sum()).collect();
+    let mut sums: Vec<f64> = (0..w).map(|x| (-15..14).map(|d| rows[mirrored(d, h) * w + x]).sum()).collect();
+    let mut values = Vec::with_capacity(w * h);
+    for y in 0..h {
+        let (enters, leaves) = moved(y, h);
+        let pairs = rows[enters * w..][..w].iter().zip(&rows[leaves * w..][..w]);
+        sums.iter_mut().zip(pairs).for_each(|(sum, (enters, leaves))| *sum += enters - leaves);
+        values.extend_from_slice(&sums);
+    }
     let peak = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
     (0..w * h).filter(|&p| values[p] >= peak - 1e-9).any(|p| {
         let (x, y) = ((p % w) as f64 + 0.5, (p / w) as f64 + 0.5);

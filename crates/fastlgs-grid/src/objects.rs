@@ -10,10 +10,8 @@ use std::collections::BTreeSet;
 /// When a set is an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
-    /// Fewest views that must show it.
+    /// Fewest views that must show it, each in [`MIN_PIXELS`](crate::sightings::MIN_PIXELS) at least: so glimpses from afar make nothing smaller.
     pub min_views: usize,
-    /// Smallest object, as the share of a view's pixels that so many views must show. Further photos from afar make nothing smaller.
-    pub min_share: f32,
     /// Least support by masks: their IoU, as where masks propose a set.
     pub min_support: f32,
     /// Of sets whose IoU is more than this only the best supported one is an object.
@@ -22,7 +20,7 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { min_views: 3, min_share: 0.0005, min_support: 0.5, same: 0.7 }
+        Self { min_views: 3, min_support: 0.5, same: 0.7 }
     }
 }
 
@@ -39,8 +37,8 @@ pub struct Chosen {
     pub shown: Vec<f32>,
     /// What the views show of each object.
     pub support: Vec<Support>,
-    /// Sets that are no objects: too few views, too small, no masks of their shape, the same as another.
-    pub dropped: [usize; 4],
+    /// Sets that are no objects: too few views that show enough of them, no masks of their shape, the same as another.
+    pub dropped: [usize; 3],
 }
 
 impl Chosen {
@@ -73,8 +71,7 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
     let mut chosen = Chosen::default();
     let mut left: Vec<(Proposal, Support)> = Vec::new();
     for (set, s) in sets.into_iter().zip(support) {
-        let small = (s.reached_by(config.min_views) as f32) < config.min_share * pixels as f32;
-        match [s.areas.len() < config.min_views, small, s.iou < config.min_support].iter().position(|bad| *bad) {
+        match [s.areas.len() < config.min_views, s.iou < config.min_support].iter().position(|bad| *bad) {
             Some(reason) => chosen.dropped[reason] += 1,
             None => left.push((set, s)),
         }
@@ -92,7 +89,7 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
         let alike =
             kept.common(&set.set, &weights).into_iter().any(|(other, common)| common > config.same * (size + objects[other].0 - common));
         if alike || objects.len() == usize::from(u16::MAX) - 1 {
-            chosen.dropped[3] += 1;
+            chosen.dropped[2] += 1;
             continue;
         }
         kept.add(objects.len(), &set.set);
@@ -169,25 +166,18 @@ mod tests {
     fn supported_sets_are_objects_by_falling_size_and_may_overlap() {
         // A part that reaches out of its whole, another of which too little is supported, a neighbour that overlaps the whole.
         let found = chosen(&[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)], &Config::default());
-        assert_eq!((found.parents.as_slice(), found.dropped), (&[0, 0, 1][..], [0, 0, 1, 0]));
+        assert_eq!((found.parents.as_slice(), found.dropped), (&[0, 0, 1][..], [0, 1, 0]));
         let lists = found.lists();
         let of: Vec<&[u16]> = found.ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
         let all: [(&[u16], usize); 7] = [(&[], 1), (&[3], 1), (&[3, 1], 3), (&[1], 5), (&[2, 1], 2), (&[2], 4), (&[], 4)];
         assert_eq!(of, all.iter().flat_map(|(list, count)| vec![*list; *count]).collect::<Vec<_>>());
         assert_eq!(found.layers(), [BTreeSet::from([1]), BTreeSet::from([2, 3])]);
-        assert_eq!(chosen(&[(0..5, 0.9)], &Config { min_views: 5, ..Config::default() }).dropped, [1, 0, 0, 0]);
-    }
-
-    #[test]
-    fn glimpses_from_afar_make_nothing_smaller() {
-        let near = |areas: &[u32]| Support { iou: 1.0, areas: areas.iter().copied().zip(0..).collect() };
-        assert_eq!((near(&[100, 120, 110, 1, 1]).reached_by(3), near(&[100, 120, 90]).reached_by(3)), (100, 90));
-        assert_eq!(chosen(&[(0..1, 1.0)], &Config { min_share: 0.02, ..Config::default() }).dropped, [0, 1, 0, 0]);
+        assert_eq!(chosen(&[(0..5, 0.9)], &Config { min_views: 5, ..Config::default() }).dropped, [1, 0, 0]);
     }
 
     #[test]
     fn of_two_that_are_nearly_the_same_the_better_one_stays() {
         let found = chosen(&[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)], &Config::default());
-        assert_eq!((found.support.iter().map(|s| s.iou).collect::<Vec<_>>(), found.dropped), (vec![0.9, 0.6], [0, 0, 0, 1]));
+        assert_eq!((found.support.iter().map(|s| s.iou).collect::<Vec<_>>(), found.dropped), (vec![0.9, 0.6], [0, 0, 1]));
     }
 }

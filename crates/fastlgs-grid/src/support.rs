@@ -9,17 +9,8 @@ use rayon::prelude::*;
 pub struct Support {
     /// Mean IoU of the set with the best mask of each view, weighted by the set's pixels there.
     pub iou: f32,
-    /// (pixels, view) of the views that show it.
+    /// (pixels, view) of the views that show it, in [`MIN_PIXELS`](crate::sightings::MIN_PIXELS) at least.
     pub areas: Vec<(u32, u32)>,
-}
-
-impl Support {
-    /// The pixels that so many views show at least; 0 where fewer show it.
-    pub fn reached_by(&self, count: usize) -> u32 {
-        let mut areas: Vec<u32> = self.areas.iter().map(|a| a.0).collect();
-        areas.sort_unstable_by(|a, b| b.cmp(a));
-        areas.get(count.saturating_sub(1)).copied().unwrap_or(0)
-    }
 }
 
 /// Compares every set with the masks of every view.
@@ -53,6 +44,5 @@ mod tests {
         let found = support(&sightings, &sets);
         assert_eq!(found.iter().map(|s| s.iou).collect::<Vec<_>>(), [1.0, 0.5, 1.0, 0.0, 0.8]);
         assert_eq!(found[2].areas, [(400, 0), (400, 1), (400, 2)]);
-        assert_eq!((found[2].reached_by(3), found[2].reached_by(4)), (400, 0));
     }
 }

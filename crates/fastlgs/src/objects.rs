@@ -123,8 +123,8 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     let chosen = chosen::choose(&sightings, elected, support, pixels, &config.objects);
     told("objects", chosen.support.len());
     scene.object_ids.clone_from(&chosen.ids);
-    let [few_views, small, unsupported, same] = chosen.dropped;
-    let summary = Summary { masks, megabytes, sets, overlaps: chosen.overlaps.0.len(), few_views, small, unsupported, same };
+    let [few_views, unsupported, same] = chosen.dropped;
+    let summary = Summary { masks, megabytes, sets, overlaps: chosen.overlaps.0.len(), few_views, unsupported, same };
     Ok(Mapped { chosen, summary })
 }
 
@@ -235,10 +235,8 @@ pub struct Summary {
     pub sets: usize,
     /// Ways in which objects overlap that no tree of them has.
     pub overlaps: usize,
-    /// Sets that too few views show.
+    /// Sets of which too few views show enough pixels.
     pub few_views: usize,
-    /// Sets that are too small.
-    pub small: usize,
     /// Sets that no masks support.
     pub unsupported: usize,
     /// Sets that are the same as another.

@@ -15,12 +15,17 @@ pub enum Masks {
     Lists,
 }
 
+/// A view that shows less than one part in so many of what the best view shows of a thing shows a sliver of it, often a line of one pixel, which
+/// nobody would outline: it is not labelled there.
+const SLIVER: usize = 100;
+
 /// Writes PHOTOS: `images/`, `transforms.json`, exact masks, `depth/` (EXR) and `labels/` of every `holdout`-th view.
 ///
 /// # Errors
 /// The system's refusal.
 pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: impl FnMut()) -> Result<()> {
     let mut frames = Vec::new();
+    let (mut labelled, mut most) = (Vec::new(), vec![0; world.things.len()]);
     for (index, camera) in world.cameras.iter().enumerate() {
         let view = world.render(index, 2);
         let name = &camera.name;
@@ -36,13 +41,18 @@ pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: 
         }
         let depth = out.join("depth").join(format!("{name}.exr"));
         exr_image::write(&depth, camera.width as usize, camera.height as usize, &[("Z", &view.depth)])?;
+        let areas = areas(&world.things, &view.instances);
+        most.iter_mut().zip(&areas).for_each(|(most, area)| *most = *area.max(most));
         if crate::scene_folder::is_held_out(index, holdout) {
-            write_labels(out, &world.things, camera, &view.instances)?;
+            labelled.push((camera, view.instances, areas));
         }
         let flip = glam::Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));
         let camera_to_world = (camera.world_to_camera.inverse() * flip).transpose().to_cols_array_2d();
         frames.push(json!({ "file_path": format!("images/{name}"), "transform_matrix": camera_to_world }));
         done();
+    }
+    for (camera, instances, areas) in &labelled {
+        write_labels(out, &world.things, camera, instances, &slivers(areas, &most))?;
     }
     let first = &world.cameras[0];
     let instances = world.things.iter().enumerate().map(|(k, t)| json!({ "instance": k + 1, "name": t.name, "parent": t.parent }));
@@ -73,10 +83,22 @@ fn overlapping(things: &[Thing], instances: &LabelMap) -> MaskList {
     list
 }
 
+/// By thing, the pixels that it and its parts have.
+fn areas(things: &[Thing], instances: &LabelMap) -> Vec<usize> {
+    let mut areas = vec![0; things.len()];
+    instances.labels.iter().for_each(|id| chain(things, *id).for_each(|own| areas[usize::from(own) - 1] += 1));
+    areas
+}
+
+/// The things of which so few pixels are slivers, by the most that a view shows of them.
+fn slivers(areas: &[usize], most: &[usize]) -> Vec<bool> {
+    areas.iter().zip(most).map(|(area, most)| SLIVER * area < *most).collect()
+}
+
 /// Exact labels of things and parts in the LERF-OVS layout: one rectangle for each run of pixels in a row.
-fn write_labels(out: &Path, things: &[Thing], camera: &Camera, instances: &LabelMap) -> Result<()> {
+fn write_labels(out: &Path, things: &[Thing], camera: &Camera, instances: &LabelMap, sliver: &[bool]) -> Result<()> {
     let mut objects = Vec::new();
-    for (k, thing) in things.iter().enumerate() {
+    for (k, thing) in things.iter().enumerate().filter(|(k, _)| !sliver[*k]) {
         let own = k as u16 + 1;
         let inside = |x: u32, y: u32| chain(things, instances.at(x, y)).any(|id| id == own);
         for y in 0..instances.height {
@@ -110,8 +132,9 @@ mod tests {
         assert_eq!([0, 1, 2].map(|level| at_level(&things, 4, level)), [4, 4, 4]);
         assert_eq!(at_level(&things, 0, 1), 0);
         // A pixel each of nothing, the cart, its wheel, the hub, and the ball.
-        let list = overlapping(&things, &LabelMap { width: 5, height: 1, labels: vec![0, 1, 2, 3, 4] });
-        let areas: Vec<usize> = list.masks.iter().map(|m| m.runs.area()).collect();
-        assert_eq!(areas, [3, 2, 1, 1]);
+        let map = LabelMap { width: 5, height: 1, labels: vec![0, 1, 2, 3, 4] };
+        let of_masks: Vec<usize> = overlapping(&things, &map).masks.iter().map(|m| m.runs.area()).collect();
+        assert_eq!((of_masks, areas(&things, &map)), (vec![3, 2, 1, 1], vec![3, 2, 1, 1]));
+        assert_eq!(slivers(&[3, 2, 1, 0], &[301, 200, 1, 0]), [true, false, false, false]);
     }
 }

@@ -244,9 +244,6 @@ pub struct Config {
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
-    /// Global mapping: smallest object, as the share of a photo's pixels that three views must show.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_share))]
-    pub min_share: f32,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
     pub curve: Option<u32>,
@@ -282,7 +279,6 @@ impl Default for Config {
             alpha: paper.alpha,
             cues: vec![Cue::Keypoints, Cue::Color],
             support: objects.min_support,
-            min_share: objects.min_share,
             curve: None,
             feature_weight: FEATURE_WEIGHT,
             resume: false,
@@ -328,7 +324,7 @@ impl Config {
     pub(super) fn global(&self) -> objects::Config {
         objects::Config {
             antialias: self.antialias,
-            objects: chosen::Config { min_support: self.support, min_share: self.min_share, ..chosen::Config::default() },
+            objects: chosen::Config { min_support: self.support, ..chosen::Config::default() },
         }
     }
 }
