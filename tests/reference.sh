@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# SAM and CLIP with random weights against their authors' programs: makes ONNX exports and what the originals answer, and compares. Needs PyPI, a
+# SAM, CLIP and SigLIP with random weights against their authors' programs: makes ONNX exports and what the originals answer, and compares. Needs PyPI, a
 # gigabyte for PyTorch, and some minutes; test.sh --all runs it. Python 3.8 to 3.10, which that PyTorch takes, by name or whole path as REFERENCE_PYTHON.
 # SAM 2 takes another five gigabytes, for a later PyTorch and all that this brings: only where REFERENCE_SAM2 names a Python 3.10 to 3.12 for it.
 set -euo pipefail
@@ -9,7 +9,7 @@ for version in 3.10 3.9 3.8; do
     [ "$python" ] || ! "python$version" -c 'import venv, ensurepip' 2>/dev/null || python=python$version
 done
 if [ -z "$python" ]; then
-    echo "SKIPPED: no Python 3.8 to 3.10 for the originals of SAM and CLIP; name one: REFERENCE_PYTHON=FILE tests/reference.sh"
+    echo "SKIPPED: no Python 3.8 to 3.10 for the originals of SAM, CLIP and SigLIP; name one: REFERENCE_PYTHON=FILE tests/reference.sh"
     exit 0
 fi
 venv=target/reference/venv out=$PWD/target/reference/out
@@ -17,13 +17,14 @@ ready=$venv/ready-$(cksum < tests/reference.sh | cut -d' ' -f1)
 if [ ! -f "$ready" ]; then
     rm -rf "$venv"
     "$python" -m venv "$venv"
-    "$venv/bin/pip" install --quiet torch==1.12.1 torchvision==0.13.1 transformers==4.36.2 segment-anything==1.0 \
+    "$venv/bin/pip" install --quiet torch==1.12.1 torchvision==0.13.1 transformers==4.37.2 segment-anything==1.0 \
         'numpy<2' 'onnx<1.16' 'protobuf<5' pillow
     touch "$ready"
 fi
 merges=${FASTLGS_CACHE:-${XDG_CACHE_HOME:-$HOME/.cache}/fastlgs}/offline/bpe_simple_vocab_16e6.txt.gz
 "$venv/bin/python" -W ignore tests/reference/sam.py "$out" > /dev/null
 "$venv/bin/python" -W ignore tests/reference/clip.py "$out" "$merges" > /dev/null
+"$venv/bin/python" -W ignore tests/reference/siglip.py "$out" > /dev/null
 if [ -n "${REFERENCE_SAM2:-}" ]; then
     venv=target/reference/venv-sam2
     ready=$venv/ready-$(cksum < tests/reference.sh | cut -d' ' -f1)

@@ -17,6 +17,8 @@ import torch
 from PIL import Image
 from transformers import CLIPConfig, CLIPImageProcessor, CLIPModel, CLIPTextConfig, CLIPTokenizer, CLIPVisionConfig
 
+from shared import detailed, framed
+
 TEXTS = ["fox", "a photo of a red bottle.", "Café & crème, 42 pieces!", "the wooden stand's   left leg", "mirror"]
 
 
@@ -65,17 +67,12 @@ def main():
     names = ["input_ids", "attention_mask"]
     torch.onnx.export(Text(), given, out / "text.onnx", input_names=names, output_names=["text_embeds"], dynamic_axes={n: rows for n in names}, opset_version=16)
 
-    # A square whose details are finer than what CLIP sees: how it is made smaller matters.
-    y, x = np.mgrid[0:420, 0:420]
-    picture = np.stack([127 + 60 * np.sin(x * x / 900), 127 + 60 * np.sin(y / 3), np.where((x // 7 + y // 5) % 2, 160, 90)], -1).astype(np.uint8)
+    picture = detailed()
     Image.fromarray(picture).save(out / "photo.png")
-    # A mask's box is shown with a twentieth of its side around it, in grey.
-    cut = np.full((441, 441, 3), 127, np.uint8)
-    cut[11:431, 11:431] = picture
     processor = CLIPImageProcessor()
     processor.save_pretrained(out)
     with torch.no_grad():
-        np.save(out / "picture.npy", clip.get_image_features(processor(cut, return_tensors="pt")["pixel_values"]).numpy())
+        np.save(out / "picture.npy", clip.get_image_features(processor(framed(picture), return_tensors="pt")["pixel_values"]).numpy())
         np.save(out / "texts.npy", clip.get_text_features(*given).numpy())
     (out / "texts.json").write_text(json.dumps(TEXTS))
 

@@ -1,4 +1,4 @@
-"""What both Segment Anythings are asked about, and how random weights are made to answer."""
+"""What several originals are asked about, and how random weights are made to answer."""
 
 import json
 
@@ -18,6 +18,19 @@ def photo():
     picture[200:500, 130:450] = [220, 30, 30]
     picture[380:660, 640:920] = [20, 40, 220]
     return picture
+
+
+def detailed():
+    """A square whose details are finer than what CLIP and SigLIP see: how it is made smaller matters."""
+    y, x = np.mgrid[0:420, 0:420]
+    return np.stack([127 + 60 * np.sin(x * x / 900), 127 + 60 * np.sin(y / 3), np.where((x // 7 + y // 5) % 2, 160, 90)], -1).astype(np.uint8)
+
+
+def framed(picture):
+    """A mask's box is shown with a twentieth of its side around it, in grey."""
+    cut = np.full((441, 441, 3), 127, np.uint8)
+    cut[11:431, 11:431] = picture
+    return cut
 
 
 def lively(points, hyper, upscaling, score):

@@ -172,6 +172,17 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     g.save(decoder);
 }
 
+/// An image tower that gives its embedding as SigLIP's do: the second of two outputs.
+pub fn siglip_image(image: &Path, size: i64) {
+    let mut g = Graph::default();
+    let pixels = g.input("pixel_values", Kind::Float, &[-1, 3, size, size]);
+    let mean = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
+    let rows = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[3]), Attribute::Int("keepdims", 0)]);
+    g.output(&rows, "last_hidden_state", &[-1, 3, size]);
+    g.output(&mean, "pooler_output", &[-1, 3]);
+    g.save(image);
+}
+
 /// Token of each colour's name in CLIP's published vocabulary.
 pub const COLOR_TOKENS: [i64; 3] = [736, 1901, 1746];
 

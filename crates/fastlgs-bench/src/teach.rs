@@ -1,20 +1,21 @@
 //! `fastlgs bench teach`: whether what is taught by a click in one view is found by its name in other views and in other scenes.
 //!
-//! The click is the pixel of a label that lies deepest in it, and the name is asked for wherever that label is. What is found is compared with the
-//! best object there is. The user's own names stay as they are.
+//! The first click is the pixel of a label that lies deepest in it, further ones go to what is far from those before, and the name is asked for wherever
+//! that label is. What is found is compared with the best object there is. The user's own names stay as they are.
 
 use crate::labelled::Labelled;
 use crate::table;
 use anyhow::Result;
 use fastlgs::calibrations::Calibrations;
 use fastlgs::eval::best_object;
+use fastlgs::session::Pixels;
 use fastlgs::session::ask::{Ask, Meaning};
 use fastlgs::{Run, Session};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
-use fastlgs_grid::query::QueryConfig;
+use fastlgs_grid::query::{Hit, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -27,6 +28,9 @@ pub struct Args {
     /// Share of the names of absent things that may be answered all the same.
     #[arg(long, value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms)]
     false_alarms: f32,
+    /// Clicks into each label.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=9))]
+    clicks: u8,
     /// Folder for the table (teach.md, teach.csv, teach.json).
     #[arg(short, long)]
     output: Option<PathBuf>,
@@ -55,7 +59,7 @@ struct School {
 }
 
 /// Columns of the table.
-const COLUMNS: [&str; 7] = ["label", "taught_in", "view", "asked_in", "object", "iou", "share_of_best"];
+const COLUMNS: [&str; 8] = ["label", "taught_in", "view", "clicked", "asked_in", "object", "iou", "share_of_best"];
 
 /// Share of the best object's IoU from which a name counts as known.
 const KNOWN: f64 = 0.8;
@@ -70,10 +74,13 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut rows = Vec::new();
     for school in &schools {
         for lesson in &school.seen {
-            for Taught { name, mask, .. } in &lesson.labels {
-                let object = school.clicked(lesson, mask, &config)?;
+            for Taught { name, mask, best } in &lesson.labels {
+                let targets = school.clicked(lesson, mask, args.clicks, &config)?;
+                let clicked = metrics::iou(&lesson.field.mask(&school.grid, &targets), mask) / best.max(f64::MIN_POSITIVE);
                 for asked in &schools {
-                    rows.extend(asked.exam(school, &lesson.camera.name, name, object, &config)?);
+                    let mut found = asked.exam(school, &lesson.camera.name, name, targets.first().map(|hit| hit.id), &config)?;
+                    found.iter_mut().for_each(|row| row["clicked"] = json!(clicked));
+                    rows.extend(found);
                 }
             }
         }
@@ -113,11 +120,10 @@ impl School {
         Ok(Self { name: crate::trial::name(root), scene, grid, seen })
     }
 
-    /// The object that a click into the middle of a mask means; nothing where there is none that was embedded.
-    fn clicked(&self, view: &Seen, mask: &[bool], config: &QueryConfig) -> Result<Option<u16>> {
-        let [x, y] = deepest(mask, view.camera.width);
-        let found = Ask::Point(x, y).meaning(&self.scene, &[])?.find(&self.grid, &view.field, &view.camera, config)?;
-        Ok(found.targets.first().map(|hit| hit.id))
+    /// The object that so many clicks into a mask mean; nothing where there is none that was embedded.
+    fn clicked(&self, view: &Seen, mask: &[bool], clicks: u8, config: &QueryConfig) -> Result<Vec<Hit>> {
+        let pixels = clicked(mask, view.camera.width, clicks);
+        Ok(Ask::Point(pixels).meaning(&self.scene, &[])?.find(&self.grid, &view.field, &view.camera, config)?.targets)
     }
 
     /// Asks for a name, wherever it labels something here, that was taught by an object of another scene or of this one.
@@ -149,8 +155,24 @@ impl School {
     }
 }
 
-/// The pixel of a mask that is farthest from what is not in it, the photo's border included (city-block distance).
-fn deepest(mask: &[bool], width: u32) -> [u32; 2] {
+/// Clicks into a mask: the pixel that is farthest from what is not in it, and then those that are farthest from the clicks before and a third as far as that
+/// one from what is not in it.
+fn clicked(mask: &[bool], width: u32, clicks: u8) -> Pixels {
+    let depth = depths(mask, width);
+    let at = |p: usize| (p as u32 % width, p as u32 / width);
+    let first = (0..mask.len()).rev().max_by_key(|p| depth[*p]).unwrap_or(0);
+    let mut pixels = vec![at(first)];
+    let inside: Vec<usize> = (0..mask.len()).filter(|p| mask[*p] && 3 * depth[*p] >= depth[first]).collect();
+    while pixels.len() < usize::from(clicks) {
+        let far = |p: &usize| pixels.iter().map(|(x, y)| at(*p).0.abs_diff(*x) + at(*p).1.abs_diff(*y)).min();
+        let Some(next) = inside.iter().copied().max_by_key(far) else { break };
+        pixels.push(at(next));
+    }
+    Pixels(pixels)
+}
+
+/// How far each pixel of a mask is from what is not in it, the photo's border included (city-block distance).
+fn depths(mask: &[bool], width: u32) -> Vec<u32> {
     let (w, h) = (width as usize, mask.len() / width as usize);
     let mut depth = vec![0u32; mask.len()];
     let at = |depth: &[u32], x: usize, y: usize| if x < w && y < h { depth[y * w + x] } else { 0 };
@@ -163,8 +185,7 @@ fn deepest(mask: &[bool], width: u32) -> [u32; 2] {
         let (x, y) = (p % w, p / w);
         depth[p] = depth[p].min(at(&depth, x + 1, y).min(at(&depth, x, y + 1)) + 1);
     }
-    let place = (0..mask.len()).rev().max_by_key(|p| depth[*p]).unwrap_or(0);
-    [(place % w) as u32, (place / w) as u32]
+    depth
 }
 
 #[cfg(test)]
@@ -176,8 +197,10 @@ mod tests {
         // A diamond of radius 2 in six columns.
         let at = |x: i32, y: i32| (x - 3).abs() + (y - 2).abs() <= 2;
         let diamond: Vec<bool> = (0..30).map(|p| at(p % 6, p / 6)).collect();
-        assert_eq!(deepest(&diamond, 6), [3, 2]);
+        assert_eq!(clicked(&diamond, 6, 1).0, [(3, 2)]);
         // The border of the photo is one, too.
-        assert_eq!(deepest(&[true; 25], 5), [2, 2]);
+        assert_eq!(clicked(&[true; 25], 5, 1).0, [(2, 2)]);
+        // Of a row of nine, its ends come next.
+        assert_eq!(clicked(&[true; 9], 9, 3).0, [(4, 0), (8, 0), (0, 0)]);
     }
 }

@@ -43,14 +43,13 @@ impl Field {
         }
     }
 
-    /// The objects that have most of a pixel, from small to large.
-    pub fn at(&self, grid: &Grid, x: u32, y: u32) -> Vec<u16> {
-        let (wanted, mut place) = (y * self.size().0 + x, 0);
-        let mut found = Vec::new();
+    /// The objects that have most of each of these pixels, from small to large.
+    pub fn at(&self, grid: &Grid, pixels: &[(u32, u32)]) -> Vec<Vec<u16>> {
+        let (width, mut place) = (self.size().0, 0);
+        let mut found = vec![Vec::new(); pixels.len()];
         self.each(grid, |objects| {
-            if place == wanted {
-                found = objects.to_vec();
-            }
+            let asked = pixels.iter().zip(&mut found).filter(|((x, y), _)| y * width + x == place);
+            asked.for_each(|(_, found)| *found = objects.to_vec());
             place += 1;
         });
         found

@@ -4,6 +4,7 @@ use crate::calibration::Best;
 use crate::grid::{Grid, Object};
 use crate::relevancy::TextQuery;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 
 /// How objects are chosen.
 #[derive(Clone, Copy, Debug)]
@@ -123,13 +124,25 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
 /// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
 pub const SUPPORT_SHARE: f32 = 0.98;
 
-/// Of objects that lie in each other, from small to large: the largest whose support comes near the best. Views agree easily on what fills them, so
-/// that support counts by how much of the scene an object is not: all of it is no thing.
-pub fn best_supported(grid: &Grid, nested: &[u16]) -> Option<u16> {
+/// Share of clicks that go beside what is meant.
+const BESIDE: f32 = 0.1;
+
+/// The objects that some pixels of one thing show, from small to large, and the one that is meant; of each pixel, those that have most of it.
+///
+/// One pixel means the largest object there whose support comes near the best. Views agree easily on what fills them, so that support counts by how much
+/// of the scene an object is not: all of it is no thing. Further pixels tell how far the thing reaches, by Bayes: a pixel that falls on it anywhere
+/// says the more for it the smaller it is, and one beside it is a mistake.
+pub fn pointed(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
     let shares = grid.shares();
-    let support = |id: &u16| grid.objects[usize::from(*id) - 1].support * (1.0 - shares[usize::from(*id) - 1]);
-    let best = nested.iter().map(support).fold(0.0, f32::max);
-    nested.iter().rev().find(|id| support(id) >= SUPPORT_SHARE * best).copied()
+    let there: BTreeSet<u16> = pixels.iter().flatten().copied().collect();
+    let odds = |id: u16| {
+        let (object, share) = (&grid.objects[usize::from(id) - 1], shares[usize::from(id) - 1].max(1e-6));
+        let on = pixels.iter().filter(|at| at.contains(&id)).count();
+        object.support * (1.0 - share) * share.powi(1 - on as i32) * BESIDE.powi((pixels.len() - on) as i32)
+    };
+    let best = there.iter().map(|id| odds(*id)).fold(0.0, f32::max);
+    let meant = there.iter().find(|id| odds(**id) >= SUPPORT_SHARE * best).copied();
+    (there.into_iter().rev().collect(), meant)
 }
 
 /// Score of the object that is most like the text: what decides whether it is found.
@@ -298,9 +311,14 @@ pub(crate) mod tests {
         let object = |id: u16, parent: u16, support: f32| Object { support, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
         let objects = vec![object(1, 0, 1.0), object(2, 1, 0.9), object(3, 2, 0.7)];
         let grid = Grid { objects, shown: vec![0.0, 0.8, 0.15, 0.05], ..Grid::default() };
-        assert_eq!(best_supported(&grid, &[3, 2, 1]), Some(2));
-        assert_eq!(best_supported(&grid, &[1]), Some(1), "where there is nothing else");
-        assert_eq!(best_supported(&grid, &[]), None);
+        let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels);
+        assert_eq!(meant(&[vec![3, 2, 1]]), (vec![3, 2, 1], Some(2)));
+        assert_eq!(meant(&[vec![1]]).1, Some(1), "where there is nothing else");
+        assert_eq!(meant(&[vec![]]), (vec![], None));
+        // All that both clicks hit: the part; a click beside it counts little against two, and one on each of two things means what holds both.
+        assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1]]).1, Some(3));
+        assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1], vec![2, 1], vec![2, 1]]).1, Some(2));
+        assert_eq!(meant(&[vec![2, 1], vec![2, 1], vec![1], vec![2, 1]]).1, Some(2));
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::{Error, raised};
 use fastlgs::Session;
 use fastlgs::session::answer::{CANDIDATES, Question};
 use fastlgs::session::ask::Ask;
-use fastlgs::session::selection;
+use fastlgs::session::{Pixels, selection};
 use fastlgs_core::gaussians::rest_len;
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -22,6 +22,22 @@ use pyo3::types::PyDict;
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
+
+/// One pixel, or several of one thing.
+#[derive(FromPyObject)]
+enum Pointed {
+    One((u32, u32)),
+    Several(Vec<(u32, u32)>),
+}
+
+impl Pointed {
+    fn pixels(self) -> Pixels {
+        match self {
+            Self::One(pixel) => Pixels(vec![pixel]),
+            Self::Several(pixels) => Pixels(pixels),
+        }
+    }
+}
 
 /// A trained scene on a device.
 #[pyclass(frozen, module = "fastlgs")]
@@ -137,14 +153,14 @@ impl Scene {
         self.with(py, |opened| opened.camera(&which)).map(Camera)
     }
 
-    /// Asks for a text, for what a pixel of the view shows, or for what a picture (uint8, (height, width, 3)) shows.
+    /// Asks for a text, for what a pixel of the view shows (or several of one thing, as a list), or for what a picture (uint8, (height, width, 3)) shows.
     #[pyo3(signature = (text = None, *, view = None, point = None, image = None, negatives = Vec::new(), false_alarms = None, top_k = None))]
     fn query(
         &self,
         py: Python<'_>,
         text: Option<String>,
         view: Option<&Bound<'_, PyAny>>,
-        point: Option<(u32, u32)>,
+        point: Option<Pointed>,
         image: Option<PyReadonlyArray3<'_, u8>>,
         negatives: Vec<String>,
         false_alarms: Option<f32>,
@@ -152,7 +168,7 @@ impl Scene {
     ) -> PyResult<Answer> {
         let ask = match (text, point, image) {
             (Some(text), None, None) => Ask::Text(text),
-            (None, Some((x, y)), None) => Ask::Point(x, y),
+            (None, Some(point), None) => Ask::Point(point.pixels()),
             (None, None, Some(image)) => Ask::Image("image".to_owned(), picture(&image)?),
             _ => return Err(Error::new_err("ask in one way: a text, a point or an image")),
         };

@@ -12,6 +12,7 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use fastlgs::session::answer::{CANDIDATES, Question};
+use fastlgs::session::Pixels;
 use fastlgs::session::ask::Ask;
 use fastlgs::session::pictures::{heatmap, mask_picture, overlay};
 use fastlgs::session::{parse_size, selection};
@@ -168,7 +169,7 @@ fn checked_text(text: &str) -> Answer<&str> {
 #[serde(deny_unknown_fields, default)]
 pub struct Asked {
     text: Option<String>,
-    point: Option<[u32; 2]>,
+    point: Option<Pixels>,
     /// A PNG or JPEG in base64.
     image: Option<String>,
     negative: Vec<String>,
@@ -188,12 +189,14 @@ pub struct Asked {
 pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>) -> Answer {
     let Json(asked) = request?;
     let camera = camera_of(&app, asked.view.as_deref(), asked.camera.clone(), asked.size.as_deref())?;
-    let ask = match (&asked.text, asked.point, &asked.image) {
+    let ask = match (&asked.text, &asked.point, &asked.image) {
         (Some(text), None, None) => Ask::Text(checked_text(text)?.to_owned()),
-        (None, Some([x, y]), None) if x < camera.width && y < camera.height => Ask::Point(x, y),
-        (None, Some([x, y]), None) => {
-            return Err(Failure::bad(format!("the point {x},{y} lies outside the view of {}x{}", camera.width, camera.height)));
-        }
+        (None, Some(pixels), None) => match pixels.outside(&camera) {
+            None => Ask::Point(pixels.clone()),
+            Some((x, y)) => {
+                return Err(Failure::bad(format!("the point {x},{y} lies outside the view of {}x{}", camera.width, camera.height)));
+            }
+        },
         (None, None, Some(data)) => {
             let data = base64::engine::general_purpose::STANDARD.decode(data).map_err(|e| Failure::bad(format!("image: {e}")))?;
             Ask::Image("image".into(), image_io::decode_rgb("image", &data).map_err(|e| Failure::bad(e.to_string()))?)

@@ -1,6 +1,6 @@
-//! CLIP (Radford et al. 2021) from ONNX exports of its two towers.
+//! CLIP (Radford et al. 2021) and SigLIP (Zhai et al. 2023) from ONNX exports of their two towers.
 
-use crate::clip_tokens::{CONTEXT, ClipTokens};
+use crate::clip_tokens::Tokens;
 use crate::crops;
 use crate::encoder::{Encoder, TextEncoder, normalise};
 use crate::runtime::{Array, Model};
@@ -22,6 +22,8 @@ const TEMPLATES: [&str; 4] = ["{}", "a photo of a {}.", "a photo of the {}.", "a
 /// Names under which exporters give the embedding, best first.
 const IMAGE_OUTPUTS: [&str; 4] = ["image_embeds", "image_features", "image_embedding", "embeddings"];
 const TEXT_OUTPUTS: [&str; 4] = ["text_embeds", "text_features", "text_embedding", "embeddings"];
+/// Where SigLIP's towers have it. CLIP's is not in the space that texts and pictures share: a projection follows.
+const POOLED: &str = "pooler_output";
 
 /// The image tower.
 pub struct ClipImage {
@@ -36,23 +38,35 @@ pub struct ClipImage {
 /// The text tower.
 pub struct ClipText {
     model: Model,
-    tokens: ClipTokens,
+    tokens: Tokens,
     ids: String,
     mask: Option<String>,
     output: String,
     context: usize,
 }
 
+/// A file of settings in the model's folder or the one above; null where there is none.
+fn settings(model: &Path, name: &str) -> Result<serde_json::Value> {
+    let found = model.ancestors().skip(1).take(2).map(|folder| folder.join(name)).find(|file| file.is_file());
+    Ok(found.map(|file| fs::read_json(&file)).transpose()?.unwrap_or_default())
+}
+
+/// Whether the configuration of a model is that of a SigLIP.
+fn is_siglip(configuration: &serde_json::Value) -> bool {
+    configuration["model_type"].as_str().is_some_and(|kind| kind.starts_with("siglip"))
+}
+
 /// The output of one of these names, else the only one.
-fn embedding_output(model: &Model, names: &[&str]) -> Result<String> {
+fn embedding_output(model: &Model, names: &[&str], configuration: &serde_json::Value) -> Result<String> {
+    let pooled = || model.output(&[POOLED]).filter(|_| is_siglip(configuration));
     let only = || model.outputs.first().filter(|_| model.outputs.len() == 1).map(String::as_str);
-    let found = model.output(names).or_else(only);
+    let found = model.output(names).or_else(pooled).or_else(only);
     found.map(str::to_owned).ok_or_else(|| model.refuse(format!("none of its outputs is an embedding: {}", model.outputs.join(", "))))
 }
 
 impl ClipImage {
     /// Loads the tower. Size and normalisation are those of `preprocessor_config.json` in its folder or the one above, as
-    /// far as there is one; a size that the model fixes goes first.
+    /// far as there is one; a size that the model fixes goes first. `config.json` there tells whether it is SigLIP's.
     ///
     /// # Errors
     /// When the file is missing or no image tower.
@@ -66,15 +80,14 @@ impl ClipImage {
             return Err(model.refuse(format!("its input '{}' takes no pictures", slot.name)));
         }
         let (fixed, input) = (slot.shape[2], slot.name.clone());
-        let configuration = path.ancestors().skip(1).take(2).map(|f| f.join("preprocessor_config.json")).find(|f| f.is_file());
-        let configuration: serde_json::Value = configuration.map(|f| fs::read_json(&f)).transpose()?.unwrap_or_default();
+        let configuration = settings(path, "preprocessor_config.json")?;
         let triple = |name: &str, otherwise: [f32; 3]| {
             let values = configuration[name].as_array().filter(|a| a.len() == 3);
             values.map_or(otherwise, |a| std::array::from_fn(|k| a[k].as_f64().unwrap_or(f64::from(otherwise[k])) as f32))
         };
         let side = |v: &serde_json::Value| v.as_u64().or_else(|| v["height"].as_u64()).or_else(|| v["shortest_edge"].as_u64());
         let told = side(&configuration["crop_size"]).or_else(|| side(&configuration["size"])).map(|s| s as usize);
-        let output = embedding_output(&model, &IMAGE_OUTPUTS)?;
+        let output = embedding_output(&model, &IMAGE_OUTPUTS, &settings(path, "config.json")?)?;
         let (mean, deviation) = (triple("image_mean", MEAN), triple("image_std", DEVIATION));
         Ok(Self { size: fixed.or(told).unwrap_or(SIZE), mean, deviation, input, output, model })
     }
@@ -127,8 +140,11 @@ impl ClipText {
         let ids = model.input(&["input_ids", "text", "tokens", "input"]).map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
         let (ids, context) = ids.ok_or_else(|| model.refuse("no text tower: it takes no token ids"))?;
         let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
-        let output = embedding_output(&model, &TEXT_OUTPUTS)?;
-        Ok(Self { tokens: ClipTokens::beside(path)?, context: context.unwrap_or(CONTEXT), ids, mask, output, model })
+        let configuration = settings(path, "config.json")?;
+        let output = embedding_output(&model, &TEXT_OUTPUTS, &configuration)?;
+        let told = configuration["text_config"]["max_position_embeddings"].as_u64().map(|longest| longest as usize);
+        let tokens = if is_siglip(&configuration) { Tokens::of_siglip(path)? } else { Tokens::beside(path)? };
+        Ok(Self { context: context.or(told).unwrap_or(tokens.context()), tokens, ids, mask, output, model })
     }
 
     /// L2-normalised embeddings of whole sentences.
@@ -139,8 +155,7 @@ impl ClipText {
             let (mut ids, mut mask) = (Vec::new(), Vec::new());
             for sentence in batch {
                 let row = self.tokens.encode(sentence, self.context)?;
-                // OpenAI's models are padded with zeros; those that take a mask with the end token, as their tokenizers do.
-                let padding = if self.mask.is_some() { self.tokens.end() } else { 0 };
+                let padding = self.tokens.padding(self.mask.is_some());
                 ids.extend((0..self.context).map(|k| row.get(k).copied().unwrap_or(padding) as f32));
                 mask.extend((0..self.context).map(|k| f32::from(u8::from(k < row.len()))));
             }
@@ -235,6 +250,25 @@ mod tests {
             assert!(cosine(&crops[crop], &texts[own]) > 0.9);
         }
         assert_eq!(crops[1], vec![0.0; 3]);
+    }
+
+    #[test]
+    fn a_pooled_output_is_an_embedding_where_it_is_siglips() {
+        let dir = tempfile::tempdir().unwrap();
+        let image = dir.path().join("vision_model.onnx");
+        toy_models::siglip_image(&image, 16);
+        if crate::places::runtime_library().is_err() {
+            return;
+        }
+        let refused = ClipImage::load(&image).err().unwrap().to_string();
+        assert!(refused.contains("vision_model.onnx") && refused.contains("pooler_output"), "{refused}");
+        let write = |name: &str, text: &str| std::fs::write(dir.path().join(name), text).unwrap();
+        write("config.json", r#"{"model_type": "siglip", "text_config": {"max_position_embeddings": 64}}"#);
+        write("preprocessor_config.json", r#"{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}"#);
+        let tower = ClipImage::load(&image).unwrap();
+        let masks = LabelMap { width: 20, height: 20, labels: vec![1; 400] };
+        let red = tower.embed_masks("", &RgbImage::from_pixel(20, 20, Rgb([255, 0, 0])), &masks).unwrap().remove(0);
+        assert!(red.iter().zip([1.0, -1.0, -1.0]).all(|(own, wanted)| (own - wanted / 3.0f32.sqrt()).abs() < 0.05), "{red:?}");
     }
 
     #[test]

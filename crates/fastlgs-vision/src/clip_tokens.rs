@@ -1,15 +1,15 @@
-//! CLIP's byte-pair tokenizer: from the `tokenizer.json` beside a model, else from the merges that OpenAI published.
+//! CLIP's byte-pair tokenizer, from the `tokenizer.json` beside a model, else from the merges that OpenAI published; and SigLIP's, from that file.
 
 use crate::{Error, Result, places};
 use fastlgs_core::fs;
 use flate2::read::GzDecoder;
 use serde_json::json;
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use tokenizers::Tokenizer;
 
-/// Tokens of a text, start and end included, that the published models take.
-pub const CONTEXT: usize = 77;
+/// Tokens of a text, start and end included, that the published models of CLIP take, and those of SigLIP.
+const CONTEXT: [usize; 2] = [77, 64];
 /// Merges of the published vocabulary; the file holds more.
 const MERGES: usize = 49_152 - 256 - 2;
 const START: &str = "<|startoftext|>";
@@ -18,24 +18,46 @@ const END: &str = "<|endoftext|>";
 const WORDS: &str = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+";
 
 /// Turns texts into token ids.
-pub struct ClipTokens {
+pub struct Tokens {
     tokenizer: Tokenizer,
-    start: u32,
-    end: u32,
+    kind: Kind,
 }
 
-impl ClipTokens {
+/// What stands around the words of a text.
+enum Kind {
+    /// CLIP's start and end.
+    Clip { start: u32, end: u32 },
+    /// What the tokenizer's own rules add, and what fills the rest.
+    Siglip { padding: u32 },
+}
+
+impl Tokens {
     /// The tokenizer that belongs to a model file: `tokenizer.json` in its folder or the one above, else the published
     /// merges that `models install-offline` keeps.
     ///
     /// # Errors
     /// When neither is there or they are damaged.
     pub fn beside(model: &Path) -> Result<Self> {
-        let folders = model.ancestors().skip(1).take(2);
-        match folders.map(|f| f.join("tokenizer.json")).find(|f| f.is_file()) {
-            Some(path) => Self::new(Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?, &path),
+        match described(model) {
+            Some(path) => Self::of_clip(Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?, &path),
             None => Self::published(&places::offline_dir().join(places::CLIP_MERGES)),
         }
+    }
+
+    /// SigLIP's tokenizer beside a model file. What fills the rest of a text is told by the file itself, else it is the token that its rules end a text
+    /// with, as the published ones have it.
+    ///
+    /// # Errors
+    /// When it is missing or damaged.
+    pub fn of_siglip(model: &Path) -> Result<Self> {
+        let missing = || Error::Missing(format!("{}: SigLIP needs its tokenizer.json beside it", model.display()));
+        let path = described(model).ok_or_else(missing)?;
+        let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?;
+        let told = tokenizer.get_padding().map(|padding| padding.pad_id).or_else(|| tokenizer.token_to_id("<pad>"));
+        plain(&mut tokenizer, &path)?;
+        let ended = || Some(*tokenizer.encode("", true).ok()?.get_ids().last()?);
+        let padding = told.or_else(ended).ok_or_else(|| bad(&path, "it tells of no token that fills or ends a text"))?;
+        Ok(Self { kind: Kind::Siglip { padding }, tokenizer })
     }
 
     /// The published tokenizer from its gzipped list of merges.
@@ -77,31 +99,64 @@ impl ClipTokens {
                 "fuse_unk": false, "vocab": vocabulary, "merges": merges,
             },
         });
-        Self::new(description.to_string().parse().map_err(|e| bad(path, e))?, path)
+        Self::of_clip(description.to_string().parse().map_err(|e| bad(path, e))?, path)
     }
 
-    fn new(mut tokenizer: Tokenizer, path: &Path) -> Result<Self> {
-        tokenizer.with_padding(None);
-        tokenizer.with_truncation(None).map_err(|e| bad(path, e))?;
+    fn of_clip(mut tokenizer: Tokenizer, path: &Path) -> Result<Self> {
+        plain(&mut tokenizer, path)?;
         let id = |token: &str| tokenizer.token_to_id(token).ok_or_else(|| bad(path, format!("it has no token {token}")));
-        Ok(Self { start: id(START)?, end: id(END)?, tokenizer })
+        Ok(Self { kind: Kind::Clip { start: id(START)?, end: id(END)? }, tokenizer })
     }
 
-    /// Token ids of a text between start and end, cut to `context`.
+    /// Token ids of a text with what stands around it, cut to `context`; the last one stays.
     ///
     /// # Errors
     /// When a text cannot be tokenised.
     pub fn encode(&self, text: &str, context: usize) -> Result<Vec<u32>> {
-        let encoded =
-            self.tokenizer.encode(text.trim(), false).map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")))?;
-        let words = encoded.get_ids().iter().copied().filter(|id| *id != self.start && *id != self.end).take(context.saturating_sub(2));
-        Ok([self.start].into_iter().chain(words).chain([self.end]).collect())
+        let encoded = |special| {
+            self.tokenizer.encode(text.trim(), special).map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")))
+        };
+        Ok(match self.kind {
+            Kind::Clip { start, end } => {
+                let encoded = encoded(false)?;
+                let words = encoded.get_ids().iter().copied().filter(|id| *id != start && *id != end).take(context.saturating_sub(2));
+                [start].into_iter().chain(words).chain([end]).collect()
+            }
+            Kind::Siglip { .. } => {
+                let mut ids = encoded(true)?.get_ids().to_vec();
+                if ids.len() > context {
+                    ids.drain(context.saturating_sub(1)..ids.len() - 1);
+                }
+                ids
+            }
+        })
     }
 
-    /// Id that ends a text.
-    pub fn end(&self) -> u32 {
-        self.end
+    /// Id that fills the rest of a text, for a model that is told by a mask where the text ends, or is not. OpenAI's models are padded with zeros; those
+    /// that take a mask with the end token, as their tokenizers do.
+    pub fn padding(&self, masked: bool) -> u32 {
+        match self.kind {
+            Kind::Clip { end, .. } => u32::from(masked) * end,
+            Kind::Siglip { padding } => padding,
+        }
     }
+
+    /// Tokens of a text that the published models take.
+    pub fn context(&self) -> usize {
+        CONTEXT[usize::from(matches!(self.kind, Kind::Siglip { .. }))]
+    }
+}
+
+/// The tokenizer's description in a model's folder or the one above.
+fn described(model: &Path) -> Option<PathBuf> {
+    model.ancestors().skip(1).take(2).map(|folder| folder.join("tokenizer.json")).find(|file| file.is_file())
+}
+
+/// Texts are filled and cut here.
+fn plain(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
+    tokenizer.with_padding(None);
+    tokenizer.with_truncation(None).map_err(|e| bad(path, e))?;
+    Ok(())
 }
 
 fn bad(path: &Path, reason: impl std::fmt::Display) -> Error {
@@ -121,8 +176,8 @@ fn byte_signs() -> Vec<char> {
 mod tests {
     use super::*;
 
-    fn tokens() -> Option<ClipTokens> {
-        match ClipTokens::published(&places::offline_dir().join(places::CLIP_MERGES)) {
+    fn tokens() -> Option<Tokens> {
+        match Tokens::published(&places::offline_dir().join(places::CLIP_MERGES)) {
             Ok(tokens) => Some(tokens),
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
             Err(e) => {
@@ -136,7 +191,7 @@ mod tests {
     #[test]
     fn ids_are_the_published_ones() {
         let Some(tokens) = tokens() else { return };
-        let words = |text: &str| tokens.encode(text, CONTEXT).unwrap();
+        let words = |text: &str| tokens.encode(text, 77).unwrap();
         assert_eq!(words("a photo of a cat"), [49406, 320, 1125, 539, 320, 2368, 49407]);
         assert_eq!(words("  A photo of\n a DOG "), [49406, 320, 1125, 539, 320, 1929, 49407]);
         assert_eq!(words("hello world!"), [49406, 3306, 1002, 256, 49407]);
@@ -146,8 +201,39 @@ mod tests {
     #[test]
     fn long_texts_keep_their_end() {
         let Some(tokens) = tokens() else { return };
-        let long = tokens.encode(&"cat ".repeat(200), CONTEXT).unwrap();
+        let long = tokens.encode(&"cat ".repeat(200), tokens.context()).unwrap();
         assert_eq!((long.len(), long[0], long[76]), (77, 49406, 49407));
+    }
+
+    #[test]
+    fn siglips_rules_are_in_its_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let model = dir.path().join("onnx").join("text_model.onnx");
+        assert!(Tokens::of_siglip(&model).err().unwrap().to_string().contains("tokenizer.json"));
+        let mut description = json!({
+            "version": "1.0",
+            "added_tokens": [],
+            "normalizer": { "type": "Lowercase" },
+            "pre_tokenizer": { "type": "Whitespace" },
+            "post_processor": {
+                "type": "TemplateProcessing",
+                "single": [{ "Sequence": { "id": "A", "type_id": 0 } }, { "SpecialToken": { "id": "</s>", "type_id": 0 } }],
+                "pair": [{ "Sequence": { "id": "A", "type_id": 0 } }, { "Sequence": { "id": "B", "type_id": 1 } }],
+                "special_tokens": { "</s>": { "id": "</s>", "ids": [1], "tokens": ["</s>"] } },
+            },
+            "model": { "type": "WordLevel", "unk_token": "<unk>", "vocab": { "<unk>": 0, "</s>": 1, "red": 2, "fox": 3 } },
+        });
+        let write = |description: &serde_json::Value| std::fs::write(dir.path().join("tokenizer.json"), description.to_string()).unwrap();
+        write(&description);
+        let tokens = Tokens::of_siglip(&model).unwrap();
+        assert_eq!((tokens.encode(" Red fox", 64).unwrap(), tokens.padding(false), tokens.context()), (vec![2, 3, 1], 1, 64));
+        assert_eq!(tokens.encode("red fox red fox", 3).unwrap(), [2, 3, 1], "a long text keeps its end");
+        description["padding"] = json!({
+            "strategy": { "Fixed": 64 }, "direction": "Right", "pad_to_multiple_of": null, "pad_id": 7, "pad_type_id": 0, "pad_token": "<x>",
+        });
+        write(&description);
+        let tokens = Tokens::of_siglip(&model).unwrap();
+        assert_eq!((tokens.encode("fox", 64).unwrap(), tokens.padding(false)), (vec![3, 1], 7), "filled where it is used, not by the file");
     }
 
     #[test]
@@ -155,6 +241,6 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("merges.gz");
         std::fs::write(&path, b"no gzip").unwrap();
-        assert!(ClipTokens::published(&path).err().unwrap().to_string().contains("merges.gz"));
+        assert!(Tokens::published(&path).err().unwrap().to_string().contains("merges.gz"));
     }
 }

@@ -115,7 +115,16 @@ fn compare_masks(folder: &Path) {
 
 #[test]
 fn clip_embeds_as_the_original_does() {
-    let Some(folder) = folder("clip") else { return };
+    embeds_as_the_original_does("clip", "image.onnx", "text.onnx");
+}
+
+#[test]
+fn siglip_embeds_as_the_original_does() {
+    embeds_as_the_original_does("siglip", "onnx/vision_model.onnx", "onnx/text_model.onnx");
+}
+
+fn embeds_as_the_original_does(which: &str, image: &str, text: &str) {
+    let Some(folder) = folder(which) else { return };
     let cosine = |a: &[f32], b: &[f32]| {
         let product = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum::<f64>();
         product(a, b) / (product(a, a) * product(b, b)).sqrt()
@@ -123,13 +132,13 @@ fn clip_embeds_as_the_original_does() {
     let photo = image_io::load_rgb(&folder.join("photo.png")).unwrap();
     let (width, height) = photo.dimensions();
     let all = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
-    let own = ClipImage::load(&folder.join("image.onnx")).unwrap().embed_masks("", &photo, &all).unwrap().remove(0);
+    let own = ClipImage::load(&folder.join(image)).unwrap().embed_masks("", &photo, &all).unwrap().remove(0);
     let picture = cosine(&own, &numbers(&folder.join("picture.npy")).0);
     println!("picture: cosine {picture:.6}");
     assert!(picture >= 0.9999, "{picture}");
     let texts: Vec<String> = fs::read_json(&folder.join("texts.json")).unwrap();
     let (wanted, shape) = numbers(&folder.join("texts.npy"));
-    let own = ClipText::load(&folder.join("text.onnx")).unwrap().sentences(&texts).unwrap();
+    let own = ClipText::load(&folder.join(text)).unwrap().sentences(&texts).unwrap();
     for ((text, own), wanted) in texts.iter().zip(&own).zip(wanted.chunks_exact(shape[1])) {
         let alike = cosine(own, wanted);
         println!("'{text}': cosine {alike:.6}");

@@ -2,6 +2,7 @@
 
 use crate::error::{Context, bail};
 use crate::names::{Example, Names, plain};
+use crate::session::Pixels;
 use crate::session::ask::{Ask, picture};
 use crate::{Result, Run, Session, eyes};
 use fastlgs_core::image_io;
@@ -18,9 +19,9 @@ pub struct Lesson {
     pub name: String,
     /// Trained scene folder, in which the thing is shown or whose encoder embeds the picture.
     pub scene: PathBuf,
-    /// A pixel of the view: the object that it shows.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "X,Y", value_parser = crate::session::parse_point, requires = "view", group = "shown"))]
-    pub point: Option<(u32, u32)>,
+    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that shows in all of them.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "X,Y", requires = "view", group = "shown"))]
+    pub point: Option<Pixels>,
     /// The view that the pixel is of.
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME", requires = "point"))]
     pub view: Option<String>,
@@ -53,9 +54,9 @@ pub struct Report {
 /// An empty name, nothing or no object where it is shown, or the system's refusal; the names then stay as they were.
 pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
     let mut scene = Session::open(&lesson.scene, run.device)?;
-    let object = match (lesson.object, lesson.point, &lesson.image) {
+    let object = match (lesson.object, &lesson.point, &lesson.image) {
         (Some(id), None, None) => Some(id),
-        (None, Some((x, y)), None) => Some(shown_at(&mut scene, lesson, x, y)?),
+        (None, Some(pixels), None) => Some(shown_at(&mut scene, lesson, pixels)?),
         (None, None, Some(_)) => None,
         _ => bail!("show the thing in one way: --point X,Y with --view, --object ID, or --image FILE"),
     };
@@ -97,12 +98,12 @@ fn keep(scene: &Session, name: &str, object: Option<u16>, from: String, embeddin
     Ok(Report { name, object, views, examples, kept: Names::path() })
 }
 
-/// The object that a pixel of a view shows.
-fn shown_at(scene: &mut Session, lesson: &Lesson, x: u32, y: u32) -> Result<u16> {
+/// The object that pixels of a view show.
+fn shown_at(scene: &mut Session, lesson: &Lesson, pixels: &Pixels) -> Result<u16> {
     let view = lesson.view.as_deref().context("--point needs the view that it is of: --view NAME")?;
     let camera = scene.cameras[scene.folder.view_index(&scene.cameras, view)?].clone();
     let (grid, field) = (scene.grid()?, scene.field(&camera, None)?);
-    let found = Ask::Point(x, y).meaning(scene, &[])?.find(&grid, &field, &camera, &QueryConfig::default())?;
-    let nothing = || format!("no object is at {x},{y} of '{}'", camera.name);
+    let found = Ask::Point(pixels.clone()).meaning(scene, &[])?.find(&grid, &field, &camera, &QueryConfig::default())?;
+    let nothing = || format!("no object is at {pixels} of '{}'", camera.name);
     Ok(found.targets.first().with_context(nothing)?.id)
 }

@@ -11,7 +11,7 @@ use anyhow::{Result, bail};
 use fastlgs::session::answer::{CANDIDATES, ObjectReport, Question, Report};
 use fastlgs::session::ask::Ask;
 use fastlgs::session::sheet::{self, Tile};
-use fastlgs::session::{ViewChoice, parse_point, parse_size, selection};
+use fastlgs::session::{Pixels, ViewChoice, parse_size, selection};
 use fastlgs::{Run, Session};
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
@@ -38,9 +38,9 @@ pub struct Args {
     /// A picture of what to look for.
     #[arg(long, value_name = "FILE")]
     image: Vec<PathBuf>,
-    /// A pixel of the view: the object that it shows.
-    #[arg(long, value_name = "X,Y", value_parser = parse_point)]
-    point: Vec<(u32, u32)>,
+    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that shows in all of them.
+    #[arg(long, value_name = "X,Y")]
+    point: Vec<Pixels>,
     /// A text that the object must not be nearer to than to what is looked for; may be given several times.
     #[arg(long, value_name = "TEXT")]
     negative: Vec<String>,
@@ -195,7 +195,7 @@ impl Asker<'_> {
             Ok(Ask::Image(name, image_io::load_rgb(path)?))
         };
         let pictures = self.args.image.iter().map(picture).collect::<Result<Vec<_>>>()?;
-        let points = self.args.point.iter().map(|&(x, y)| Ask::Point(x, y));
+        let points = self.args.point.iter().cloned().map(Ask::Point);
         let asks: Vec<Ask> = texts.chain(pictures).chain(points).collect();
         if asks.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
             bail!("--export and --export-rest write the answer to one question: ask only one");

@@ -1,6 +1,6 @@
 //! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
 
-use super::Session;
+use super::{Pixels, Session};
 use crate::Result;
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
@@ -17,16 +17,16 @@ pub enum Ask {
     Text(String),
     /// A picture of the thing, with its name.
     Image(String, RgbImage),
-    /// A pixel of the view.
-    Point(u32, u32),
+    /// Pixels of the view that show one thing.
+    Point(Pixels),
 }
 
 /// What a question means, before any view is looked at.
 pub enum Meaning {
     /// Embedded words or pictures; for "A of B" also B and A.
     Embedded(Box<TextQuery>, Option<Box<[TextQuery; 2]>>),
-    /// A pixel of the view.
-    Point(u32, u32),
+    /// Pixels of the view that show one thing.
+    Point(Pixels),
 }
 
 impl Ask {
@@ -35,7 +35,7 @@ impl Ask {
         match self {
             Self::Text(text) => text.clone(),
             Self::Image(name, _) => name.clone(),
-            Self::Point(x, y) => format!("{x},{y}"),
+            Self::Point(pixels) => pixels.to_string(),
         }
     }
 
@@ -43,7 +43,7 @@ impl Ask {
     pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
         let with_negatives = |query| if negatives.is_empty() { Ok(query) } else { session.texts()?.with_negatives(query, negatives) };
         Ok(match self {
-            Self::Point(x, y) => Meaning::Point(*x, *y),
+            Self::Point(pixels) => Meaning::Point(pixels.clone()),
             Self::Image(name, photo) => Meaning::Embedded(Box::new(with_negatives(picture(session, name, photo)?)?), None),
             Self::Text(text) => {
                 let embedded = |text: &str| with_negatives(session.text_query(text)?);
@@ -99,14 +99,13 @@ impl Meaning {
                     _ => around,
                 })
             }
-            Self::Point(x, y) => {
-                if *x >= camera.width || *y >= camera.height {
+            Self::Point(pixels) => {
+                if let Some((x, y)) = pixels.outside(camera) {
                     bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
                 }
-                let nested = field.at(grid, *x, *y);
+                let (there, meant) = query::pointed(grid, &field.at(grid, &pixels.0));
                 let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
-                let targets = query::best_supported(grid, &nested).map(hit).into_iter().collect();
-                Ok(Found { ranked: nested.into_iter().map(hit).collect(), targets })
+                Ok(Found { ranked: there.into_iter().map(hit).collect(), targets: meant.map(hit).into_iter().collect() })
             }
         }
     }

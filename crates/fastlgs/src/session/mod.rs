@@ -24,7 +24,7 @@ use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 pub use texts::Texts;
-pub use views::{ViewChoice, parse_point, parse_size};
+pub use views::{Pixels, ViewChoice, parse_size};
 
 /// A trained scene on a device.
 pub struct Session {

@@ -61,11 +61,64 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
     sizes.filter(|(w, h)| (1..=16384).contains(w) && (1..=16384).contains(h)).ok_or_else(|| format!("'{text}' is not a size like 640x480"))
 }
 
-/// Parses `120,45`.
-///
-/// # Errors
-/// Anything that is no pixel.
-pub fn parse_point(text: &str) -> Result<(u32, u32), String> {
-    let numbers = text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
-    numbers.ok_or_else(|| format!("'{text}' is not a pixel like 120,45"))
+/// Pixels of a view that one thing shows in: `120,45`, or `120,45+160,70`, which tells more of how far it reaches.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "OneOrMore")]
+pub struct Pixels(pub Vec<(u32, u32)>);
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum OneOrMore {
+    One((u32, u32)),
+    More(Vec<(u32, u32)>),
+}
+
+impl From<OneOrMore> for Pixels {
+    fn from(pixels: OneOrMore) -> Self {
+        match pixels {
+            OneOrMore::One(pixel) => Self(vec![pixel]),
+            OneOrMore::More(pixels) => Self(pixels),
+        }
+    }
+}
+
+impl Pixels {
+    /// The first that lies outside a view.
+    pub fn outside(&self, camera: &Camera) -> Option<(u32, u32)> {
+        self.0.iter().copied().find(|(x, y)| *x >= camera.width || *y >= camera.height)
+    }
+}
+
+impl std::str::FromStr for Pixels {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let pixel = |text: &str| text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
+        let pixels = text.split('+').map(pixel).collect::<Option<_>>();
+        pixels.map(Self).ok_or_else(|| format!("'{text}' is no pixel like 120,45, nor several of one thing like 120,45+160,70"))
+    }
+}
+
+impl std::fmt::Display for Pixels {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let pixels: Vec<String> = self.0.iter().map(|(x, y)| format!("{x},{y}")).collect();
+        f.write_str(&pixels.join("+"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_are_read_and_named() {
+        let read = |text: &str| text.parse::<Pixels>();
+        assert_eq!(read("120,45"), Ok(Pixels(vec![(120, 45)])));
+        assert_eq!(read("120,45 + 7, 8").expect("two pixels").to_string(), "120,45+7,8");
+        for wrong in ["", "120", "1,2,3", "-1,2", "1,2+", "1,2;3,4"] {
+            assert!(read(wrong).expect_err(wrong).contains("120,45+160,70"), "{wrong}");
+        }
+        let json = |text: &str| serde_json::from_str::<Pixels>(text).expect(text).0;
+        assert_eq!((json("[1, 2]"), json("[[1, 2], [3, 4]]")), (vec![(1, 2)], vec![(1, 2), (3, 4)]));
+    }
 }
