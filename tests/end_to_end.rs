@@ -127,7 +127,7 @@ fn onnx_exports_of_sam_and_clip() {
     let [encoder, decoder, image, words] = ["encoder", "decoder", "image", "text"].map(|n| file(&format!("{n}.onnx")));
     toy_models::sam(toy_models::SamExport::Official { batched: true }, &encoder, &decoder);
     toy_models::clip(&image, &words, 32);
-    let scene = file("scene");
+    let (scene, second) = (file("scene"), file("second"));
     let sam = ["--segmenter", "sam", "--sam-encoder", text(&encoder), "--sam-decoder", text(&decoder), "--sam-points", "8"];
     let clip = ["--encoder", "clip", "--clip-image", text(&image), "--clip-text", text(&words)];
     let mut args = vec!["preprocess", text(&f.photos), "-o", text(&scene), "--max-side", "160", "--levels", "whole,part"];
@@ -154,7 +154,16 @@ fn onnx_exports_of_sam_and_clip() {
     let towers = ["--clip-image", text(&image), "--clip-text", text(&words)];
     let measured = json(&[&["models", "calibrate"], &towers[..]].concat());
     assert!(measured["texts"]["temperature"].as_f64().is_some_and(|t| t > 0.0), "{measured}");
+    // Whatever stood around this scene's masks when it was made; the next one is made with what is best.
     assert_eq!(ask("red")["calibrated"], true);
+    let background = measured["background"].as_str().expect("a word").to_owned();
+    let separation = &measured["separation"];
+    let of = |background: &str| separation[background].as_f64().expect("a number");
+    assert!(["grey", "black", "blurred"].iter().all(|other| of(other) <= of(&background)), "{measured}");
+    args[3] = text(&second);
+    json(&args);
+    let remembered: serde_json::Value = fastlgs_core::fs::read_json(&second.join("scene.json")).expect("the manifest");
+    assert_eq!(remembered["crops"].as_str().expect("a word").replace("grey", ""), background.replace("grey", ""), "{measured}");
     // Embeddings of another encoder are not compared.
     let manifest = std::fs::read_to_string(scene.join("scene.json")).expect("the manifest");
     std::fs::write(scene.join("scene.json"), manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\"")).expect("a file");

@@ -172,31 +172,13 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     g.save(decoder);
 }
 
-/// An image tower that gives its embedding as SigLIP's do: the second of two outputs.
-pub fn siglip_image(image: &Path, size: i64) {
-    let mut g = Graph::default();
-    let pixels = g.input("pixel_values", Kind::Float, &[-1, 3, size, size]);
-    let mean = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
-    let rows = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[3]), Attribute::Int("keepdims", 0)]);
-    g.output(&rows, "last_hidden_state", &[-1, 3, size]);
-    g.output(&mean, "pooler_output", &[-1, 3]);
-    g.save(image);
-}
-
 /// Token of each colour's name in CLIP's published vocabulary.
 pub const COLOR_TOKENS: [i64; 3] = [736, 1901, 1746];
 
 /// CLIP's towers in small: the image tower gives the mean red, green and blue above CLIP's own mean, the text tower what of
 /// "red", "green" and "blue" occurs among the tokens. Masked crops are neutral around the mask, so that colours compare.
 pub fn clip(image: &Path, text: &Path, size: i64) {
-    let mut g = Graph::default();
-    let pixels = g.input("pixel_values", Kind::Float, &[-1, 3, size, size]);
-    let mean = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
-    let overall = g.op("ReduceMean", &[&mean], &[Attribute::Ints("axes", &[1]), Attribute::Int("keepdims", 1)]);
-    let color = g.op("Sub", &[&mean, &overall], &[]);
-    g.output(&color, "image_embeds", &[-1, 3]);
-    g.save(image);
-
+    image_tower(image, size, &["image_embeds"]);
     let mut g = Graph::default();
     let ids = g.input("input_ids", Kind::Int, &[-1, 77]);
     let axes = g.ints(&[2]);
@@ -209,4 +191,17 @@ pub fn clip(image: &Path, text: &Path, size: i64) {
     let centred = g.op("Sub", &[&found, &overall], &[]);
     g.output(&centred, "text_embeds", &[-1, 3]);
     g.save(text);
+}
+
+/// The image tower, which gives the same under several names.
+pub fn image_tower(image: &Path, size: i64, outputs: &[&str]) {
+    let mut g = Graph::default();
+    let pixels = g.input("pixel_values", Kind::Float, &[-1, 3, size, size]);
+    let mean = g.op("ReduceMean", &[&pixels], &[Attribute::Ints("axes", &[2, 3]), Attribute::Int("keepdims", 0)]);
+    let overall = g.op("ReduceMean", &[&mean], &[Attribute::Ints("axes", &[1]), Attribute::Int("keepdims", 1)]);
+    for name in outputs {
+        let color = g.op("Sub", &[&mean, &overall], &[]);
+        g.output(&color, name, &[-1, 3]);
+    }
+    g.save(image);
 }

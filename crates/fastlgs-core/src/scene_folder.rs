@@ -35,6 +35,9 @@ pub struct Manifest {
     pub segmenter: String,
     /// Encoder that made the embeddings; queries must use the same.
     pub encoder: String,
+    /// What stands around the masks that CLIP sees; empty where that is grey.
+    #[serde(default)]
+    pub crops: String,
     /// Model files by their role (`clip_image`, `clip_text`, `sam_encoder`, `sam_decoder`).
     #[serde(default)]
     pub models: BTreeMap<String, ModelFile>,

@@ -58,6 +58,12 @@ impl Samples {
         }
     }
 
+    /// By how many standard deviations of other things' cosines with a name the thing that has it exceeds their mean.
+    pub fn separation(&self) -> f32 {
+        let [excess, variance] = [0, 1].map(|k| self.told.iter().map(|told| told[k]).sum::<f32>() / self.told.len().max(1) as f32);
+        excess / variance.sqrt()
+    }
+
     /// Those of several scenes.
     pub fn extend(&mut self, other: &Self) {
         self.told.extend(&other.told);

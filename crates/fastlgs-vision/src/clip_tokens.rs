@@ -113,9 +113,8 @@ impl Tokens {
     /// # Errors
     /// When a text cannot be tokenised.
     pub fn encode(&self, text: &str, context: usize) -> Result<Vec<u32>> {
-        let encoded = |special| {
-            self.tokenizer.encode(text.trim(), special).map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")))
-        };
+        let encoded =
+            |special| self.tokenizer.encode(text.trim(), special).map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")));
         Ok(match self.kind {
             Kind::Clip { start, end } => {
                 let encoded = encoded(false)?;

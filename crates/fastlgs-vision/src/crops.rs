@@ -3,6 +3,7 @@
 use fastlgs_core::LabelMap;
 use image::imageops::{FilterType, resize};
 use image::{Rgb, RgbImage};
+use serde::{Deserialize, Serialize};
 
 /// A square crop, `size` x `size`, planar RGB in [0, 255].
 pub struct Crop {
@@ -57,20 +58,52 @@ pub fn crop(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], si
 /// Side of a crop's box over that of the mask's.
 const MARGIN: f32 = 1.05;
 
-/// The same with grey around the mask, scaled as CLIP's own preprocessing does: bicubic, antialiased.
-pub fn bicubic(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], size: usize) -> Crop {
+/// What stands around the mask in a crop for CLIP; which tells most depends on the model.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Background {
+    /// Mid grey.
+    #[default]
+    Grey,
+    /// Black, as LangSplat has it.
+    Black,
+    /// The photo, out of focus.
+    Blurred,
+}
+
+impl Background {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Grey, Self::Black, Self::Blurred];
+}
+
+/// Side of the picture that a blurred background is reduced to: what is left tells of a place, and not of things.
+const OUT_OF_FOCUS: u32 = 12;
+
+/// The same with a background of choice, scaled as CLIP's own preprocessing does: bicubic, antialiased.
+pub fn bicubic(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], size: usize, background: Background) -> Crop {
     let [x0, y0, x1, y1] = bounds.map(|v| v as f32);
     let (sx, sy) = (photo.width() as f32 / masks.width as f32, photo.height() as f32 / masks.height as f32);
     let side = (((x1 - x0) * sx).max((y1 - y0) * sy) * MARGIN).round().max(4.0) as u32;
     let corner = |a: f32, b: f32, scale: f32| ((a + b) / 2.0 * scale - side as f32 / 2.0).round() as i64;
     let (left, top) = (corner(x0, x1, sx), corner(y0, y1, sy));
-    let pixel = |i: u32, j: u32| {
+    let place = |i: u32, j: u32| {
         let (x, y) = (u32::try_from(left + i64::from(i)).ok()?, u32::try_from(top + i64::from(j)).ok()?);
-        let mask = |v: u32, scale: f32, end: u32| ((v as f32 / scale) as u32).min(end - 1);
-        let shown = x < photo.width() && y < photo.height() && masks.at(mask(x, sx, masks.width), mask(y, sy, masks.height)) == label;
-        shown.then(|| *photo.get_pixel(x, y))
+        (x < photo.width() && y < photo.height()).then_some((x, y))
     };
-    let cut = RgbImage::from_fn(side, side, |i, j| pixel(i, j).unwrap_or(Rgb([127; 3])));
+    let inside = |(x, y): &(u32, u32)| {
+        let mask = |v: u32, scale: f32, end: u32| ((v as f32 / scale) as u32).min(end - 1);
+        masks.at(mask(*x, sx, masks.width), mask(*y, sy, masks.height)) == label
+    };
+    let plain = Rgb(if background == Background::Black { [0; 3] } else { [127; 3] });
+    let around = (background == Background::Blurred).then(|| {
+        let all = RgbImage::from_fn(side, side, |i, j| place(i, j).map_or(plain, |(x, y)| *photo.get_pixel(x, y)));
+        let blurred = resize(&all, OUT_OF_FOCUS.min(side), OUT_OF_FOCUS.min(side), FilterType::Triangle);
+        resize(&blurred, side, side, FilterType::Triangle)
+    });
+    let cut = RgbImage::from_fn(side, side, |i, j| match place(i, j).filter(inside) {
+        Some((x, y)) => *photo.get_pixel(x, y),
+        None => around.as_ref().map_or(plain, |around| *around.get_pixel(i, j)),
+    });
     let scaled = resize(&cut, size as u32, size as u32, FilterType::CatmullRom);
     let mut planar = vec![0.0; 3 * size * size];
     for (p, pixel) in scaled.pixels().enumerate() {
@@ -92,10 +125,16 @@ mod tests {
         let masks = LabelMap { width: 64, height: 64, labels };
         let bounds = masks.boxes()[1].expect("a mask");
         let at = |crop: &Crop, x: usize, y: usize| [0, 1, 2].map(|k| crop.planar[k * 1024 + y * 32 + x]);
-        let [sampled, scaled] = [crop(&photo, &masks, 1, bounds, 32, Surround::Neutral), bicubic(&photo, &masks, 1, bounds, 32)];
+        let [sampled, scaled] =
+            [crop(&photo, &masks, 1, bounds, 32, Surround::Neutral), bicubic(&photo, &masks, 1, bounds, 32, Background::Grey)];
         for crop in [&sampled, &scaled] {
             assert_eq!([at(crop, 16, 16), at(crop, 16, 3), at(crop, 1, 16)], [[255.0, 0.0, 0.0], [0.0, 255.0, 0.0], [127.0; 3]]);
         }
+        let [black, blurred] = [Background::Black, Background::Blurred].map(|around| bicubic(&photo, &masks, 1, bounds, 32, around));
+        assert_eq!([at(&black, 16, 16), at(&black, 1, 16)], [[255.0, 0.0, 0.0], [0.0; 3]]);
+        let [red, green, blue] = at(&blurred, 1, 16);
+        assert_eq!((at(&blurred, 16, 16), blue), ([255.0, 0.0, 0.0], 0.0));
+        assert!(red > 20.0 && green > 20.0, "some of the thing is around it: {red}, {green}");
         let context = crop(&photo, &masks, 1, bounds, 32, Surround::Context);
         assert_eq!(at(&context, 1, 16), [0.0, 255.0, 0.0]);
     }

@@ -1,7 +1,7 @@
 //! The offline text tower: all-MiniLM-L6-v2.
 
 use crate::attributes;
-use crate::encoder::TextEncoder;
+use crate::encoder::{TextEncoder, normalise};
 use crate::runtime::{Array, Model};
 use crate::{Error, Result, places};
 use tokenizers::Tokenizer;
@@ -72,11 +72,39 @@ impl OfflineText {
 impl TextEncoder for OfflineText {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
         let (named, rest): (Vec<_>, Vec<String>) = texts.iter().map(|t| attributes::of_text(t)).unzip();
-        let meanings = self.0.embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
+        // "orange juice" and "golden retriever" are more than juice and retriever of a colour: half of the meaning is that of the whole phrase.
+        let colored: Vec<usize> = (0..texts.len()).filter(|k| rest[*k] != texts[*k]).collect();
+        let mut meanings = self.0.embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let whole = self.0.embed(&colored.iter().map(|k| texts[*k]).collect::<Vec<_>>())?;
+        for (k, whole) in colored.into_iter().zip(whole) {
+            meanings[k].iter_mut().zip(whole).for_each(|(rest, whole)| *rest += whole);
+            normalise(&mut meanings[k]);
+        }
         Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named].concat()).collect())
     }
 
     fn advantage(&self, text: &str) -> f32 {
         attributes::advantage(text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_colour_is_told_by_pixels_and_still_part_of_the_phrase() {
+        let text = match OfflineText::load() {
+            Ok(text) => text,
+            Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
+            Err(e) => return eprintln!("SKIPPED: {e}"),
+        };
+        let embedded = text.embed(&["orange juice", "juice", "golden retriever", "yellow retriever"]).unwrap();
+        let meaning = |k: usize| &embedded[k][..embedded[k].len() - attributes::COUNT];
+        let cosine = |a: usize, b: usize| meaning(a).iter().zip(meaning(b)).map(|(x, y)| x * y).sum::<f32>();
+        assert!((0..4).all(|k| (cosine(k, k) - 1.0).abs() < 1e-4));
+        assert!(cosine(0, 1) < 0.99 && cosine(2, 3) < 0.99, "{} {}", cosine(0, 1), cosine(2, 3));
+        assert!(embedded[1].iter().rev().take(attributes::COUNT).all(|named| *named == 0.0));
+        assert!(embedded[0].iter().rev().take(attributes::COUNT).any(|named| *named > 0.0));
     }
 }

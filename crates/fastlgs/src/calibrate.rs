@@ -1,7 +1,7 @@
 //! Measures what the cosines of an encoder are worth: on generated scenes whose things are known, and on labelled ones.
 
 use crate::absent::{ABSENT, COLORS};
-use crate::calibrations::{Calibrations, Kept, beside};
+use crate::calibrations::{self, Calibrations, Kept, beside};
 use crate::error::{Context, bail};
 use crate::eval::best_object;
 use crate::eyes::{EncoderKind, Eyes};
@@ -11,17 +11,24 @@ use fastlgs_core::synth::{Kind, Thing, World};
 use fastlgs_core::{LabelMap, fs};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use fastlgs_grid::grid::Object;
+use fastlgs_grid::mapping::Mask;
 use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_grid::{Grid, query};
-use fastlgs_vision::{Encoder, models};
+use fastlgs_vision::crops::Background;
+use fastlgs_vision::{ClipImage, models};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// What was measured.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
+    /// What should stand around masks.
+    pub background: Background,
+    /// With each background, by how many standard deviations of other things' cosines with a name the thing that has it exceeds them.
+    pub separation: BTreeMap<Background, f32>,
     /// What texts are worth.
     pub texts: Calibration,
     /// What pictures are worth.
@@ -63,61 +70,81 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
         );
     }
     let image_tower = eyes.clip_files()?[0].clone();
-    let encoder = eyes.encoder(Path::new(""), &Default::default())?;
+    let tower = eyes.clip_image()?;
+    let encoders = Background::ALL.map(|background| tower.clone().with_background(background));
     let texts = eyes.text_encoder()?;
     let pictures = models::pictures_dir();
     let mut worlds = TABLES.iter().map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed)).collect::<Result<Vec<_>, _>>()?;
     // The room shows pictures that may not be installed; the tables do without.
     worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
     let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
-    let known = worlds.into_iter().map(|world| seen(world, encoder.as_ref(), || work.advance())).collect::<Result<Vec<_>>>()?;
+    let mut known: Vec<Vec<Known>> = Background::ALL.map(|_| Vec::new()).into();
+    for world in worlds {
+        seen(&world, &encoders, || work.advance())?.into_iter().zip(&mut known).for_each(|(seen, known)| known.push(seen));
+    }
     let canonical = texts.embed(&CANONICAL)?;
     let anything = Calibration::CLIP.anything;
     let query = |text: &str| -> Result<TextQuery> {
         let anything = anything + texts.advantage(text);
         Ok(TextQuery { canonical: canonical.clone(), anything, ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP) })
     };
-    let there = |name: &str| known.iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
+    let there = |name: &str| known[0].iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
     let absent = absent_where(there);
     let blind = || format!("{}: the encoder tells the generated things not apart by their names; is it CLIP?", image_tower.display());
-    let of_texts = Calibration::measured(&by_names(&known, &absent, query)?, anything).with_context(blind)?;
-    let of_pictures = Calibration::measured(&by_examples(&known), anything).with_context(blind)?;
-    let calibrations = Calibrations { texts: of_texts, pictures: of_pictures };
-    let files = eyes.files()?;
-    let sum = |role: &str| files.get(role).map(|f| f.sha256.clone()).unwrap_or_default();
+    let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
+    for (background, known) in Background::ALL.into_iter().zip(&known) {
+        let named = by_names(known, &absent, query)?;
+        let texts = Calibration::measured(&named, anything);
+        let pictures = Calibration::measured(&by_examples(known), anything);
+        if let (Some(texts), Some(pictures)) = (texts, pictures) {
+            calibrations.insert(background, Calibrations { texts, pictures });
+            separation.insert(background, named.separation());
+        }
+    }
+    // Of equals grey, which comes first.
+    let (background, _) = separation.iter().rev().max_by(|a, b| a.1.total_cmp(b.1)).with_context(blind)?;
+    let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
     let kept = beside(&image_tower);
-    fs::write_json(&kept, &Kept { sha256: ["clip_image", "clip_text"].map(sum), calibrations })?;
+    fs::write_json(&kept, &Kept { sha256: calibrations::sums(&eyes.files()?), background, calibrations })?;
     Ok(Report {
-        texts: of_texts,
-        pictures: of_pictures,
-        things: known.iter().map(|k| k.things.len()).sum(),
+        background,
+        separation,
+        texts,
+        pictures,
+        things: known[0].iter().map(|k| k.things.len()).sum(),
         absent: absent.len(),
         kept,
         seconds: clock.elapsed().as_secs_f64(),
     })
 }
 
-/// Renders a generated scene and embeds all its things with their exact masks.
-fn seen(world: World, encoder: &dyn Encoder, advance: impl Fn() -> Result<()>) -> Result<Known> {
+/// Renders a generated scene and embeds all its things with their exact masks, by each encoder.
+fn seen(world: &World, encoders: &[ClipImage], advance: impl Fn() -> Result<()>) -> Result<Vec<Known>> {
     let things = world.things.clone();
     let chain =
         |id: u16| std::iter::successors(Some(id).filter(|id| *id > 0), |id| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0));
     let depth = |id: u16| chain(id).count();
     let depths = (1..=things.len() as u16).map(depth).max().unwrap_or(0);
-    let mut found = Vec::new();
+    let mut found: Vec<Vec<Mask>> = vec![Vec::new(); encoders.len()];
     for (index, camera) in world.cameras.iter().enumerate() {
         let view = world.render(index, 2);
         for layer in 1..=depths {
             let labels = view.instances.labels.iter().map(|id| chain(*id).find(|a| depth(*a) == layer).unwrap_or(0)).collect();
-            let masks = masks::described(&camera.name, &view.photo, index, &LabelMap { labels, ..view.instances }, encoder)?;
-            found.extend(masks.into_iter().filter(|m| m.area >= LEAST_AREA));
+            let map = LabelMap { labels, ..view.instances };
+            for (encoder, found) in encoders.iter().zip(&mut found) {
+                let masks = masks::described(&camera.name, &view.photo, index, &map, encoder)?;
+                found.extend(masks.into_iter().filter(|m| m.area >= LEAST_AREA));
+            }
         }
         advance()?;
     }
-    let object_of: Vec<u16> = found.iter().map(|m| m.label).collect();
-    let mut grid = Grid::build(&found, &object_of, vec![Vec3::ZERO; things.len()]);
-    grid.objects.iter_mut().zip(&things).for_each(|(object, thing)| object.parent = thing.parent);
-    Ok(Known { things, grid })
+    let known = |found: Vec<Mask>| {
+        let object_of: Vec<u16> = found.iter().map(|m| m.label).collect();
+        let mut grid = Grid::build(&found, &object_of, vec![Vec3::ZERO; things.len()]);
+        grid.objects.iter_mut().zip(&things).for_each(|(object, thing)| object.parent = thing.parent);
+        Known { things: things.clone(), grid }
+    };
+    Ok(found.into_iter().map(known).collect())
 }
 
 impl Known {

@@ -2,9 +2,11 @@
 
 use crate::eyes;
 use fastlgs_core::fs;
-use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_grid::calibration::Calibration;
+use fastlgs_vision::crops::Background;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// What cosines with texts, and cosines with other pictures, are worth.
@@ -19,9 +21,33 @@ pub struct Calibrations {
 /// A measurement as it is kept beside the model, with the files that it holds for.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Kept {
+    /// Of image and text tower.
     pub sha256: [String; 2],
-    #[serde(flatten)]
-    pub calibrations: Calibrations,
+    /// What should stand around masks: that with which names tell things apart best.
+    pub background: Background,
+    /// With each of them.
+    pub calibrations: BTreeMap<Background, Calibrations>,
+}
+
+/// SHA-256 of the towers among some model files.
+pub(crate) fn sums(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
+    ["clip_image", "clip_text"].map(|role| files.get(role).map(|file| file.sha256.clone()).unwrap_or_default())
+}
+
+/// What was measured with these towers, if it was.
+fn kept(files: &BTreeMap<String, ModelFile>) -> Option<Kept> {
+    let path = beside(&files.get("clip_image")?.path);
+    let kept = path.is_file().then(|| fs::read_json::<Kept>(&path))?;
+    // What another version measured was measured for other rules.
+    if kept.is_err() {
+        tracing::warn!("{}: it is of another version and does not count; run 'fastlgs models calibrate' again", path.display());
+    }
+    kept.ok().filter(|kept| kept.sha256 == sums(files))
+}
+
+/// What should stand around the masks that these towers see.
+pub(crate) fn best_background(files: &BTreeMap<String, ModelFile>) -> Background {
+    kept(files).map(|kept| kept.background).unwrap_or_default()
 }
 
 /// Where the measurement of a CLIP is kept.
@@ -41,17 +67,7 @@ impl Calibrations {
         if manifest.encoder == eyes::OFFLINE {
             return Self::OFFLINE;
         }
-        let (image, text) = (manifest.models.get("clip_image"), manifest.models.get("clip_text"));
-        let path = image.map(|image| beside(&image.path)).filter(|path| path.is_file());
-        // What another version measured was measured for other rules.
-        let kept: Option<Kept> = path.and_then(|path| {
-            let kept = fs::read_json(&path);
-            if kept.is_err() {
-                tracing::warn!("{}: it is of another version and does not count; run 'fastlgs models calibrate' again", path.display());
-            }
-            kept.ok()
-        });
-        let same = |kept: &Kept| [image, text].iter().zip(&kept.sha256).all(|(file, sum)| file.is_some_and(|f| f.sha256 == *sum));
-        kept.filter(same).map_or(Self::CLIP, |kept| kept.calibrations)
+        let known = eyes::background_of(manifest).ok().and_then(|background| kept(&manifest.models)?.calibrations.remove(&background));
+        known.unwrap_or(Self::CLIP)
     }
 }

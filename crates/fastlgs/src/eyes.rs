@@ -6,6 +6,7 @@ use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
+use fastlgs_vision::crops::Background;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
@@ -193,16 +194,18 @@ impl Eyes {
     /// The image encoder.
     pub fn encoder(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Encoder>> {
         Ok(match self.encoder {
-            EncoderKind::Clip => {
-                let [image, text] = self.clip_files()?;
-                let image = ClipImage::load(&image)?;
-                // A pair that does not belong together would only show in the first query.
-                clip::check_pair(&image, &ClipText::load(&text)?)?;
-                Box::new(image)
-            }
+            EncoderKind::Clip => Box::new(self.clip_image()?),
             EncoderKind::Import => Box::new(Import::open(photos, lenses.clone())?),
             EncoderKind::Offline => Box::new(Conse::load()?),
         })
+    }
+
+    /// CLIP's image tower, once the text tower is known to belong to it: a wrong pair would only show in the first query.
+    pub(crate) fn clip_image(&self) -> Result<ClipImage> {
+        let [image, text] = self.clip_files()?;
+        let image = ClipImage::load(&image)?;
+        clip::check_pair(&image, &ClipText::load(&text)?)?;
+        Ok(image)
     }
 
     /// The text tower that belongs to the image encoder.
@@ -266,10 +269,28 @@ pub(crate) const OFFLINE: &str = "offline";
 
 /// What embeddings of a scene can be compared with: those that the same files made.
 pub(crate) fn identity_of(manifest: &Manifest) -> String {
-    let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {}", file.sha256));
+    let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {} {}", file.sha256, manifest.crops).trim_end().to_owned());
     match manifest.encoder.as_str() {
         OFFLINE => format!("offline {}", conse::VERSION),
         other => file("clip_image").or_else(|| file("clip_text")).unwrap_or_else(|| other.to_owned()),
+    }
+}
+
+/// What stands around the masks that a scene's encoder saw; a word that this program does not know is refused.
+pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
+    if manifest.crops.is_empty() {
+        return Ok(Background::default());
+    }
+    let known = serde_json::from_value(manifest.crops.clone().into()).ok();
+    known
+        .with_context(|| format!("the scene's masks were embedded with '{}' around them, which this program does not know", manifest.crops))
+}
+
+/// The word that a scene remembers for it.
+pub(crate) fn word_of(background: Background) -> String {
+    match background {
+        Background::Grey => String::new(),
+        other => serde_json::to_value(other).ok().and_then(|word| Some(word.as_str()?.to_owned())).unwrap_or_default(),
     }
 }
 
@@ -288,7 +309,7 @@ fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
 pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn Encoder>> {
     Ok(match manifest.encoder.as_str() {
         "offline" => Box::new(Conse::load()?),
-        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?),
+        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?.with_background(background_of(manifest)?)),
         "import" => Box::new(Recorded::load(folder, manifest)?),
         other => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
     })

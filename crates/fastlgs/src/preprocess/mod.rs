@@ -9,8 +9,8 @@ mod video;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
-use crate::eyes::EncoderKind;
-use crate::{Result, Run};
+use crate::eyes::{self, EncoderKind};
+use crate::{Result, Run, calibrations};
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
@@ -85,6 +85,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
     let held_out_views = labelled_views(config, &cameras)?;
+    let models = config.eyes.files()?;
     let mut manifest = Manifest {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         photos: config.photos.clone(),
@@ -92,7 +93,8 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         held_out_views,
         segmenter: config.eyes.segmenter.name().to_owned(),
         encoder: config.eyes.encoder.name().to_owned(),
-        models: config.eyes.files()?,
+        crops: eyes::word_of(calibrations::best_background(&models)),
+        models,
         seed: run.seed,
         warnings: warnings.clone(),
         excluded,

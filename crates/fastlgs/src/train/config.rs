@@ -322,10 +322,7 @@ impl Config {
 
     /// Constants of global mapping.
     pub(super) fn global(&self) -> objects::Config {
-        objects::Config {
-            antialias: self.antialias,
-            objects: chosen::Config { min_support: self.support, ..chosen::Config::default() },
-        }
+        objects::Config { antialias: self.antialias, objects: chosen::Config { min_support: self.support, ..chosen::Config::default() } }
     }
 }
 
