@@ -63,6 +63,13 @@ fn every_way_to_ask_ends_in_the_same_object() {
     let on_mask = (middle[0]..middle[2]).map(|x| (x, (middle[1] + middle[3]) / 2)).find(|(x, y)| mask.at(*x, *y) > 0).expect("a pixel");
     let point = ask(&["--point", &format!("{},{}", on_mask.0, on_mask.1)]);
     assert_eq!(point["objects"][0]["id"], id, "{point}");
+    let pixels_of = (middle[1]..middle[3]).flat_map(|y| (middle[0]..middle[2]).map(move |x| (x, y)));
+    let all: Vec<(u32, u32)> = pixels_of.filter(|(x, y)| mask.at(*x, *y) > 0).collect();
+    let several: Vec<String> = (1..6).map(|k| all[k * all.len() / 6]).map(|(x, y)| format!("{x},{y}")).collect();
+    let point = ask(&["--point", &several.join("+")]);
+    assert_eq!(point["objects"][0]["id"], id, "{point}");
+    let wrong = fastlgs(&["query", text(&f.scene), "--point", "1,2+", "--view", "008"]);
+    assert!(wrong.status.code() == Some(2) && String::from_utf8_lossy(&wrong.stderr).contains("120,45+160,70"), "{wrong:?}");
     let photo = fastlgs_core::image_io::load_rgb(&f.photos.join("images/008.png")).expect("the photo");
     let crop = image::imageops::crop_imm(&photo, middle[0], middle[1], middle[2] - middle[0], middle[3] - middle[1]).to_image();
     fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");

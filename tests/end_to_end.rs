@@ -163,7 +163,16 @@ fn onnx_exports_of_sam_and_clip() {
     args[3] = text(&second);
     json(&args);
     let remembered: serde_json::Value = fastlgs_core::fs::read_json(&second.join("scene.json")).expect("the manifest");
-    assert_eq!(remembered["crops"].as_str().expect("a word").replace("grey", ""), background.replace("grey", ""), "{measured}");
+    assert_eq!(remembered["crops"].as_str().expect("a word"), background.replace("grey", ""), "{measured}");
+    // Whatever is best for these towers: another word in the measurement is followed as well.
+    let kept = measured["kept"].as_str().expect("a path");
+    let other = if background == "black" { "blurred" } else { "black" };
+    let mut measurement: serde_json::Value = fastlgs_core::fs::read_json(Path::new(kept)).expect("the measurement");
+    measurement["background"] = other.into();
+    fastlgs_core::fs::write_json(Path::new(kept), &measurement).expect("a file");
+    json(&args);
+    let remembered: serde_json::Value = fastlgs_core::fs::read_json(&second.join("scene.json")).expect("the manifest");
+    assert_eq!(remembered["crops"], other);
     // Embeddings of another encoder are not compared.
     let manifest = std::fs::read_to_string(scene.join("scene.json")).expect("the manifest");
     std::fs::write(scene.join("scene.json"), manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\"")).expect("a file");

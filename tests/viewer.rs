@@ -83,6 +83,8 @@ fn the_interface_answers_as_the_query_command_does() {
         ("/api/query", r#"{"text":"cat","view":"nowhere"}"#, 400, "nowhere"),
         ("/api/query", r#"{"text":"cat","size":"9000x9000"}"#, 400, "too large"),
         ("/api/query", r#"{"point":[999,3]}"#, 400, "outside"),
+        ("/api/query", r#"{"point":[[1,3],[999,3]]}"#, 400, "outside"),
+        ("/api/query", r#"{"point":[]}"#, 422, "no pixel"),
         ("/api/query", r#"{"image":"AAAA"}"#, 400, "picture"),
         ("/api/query", huge.as_str(), 413, "large"),
         ("/api/render", r#"{"what":"smell"}"#, 400, "smell"),

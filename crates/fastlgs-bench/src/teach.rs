@@ -122,7 +122,7 @@ impl School {
 
     /// The object that so many clicks into a mask mean; nothing where there is none that was embedded.
     fn clicked(&self, view: &Seen, mask: &[bool], clicks: u8, config: &QueryConfig) -> Result<Vec<Hit>> {
-        let pixels = clicked(mask, view.camera.width, clicks);
+        let pixels = Pixels::new(clicked(mask, view.camera.width, clicks)).map_err(anyhow::Error::msg)?;
         Ok(Ask::Point(pixels).meaning(&self.scene, &[])?.find(&self.grid, &view.field, &view.camera, config)?.targets)
     }
 
@@ -157,7 +157,7 @@ impl School {
 
 /// Clicks into a mask: the pixel that is farthest from what is not in it, and then those that are farthest from the clicks before and a third as far as that
 /// one from what is not in it.
-fn clicked(mask: &[bool], width: u32, clicks: u8) -> Pixels {
+fn clicked(mask: &[bool], width: u32, clicks: u8) -> Vec<(u32, u32)> {
     let depth = depths(mask, width);
     let at = |p: usize| (p as u32 % width, p as u32 / width);
     let first = (0..mask.len()).rev().max_by_key(|p| depth[*p]).unwrap_or(0);
@@ -165,10 +165,10 @@ fn clicked(mask: &[bool], width: u32, clicks: u8) -> Pixels {
     let inside: Vec<usize> = (0..mask.len()).filter(|p| mask[*p] && 3 * depth[*p] >= depth[first]).collect();
     while pixels.len() < usize::from(clicks) {
         let far = |p: &usize| pixels.iter().map(|(x, y)| at(*p).0.abs_diff(*x) + at(*p).1.abs_diff(*y)).min();
-        let Some(next) = inside.iter().copied().max_by_key(far) else { break };
+        let Some(next) = inside.iter().copied().max_by_key(far).filter(|p| !pixels.contains(&at(*p))) else { break };
         pixels.push(at(next));
     }
-    Pixels(pixels)
+    pixels
 }
 
 /// How far each pixel of a mask is from what is not in it, the photo's border included (city-block distance).
@@ -197,10 +197,11 @@ mod tests {
         // A diamond of radius 2 in six columns.
         let at = |x: i32, y: i32| (x - 3).abs() + (y - 2).abs() <= 2;
         let diamond: Vec<bool> = (0..30).map(|p| at(p % 6, p / 6)).collect();
-        assert_eq!(clicked(&diamond, 6, 1).0, [(3, 2)]);
+        assert_eq!(clicked(&diamond, 6, 1), [(3, 2)]);
         // The border of the photo is one, too.
-        assert_eq!(clicked(&[true; 25], 5, 1).0, [(2, 2)]);
-        // Of a row of nine, its ends come next.
-        assert_eq!(clicked(&[true; 9], 9, 3).0, [(4, 0), (8, 0), (0, 0)]);
+        assert_eq!(clicked(&[true; 25], 5, 1), [(2, 2)]);
+        // Of a row, all of which lies at the border, the first, the last, and the middle.
+        assert_eq!(clicked(&[true; 9], 9, 3), [(0, 0), (8, 0), (4, 0)]);
+        assert_eq!(clicked(&[true; 4], 2, 9).len(), 4, "each pixel once");
     }
 }

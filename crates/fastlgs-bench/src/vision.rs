@@ -134,15 +134,15 @@ fn oracle(list: &MaskList, truth: &[bool]) -> (f64, f64) {
             masks.push((shared, mask));
         }
     }
+    let single = masks.iter().map(|m| metrics::iou(&m.1, truth)).fold(0.0f64, f64::max);
     masks.sort_by_key(|m| std::cmp::Reverse(m.0));
     masks.truncate(UNITED);
     let united = |chosen: &[usize]| {
         let union: Vec<bool> = (0..truth.len()).map(|p| chosen.iter().any(|&k| masks[k].1[p])).collect();
         metrics::iou(&union, truth)
     };
-    let (mut single, mut best) = (0.0f64, 0.0f64);
+    let mut best = single;
     for a in 0..masks.len() {
-        single = single.max(united(&[a]));
         for b in a..masks.len() {
             for c in b..masks.len() {
                 best = best.max(united(&[a, b, c]));

@@ -232,5 +232,22 @@ mod tests {
         map[20 * 64 + 40] = 1.0;
         assert!(localised(&map, 64, 64, &[[30.0, 10.0, 50.0, 30.0]]));
         assert!(!localised(&map, 64, 64, &[[0.0, 45.0, 10.0, 60.0]]));
+        // The window summed anew for each pixel, mirrored at the borders, has the same peak.
+        for (seed, (w, h)) in [(40, 31), (33, 64), (9, 12)].into_iter().enumerate() {
+            let mut rng = crate::rng::Rng::new(seed as u64, "localised");
+            let map: Vec<f32> = (0..w * h).map(|_| rng.uniform().powi(6)).collect();
+            let back = |k: i32, n: i32| if k < 0 { -k } else { 2 * (n - 1) - k };
+            let mirrored = |k: i32, n: i32| std::iter::successors(Some(k), |k| Some(back(*k, n))).find(|k| (0..n).contains(k)).unwrap();
+            let window = |c: i32, n: i32| (c - 14..=c + 14).map(move |k| mirrored(k, n));
+            let sum = |p: &i32| -> f64 {
+                let pixels = window(p / w, h).flat_map(|y| window(p % w, w).map(move |x| (y * w + x) as usize));
+                pixels.map(|p| f64::from(map[p])).sum()
+            };
+            let best = (0..w * h).max_by(|a, b| sum(a).total_cmp(&sum(b))).unwrap();
+            let (x, y, right, bottom) = (f64::from(best % w), f64::from(best / w), f64::from(w), f64::from(h));
+            let is_in = |boxes: &[[f64; 4]]| localised(&map, w as u32, h as u32, boxes);
+            assert!(is_in(&[[x, y, x + 1.0, y + 1.0]]), "{w}x{h}");
+            assert!(!is_in(&[[0.0, 0.0, right, y], [0.0, y + 1.0, right, bottom], [0.0, 0.0, x, bottom], [x + 1.0, 0.0, right, bottom]]));
+        }
     }
 }

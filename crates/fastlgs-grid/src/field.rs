@@ -45,11 +45,14 @@ impl Field {
 
     /// The objects that have most of each of these pixels, from small to large.
     pub fn at(&self, grid: &Grid, pixels: &[(u32, u32)]) -> Vec<Vec<u16>> {
-        let (width, mut place) = (self.size().0, 0);
-        let mut found = vec![Vec::new(); pixels.len()];
+        let width = self.size().0;
+        let mut asked: Vec<(u32, usize)> = pixels.iter().enumerate().map(|(k, (x, y))| (y * width + x, k)).collect();
+        asked.sort_unstable_by(|a, b| b.cmp(a));
+        let (mut place, mut found) = (0, vec![Vec::new(); pixels.len()]);
         self.each(grid, |objects| {
-            let asked = pixels.iter().zip(&mut found).filter(|((x, y), _)| y * width + x == place);
-            asked.for_each(|(_, found)| *found = objects.to_vec());
+            while let Some((_, k)) = asked.pop_if(|(wanted, _)| *wanted == place) {
+                found[k] = objects.to_vec();
+            }
             place += 1;
         });
         found

@@ -138,10 +138,11 @@ pub fn pointed(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
     let odds = |id: u16| {
         let (object, share) = (&grid.objects[usize::from(id) - 1], shares[usize::from(id) - 1].max(1e-6));
         let on = pixels.iter().filter(|at| at.contains(&id)).count();
-        object.support * (1.0 - share) * share.powi(1 - on as i32) * BESIDE.powi((pixels.len() - on) as i32)
+        // In logarithms: many clicks say much.
+        (object.support * (1.0 - share)).ln() + (1.0 - on as f32) * share.ln() + (pixels.len() - on) as f32 * BESIDE.ln()
     };
-    let best = there.iter().map(|id| odds(*id)).fold(0.0, f32::max);
-    let meant = there.iter().find(|id| odds(**id) >= SUPPORT_SHARE * best).copied();
+    let best = there.iter().map(|id| odds(*id)).fold(f32::NEG_INFINITY, f32::max);
+    let meant = there.iter().find(|id| odds(**id) >= SUPPORT_SHARE.ln() + best).copied();
     (there.into_iter().rev().collect(), meant)
 }
 
@@ -315,10 +316,24 @@ pub(crate) mod tests {
         assert_eq!(meant(&[vec![3, 2, 1]]), (vec![3, 2, 1], Some(2)));
         assert_eq!(meant(&[vec![1]]).1, Some(1), "where there is nothing else");
         assert_eq!(meant(&[vec![]]), (vec![], None));
-        // All that both clicks hit: the part; a click beside it counts little against two, and one on each of two things means what holds both.
+        // What all clicks hit is the part, however many they are; one beside it counts less than two.
         assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1]]).1, Some(3));
+        assert_eq!(meant(&vec![vec![3, 2, 1]; 60]).1, Some(3));
         assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1], vec![2, 1], vec![2, 1]]).1, Some(2));
-        assert_eq!(meant(&[vec![2, 1], vec![2, 1], vec![1], vec![2, 1]]).1, Some(2));
+    }
+
+    #[test]
+    fn clicks_on_two_parts_mean_what_holds_both_and_one_may_go_beside() {
+        let object = |id: u16, parent: u16| Object { support: 0.8, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
+        // 2 and 3 are parts of 1, which is 0.4 of the scene; 4 is the rest.
+        let objects = vec![object(1, 0), object(2, 1), object(3, 1), object(4, 0)];
+        let grid = Grid { objects, shown: vec![0.0, 0.1, 0.2, 0.1, 0.6], ..Grid::default() };
+        let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels).1;
+        assert_eq!(meant(&[vec![2, 1], vec![3, 1]]), Some(1));
+        assert_eq!(meant(&[vec![2, 1], vec![2, 1], vec![2, 1], vec![2, 1], vec![]]), Some(2));
+        // Four on one part outweigh one on the other; two do not.
+        assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![3, 1], vec![3, 1], vec![2, 1]]), Some(3));
+        assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![2, 1]]), Some(1));
     }
 
     #[test]

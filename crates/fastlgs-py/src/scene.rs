@@ -26,16 +26,17 @@ use std::sync::{Mutex, PoisonError};
 /// One pixel, or several of one thing.
 #[derive(FromPyObject)]
 enum Pointed {
-    One((u32, u32)),
-    Several(Vec<(u32, u32)>),
+    One([u32; 2]),
+    Several(Vec<[u32; 2]>),
 }
 
 impl Pointed {
-    fn pixels(self) -> Pixels {
-        match self {
-            Self::One(pixel) => Pixels(vec![pixel]),
-            Self::Several(pixels) => Pixels(pixels),
-        }
+    fn pixels(self) -> PyResult<Pixels> {
+        let pixels = match self {
+            Self::One(pixel) => vec![pixel],
+            Self::Several(pixels) => pixels,
+        };
+        Pixels::new(pixels.into_iter().map(|[x, y]| (x, y)).collect()).map_err(Error::new_err)
     }
 }
 
@@ -168,7 +169,7 @@ impl Scene {
     ) -> PyResult<Answer> {
         let ask = match (text, point, image) {
             (Some(text), None, None) => Ask::Text(text),
-            (None, Some(point), None) => Ask::Point(point.pixels()),
+            (None, Some(point), None) => Ask::Point(point.pixels()?),
             (None, None, Some(image)) => Ask::Image("image".to_owned(), picture(&image)?),
             _ => return Err(Error::new_err("ask in one way: a text, a point or an image")),
         };

@@ -49,6 +49,8 @@ def test_questions_are_answered(scene):
     y, x = np.argwhere(drawn > 0)[0]
     pointed = scene.query(point=(int(x), int(y)), view=view)
     assert pointed.found and pointed.mask[y, x]
+    several = scene.query(point=[[int(x), int(y)], (int(x), int(y))], view=view)
+    assert [o["id"] for o in several.objects] == [o["id"] for o in pointed.objects]
     # A picture of the thing itself, cut out of the render.
     shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
     assert shown.text == "image"

@@ -38,7 +38,7 @@ export class Objects {
     return this.children.get(id) ?? [];
   }
 
-  // Of things that lie in each other, the largest whose support comes near the best (fastlgs_grid::query::best_supported).
+  // Of things that lie in each other, the largest whose support comes near the best (fastlgs_grid::query::pointed).
   meant(id) {
     const chain = this.chain(id);
     const support = (id) => this.byId.get(id).support * (1 - this.byId.get(id).share);

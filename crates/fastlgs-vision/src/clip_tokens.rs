@@ -44,8 +44,8 @@ impl Tokens {
         }
     }
 
-    /// SigLIP's tokenizer beside a model file. What fills the rest of a text is told by the file itself, else it is the token that its rules end a text
-    /// with, as the published ones have it.
+    /// SigLIP's tokenizer beside a model file. What fills the rest of a text is told by the file itself or by `tokenizer_config.json` beside it; else it is
+    /// the token that its rules end a text with, as the published ones have it.
     ///
     /// # Errors
     /// When it is missing or damaged.
@@ -53,7 +53,11 @@ impl Tokens {
         let missing = || Error::Missing(format!("{}: SigLIP needs its tokenizer.json beside it", model.display()));
         let path = described(model).ok_or_else(missing)?;
         let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?;
-        let told = tokenizer.get_padding().map(|padding| padding.pad_id).or_else(|| tokenizer.token_to_id("<pad>"));
+        let configuration = path.with_file_name("tokenizer_config.json");
+        let configuration: serde_json::Value = if configuration.is_file() { fs::read_json(&configuration)? } else { json!(null) };
+        let token = &configuration["pad_token"];
+        let named = || token.as_str().or_else(|| token["content"].as_str()).and_then(|token| tokenizer.token_to_id(token));
+        let told = tokenizer.get_padding().map(|padding| padding.pad_id).or_else(named);
         plain(&mut tokenizer, &path)?;
         let ended = || Some(*tokenizer.encode("", true).ok()?.get_ids().last()?);
         let padding = told.or_else(ended).ok_or_else(|| bad(&path, "it tells of no token that fills or ends a text"))?;
@@ -159,7 +163,7 @@ fn plain(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
 }
 
 fn bad(path: &Path, reason: impl std::fmt::Display) -> Error {
-    Error::Invalid(format!("{}: not a CLIP tokenizer ({reason})", path.display()))
+    Error::Invalid(format!("{}: not a tokenizer of CLIP or SigLIP ({reason})", path.display()))
 }
 
 /// The printable sign that stands for each byte, in the vocabulary's order: printable bytes stand for themselves, the
@@ -220,13 +224,16 @@ mod tests {
                 "pair": [{ "Sequence": { "id": "A", "type_id": 0 } }, { "Sequence": { "id": "B", "type_id": 1 } }],
                 "special_tokens": { "</s>": { "id": "</s>", "ids": [1], "tokens": ["</s>"] } },
             },
-            "model": { "type": "WordLevel", "unk_token": "<unk>", "vocab": { "<unk>": 0, "</s>": 1, "red": 2, "fox": 3 } },
+            "model": { "type": "WordLevel", "unk_token": "<unk>", "vocab": { "<pad>": 0, "</s>": 1, "red": 2, "fox": 3, "<unk>": 4 } },
         });
         let write = |description: &serde_json::Value| std::fs::write(dir.path().join("tokenizer.json"), description.to_string()).unwrap();
         write(&description);
+        // The vocabulary has a token "<pad>" that is not the one.
         let tokens = Tokens::of_siglip(&model).unwrap();
         assert_eq!((tokens.encode(" Red fox", 64).unwrap(), tokens.padding(false), tokens.context()), (vec![2, 3, 1], 1, 64));
         assert_eq!(tokens.encode("red fox red fox", 3).unwrap(), [2, 3, 1], "a long text keeps its end");
+        std::fs::write(dir.path().join("tokenizer_config.json"), r#"{"pad_token": {"content": "fox"}}"#).unwrap();
+        assert_eq!(Tokens::of_siglip(&model).unwrap().padding(false), 3);
         description["padding"] = json!({
             "strategy": { "Fixed": 64 }, "direction": "Right", "pad_to_multiple_of": null, "pad_id": 7, "pad_type_id": 0, "pad_token": "<x>",
         });

@@ -45,6 +45,11 @@ fn kept(files: &BTreeMap<String, ModelFile>) -> Option<Kept> {
     kept.ok().filter(|kept| kept.sha256 == sums(files))
 }
 
+/// Whether a measurement of this version lies beside an image tower.
+pub fn is_measured(image_tower: &Path) -> bool {
+    fs::read_json::<Kept>(&beside(image_tower)).is_ok()
+}
+
 /// What should stand around the masks that these towers see.
 pub(crate) fn best_background(files: &BTreeMap<String, ModelFile>) -> Background {
     kept(files).map(|kept| kept.background).unwrap_or_default()

@@ -1,7 +1,7 @@
 //! Which segmenter and encoders a command works with: chosen by options in `preprocess`, remembered in `scene.json`.
 
-use crate::Result;
 use crate::error::{Context, bail};
+use crate::{Result, calibrations};
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::evidence;
@@ -194,7 +194,7 @@ impl Eyes {
     /// The image encoder.
     pub fn encoder(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Encoder>> {
         Ok(match self.encoder {
-            EncoderKind::Clip => Box::new(self.clip_image()?),
+            EncoderKind::Clip => Box::new(self.clip_image()?.with_background(calibrations::best_background(&self.files()?))),
             EncoderKind::Import => Box::new(Import::open(photos, lenses.clone())?),
             EncoderKind::Offline => Box::new(Conse::load()?),
         })
@@ -222,7 +222,8 @@ impl Eyes {
     pub fn files(&self) -> Result<BTreeMap<String, ModelFile>> {
         let mut files = BTreeMap::new();
         let mut add = |role: &str, path: PathBuf| -> Result<()> {
-            let path = path.canonicalize().unwrap_or(path);
+            // Not what it links to: other files of the model lie beside the link.
+            let path = std::path::absolute(&path).unwrap_or(path);
             let (bytes, sha256) = places::digest(&path)?;
             files.insert(role.to_owned(), ModelFile { path, bytes, sha256 });
             Ok(())
@@ -267,7 +268,7 @@ impl Eyes {
 /// The manifest's name of the encoder that comes with the program.
 pub(crate) const OFFLINE: &str = "offline";
 
-/// What embeddings of a scene can be compared with: those that the same files made.
+/// What embeddings of a scene can be compared with: those that the same files made, with the same around the masks.
 pub(crate) fn identity_of(manifest: &Manifest) -> String {
     let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {} {}", file.sha256, manifest.crops).trim_end().to_owned());
     match manifest.encoder.as_str() {
@@ -282,8 +283,9 @@ pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
         return Ok(Background::default());
     }
     let known = serde_json::from_value(manifest.crops.clone().into()).ok();
-    known
-        .with_context(|| format!("the scene's masks were embedded with '{}' around them, which this program does not know", manifest.crops))
+    known.with_context(|| {
+        format!("scene.json: 'crops' is '{}', which this program does not know; preprocess the photos again", manifest.crops)
+    })
 }
 
 /// The word that a scene remembers for it.

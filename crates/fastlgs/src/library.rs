@@ -171,11 +171,10 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
         let why = match &manifest {
             Err(error) => Some(error.to_string()),
             Ok(own) if train::Report::of(own).is_none() => Some("it was never trained".to_owned()),
-            Ok(own) => scenes
-                .first()
-                .map(|s| &s.1)
-                .filter(|first| eyes::identity_of(first) != eyes::identity_of(own))
-                .map(|first| format!("its encoder is another ('{}') than that of the library ('{}')", own.encoder, first.encoder)),
+            Ok(own) => scenes.first().map(|s| &s.1).filter(|first| eyes::identity_of(first) != eyes::identity_of(own)).map(|first| {
+                let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
+                format!("its encoder is another ('{own}') than that of the library ('{first}'); preprocess and train it again with that")
+            }),
         };
         match (why, manifest) {
             (None, Ok(manifest)) => scenes.push((Entry { path, stamp: stamp(&folder)? }, manifest)),

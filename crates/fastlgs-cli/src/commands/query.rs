@@ -38,7 +38,7 @@ pub struct Args {
     /// A picture of what to look for.
     #[arg(long, value_name = "FILE")]
     image: Vec<PathBuf>,
-    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that shows in all of them.
+    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that they tell of together.
     #[arg(long, value_name = "X,Y")]
     point: Vec<Pixels>,
     /// A text that the object must not be nearer to than to what is looked for; may be given several times.

@@ -108,13 +108,13 @@ class Scene:
         text: Optional[str] = None,
         *,
         view: Optional[View] = None,
-        point: Optional[Tuple[int, int]] = None,
+        point: Union[None, Tuple[int, int], Sequence[Tuple[int, int]]] = None,
         image: Optional[NDArray[np.uint8]] = None,
         negatives: Sequence[str] = (),
         false_alarms: Optional[float] = None,
         top_k: Optional[int] = None,
     ) -> Answer:
-        """Asks for a text, for what a pixel of the view shows, or for what a picture (uint8, (height, width, 3)) shows."""
+        """Asks for a text, for what a pixel of the view (or several of one thing) shows, or for what a picture (uint8, (height, width, 3)) shows."""
     @property
     def objects(self) -> List[Dict[str, Any]]:
         """id, parent (0 for none), support, views, area (largest share of a photo), code."""

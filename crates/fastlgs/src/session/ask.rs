@@ -103,7 +103,7 @@ impl Meaning {
                 if let Some((x, y)) = pixels.outside(camera) {
                     bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
                 }
-                let (there, meant) = query::pointed(grid, &field.at(grid, &pixels.0));
+                let (there, meant) = query::pointed(grid, &field.at(grid, pixels.all()));
                 let hit = |id: u16| Hit { id, score: grid.objects[usize::from(id) - 1].support };
                 Ok(Found { ranked: there.into_iter().map(hit).collect(), targets: meant.map(hit).into_iter().collect() })
             }

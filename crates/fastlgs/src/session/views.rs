@@ -63,26 +63,53 @@ pub fn parse_size(text: &str) -> Result<(u32, u32), String> {
 
 /// Pixels of a view that one thing shows in: `120,45`, or `120,45+160,70`, which tells more of how far it reaches.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(from = "OneOrMore")]
-pub struct Pixels(pub Vec<(u32, u32)>);
+#[serde(try_from = "OneOrMore")]
+pub struct Pixels(Vec<(u32, u32)>);
+
+/// Most pixels of one thing.
+const MOST_PIXELS: usize = 64;
 
 #[derive(Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "a pixel [x, y], or a list of pixels of one thing")]
 enum OneOrMore {
     One((u32, u32)),
     More(Vec<(u32, u32)>),
 }
 
-impl From<OneOrMore> for Pixels {
-    fn from(pixels: OneOrMore) -> Self {
-        match pixels {
-            OneOrMore::One(pixel) => Self(vec![pixel]),
-            OneOrMore::More(pixels) => Self(pixels),
-        }
+impl TryFrom<OneOrMore> for Pixels {
+    type Error = String;
+
+    fn try_from(pixels: OneOrMore) -> Result<Self, String> {
+        Self::new(match pixels {
+            OneOrMore::One(pixel) => vec![pixel],
+            OneOrMore::More(pixels) => pixels,
+        })
     }
 }
 
 impl Pixels {
+    /// These pixels, each once.
+    ///
+    /// # Errors
+    /// None, or more than 64.
+    pub fn new(pixels: Vec<(u32, u32)>) -> Result<Self, String> {
+        let mut own: Vec<(u32, u32)> = Vec::new();
+        for pixel in pixels {
+            if !own.contains(&pixel) {
+                own.push(pixel);
+            }
+            if own.len() > MOST_PIXELS {
+                return Err(format!("more than {MOST_PIXELS} pixels of one thing"));
+            }
+        }
+        if own.is_empty() { Err("no pixel is named".to_owned()) } else { Ok(Self(own)) }
+    }
+
+    /// x and y of each.
+    pub fn all(&self) -> &[(u32, u32)] {
+        &self.0
+    }
+
     /// The first that lies outside a view.
     pub fn outside(&self, camera: &Camera) -> Option<(u32, u32)> {
         self.0.iter().copied().find(|(x, y)| *x >= camera.width || *y >= camera.height)
@@ -95,7 +122,7 @@ impl std::str::FromStr for Pixels {
     fn from_str(text: &str) -> Result<Self, String> {
         let pixel = |text: &str| text.split_once(',').and_then(|(x, y)| Some((x.trim().parse().ok()?, y.trim().parse().ok()?)));
         let pixels = text.split('+').map(pixel).collect::<Option<_>>();
-        pixels.map(Self).ok_or_else(|| format!("'{text}' is no pixel like 120,45, nor several of one thing like 120,45+160,70"))
+        pixels.ok_or_else(|| format!("'{text}' is no pixel like 120,45, nor several of one thing like 120,45+160,70")).and_then(Self::new)
     }
 }
 
@@ -114,7 +141,11 @@ mod tests {
     fn pixels_are_read_and_named() {
         let read = |text: &str| text.parse::<Pixels>();
         assert_eq!(read("120,45"), Ok(Pixels(vec![(120, 45)])));
-        assert_eq!(read("120,45 + 7, 8").expect("two pixels").to_string(), "120,45+7,8");
+        assert_eq!(read("120,45 + 7, 8+120,45").expect("two pixels").to_string(), "120,45+7,8", "each once");
+        let row = |count: u32| Pixels::new((0..count).map(|x| (x, 0)).collect());
+        assert!(row(64).is_ok() && row(65).is_err_and(|e| e.contains("64")));
+        let wrong = |json: &str| serde_json::from_str::<Pixels>(json).expect_err(json).to_string();
+        assert!(wrong("[]").contains("no pixel") && wrong("[[1]]").contains("[x, y]"), "{} {}", wrong("[]"), wrong("[[1]]"));
         for wrong in ["", "120", "1,2,3", "-1,2", "1,2+", "1,2;3,4"] {
             assert!(read(wrong).expect_err(wrong).contains("120,45+160,70"), "{wrong}");
         }
