@@ -1,6 +1,7 @@
 //! What the cosines of a scene's encoder are worth: known for the offline encoder, kept beside the model for others.
 
-use crate::eyes;
+use crate::Result;
+use crate::error::Context;
 use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_grid::calibration::Calibration;
@@ -8,6 +9,9 @@ use fastlgs_vision::crops::Background;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// The manifest's name of the encoder that comes with the program.
+pub(crate) const OFFLINE: &str = "offline";
 
 /// What cosines with texts, and cosines with other pictures, are worth.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -45,6 +49,25 @@ fn kept(files: &BTreeMap<String, ModelFile>) -> Option<Kept> {
     kept.ok().filter(|kept| kept.sha256 == sums(files))
 }
 
+/// What stands around the masks that a scene's encoder saw; a word that this program does not know is refused.
+pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
+    if manifest.crops.is_empty() {
+        return Ok(Background::default());
+    }
+    let known = serde_json::from_value(manifest.crops.clone().into()).ok();
+    known.with_context(|| {
+        format!("scene.json: 'crops' is '{}', which this program does not know; preprocess the photos again", manifest.crops)
+    })
+}
+
+/// The word that a scene remembers for it.
+pub(crate) fn word_of(background: Background) -> String {
+    match background {
+        Background::Grey => String::new(),
+        other => serde_json::to_value(other).ok().and_then(|word| Some(word.as_str()?.to_owned())).unwrap_or_default(),
+    }
+}
+
 /// Whether a measurement of this version lies beside an image tower.
 pub fn is_measured(image_tower: &Path) -> bool {
     fs::read_json::<Kept>(&beside(image_tower)).is_ok()
@@ -69,10 +92,10 @@ impl Calibrations {
 
     /// Those of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {
-        if manifest.encoder == eyes::OFFLINE {
+        if manifest.encoder == OFFLINE {
             return Self::OFFLINE;
         }
-        let known = eyes::background_of(manifest).ok().and_then(|background| kept(&manifest.models)?.calibrations.remove(&background));
+        let known = background_of(manifest).ok().and_then(|background| kept(&manifest.models)?.calibrations.remove(&background));
         known.unwrap_or(Self::CLIP)
     }
 }

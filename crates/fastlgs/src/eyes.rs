@@ -6,7 +6,6 @@ use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
-use fastlgs_vision::crops::Background;
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
@@ -265,34 +264,12 @@ impl Eyes {
     }
 }
 
-/// The manifest's name of the encoder that comes with the program.
-pub(crate) const OFFLINE: &str = "offline";
-
 /// What embeddings of a scene can be compared with: those that the same files made, with the same around the masks.
 pub(crate) fn identity_of(manifest: &Manifest) -> String {
     let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {} {}", file.sha256, manifest.crops).trim_end().to_owned());
     match manifest.encoder.as_str() {
-        OFFLINE => format!("offline {}", conse::VERSION),
+        calibrations::OFFLINE => format!("offline {}", conse::VERSION),
         other => file("clip_image").or_else(|| file("clip_text")).unwrap_or_else(|| other.to_owned()),
-    }
-}
-
-/// What stands around the masks that a scene's encoder saw; a word that this program does not know is refused.
-pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
-    if manifest.crops.is_empty() {
-        return Ok(Background::default());
-    }
-    let known = serde_json::from_value(manifest.crops.clone().into()).ok();
-    known.with_context(|| {
-        format!("scene.json: 'crops' is '{}', which this program does not know; preprocess the photos again", manifest.crops)
-    })
-}
-
-/// The word that a scene remembers for it.
-pub(crate) fn word_of(background: Background) -> String {
-    match background {
-        Background::Grey => String::new(),
-        other => serde_json::to_value(other).ok().and_then(|word| Some(word.as_str()?.to_owned())).unwrap_or_default(),
     }
 }
 
@@ -311,7 +288,7 @@ fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
 pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn Encoder>> {
     Ok(match manifest.encoder.as_str() {
         "offline" => Box::new(Conse::load()?),
-        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?.with_background(background_of(manifest)?)),
+        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?.with_background(calibrations::background_of(manifest)?)),
         "import" => Box::new(Recorded::load(folder, manifest)?),
         other => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
     })

@@ -9,7 +9,7 @@ mod video;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
-use crate::eyes::{self, EncoderKind};
+use crate::eyes::EncoderKind;
 use crate::{Result, Run, calibrations};
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
@@ -93,7 +93,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         held_out_views,
         segmenter: config.eyes.segmenter.name().to_owned(),
         encoder: config.eyes.encoder.name().to_owned(),
-        crops: eyes::word_of(calibrations::best_background(&models)),
+        crops: calibrations::word_of(calibrations::best_background(&models)),
         models,
         seed: run.seed,
         warnings: warnings.clone(),

@@ -1,6 +1,6 @@
 //! The text tower of a scene's encoder, with what its scores are judged by and the names that were taught.
 
-use crate::calibrations::Calibrations;
+use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
 use crate::names::Names;
 use crate::{Result, eyes};
@@ -29,7 +29,7 @@ impl Texts {
 
     /// A text tower of the caller's, which must belong to what made the scene's embeddings.
     pub fn of(encoder: Box<dyn TextEncoder>, folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
-        let canonical = if manifest.encoder == eyes::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
+        let canonical = if manifest.encoder == calibrations::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
         let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
