@@ -3,6 +3,7 @@
 pub mod answer;
 pub mod ask;
 pub mod pictures;
+mod pixels;
 pub mod selection;
 pub mod sheet;
 mod texts;
@@ -20,11 +21,12 @@ use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::{Encoder, TextEncoder};
+pub use pixels::Pixels;
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 pub use texts::Texts;
-pub use views::{Pixels, ViewChoice, parse_size};
+pub use views::{ViewChoice, parse_size};
 
 /// A trained scene on a device.
 pub struct Session {
