@@ -97,7 +97,7 @@ fn large_query(scene: &Path, run: &Run) -> Result<f64> {
     Ok(started.elapsed().as_secs_f64() * 1e3)
 }
 
-const COLUMNS: [&str; 13] = [
+const COLUMNS: [&str; 14] = [
     "scene",
     "way",
     "seconds",
@@ -105,6 +105,7 @@ const COLUMNS: [&str; 13] = [
     "large_ms",
     "oracle_miou",
     "miou",
+    "macc",
     "loc_acc",
     "psnr",
     "objects",

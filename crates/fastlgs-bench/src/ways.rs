@@ -75,6 +75,7 @@ fn trained(trial: &Trial, command: &[&str]) -> Result<Value> {
         "query_ms": scored["query_ms_first"],
         "oracle_miou": scored["oracle_miou"],
         "miou": scored["miou"],
+        "macc": scored["macc"],
         "text_top1": scored["text_top1"],
         "loc_acc": scored["loc_acc"],
         "psnr": scored["psnr"],

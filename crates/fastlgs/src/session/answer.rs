@@ -59,8 +59,8 @@ impl Question<'_> {
         }
         let answer = Answer { grid, field, found, mask, calibrated: meaning.is_calibrated() };
         let total = encode_ms + render_ms + select_ms + restore_ms;
-        let ms = Milliseconds { encode: encode_ms, render: render_ms, select: select_ms, restore: restore_ms, total };
-        let report = answer.report(session, self.ask.name(), camera, self.candidates, ms);
+        let ms = Milliseconds { encode: encode_ms, render: render_ms, select: select_ms, restore: restore_ms, total, gaussians: 0.0 };
+        let report = answer.report(session, self.ask, camera, self.candidates, ms);
         Ok((answer, report))
     }
 }
@@ -150,6 +150,8 @@ pub struct Milliseconds {
     pub restore: f64,
     /// All of it.
     pub total: f64,
+    /// Choosing the Gaussians of the answer, for boxes and exports, which a mask does not wait for.
+    pub gaussians: f64,
 }
 
 /// What was found, in a view.
@@ -167,17 +169,21 @@ pub struct Answer<'a> {
 }
 
 impl Answer<'_> {
-    fn report(&self, session: &Session, text: String, camera: &Camera, candidates: usize, ms: Milliseconds) -> Report {
+    fn report(&self, session: &Session, ask: &Ask, camera: &Camera, candidates: usize, mut ms: Milliseconds) -> Report {
         let Found { ranked, targets } = &self.found;
+        let text = ask.name();
+        let started = Instant::now();
+        let owned: Vec<Vec<usize>> = targets.iter().map(|t| selection::gaussians(&session.gaussians, self.grid, &[t.id])).collect();
+        ms.gaussians = started.elapsed().as_secs_f64() * 1e3;
         Report {
             view: camera.name.clone(),
             size: format!("{}x{}", camera.width, camera.height),
             found: !targets.is_empty(),
             score: best_score(ranked),
             calibrated: self.calibrated,
-            taught: session.is_taught(&text),
+            taught: matches!(ask, Ask::Text(_)) && session.is_taught(&text),
             text,
-            objects: targets.iter().map(|t| self.object(session, camera.width, t)).collect(),
+            objects: targets.iter().zip(&owned).map(|(t, own)| self.object(session, camera.width, t, own)).collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),
             seen_best: None,
@@ -190,7 +196,7 @@ impl Answer<'_> {
     }
 
     /// Box and size of one object in this view and in the world.
-    fn object(&self, session: &Session, width: u32, hit: &Hit) -> ObjectReport {
+    fn object(&self, session: &Session, width: u32, hit: &Hit, own: &[usize]) -> ObjectReport {
         let mut bounds: Option<[u32; 4]> = None;
         let mask = self.field.mask(self.grid, &[*hit]);
         for p in (0..mask.len() as u32).filter(|p| mask[*p as usize]) {
@@ -198,7 +204,6 @@ impl Answer<'_> {
             let b = bounds.get_or_insert([x, y, x + 1, y + 1]);
             *b = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
         }
-        let own = selection::gaussians(&session.gaussians, self.grid, &[hit.id]);
         let object = &self.grid.objects[usize::from(hit.id) - 1];
         ObjectReport {
             id: hit.id,
@@ -206,7 +211,7 @@ impl Answer<'_> {
             support: object.support,
             score: hit.score,
             bbox2d: bounds,
-            bbox3d: selection::robust_box(&session.gaussians, &own),
+            bbox3d: selection::robust_box(&session.gaussians, own),
             pixels: mask.iter().filter(|m| **m).count(),
             gaussians: own.len(),
         }

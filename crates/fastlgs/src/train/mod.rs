@@ -49,6 +49,7 @@ pub(crate) fn forget(folder: &SceneFolder) {
 /// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
 pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let config = &config.resolved();
+    let began = Instant::now();
     let by_descent = config.feature_mode == FeatureMode::Train;
     if by_descent && config.mapping == Mapping::Global {
         bail!(
@@ -71,7 +72,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &config.background, |name| light.gain(name));
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &config.background, |_| [1.0; 3]);
     held_out.check()?;
-    let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, run)?;
+    let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, began, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
         // What most views say: where they disagree, descent from elsewhere ends between their codes.

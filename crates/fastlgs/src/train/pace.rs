@@ -1,6 +1,6 @@
 //! How many iterations fit into the minutes that somebody has.
 
-use super::config::{Config, Preset};
+use super::config::{Config, Mapping, Preset};
 use super::{device, settings, start};
 use crate::preprocess::Brightness;
 use crate::{Result, Run, objects};
@@ -21,13 +21,15 @@ const MOST: u32 = 30_000;
 /// Note of the manifest: what was decided, for a run that goes on after it was broken off.
 const NOTE: &str = "minutes";
 
-/// `config` with iterations, and the preset's limits, that fit into its minutes together with the mapping; itself where it has none.
+/// `config` with iterations, and the preset's limits, that fit into its minutes together with the mapping, of which those that have gone since
+/// `began` are no longer there; itself where it has none.
 pub fn fitted(
     config: &Config,
     folder: &SceneFolder,
     manifest: &mut Manifest,
     training: &[Camera],
     targets: &Targets,
+    began: Instant,
     run: &Run,
 ) -> Result<Config> {
     let Some(minutes) = config.minutes else { return Ok(config.clone()) };
@@ -35,11 +37,11 @@ pub fn fitted(
     let iterations = match decided.filter(|_| config.resume) {
         Some(iterations) => iterations,
         None => {
-            let started = Instant::now();
-            let mapping = objects::seconds_of_embedding(folder, training)?;
+            // Algorithm 1 is done by now, and so are objects that are kept.
+            let mapping = if config.mapping == Mapping::Global { objects::seconds_of_embedding(folder, training)? } else { 0.0 };
             let step = GROWTH * trial(config, folder, manifest, targets, run)?;
             // What the trial took is gone as well.
-            let fit = (60.0 * minutes - started.elapsed().as_secs_f64() - mapping) / step;
+            let fit = (60.0 * minutes - began.elapsed().as_secs_f64() - mapping) / step;
             tracing::info!(minutes, mapping, milliseconds_a_step = 1e3 * step, fit, "what fits");
             if fit < f64::from(FEWEST) {
                 let (left, needed) = (minutes.max(0.0), (mapping + step * f64::from(FEWEST)) / 60.0);
