@@ -75,8 +75,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cxx = cov.x;
     let cxy = cov.y;
     let cyy = cov.z;
-    let det = cxx * cyy - cxy * cxy;
-    let opacity = kept_gain(view) * compensation(cov, view) / (1.0 + exp(-param(OPACITY, i)));
+    let dets = determinants(ax, ay);
+    let det = dets.y;
+    let opacity = kept_gain(view) * compensation(dets, view) / (1.0 + exp(-param(OPACITY, i)));
     if !(opacity >= ALPHA_MIN) {
         return;
     }

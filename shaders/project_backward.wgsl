@@ -145,13 +145,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cov = dilated(a_x, a_y);
     // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
-    let clamped = opacity * compensation(cov, view) >= ALPHA_MAX;
+    let dets = determinants(a_x, a_y);
+    let clamped = opacity * compensation(dets, view) >= ALPHA_MAX;
     let unclamped_opacity = select(1.0, 0.0, clamped && sum1.y < 0.0);
     put(OPACITY, i, sum1.y * (1.0 - opacity) * unclamped_opacity);
-    if view.antialias == 1u && determinant_share(cov) > 1e-6 {
+    if view.antialias == 1u && determinant_share(dets) > 1e-6 {
         // d log(compensation) / d cov = (inverse before dilation - inverse after it) / 2.
         let before = vec3<f32>(cov.x - DILATION, cov.y, cov.z - DILATION);
-        let det = before.x * before.z - before.y * before.y;
+        let det = dets.x;
         let half = 0.5 * sum1.y * unclamped_opacity;
         d_cov_xx += half * (before.z / det - q_xx);
         d_cov_xy += half * (-before.y / det - q_xy);

@@ -4,6 +4,7 @@ use crate::{Error, Result};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Writes `path` through a temporary neighbour that is renamed into place when `write` succeeded. A symbolic link stays one: what
 /// it points at is replaced. What is no regular file (`/dev/null`, a pipe) is written to as it is.
@@ -37,10 +38,11 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std
     Ok(())
 }
 
-/// The temporary name beside `path`; the process id keeps concurrent writers apart.
+/// The temporary name beside `path`: the process id and a number of its own keep concurrent writers apart, also of one file.
 fn partial_name(path: &Path) -> PathBuf {
+    static COUNT: AtomicU64 = AtomicU64::new(0);
     let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(format!(".{}.partial", std::process::id()));
+    name.push(format!(".{}-{}.partial", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
     path.with_file_name(name)
 }
 

@@ -1,11 +1,12 @@
 //! Photos and pictures on disk.
 
 use crate::{Error, Result, fs};
-use image::{DynamicImage, GrayImage, ImageFormat, ImageReader, RgbImage, imageops::FilterType};
+use image::metadata::Orientation;
+use image::{DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, RgbImage, imageops::FilterType};
 use std::io::Cursor;
 use std::path::Path;
 
-/// Reads a photo as 8-bit RGB.
+/// Reads a picture as 8-bit RGB, the way up that its file says.
 ///
 /// # Errors
 /// [`Error::Io`], or [`Error::Format`] when it cannot be decoded.
@@ -18,8 +19,18 @@ fn decode(path: &Path) -> Result<DynamicImage> {
 }
 
 fn decode_bytes(path: &Path, data: &[u8]) -> Result<DynamicImage> {
+    let (mut picture, way_up) = stored(path, data)?;
+    picture.apply_orientation(way_up);
+    Ok(picture)
+}
+
+/// Pixels as they are stored, and what makes of them the picture that is meant (EXIF).
+fn stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)> {
     let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
-    reader.decode().map_err(|e| Error::format(path, format!("the picture cannot be read ({e}); export it again or remove it")))
+    let failed = |e: image::ImageError| Error::format(path, format!("the picture cannot be read ({e}); export it again or remove it"));
+    let mut decoder = reader.into_decoder().map_err(failed)?;
+    let way_up = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?, way_up))
 }
 
 /// A photo with what it says about itself.
@@ -30,12 +41,24 @@ pub struct Photo {
     pub alpha: Option<GrayImage>,
 }
 
-/// Reads a photo as 8-bit RGB, and its alpha channel.
+/// Reads a photo as 8-bit RGB, and its alpha channel. `camera` has the sides for which its pose was found, if it has one.
+///
+/// A photo that was stored on its side is set upright, unless its pose counts its pixels as they are stored, as COLMAP does. Only its sides tell, so
+/// that squares, and what is upside down, stay as they are.
 ///
 /// # Errors
 /// As [`load_rgb`].
-pub fn load_photo(path: &Path) -> Result<Photo> {
-    let decoded = decode(path)?;
+pub fn load_photo(path: &Path, camera: Option<(u32, u32)>) -> Result<Photo> {
+    let (mut decoded, way_up) = stored(path, &fs::read(path)?)?;
+    let on_its_side = {
+        use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+        matches!(way_up, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+    };
+    let is_tall = |(width, height): (u32, u32)| height > width;
+    let stored = (decoded.width(), decoded.height());
+    if on_its_side && stored.0 != stored.1 && camera.is_none_or(|sides| is_tall(sides) != is_tall(stored)) {
+        decoded.apply_orientation(way_up);
+    }
     let alpha = decoded.color().has_alpha().then(|| {
         let rgba = decoded.to_rgba8();
         GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]))
@@ -122,4 +145,40 @@ pub fn from_planar(planar: &[f32], width: u32, height: u32) -> RgbImage {
         let p = (j * width + i) as usize;
         image::Rgb([byte(planar[p]), byte(planar[n + p]), byte(planar[2 * n + p])])
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A JPEG whose EXIF says orientation 6: to be turned by a quarter, clockwise.
+    fn on_its_side(width: u32, height: u32) -> (tempfile::TempDir, std::path::PathBuf) {
+        // Left half red, right half blue, as stored.
+        let picture = RgbImage::from_fn(width, height, |x, _| image::Rgb(if x < width / 2 { [250, 0, 0] } else { [0, 0, 250] }));
+        let mut jpeg = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(&picture).expect("a JPEG");
+        let tiff = [b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01".as_slice(), &[1, 0x12, 0, 3, 0, 0, 0, 1, 0, 6, 0, 0, 0, 0, 0, 0]].concat();
+        let segment = [&[0xff, 0xe1], (tiff.len() as u16 + 2).to_be_bytes().as_slice(), &tiff].concat();
+        jpeg.splice(2..2, segment);
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("photo.jpg");
+        std::fs::write(&path, jpeg).expect("a file");
+        (dir, path)
+    }
+
+    #[test]
+    fn photos_stand_upright_unless_their_poses_count_stored_pixels() {
+        let (_dir, path) = on_its_side(64, 32);
+        assert_eq!(load_rgb(&path).unwrap().dimensions(), (32, 64));
+        let upright = load_photo(&path, None).unwrap().pixels;
+        assert_eq!(upright.dimensions(), (32, 64));
+        let (top, bottom) = (upright.get_pixel(16, 10), upright.get_pixel(16, 54));
+        assert!(top[0] > 200 && bottom[2] > 200, "what was left is above: {top:?}, {bottom:?}");
+        for (camera, sides) in [((3024, 4032), (32, 64)), ((4032, 3024), (64, 32))] {
+            assert_eq!(load_photo(&path, Some(camera)).unwrap().pixels.dimensions(), sides, "{camera:?}");
+        }
+        let (_dir, square) = on_its_side(32, 32);
+        let stored = load_photo(&square, None).unwrap().pixels;
+        assert!(stored.get_pixel(4, 16)[0] > 200, "no camera could tell");
+    }
 }

@@ -128,6 +128,17 @@ impl SceneFolder {
         fs::write_json(&self.manifest_path(), manifest)
     }
 
+    /// Forgets what made the folder, which is no scene until it is saved again.
+    ///
+    /// # Errors
+    /// The system's refusal.
+    pub fn remove_manifest(&self) -> Result<()> {
+        match std::fs::remove_file(self.manifest_path()) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::io(&self.manifest_path())(error)),
+            _ => Ok(()),
+        }
+    }
+
     /// The trained scene in compact form.
     pub fn compact_path(&self) -> PathBuf {
         self.root.join("scene.safetensors")

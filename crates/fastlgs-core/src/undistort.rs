@@ -92,6 +92,17 @@ pub fn undistort(photo: &RgbImage, camera: &Camera, distortion: &Distortion) -> 
     })
 }
 
+/// Where [`undistort`] found something to show, 255, and 0 where the lens imaged what lies there beside the photo; nothing where it always did.
+pub fn imaged(camera: &Camera, distortion: &Distortion) -> Option<GrayImage> {
+    let (width, height) = (camera.width as f32, camera.height as f32);
+    let mask = GrayImage::from_fn(camera.width, camera.height, |i, j| {
+        let d = distortion.distort(camera.ray(Vec2::new(i as f32 + 0.5, j as f32 + 0.5)).truncate());
+        let (x, y) = (camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy);
+        Luma([if (0.0..=width).contains(&x) && (0.0..=height).contains(&y) { 255 } else { 0 }])
+    });
+    mask.pixels().any(|p| p[0] == 0).then_some(mask)
+}
+
 /// As [`undistort`], for masks.
 pub fn undistort_gray(mask: &GrayImage, camera: &Camera, distortion: &Distortion) -> GrayImage {
     let rgb = RgbImage::from_fn(mask.width(), mask.height(), |x, y| Rgb([mask.get_pixel(x, y)[0]; 3]));
@@ -118,6 +129,19 @@ fn sample(photo: &RgbImage, x: f32, y: f32) -> Rgb<u8> {
 mod tests {
     use super::*;
     use glam::Vec3;
+
+    #[test]
+    fn what_the_lens_did_not_image_is_told() {
+        let name = "a.jpg".to_owned();
+        let world_to_camera = glam::Mat4::IDENTITY;
+        let camera = Camera { name, width: 160, height: 120, fx: 138.0, fy: 138.0, cx: 80.0, cy: 60.0, world_to_camera };
+        let barrel = Distortion { k1: -0.1, ..Distortion::default() };
+        assert!(imaged(&camera, &barrel).is_none() && imaged(&camera, &Distortion::default()).is_none());
+        // A pincushion draws the corners in from outside of the photo.
+        let mask = imaged(&camera, &Distortion { k1: 0.05, ..Distortion::default() }).expect("corners are missing");
+        assert_eq!([(0, 0), (159, 119), (80, 60), (80, 0)].map(|(x, y)| mask.get_pixel(x, y)[0]), [0, 0, 255, 0]);
+        assert_eq!(mask.get_pixel(80, 3)[0], 255);
+    }
 
     #[test]
     fn a_bent_ray_is_straightened() {

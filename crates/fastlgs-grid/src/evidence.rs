@@ -6,7 +6,6 @@ use crate::mapping::{Correspondences, Mask};
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 use fastlgs_core::{Error, SceneFolder};
 use std::collections::BTreeMap;
-use std::io::ErrorKind;
 use std::path::PathBuf;
 
 /// A mask by its view's place among the training views, and its label there.
@@ -66,18 +65,6 @@ pub fn save_masks(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
         ("histograms", vec![n, width(|m| &m.histogram)], &histograms),
     ];
     Ok(save_tensors(&masks_path(folder), &tensors)?)
-}
-
-/// Removes what [`save_masks`] wrote, if it did: other masks are to come.
-///
-/// # Errors
-/// The system's refusal.
-pub fn forget_masks(folder: &SceneFolder) -> Result<()> {
-    let path = masks_path(folder);
-    match std::fs::remove_file(&path) {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(Error::io(&path)(error).into()),
-        _ => Ok(()),
-    }
 }
 
 /// Reads what [`save_masks`] wrote.

@@ -255,8 +255,8 @@ impl Grid {
         let objects = rows
             .into_iter()
             .map(|r| {
-                let range = r.first..r.first + r.count;
-                if range.end > areas.1.len() || range.end * dimension > embeddings.1.len() {
+                let range = r.first..r.first.saturating_add(r.count);
+                if range.end > areas.1.len() || range.end.saturating_mul(dimension) > embeddings.1.len() {
                     return Err(Error::format(&path, "it does not fit grid.json; run 'fastlgs preprocess' again"));
                 }
                 let own = &embeddings.1[range.start * dimension..range.end * dimension];

@@ -144,7 +144,8 @@ pub fn write(path: &Path, scenes: &[(Entry, Grid)]) -> Result<()> {
     let n = embeddings.len();
     let entries: Vec<&Entry> = scenes.iter().map(|s| &s.0).collect();
     let entries = serde_json::to_string(&entries).map_err(|e| CoreError::format(path, e.to_string()))?;
-    let metadata = HashMap::from([("fastlgs library".to_owned(), "1".to_owned()), ("scenes".to_owned(), entries)]);
+    // One entry: of several the order would be chance.
+    let metadata = HashMap::from([("scenes".to_owned(), entries)]);
     let tensor =
         |kind, shape: Vec<usize>, data| TensorView::new(kind, shape, data).map_err(|e| Error::Core(CoreError::format(path, e.to_string())));
     let tensors = [

@@ -25,6 +25,9 @@ pub(crate) struct Course {
     pub removals: Vec<Removal>,
     pub exposures: Vec<LearnedExposure>,
     pub background: Learned<6>,
+    /// Names and sizes of the training views.
+    #[serde(default)]
+    pub views: Vec<(String, [u32; 2])>,
     /// Poses of the training views, world to camera.
     pub poses: Vec<Mat4>,
     /// What the watched views gained by alignment, in dB, once that was looked at.

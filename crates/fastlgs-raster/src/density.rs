@@ -227,11 +227,15 @@ fn sampled(state: &State, count: usize, rng: &mut Rng) -> Vec<usize> {
     let live = |o: f32| if o > DEAD { f64::from(o) } else { 0.0 };
     let cumulative: Vec<f64> = (0..state.len())
         .map(|i| {
-            sum += live(state.opacity(i));
+            sum += if state.is_finite(i) { live(state.opacity(i)) } else { 0.0 };
             sum
         })
         .collect();
-    (0..count).map(|_| cumulative.partition_point(|c| *c <= f64::from(rng.uniform()) * sum).min(state.len() - 1)).collect()
+    let mut draw = || {
+        let drawn = f64::from(rng.uniform()) * sum;
+        cumulative.partition_point(|c| *c <= drawn).min(state.len() - 1)
+    };
+    (0..count).map(|_| draw()).collect()
 }
 
 /// The state whose Gaussian k is a copy of `sources[k]`, copies of one being made fainter and smaller so that together
@@ -320,6 +324,21 @@ mod tests {
         let mut s = state(&scene);
         assert_eq!(refine(&mut s, &[0.0; 8], 1.0, &Config::default(), &mut Rng::new(1, "test")).pruned, 2);
         assert_eq!(s.len(), 2);
+    }
+
+    #[test]
+    fn sources_are_drawn_by_their_opacity() {
+        let mut scene = Gaussians::default();
+        (0..100).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, if i < 50 { 0.2 } else { 0.6 }, [0.5; 3]));
+        scene.means[99].x = f32::NAN;
+        let drawn = sampled(&state(&scene), 100_000, &mut Rng::new(1, "test"));
+        let mut counts = [0u32; 100];
+        drawn.iter().for_each(|&i| counts[i] += 1);
+        assert_eq!(counts[99], 0, "what is nowhere is copied nowhere");
+        for (i, count) in counts[..99].iter().enumerate() {
+            let wanted = 100_000.0 * if i < 50 { 0.2 } else { 0.6 } / (50.0 * 0.2 + 49.0 * 0.6);
+            assert!((f64::from(*count) - wanted).abs() < 5.0 * wanted.sqrt(), "{i}: {count} of {wanted}");
+        }
     }
 
     #[test]

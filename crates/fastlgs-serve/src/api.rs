@@ -41,7 +41,7 @@ pub async fn scene(State(app): App) -> Answer {
         "name": app.name,
         "views": app.views()?,
         "trained_here": app.live.is_some(),
-        "up": mean_up(&app.cameras).to_array(),
+        "up": mean_up(&app.cameras()).to_array(),
         "limits": { "pixels": MOST_PIXELS, "text": LONGEST_TEXT, "body": LARGEST_BODY },
     });
     let more = match app.bell() {
@@ -114,7 +114,7 @@ pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>)
         if !known {
             return Err(Failure::new(StatusCode::NOT_FOUND, format!("there is no object {}", naming.object)));
         }
-        let learned = learn(&desk.scene, &name, naming.object)?;
+        let learned = learn(&desk.scene, &desk.grid, &name, naming.object)?;
         desk.scene.forget_texts();
         Ok(Json(json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples })))
     };
@@ -123,7 +123,7 @@ pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>)
 
 /// `GET /api/photos/{view}`: the photo as it was trained on.
 pub async fn photo(State(app): App, Path(view): Path<String>) -> Answer<Response> {
-    let known = app.cameras.iter().find(|c| c.name == view).map(|c| app.folder.photo_path(&c.name)).filter(|p| p.is_file());
+    let known = app.cameras().iter().find(|c| c.name == view).map(|c| app.folder.photo_path(&c.name)).filter(|p| p.is_file());
     let path = known.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("the scene has no photo '{view}'")))?;
     Ok(([(header::CONTENT_TYPE, "image/png")], fastlgs_core::fs::read(&path)?).into_response())
 }
@@ -134,10 +134,11 @@ fn camera_of(app: &Shared, view: Option<&str>, camera: Option<Camera>, size: Opt
         (Some(_), Some(_)) => return Err(Failure::bad("give a view or a camera, not both")),
         (None, Some(camera)) => camera,
         (Some(view), None) => {
-            let index = app.folder.view_index(&app.cameras, view).map_err(|e| Failure::bad(e.to_string()))?;
-            app.cameras[index].clone()
+            let cameras = app.cameras();
+            let index = app.folder.view_index(&cameras, view).map_err(|e| Failure::bad(e.to_string()))?;
+            cameras[index].clone()
         }
-        (None, None) => app.cameras.first().cloned().ok_or_else(|| Failure::bad("the scene has no views"))?,
+        (None, None) => app.cameras().first().cloned().ok_or_else(|| Failure::bad("the scene has no views"))?,
     };
     if let Some(size) = size {
         let (w, h) = parse_size(size).map_err(Failure::bad)?;

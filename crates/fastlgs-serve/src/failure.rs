@@ -63,6 +63,9 @@ impl From<QueryRejection> for Failure {
 
 impl From<fastlgs::Error> for Failure {
     fn from(error: fastlgs::Error) -> Self {
+        if let fastlgs::Error::Invalid(reason) = &error {
+            return Self::bad(reason.clone());
+        }
         anyhow::Error::from(error).into()
     }
 }

@@ -24,7 +24,7 @@ pub use live::Live;
 use shared::Shared;
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
@@ -51,7 +51,7 @@ impl Server {
         let root = folder.root.canonicalize().unwrap_or_else(|_| folder.root.clone());
         let shared = Arc::new(Shared {
             name: root.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-            cameras: folder.cameras()?,
+            cameras: RwLock::new(Arc::new(folder.cameras()?)),
             folder: folder.clone(),
             live,
             bell: OnceLock::new(),
@@ -68,11 +68,13 @@ impl Server {
 
     /// Tells the page how far the cameras' subjects are.
     pub fn set_focus(&self, means: &[Vec3]) {
-        let _ = self.shared.focus.set(self.shared.cameras.iter().map(|c| focus(means, c)).collect());
+        let _ = self.shared.focus.set(self.shared.cameras().iter().map(|c| focus(means, c)).collect());
     }
 
     /// Opens the trained scene for questions.
     pub fn open_scene(&self, device: &str, clip_text: Option<PathBuf>) -> Result<()> {
+        // Training may have moved them.
+        *self.shared.cameras.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(self.shared.folder.cameras()?);
         let bell = Desk::open(self.shared.folder.root.clone(), device.to_owned(), clip_text)?;
         let _ = self.shared.bell.set(bell);
         Ok(())
@@ -106,7 +108,7 @@ impl Sink for Server {
                 self.set_focus(&first.means);
                 live.picture(first);
             }
-            Message::Trained { step, scene, .. } if live.report(step) => match scene() {
+            Message::Trained { step, total, scene } if live.report(step, total) => match scene() {
                 Ok(scene) => live.picture(&scene),
                 Err(error) => tracing::warn!("the growing scene cannot be shown: {error}"),
             },

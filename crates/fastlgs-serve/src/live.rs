@@ -46,7 +46,7 @@ struct Watched {
 }
 
 impl Live {
-    /// A run of `iterations` steps that is about to begin.
+    /// A run that is about to begin, as far as is known of `iterations` steps.
     pub fn new(iterations: u32, antialias: bool, background: [f32; 3]) -> Self {
         let progress = Progress { iterations, ..Progress::default() };
         let first = Watched { progress, splats: Bytes::from(splats::pack(&Gaussians::default())), ..Watched::default() };
@@ -57,9 +57,10 @@ impl Live {
         self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// Adds to the curves; true when a new picture of the scene is wanted.
-    pub fn report(&self, point: TrainStep) -> bool {
+    /// Adds to the curves of a run of `total` steps; true when a new picture of the scene is wanted.
+    pub fn report(&self, point: TrainStep, total: u32) -> bool {
         let mut state = self.state();
+        state.progress.iterations = total;
         let curve = &mut state.progress.curve;
         curve.push(point);
         if curve.len() > POINTS {

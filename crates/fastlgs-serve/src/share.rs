@@ -39,6 +39,8 @@ pub struct Config {
     pub sh_degree: Option<u32>,
     /// Common words that are answered.
     pub words: usize,
+    /// CLIP's text tower, instead of the one that the scene remembers.
+    pub clip_text: Option<PathBuf>,
 }
 
 /// What was written.
@@ -68,7 +70,7 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
     if root.exists() && !ours && root.read_dir().map_or(true, |mut entries| entries.next().is_some()) {
         bail!("{}: something else is there; name a new folder", root.display());
     }
-    let mut desk = Desk::new(&config.scene, run.device, None)?;
+    let mut desk = Desk::new(&config.scene, run.device, config.clip_text.clone())?;
     if let Some(degree) = config.sh_degree {
         let lower = desk.scene.gaussians.clone().with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
         desk.scene.show(lower)?;

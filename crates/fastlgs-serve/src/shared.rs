@@ -7,13 +7,14 @@ use anyhow::Result;
 use axum::http::StatusCode;
 use fastlgs_core::{Camera, SceneFolder};
 use serde_json::{Value, json};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
 /// What all requests share.
 pub struct Shared {
     pub name: String,
     pub folder: SceneFolder,
-    pub cameras: Vec<Camera>,
+    /// As training left them so far.
+    pub cameras: RwLock<Arc<Vec<Camera>>>,
     pub live: Option<Arc<Live>>,
     pub bell: OnceLock<Bell>,
     pub focus: OnceLock<Vec<f32>>,
@@ -30,9 +31,14 @@ impl Shared {
         self.bell().ok_or_else(|| Failure::new(StatusCode::CONFLICT, "the scene is still in training; ask again when it has objects"))
     }
 
+    /// The cameras that the scene has now.
+    pub fn cameras(&self) -> Arc<Vec<Camera>> {
+        self.cameras.read().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
     /// All views as the page wants them.
     pub fn views(&self) -> Result<Vec<Value>> {
-        views(&self.folder, &self.cameras, self.focus.get().map_or(&[], Vec::as_slice))
+        views(&self.folder, &self.cameras(), self.focus.get().map_or(&[], Vec::as_slice))
     }
 }
 

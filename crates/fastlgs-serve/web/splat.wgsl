@@ -122,8 +122,10 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
     view.antialias = u32(frame.camera.w);
     let r = rotation_matrix(unpack_rotation(b.z, b.w & 0xffffu));
     let jw = affine(t, view);
-    let cov = dilated((jw.x * r) * s, (jw.y * r) * s);
-    let opacity = last.y * compensation(cov, view);
+    let ax = (jw.x * r) * s;
+    let ay = (jw.y * r) * s;
+    let cov = dilated(ax, ay);
+    let opacity = last.y * compensation(determinants(ax, ay), view);
     if !(opacity >= ALPHA_MIN) {
         return out;
     }

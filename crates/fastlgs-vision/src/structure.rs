@@ -6,7 +6,7 @@ use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
 use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
-use fastlgs_core::dataset::{colmap, is_photo};
+use fastlgs_core::dataset::{self, colmap, is_photo};
 use fastlgs_core::{Camera, fs, image_io};
 use glam::Mat4;
 use rayon::prelude::*;
@@ -71,7 +71,11 @@ pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &st
     let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
     files.sort();
     if files.len() < 3 {
-        return Err(Error::Invalid(format!("{}: {} photos; poses need at least 3", images.display(), files.len())));
+        let folders = dataset::folders_within(&images);
+        let below =
+            (!folders.is_empty()).then(|| format!("photos in folders within it are not read ({}): move them up", folders.join(", ")));
+        let why: String = dataset::passed_over(&images).into_iter().chain(below).map(|reason| format!("; {reason}")).collect();
+        return Err(Error::Invalid(format!("{}: {} photos; poses need at least 3{why}", images.display(), files.len())));
     }
     let work = photos.join("sparse.partial");
     let _ = std::fs::remove_dir_all(&work);
@@ -142,7 +146,7 @@ fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option
 fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + Sync)) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
         say("features", &path.file_name().unwrap_or_default().to_string_lossy());
-        let photo = image_io::load_rgb(path)?;
+        let photo = image_io::load_photo(path, None)?.pixels;
         let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
         let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
         let small = image_io::resize(&photo, size(photo.width()), size(photo.height()));
@@ -234,6 +238,11 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
     folders.max_by_key(|p| (std::fs::metadata(p.join("images.bin")).map_or(0, |m| m.len()), std::cmp::Reverse(p.clone())))
 }
 
+/// What a program prints, line by line, whatever its letters.
+pub(crate) fn lines(stream: impl std::io::Read) -> impl Iterator<Item = String> {
+    BufReader::new(stream).split(b'\n').map_while(std::result::Result::ok).map(|line| String::from_utf8_lossy(&line).into_owned())
+}
+
 /// Runs one stage and passes on what it prints.
 fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str)) -> Result<()> {
     let name = command.get_program().to_string_lossy().into_owned();
@@ -241,8 +250,8 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str)) -> Result<
     say(stage, "");
     // Both streams are read, so that neither fills up and stops the tool.
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(|e| failed(e.to_string()))?;
-    let errors = child.stderr.take().map(|stream| std::thread::spawn(move || BufReader::new(stream).lines().map_while(|l| l.ok()).last()));
-    let lines = child.stdout.take().into_iter().flat_map(|stream| BufReader::new(stream).lines().map_while(|l| l.ok()));
+    let errors = child.stderr.take().map(|stream| std::thread::spawn(move || lines(stream).last()));
+    let lines = child.stdout.take().into_iter().flat_map(lines);
     let mut last = String::new();
     for line in lines.filter(|l| !l.trim().is_empty()) {
         say(stage, line.trim());

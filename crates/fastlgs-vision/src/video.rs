@@ -3,10 +3,11 @@
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
 use crate::photo_quality::Impression;
+use crate::structure::lines;
 use crate::{Error, Result};
 use image::GrayImage;
 use std::collections::VecDeque;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufReader, Read};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::thread::JoinHandle;
@@ -79,7 +80,7 @@ impl<'a> Ffmpeg<'a> {
             Error::Missing(format!("{}: videos are read by ffmpeg, which cannot be started; {mend}", video.display()))
         })?;
         let errors = child.stderr.take();
-        let complaint = std::thread::spawn(move || BufReader::new(errors?).lines().map_while(|l| l.ok()).last());
+        let complaint = std::thread::spawn(move || lines(errors?).last());
         Ok(Self { video, child, complaint })
     }
 

@@ -148,6 +148,27 @@ impl Default for Eyes {
 }
 
 impl Eyes {
+    /// Refuses files and settings that the chosen segmenter and encoder would not look at.
+    pub(crate) fn check(&self) -> Result<()> {
+        let of_sam = [
+            ("--sam-encoder", self.sam_encoder.is_some()),
+            ("--sam-decoder", self.sam_decoder.is_some()),
+            ("--sam-points", self.sam_points.is_some()),
+            ("--sam-iou", self.sam_iou.is_some()),
+            ("--sam-stability", self.sam_stability.is_some()),
+        ];
+        if let Some((option, _)) = of_sam.iter().find(|(_, is_set)| *is_set && self.segmenter != SegmenterKind::Sam) {
+            bail!("{option} is for SAM: add --segmenter sam");
+        }
+        if self.encoder != EncoderKind::Clip && self.clip_image.is_some() {
+            bail!("--clip-image is for CLIP: add --encoder clip");
+        }
+        if self.encoder == EncoderKind::Offline && self.clip_text.is_some() {
+            bail!("--clip-text is for CLIP: add --encoder clip");
+        }
+        Ok(())
+    }
+
     fn sam_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.sam_encoder, &self.sam_decoder) {
             (Some(encoder), Some(decoder)) => [encoder.clone(), decoder.clone()],

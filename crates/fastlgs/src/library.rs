@@ -176,9 +176,10 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
                 format!("its encoder is another ('{own}') than that of the library ('{first}'); preprocess and train it again with that")
             }),
         };
-        match (why, manifest) {
-            (None, Ok(manifest)) => scenes.push((Entry { path, stamp: stamp(&folder)? }, manifest)),
-            (why, _) => skipped.push(Skipped { scene: path, why: why.unwrap_or_default() }),
+        match (why, manifest, stamp(&folder)) {
+            (None, Ok(manifest), Ok(stamp)) => scenes.push((Entry { path, stamp }, manifest)),
+            (None, _, Err(error)) => skipped.push(Skipped { scene: path, why: error.to_string() }),
+            (why, ..) => skipped.push(Skipped { scene: path, why: why.unwrap_or_default() }),
         }
     }
     Ok((scenes, skipped))
@@ -189,13 +190,16 @@ fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
     for entry in entries {
         let entry = entry?;
         let path = entry.path();
-        if !entry.file_type()?.is_dir() {
+        // Scenes may be linked.
+        if !path.is_dir() {
             continue;
         }
         if path.join("scene.json").is_file() {
             out.push(path);
-        } else if depth > 1 {
-            collect(&path, depth - 1, out)?;
+        } else if depth > 1
+            && let Err(error) = collect(&path, depth - 1, out)
+        {
+            tracing::warn!("{error}");
         }
     }
     Ok(())

@@ -3,7 +3,7 @@
 use crate::error::{Context, bail};
 use crate::{Result, Run, eyes, masks};
 use fastlgs_core::mask_list::{Atoms, Table};
-use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
+use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as chosen, Chosen};
 use fastlgs_grid::sightings::{Sighting, Sightings};
@@ -15,6 +15,7 @@ use fastlgs_vision::photo_quality::{self, Impression};
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 /// Constants of global mapping.
 pub struct Config {
@@ -33,6 +34,7 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
     let pairs = evidence::load_pairs(folder, &masks)?;
     let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
+    begin_maps(folder)?;
     for (view, camera) in training.iter().enumerate() {
         let labels = masks::whole(folder, camera)?;
         let mut table = vec![0u16; usize::from(labels.max()) + 1];
@@ -47,12 +49,38 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
     Ok(Grid::build(&masks, &object_of, codes::lattice(usize::from(count), run.seed)))
 }
 
+/// What is there while object maps do not belong to the scene's table of objects.
+fn unfinished(folder: &SceneFolder) -> PathBuf {
+    folder.objects_path("unfinished").with_extension("txt")
+}
+
+/// Object maps are being written, and the table of these objects is not saved.
+fn begin_maps(folder: &SceneFolder) -> Result<()> {
+    let why = "These maps and grid.json are not of one training.\n";
+    Ok(fs::write_atomic(&unfinished(folder), |file| std::io::Write::write_all(file, why.as_bytes()))?)
+}
+
+/// Saves the table of the objects that the maps show.
+pub fn save(grid: &Grid, folder: &SceneFolder) -> Result<()> {
+    grid.save(folder)?;
+    let _ = std::fs::remove_file(unfinished(folder));
+    Ok(())
+}
+
 /// The objects that an earlier run found, whose maps must be there for all training views.
 pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     let advice = || format!("{}: --mapping keep needs the objects of a trained scene; train it first", folder.root.display());
     let grid = Grid::load(folder).with_context(advice)?;
+    if unfinished(folder).is_file() {
+        bail!("{}: a training that was broken off left object maps that are not those of grid.json; {}", folder.root.display(), advice());
+    }
     for camera in training {
-        let highest = folder.objects(&camera.name).with_context(advice)?.max();
+        let map = folder.objects(&camera.name).with_context(advice)?;
+        if (map.width, map.height) != (camera.width, camera.height) {
+            let path = folder.objects_path(&camera.name);
+            bail!("{}: it is {}x{}, the photo {}x{}; {}", path.display(), map.width, map.height, camera.width, camera.height, advice());
+        }
+        let highest = map.max();
         if highest > grid.highest() {
             let (path, count) = (folder.objects_path(&camera.name), grid.highest());
             bail!("{}: it shows object {highest} of {count}; train the scene again with --mapping global or paper", path.display());
@@ -155,6 +183,7 @@ fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], list
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
     let work = run.work("objects", training.len() as u64);
+    begin_maps(folder)?;
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
         field::ids(&shares, lists).save(&folder.objects_path(&camera.name))?;

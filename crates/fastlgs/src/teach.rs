@@ -6,6 +6,7 @@ use crate::session::Pixels;
 use crate::session::ask::{Ask, picture};
 use crate::{Result, Run, Session, eyes};
 use fastlgs_core::image_io;
+use fastlgs_grid::Grid;
 use fastlgs_grid::query::QueryConfig;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -61,7 +62,7 @@ pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
         _ => bail!("show the thing in one way: --point X,Y with --view, --object ID, or --image FILE"),
     };
     match (object, &lesson.image) {
-        (Some(id), _) => learn(&scene, &lesson.name, id),
+        (Some(id), _) => learn(&scene, &scene.grid()?, &lesson.name, id),
         (None, Some(path)) => {
             let embeddings = picture(&scene, &path.display().to_string(), &image_io::load_rgb(path)?)?.meant;
             keep(&scene, &lesson.name, None, path.display().to_string(), embeddings)
@@ -70,12 +71,12 @@ pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
     }
 }
 
-/// Teaches the name of an object of a scene.
+/// Teaches the name of an object of `grid`, the table of a scene.
 ///
 /// # Errors
 /// As [`teach`].
-pub fn learn(scene: &Session, name: &str, id: u16) -> Result<Report> {
-    let (grid, root) = (scene.grid()?, scene.folder.root.display().to_string());
+pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report> {
+    let root = scene.folder.root.display().to_string();
     let Some(object) = usize::from(id).checked_sub(1).and_then(|k| grid.objects.get(k)) else {
         bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len())
     };

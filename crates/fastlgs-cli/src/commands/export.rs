@@ -18,6 +18,9 @@ pub struct Args {
     /// With --html, how many common words are answered.
     #[arg(long, default_value_t = share::WORDS, requires = "html")]
     words: usize,
+    /// With --html, CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[arg(long, value_name = "FILE", requires = "html")]
+    clip_text: Option<std::path::PathBuf>,
 }
 
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
@@ -29,7 +32,12 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     if ending == "json" || ENDINGS.contains(&ending) || !(names_folder(&config.output) || ending.is_empty()) {
         bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
     }
-    let share =
-        share::Config { scene: config.scene.clone(), output: config.output.clone(), sh_degree: config.sh_degree, words: args.words };
+    let share = share::Config {
+        scene: config.scene.clone(),
+        output: config.output.clone(),
+        sh_degree: config.sh_degree,
+        words: args.words,
+        clip_text: args.clip_text.clone(),
+    };
     report::tell(common, &share::share(&share, run)?, words::share)
 }

@@ -156,6 +156,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         {
             bail!("--library answers texts with scenes; ask one of these scenes for pictures, points and selections");
         }
+        if args.views.is_given() || args.heatmap || args.dilate.is_some() || args.tau_ac.is_some() {
+            bail!("--library looks at no view: leave out options of views, masks and heat maps");
+        }
         let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
         let config = fastlgs::library::Config { scenes: args.scenes, false_alarms: args.false_alarms, negatives, clip_text };
         return library::run(root, config, &texts, common, run);
@@ -167,6 +170,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let lines = args.text.iter().any(|t| t == "-");
     if lines && (args.text.len() > 1 || !args.image.is_empty() || !args.point.is_empty()) {
         bail!("'-' reads all questions from standard input: leave out other texts, --image and --point");
+    }
+    if args.heatmap && args.output.is_none() {
+        bail!("--heatmap is a picture: name a folder for it with -o");
     }
     let Some(path) = &args.scene else { bail!("name a trained scene") };
     let mut scene = Session::open(path, run.device)?;

@@ -76,14 +76,23 @@ pub fn load(photos: &Path) -> Result<Dataset> {
     for photo in &dataset.photos {
         photo.camera.check().map_err(|reason| Error::format(photos, reason))?;
     }
+    let count = dataset.points.len();
+    dataset.points.retain(|point| point.position.is_finite());
+    if dataset.points.len() < count {
+        dataset.warnings.push(format!("{} points of {count} are nowhere (NaN or infinite) and are left out", count - dataset.points.len()));
+    }
     dataset.photos.sort_by(|a, b| a.camera.name.cmp(&b.camera.name));
     if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
-        return Err(Error::format(photos, format!("two poses for the photo '{}'", pair[0].camera.name)));
+        return Err(Error::format(
+            photos,
+            format!("two poses for the photo '{}'; photos of different folders need names of their own", pair[0].camera.name),
+        ));
     }
     for photo in dataset.photos.iter_mut().filter(|p| p.ignore.is_none()) {
         photo.ignore = ignore_mask(photos, &photo.camera.name);
     }
     warn_of_photos_without_pose(photos, &mut dataset);
+    dataset.warnings.extend(passed_over(&photos.join("images")));
     Ok(dataset)
 }
 
@@ -107,6 +116,30 @@ fn warn_of_photos_without_pose(photos: &Path, dataset: &mut Dataset) {
     if !extra.is_empty() {
         dataset.warnings.push(format!("{} photos have no pose and are left out: {}", extra.len(), first_few(&extra)));
     }
+}
+
+/// Endings of pictures that this project does not read.
+const UNREAD: [&str; 12] = ["arw", "avif", "bmp", "cr2", "cr3", "dng", "heic", "heif", "nef", "tif", "tiff", "webp"];
+
+/// What to do about pictures of a folder that are not read; nothing where there are none.
+pub fn passed_over(images: &Path) -> Option<String> {
+    let ending = |path: &Path| path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
+    let entries = std::fs::read_dir(images).ok()?.flatten().map(|entry| entry.path());
+    let mut unread: Vec<PathBuf> = entries.filter(|path| ending(path).is_some_and(|e| UNREAD.contains(&e.as_str()))).collect();
+    unread.sort();
+    let names: Vec<String> = unread.iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    let count = names.len();
+    (count > 0).then(|| format!("{count} pictures are neither JPEG nor PNG and are left out, convert them: {}", first_few(&names)))
+}
+
+/// Folders of photos within a folder of photos.
+pub fn folders_within(images: &Path) -> Vec<String> {
+    let holds_photos =
+        |path: &PathBuf| std::fs::read_dir(path).is_ok_and(|mut entries| entries.any(|e| e.is_ok_and(|e| is_photo(&e.path()))));
+    let entries = std::fs::read_dir(images).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut found: Vec<String> = entries.filter(holds_photos).filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    found.sort();
+    found
 }
 
 /// Whether the file's ending is that of a photo this project reads.

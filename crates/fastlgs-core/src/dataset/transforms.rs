@@ -22,6 +22,8 @@ struct Lens {
     k4: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
+    /// instant-ngp's.
+    is_fisheye: Option<bool>,
     /// nerfstudio's; pinholes with or without distortion where it is left out.
     camera_model: Option<String>,
 }
@@ -51,7 +53,7 @@ pub fn load(photos: &Path) -> Result<Dataset> {
     let path = photos.join("transforms.json");
     // JSON has no NaN, but Python writes it: such entries become null and are refused by name below.
     let text = String::from_utf8(fs::read(&path)?).map_err(|_| Error::format(&path, "not UTF-8 text"))?;
-    let text = text.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null");
+    let text = without_what_is_no_number(&text);
     let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(&path, format!("not the expected JSON: {e}")))?;
     if file.frames.is_empty() {
         return Err(Error::format(&path, "it lists no frames"));
@@ -70,6 +72,23 @@ pub fn load(photos: &Path) -> Result<Dataset> {
         dataset.warnings.push(format!("{} of {listed} frames of {} have no photo: {names}", missing.len(), path.display()));
     }
     Ok(dataset)
+}
+
+/// Python's NaN and Infinity as null, outside of strings.
+fn without_what_is_no_number(text: &str) -> String {
+    let mut within = false;
+    let mut escaped = false;
+    let parts = text.split_inclusive(|c| {
+        let ends = c == '"' && !escaped;
+        escaped = c == '\\' && !escaped;
+        ends
+    });
+    let mended = parts.map(|part| {
+        let number = !within;
+        within ^= part.ends_with('"');
+        if number { part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null") } else { part.to_owned() }
+    });
+    mended.collect()
 }
 
 /// Old files leave out the ending.
@@ -101,6 +120,7 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
     }
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
     let bend = match frame.lens.camera_model.as_deref().or(shared.camera_model.as_deref()) {
+        None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => Bend::Fisheye,
         None | Some("PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE") => Bend::None,
         Some("OPENCV_FISHEYE") => Bend::Fisheye,
         Some(other) => {
@@ -137,4 +157,30 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
         },
         ignore,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::RgbImage;
+
+    #[test]
+    fn instant_ngps_fisheyes_and_names_like_numbers_are_read() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let name = "Infinity \"NaN\".png";
+        crate::image_io::save_png(&dir.path().join("images").join(name), RgbImage::new(8, 6)).expect("a photo");
+        let frame = |pose: &str| {
+            let text = format!(
+                r#"{{"fl_x": 9, "w": 8, "h": 6, "k1": 0.1, "is_fisheye": true,
+                "frames": [{{"file_path": {name:?}, "transform_matrix": {pose}}}]}}"#,
+                name = format!("images/{name}")
+            );
+            std::fs::write(dir.path().join("transforms.json"), text).expect("a file");
+            load(dir.path())
+        };
+        let photos = frame("[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]").expect("a pose").photos;
+        assert_eq!((photos.len(), photos[0].distortion.bend), (1, Bend::Fisheye));
+        let refused = frame("[[NaN,0,0,0],[0,1,0,-Infinity],[0,0,1,0],[0,0,0,1]]").expect_err("no pose").to_string();
+        assert!(refused.contains("NaN or infinite"), "{refused}");
+    }
 }

@@ -5,6 +5,9 @@ use crate::{Error, Result, fs};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+/// Pixels of a picture: places in it are counted in 32 bits.
+const MOST_PIXELS: u64 = 1 << 31;
+
 /// One mask as COCO's annotations have it.
 #[derive(Serialize, Deserialize)]
 struct Annotation {
@@ -79,12 +82,15 @@ impl MaskList {
     /// Reads COCO's annotations, with run lengths as text or as numbers. A file without masks has no size.
     ///
     /// # Errors
-    /// A missing or damaged file, or masks of different sizes.
+    /// A missing or damaged file, or masks of different or impossible sizes.
     pub fn load(path: &Path) -> Result<Self> {
         let annotations = match fs::read_json(path)? {
             File::List(list) | File::Named { annotations: list } => list,
         };
         let [height, width] = annotations.first().map_or([0, 0], |a| a.segmentation.size);
+        if !annotations.is_empty() && !(1..=MOST_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
+            return Err(Error::format(path, format!("masks of {width}x{height} pixels are none")));
+        }
         let mut list = Self::new(width, height);
         for (k, annotation) in annotations.into_iter().enumerate() {
             let Segmentation { size, counts } = annotation.segmentation;

@@ -9,11 +9,12 @@ pub fn world(view: &View) -> Mat3 {
     Mat3::from_mat4(Mat4::from_cols_array(&view.world_to_camera))
 }
 
-/// x/z and y/z, clamped to 1.3 x the image's half extent.
+/// x/z and y/z, clamped to what the image shows and 0.3 x its half extent beside it.
 pub fn clamped_slope(t: Vec3, view: &View) -> Vec2 {
     let (focal, centre) = (Vec2::from(view.focal), Vec2::from(view.centre));
     let size = Vec2::new(view.size[0] as f32, view.size[1] as f32);
-    (t.truncate() / t.z).clamp(-1.3 * centre / focal, 1.3 * (size - centre) / focal)
+    let beside = 0.15 * size;
+    (t.truncate() / t.z).clamp(-(centre + beside) / focal, (size - centre + beside) / focal)
 }
 
 /// The two rows of J W.
@@ -36,13 +37,18 @@ pub fn dilated(ax: Vec3, ay: Vec3) -> Vec3 {
     Vec3::new(ax.dot(ax) + DILATION, ax.dot(ay), ay.dot(ay) + DILATION)
 }
 
-/// What dilation takes from the determinant, at least a millionth.
-pub fn determinant_share(cov: Vec3) -> f32 {
-    let det = cov.x * cov.z - cov.y * cov.y;
-    (((cov.x - DILATION) * (cov.z - DILATION) - cov.y * cov.y) / det).max(1e-6)
+/// Determinants of the covariance before and after dilation, by Lagrange's identity: of a needle nothing of xx yy - xy^2 is left once it is rounded.
+pub fn determinants(ax: Vec3, ay: Vec3) -> [f32; 2] {
+    let before = ax.cross(ay).length_squared();
+    [before, before + DILATION * (ax.dot(ax) + ay.dot(ay)) + DILATION * DILATION]
+}
+
+/// What dilation leaves of the determinant, at least a millionth.
+pub fn determinant_share([before, after]: [f32; 2]) -> f32 {
+    (before / after).max(1e-6)
 }
 
 /// Factor on the opacity that keeps a dilated Gaussian as bright as it was.
-pub fn compensation(cov: Vec3, view: &View) -> f32 {
-    if view.antialias == 1 { determinant_share(cov).sqrt() } else { 1.0 }
+pub fn compensation(determinants: [f32; 2], view: &View) -> f32 {
+    if view.antialias == 1 { determinant_share(determinants).sqrt() } else { 1.0 }
 }

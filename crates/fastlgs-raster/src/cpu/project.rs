@@ -50,8 +50,9 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
     let (ax, ay) = (r.transpose() * jx * s, r.transpose() * jy * s);
     let cov = covariance::dilated(ax, ay);
     let (cxx, cxy, cyy) = (cov.x, cov.y, cov.z);
-    let det = cxx * cyy - cxy * cxy;
-    let opacity = view.kept_gain() * covariance::compensation(cov, view) * sigmoid(param(10));
+    let dets = covariance::determinants(ax, ay);
+    let det = dets[1];
+    let opacity = view.kept_gain() * covariance::compensation(dets, view) * sigmoid(param(10));
     if opacity.is_nan() || opacity < ALPHA_MIN {
         return None;
     }

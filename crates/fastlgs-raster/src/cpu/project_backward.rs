@@ -114,14 +114,15 @@ pub(crate) fn backward_one(
     let cov = covariance::dilated(a_x, a_y);
     // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = sigmoid(param(10));
-    let clamped = opacity * covariance::compensation(cov, view) >= ALPHA_MAX;
+    let dets = covariance::determinants(a_x, a_y);
+    let clamped = opacity * covariance::compensation(dets, view) >= ALPHA_MAX;
     let unclamped_opacity = if clamped && slot[5] < 0.0 { 0.0 } else { 1.0 };
     put(10, slot[5] * (1.0 - opacity) * unclamped_opacity);
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));
-    if view.antialias == 1 && covariance::determinant_share(cov) > 1e-6 {
+    if view.antialias == 1 && covariance::determinant_share(dets) > 1e-6 {
         // d log(compensation) / d cov = (inverse before dilation - inverse after it) / 2.
         let (xx, yy) = (cov.x - DILATION, cov.z - DILATION);
-        let det = xx * yy - cov.y * cov.y;
+        let det = dets[0];
         let half = 0.5 * slot[5] * unclamped_opacity;
         d_cov_xx += half * (yy / det - q_xx);
         d_cov_xy += half * (-cov.y / det - q_xy);

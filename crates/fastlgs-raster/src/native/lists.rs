@@ -56,6 +56,13 @@ impl Lists {
         self.splats = splats(&project(view, params));
     }
 
+    /// Memory that they take.
+    pub fn bytes(&self) -> usize {
+        let words = |band: &Band| band.gaussians.len() + band.pairs.len() + band.ends.len();
+        let words: usize = self.bands.iter().map(words).sum();
+        size_of_val(self.splats.as_slice()) + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
+    }
+
     /// Pairs of a tile and a Gaussian.
     pub fn pairs(&self) -> usize {
         self.bands.iter().map(|band| band.pairs.len()).sum()

@@ -23,6 +23,9 @@ use simd::SUMS;
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
+/// Bytes of lists that are kept where Gaussians do not move; further views make theirs anew.
+const CACHE_LIMIT: usize = 1 << 30;
+
 /// Planes padded to whole tiles, `[row][C][padded width]`, so that a row of tiles is one piece of memory.
 #[derive(Default)]
 pub struct Picture<const C: usize> {
@@ -335,7 +338,9 @@ impl Engine for CpuEngine {
             Channels::Coupled => s.blend_backward::<true, true, true>(&view),
         });
         self.timed("update", |s| s.update(&view, channels, step));
-        if let Some(id) = frozen {
+        if let Some(id) = frozen
+            && self.cached.values().map(Lists::bytes).sum::<usize>() < CACHE_LIMIT
+        {
             self.cached.extend(self.lists.take().map(|lists| (id, lists)));
         }
         Ok(())

@@ -111,6 +111,7 @@ impl Trainer {
             removals: Vec::new(),
             exposures: targets.gains().iter().filter(|_| config.exposure).map(|gain| LearnedExposure::from_gain(*gain)).collect(),
             background,
+            views: targets.cameras.iter().map(|c| (c.name.clone(), [c.width, c.height])).collect(),
             poses: targets.cameras.iter().map(|c| c.world_to_camera).collect(),
             alignment_gain: None,
             config,
@@ -164,7 +165,7 @@ impl Trainer {
         self.engine.step(self.view(&camera, degree).trained().without(left_out, config.draw(iteration)), id, &options, &step)?;
         self.make_room(id);
         if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
-            self.engine.perturb(iteration, amount)?;
+            self.engine.perturb(config.draw(iteration), amount)?;
         }
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;
@@ -232,13 +233,14 @@ impl Trainer {
     }
 
     /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
-    /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views.
+    /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views, or nothing counts in any.
     ///
     /// # Errors
     /// As [`Engine::render`], and when a picture cannot be read.
     pub fn quality(&mut self, views: &Targets, sh_degree: Option<u32>) -> Result<Option<f64>> {
         let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
+        let mut count = 0u32;
         for id in 0..views.len() {
             let target = views.get(id)?;
             let (image, gain) = (&target.image, self.known_exposure(&target).gain);
@@ -250,9 +252,11 @@ impl Trainer {
                     wanted.push(f32::from(packed.to_le_bytes()[c]) / 255.0);
                 }
             }
-            sum += psnr(&rendered, &wanted);
+            if !wanted.is_empty() {
+                (sum, count) = (sum + psnr(&rendered, &wanted), count + 1);
+            }
         }
-        Ok((!views.is_empty()).then(|| sum / views.len() as f64))
+        Ok((count > 0).then(|| sum / f64::from(count)))
     }
 
     /// Runs to the end. `report` is called every 20 steps; `checkpoint`, where given, is written every 500 steps.
@@ -365,12 +369,15 @@ impl Trainer {
     /// A damaged checkpoint, or one of another configuration.
     pub fn resume(&mut self, path: &Path) -> Result<bool> {
         let Some((course, state, stats)) = checkpoint::load(path)? else { return Ok(false) };
-        if course.config != self.course.config {
+        let other = match () {
+            () if course.config != self.course.config => Some("with other options"),
+            () if course.views != self.course.views => Some("from other photos"),
+            () => None,
+        };
+        if let Some(other) = other {
             let header = path.with_extension("json");
-            return Err(Error::Invalid(format!(
-                "{}: the checkpoint was made with other options; leave out --resume, or delete it",
-                header.display()
-            )));
+            let header = header.display();
+            return Err(Error::Invalid(format!("{header}: the checkpoint was made {other}; leave out --resume, or delete it")));
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;

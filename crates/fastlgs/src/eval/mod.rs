@@ -39,12 +39,15 @@ pub struct Config {
     /// Texts that must not be found, one a line; a list of everyday things is built in.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub absent: Option<PathBuf>,
+    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
+    pub clip_text: Option<PathBuf>,
 }
 
 impl Default for Config {
     fn default() -> Self {
         let false_alarms = QueryConfig::default().false_alarms;
-        Self { scene: PathBuf::new(), labels: None, label_text: None, tau_ac: None, false_alarms, absent: None }
+        Self { scene: PathBuf::new(), labels: None, label_text: None, tau_ac: None, false_alarms, absent: None, clip_text: None }
     }
 }
 
@@ -176,7 +179,9 @@ fn mean(values: &[f64]) -> Option<f64> {
 /// # Errors
 /// A scene that was never trained, labels that fit no held-out view, or a device that fails.
 pub fn eval(config: &Config, run: &Run) -> Result<Report> {
-    eval_session(Session::open(&config.scene, run.device)?, config)
+    let mut session = Session::open(&config.scene, run.device)?;
+    session.clip_text.clone_from(&config.clip_text);
+    eval_session(session, config)
 }
 
 /// The same for a scene that is open already.

@@ -1,5 +1,6 @@
 //! Everything that is done once, before training.
 
+mod aside;
 mod config;
 mod masks;
 mod matches;
@@ -10,7 +11,8 @@ mod video;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::eyes::EncoderKind;
-use crate::{Result, Run, calibrations};
+use crate::{Result, Run, calibrations, train};
+use aside::Aside;
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
@@ -28,7 +30,7 @@ pub(crate) use video::fingerprint;
 ///
 /// # Errors
 /// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing models, or a cancelled run. What was
-/// made until then is kept, and found again by the next run.
+/// made until then is found again by the next run, and an earlier scene is as it was.
 pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let started = Instant::now();
     let mut seconds = BTreeMap::new();
@@ -37,6 +39,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         seconds.insert(format!("preprocess.{stage}"), clock.elapsed().as_secs_f64());
         clock = Instant::now();
     };
+    config.eyes.check()?;
     if config.max_side < 64 {
         bail!("--max-side {} is too small: 64 pixels are the least", config.max_side);
     }
@@ -59,10 +62,13 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     // Of use here only for what other programs embedded, whose files may go.
     let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
     dataset.warnings.iter().for_each(|warning| run.warn(warning));
-    let folder = SceneFolder::new(&config.output);
-    // What a run that was killed left.
-    let _ = std::fs::remove_dir_all(folder.root.join(poses::PARTIAL));
-    let cache = Cache::new(&folder);
+    let given: Vec<Camera> = dataset.photos.iter().map(|photo| photo.camera.clone()).collect();
+    let held_out_views = labelled_views(config, &given)?;
+    let models = config.eyes.files()?;
+    let scene = SceneFolder::new(&config.output);
+    let cache = Cache::new(&scene);
+    let aside = Aside::new(&scene)?;
+    let folder = aside.folder.clone();
     let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
     lap("photos");
     let mut warnings = dataset.warnings.clone();
@@ -84,8 +90,6 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let cameras: Vec<Camera> = known.iter().map(|p| p.camera.clone()).collect();
     folder.save_cameras(&cameras)?;
     let excluded: Vec<String> = checked.contradictory.iter().map(|&i| cameras[i].name.clone()).collect();
-    let held_out_views = labelled_views(config, &cameras)?;
-    let models = config.eyes.files()?;
     let mut manifest = Manifest {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         photos: config.photos.clone(),
@@ -108,7 +112,6 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         bail!("{}: only {} photos are left for training; at least 2 are needed", config.photos.display(), training.len());
     }
 
-    evidence::forget_masks(&folder)?;
     let (mask_count, masks_per_photo) = masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
     drop(segmenter);
     lap("masks");
@@ -143,7 +146,9 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     }
     manifest.seconds = seconds.clone();
     light.note(&mut manifest)?;
-    folder.save_manifest(&manifest)?;
+    aside.take_its_place(&scene, &manifest)?;
+    // Steps of a training on other photos.
+    train::forget(&scene);
     cache.tidy();
     Ok(Report {
         scene: config.output.clone(),

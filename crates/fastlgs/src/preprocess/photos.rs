@@ -5,7 +5,7 @@ use crate::cache::{self, Cache, Key};
 use crate::error::{Context, bail};
 use crate::{Result, Run};
 use fastlgs_core::dataset::{Dataset, PosedPhoto};
-use fastlgs_core::undistort::{Distortion, undistort, undistort_gray};
+use fastlgs_core::undistort::{Distortion, imaged, undistort, undistort_gray};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
@@ -119,6 +119,7 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
             Ok(mask.map(|m| undistort_gray(&m, &camera, &lens)))
         };
         let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
+        let ignore = in_both(ignore, imaged(&camera, &lens));
         let pixels = undistort(&folder.photo(&camera.name)?, &camera, &lens);
         (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
         known.points.positions.iter_mut().for_each(|p| *p = lens.straight_pixel(&camera, *p));
@@ -126,9 +127,20 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
     })
 }
 
+/// What counts in two masks, where there are two.
+fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage> {
+    match (one, other) {
+        (Some(mut one), Some(other)) => {
+            one.pixels_mut().zip(other.pixels()).for_each(|(a, b)| a[0] = a[0].min(b[0]));
+            Some(one)
+        }
+        (one, other) => one.or(other),
+    }
+}
+
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
 pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
-    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path)?;
+    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, Some((posed.camera.width, posed.camera.height)))?;
     // The file decides the true size; some tools scale photos and leave the poses' file as it was.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
     let aspect = f64::from(posed.camera.width) / f64::from(posed.camera.height) * f64::from(raw.height()) / f64::from(raw.width());
@@ -146,5 +158,6 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
     let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
     let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
+    let ignore = in_both(ignore, imaged(&camera, &posed.distortion));
     Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
 }

@@ -4,7 +4,7 @@ use super::config::{Adjusted, Poses, Sfm};
 use super::photos::Known;
 use crate::cache::{self, Cache};
 use crate::{Error, Result, Run};
-use fastlgs_core::{Camera, SceneFolder, image_io};
+use fastlgs_core::{Camera, SceneFolder, dataset, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::structure::Tool;
 use fastlgs_vision::tracks::PairMatches;
@@ -18,6 +18,10 @@ pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
     let tool = structure::Tool::find(sfm == Sfm::Colmap)?;
     let work = run.work("poses", 0);
     run.warn(&format!("{}: no poses; structure from motion looks for them, which takes minutes", photos.display()));
+    let folders = dataset::folders_within(&photos.join("images"));
+    if !folders.is_empty() {
+        run.warn(&format!("photos in folders within images/ are not read ({}): move them up", folders.join(", ")));
+    }
     structure::reconstruct(&tool, photos, run.seed, |stage, line| {
         work.note(&format!("{stage}: {line}"));
         tracing::debug!(stage, line, "COLMAP");
@@ -80,7 +84,7 @@ pub(super) fn check(
 }
 
 /// Where structure from motion keeps what it needs, in the scene's folder.
-pub(super) const PARTIAL: &str = "sfm.partial";
+const PARTIAL: &str = "sfm.partial";
 /// One in so many photos whose poses are doubted is a reason to place all of them anew.
 const DOUBTED: usize = 10;
 

@@ -20,7 +20,7 @@ use fastlgs_vision::inpaint::{self, Inpainter};
 use glam::Vec2;
 use membrane::Membrane;
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What is removed.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -41,11 +41,15 @@ pub struct Config {
     /// What colours places that no photo saw: membrane (the smoothest), opencv (Telea's), or an ONNX file like LaMa's.
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME|FILE", default_value_t = Self::default().inpainter))]
     pub inpainter: String,
+    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
+    pub clip_text: Option<PathBuf>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { scene: PathBuf::new(), text: None, object: None, output: PathBuf::new(), inpainter: "membrane".to_owned() }
+        let inpainter = "membrane".to_owned();
+        Self { scene: PathBuf::new(), text: None, object: None, output: PathBuf::new(), inpainter, clip_text: None }
     }
 }
 
@@ -87,9 +91,16 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     if config.output.exists() {
         bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
     }
+    let beside = config.output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")).canonicalize();
+    if let (Ok(beside), Ok(scene)) = (beside, config.scene.canonicalize())
+        && beside.starts_with(&scene)
+    {
+        bail!("{}: it lies in the scene itself; name a folder beside {}", config.output.display(), config.scene.display());
+    }
     let inpainter: Box<dyn Inpainter> =
         if config.inpainter == "membrane" { Box::new(Membrane) } else { inpaint::named(&config.inpainter).context("--inpainter")? };
     let mut session = Session::open(&config.scene, run.device)?;
+    session.clip_text.clone_from(&config.clip_text);
     if session.cameras.iter().any(|camera| !session.folder.photo_path(&camera.name).is_file()) {
         bail!("{}: its photos are not there; remove the thing from the scene that was trained, not from an export", config.scene.display());
     }

@@ -154,6 +154,16 @@ pub struct Milliseconds {
     pub gaussians: f64,
 }
 
+/// Letters of a file's name that tell what was asked.
+const NAME_LENGTH: usize = 60;
+
+/// A text as part of a file's name. Where more than spaces gets lost, a number that only this text has takes its place.
+fn file_name(text: &str) -> String {
+    let safe: String = text.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(NAME_LENGTH).collect();
+    let is_told = text.chars().count() <= NAME_LENGTH && text.chars().all(|c| c.is_alphanumeric() || c == ' ');
+    if is_told { safe } else { format!("{safe}_{}", text.bytes().fold(5381u32, |hash, byte| hash.wrapping_mul(33) ^ u32::from(byte))) }
+}
+
 /// What was found, in a view.
 pub struct Answer<'a> {
     /// The object table.
@@ -223,7 +233,7 @@ impl Answer<'_> {
     /// The system's refusal.
     pub fn write(&self, folder: &Path, frame: &Frame, heat: bool, report: &mut Report) -> Result<RgbImage> {
         let (w, h) = (frame.width, frame.height);
-        let safe: String = report.text.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).collect();
+        let safe = file_name(&report.text);
         let view = report.view.clone();
         let path = |what: &str| folder.join(format!("{view}.{safe}.{what}.png"));
         let color = image_io::from_planar(frame.channels(0, 3), w, h);
@@ -243,5 +253,18 @@ impl Answer<'_> {
             report.heatmap = Some(path("heatmap"));
         }
         Ok(lit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_of_different_questions_have_different_names() {
+        assert_eq!([file_name("fox"), file_name("red cup"), file_name("Füchse 2")], ["fox", "red_cup", "Füchse_2"]);
+        let long = [file_name(&"1,2+".repeat(64)), file_name(&"1,3+".repeat(64))];
+        assert!(long[0] != long[1] && long.iter().all(|name| name.len() < 80), "{long:?}");
+        assert_ne!(file_name("red-cup"), file_name("red_cup"));
     }
 }

@@ -29,6 +29,11 @@ pub struct ViewChoice {
 }
 
 impl ViewChoice {
+    /// Whether anything was chosen.
+    pub fn is_given(&self) -> bool {
+        self.all_views || self.view.is_some() || self.camera.is_some() || self.path.is_some() || self.size.is_some()
+    }
+
     /// The cameras; the first view where nothing was chosen.
     ///
     /// # Errors

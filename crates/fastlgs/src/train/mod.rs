@@ -48,6 +48,9 @@ pub(crate) fn forget(folder: &SceneFolder) {
 /// Options that contradict each other, a scene that was not preprocessed, a device that fails, or a cancelled run, after which the
 /// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
 pub fn train(config: &Config, run: &Run) -> Result<Report> {
+    if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
+        bail!("--preset like-paper finds objects as the paper does: leave out --mapping keep, or name another preset");
+    }
     let config = &config.resolved();
     let began = Instant::now();
     let by_descent = config.feature_mode == FeatureMode::Train;
@@ -142,7 +145,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         }
     };
     let mapping_seconds = started.elapsed().as_secs_f64();
-    grid.save(&folder)?;
+    objects::save(&grid, &folder)?;
     folder.save_trained_cameras(aligned.then_some(&cameras))?;
     ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;

@@ -76,7 +76,8 @@ impl Asker<'_> {
 
     fn look_from(&mut self, name: &str) -> Result<()> {
         let index = self.scene.folder.view_index(&self.scene.cameras, name)?;
-        self.cameras = vec![self.scene.cameras[index].clone()];
+        let camera = self.scene.cameras[index].clone();
+        self.cameras = vec![self.args.views.size.map_or(camera.clone(), |(w, h)| camera.resized(w, h))];
         self.shown = None;
         Ok(())
     }
