@@ -108,6 +108,45 @@ fn a_killed_make_goes_on() {
 }
 
 #[test]
+fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
+    let Some(f) = fixture() else { return };
+    let scene = f.dir.path().join("begun");
+    copy_folder(&f.trained, &scene);
+    let photos = f.dir.path().join("photos");
+    let all = |root: &Path| {
+        let file = |path: PathBuf| (path.clone(), std::fs::read(path).expect("a file"));
+        let within = ["photos", "cameras", "masks"].into_iter().flat_map(|folder| {
+            std::fs::read_dir(root.join(folder)).expect("a folder").flatten().map(|e| e.path()).filter(|p| p.is_file()).collect::<Vec<_>>()
+        });
+        within.chain([root.join("scene.json"), root.join("scene.ply")]).map(file).collect::<std::collections::BTreeMap<_, _>>()
+    };
+    let before = all(&scene);
+    let labels = f.dir.path().join("labels-of-others");
+    std::fs::create_dir_all(&labels).expect("a folder");
+    let label = std::fs::read_to_string(photos.join("labels/000.json")).expect("a label");
+    std::fs::write(labels.join("999.json"), label.replace("000", "999")).expect("a label");
+    let smaller = ["preprocess", text(&photos), "-o", text(&scene), "--max-side", "96", "--segmenter", "import", "--device", "cpu"];
+    run::fails(&[&smaller[..], &["--holdout-labels", text(&labels)]].concat(), &["999", "none of the photos"]);
+    assert!(all(&scene) == before, "labels of other photos");
+    let mut kills = 0;
+    for wait in [20, 60, 120, 200, 400, 800, 1600] {
+        let run = Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(smaller).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+        let mut run = run.expect("the binary starts");
+        std::thread::sleep(Duration::from_millis(wait));
+        if run.try_wait().expect("a child").is_some() {
+            break;
+        }
+        run.kill().expect("a child");
+        run.wait().expect("an end");
+        assert!(all(&scene) == before, "killed after {wait} ms");
+        kills += 1;
+    }
+    println!("preprocess: {kills} kills, the earlier scene is whole");
+    json(&smaller);
+    assert!(kills > 0 && all(&scene) != before && !scene.join("preprocess.partial").exists());
+}
+
+#[test]
 fn a_full_disk_leaves_earlier_results_whole() {
     let Some(f) = fixture() else { return };
     let scene = f.dir.path().join("full");

@@ -113,13 +113,13 @@ mod tests {
         let point = |iteration: u32| TrainStep { iteration, seconds: 0.0, loss: 0.1, psnr: 20.0, psnr_held_out: None, gaussians: 1 };
         live.picture(&Gaussians::default());
         live.state().pictured = None;
-        assert!(!live.report(point(20)), "no one watches");
+        assert!(!live.report(point(20), 30_000), "no one watches");
         assert_eq!(live.progress().revision, 1);
-        assert!(live.report(point(40)));
+        assert!(live.report(point(40), 30_000));
         live.picture(&Gaussians::default());
-        assert!(!live.report(point(60)), "the last picture is fresh");
+        assert!(!live.report(point(60), 30_000), "the last picture is fresh");
         for k in 4..5_000 {
-            live.report(TrainStep { psnr_held_out: (k == 1_000).then_some(25.0), ..point(20 * k) });
+            live.report(TrainStep { psnr_held_out: (k == 1_000).then_some(25.0), ..point(20 * k) }, 30_000);
         }
         let progress = live.progress();
         assert_eq!(progress.revision, 2);

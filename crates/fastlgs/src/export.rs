@@ -185,12 +185,12 @@ fn precision(scene: &mut Session) -> Result<Precision> {
 
 /// Writes what queries need: the compact scene, grid, cameras and manifest. Returns the scene as it reads.
 fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precision)> {
+    if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
+        bail!("{}: this is the scene itself; name another folder", root.display());
+    }
     let is_empty = root.read_dir().is_ok_and(|mut entries| entries.next().is_none());
     if root.exists() && !is_empty && !SceneFolder::new(root).is_compact() {
         bail!("{}: not empty, and not what 'export' made of a scene; name a new folder", root.display());
-    }
-    if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
-        bail!("{}: this is the scene itself; name another folder", root.display());
     }
     let folder = SceneFolder::new(root);
     let grid = scene.grid()?;

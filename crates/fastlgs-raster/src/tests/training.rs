@@ -55,6 +55,9 @@ fn resumes_to_the_same_bytes() {
         assert_eq!(report.steps_here, 100);
         assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "{strategy:?}: resumed");
         assert_eq!(whole.exposures(), resumed.exposures());
+        let fewer = Trainer::new(Box::new(CpuEngine::new()), &cloud(200, 8, 0, false), views(23), config.clone()).unwrap();
+        let message = { fewer }.resume(&checkpoint).unwrap_err().to_string();
+        assert!(message.contains("other photos"), "{message}");
         let other = TrainConfig { lambda: 0.3, ..config };
         let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
         assert!(message.contains("other options"), "{message}");
