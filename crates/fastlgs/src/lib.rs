@@ -16,6 +16,7 @@ mod absent;
 mod cache;
 pub mod calibrate;
 pub mod calibrations;
+mod checkpoints;
 mod error;
 pub mod eval;
 pub mod export;

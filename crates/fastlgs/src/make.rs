@@ -3,7 +3,7 @@
 use crate::error::Context;
 use crate::eyes::SamPreset;
 use crate::preprocess::fingerprint;
-use crate::{Result, Run, preprocess, train};
+use crate::{Result, Run, checkpoints, preprocess, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
@@ -91,10 +91,10 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         return Ok((State::Kept, report));
     }
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
-    let begun = known.is_some() && train::is_begun(&folder);
+    let begun = known.is_some() && checkpoints::is_begun(&folder);
     let started = Instant::now();
     if !begun {
-        train::forget(&folder);
+        checkpoints::forget(&folder);
         crate::preprocess(preprocess, runs[0])?;
         let mut manifest: Manifest = folder.manifest()?;
         // Poses that were found now lie beside the photos.

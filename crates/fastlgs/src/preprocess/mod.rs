@@ -11,7 +11,7 @@ mod video;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::eyes::EncoderKind;
-use crate::{Result, Run, calibrations, train};
+use crate::{Result, Run, calibrations, checkpoints};
 use aside::Aside;
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
@@ -148,7 +148,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     light.note(&mut manifest)?;
     aside.take_its_place(&scene, &manifest)?;
     // Steps of a training on other photos.
-    train::forget(&scene);
+    checkpoints::forget(&scene);
     cache.tidy();
     Ok(Report {
         scene: config.output.clone(),

@@ -6,7 +6,7 @@ mod start;
 
 use crate::error::{Context, bail};
 use crate::progress::{Message, TrainStep};
-use crate::{Result, Run, objects, preprocess};
+use crate::{Result, Run, checkpoints, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
@@ -15,7 +15,6 @@ use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
 pub(crate) use start::target;
-use std::path::PathBuf;
 use std::time::Instant;
 
 /// Note of the manifest: with what `make` made the scene.
@@ -26,21 +25,6 @@ const VARYING: f32 = 0.15;
 
 /// Iterations from which it pays to find out first which kernels the device is fastest with.
 const WORTH_TUNING: u32 = 500;
-
-/// Where steps of an unfinished run are kept: a header of this name with the ending json, and what it names.
-fn checkpoint(folder: &SceneFolder) -> PathBuf {
-    folder.root.join("checkpoints/train")
-}
-
-/// Whether a run was broken off that `config.resume` goes on with.
-pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
-    checkpoint(folder).with_extension("json").is_file()
-}
-
-/// Forgets a run that was broken off.
-pub(crate) fn forget(folder: &SceneFolder) {
-    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
-}
 
 /// Trains the scene folder `config.scene`: Gaussians, their objects, and the table of these.
 ///
@@ -91,7 +75,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    let checkpoint = checkpoint(&folder);
+    let checkpoint = checkpoints::path(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
         run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
     }
@@ -180,7 +164,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     report.note(&mut manifest)?;
     folder.save_manifest(&manifest)?;
     // Checkpoints serve a broken run only.
-    forget(&folder);
+    checkpoints::forget(&folder);
     Ok(report)
 }
 
