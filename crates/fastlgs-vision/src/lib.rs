@@ -26,6 +26,7 @@ mod opencv;
 pub mod photo_quality;
 pub mod places;
 pub mod pose_check;
+mod printed;
 pub mod pull;
 #[cfg(test)]
 mod reference;

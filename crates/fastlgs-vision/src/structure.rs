@@ -4,6 +4,7 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
+use crate::printed::lines;
 use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{self, colmap, is_photo};
@@ -12,7 +13,7 @@ use glam::Mat4;
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeSet;
-use std::io::{BufRead, BufReader, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -236,11 +237,6 @@ fn pairs(count: usize) -> Vec<(usize, usize)> {
 fn largest_model(models: &Path) -> Option<PathBuf> {
     let folders = models.read_dir().ok()?.flatten().map(|e| e.path()).filter(|p| colmap::is_model(p));
     folders.max_by_key(|p| (std::fs::metadata(p.join("images.bin")).map_or(0, |m| m.len()), std::cmp::Reverse(p.clone())))
-}
-
-/// What a program prints, line by line, whatever its letters.
-pub(crate) fn lines(stream: impl std::io::Read) -> impl Iterator<Item = String> {
-    BufReader::new(stream).split(b'\n').map_while(std::result::Result::ok).map(|line| String::from_utf8_lossy(&line).into_owned())
 }
 
 /// Runs one stage and passes on what it prints.

@@ -3,7 +3,7 @@
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
 use crate::photo_quality::Impression;
-use crate::structure::lines;
+use crate::printed::lines;
 use crate::{Error, Result};
 use image::GrayImage;
 use std::collections::VecDeque;

@@ -72,13 +72,14 @@ pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     let advice = || format!("{}: --mapping keep needs the objects of a trained scene; train it first", folder.root.display());
     let grid = Grid::load(folder).with_context(advice)?;
     if unfinished(folder).is_file() {
-        bail!("{}: a training that was broken off left object maps that are not those of grid.json; {}", folder.root.display(), advice());
+        bail!("{}: a training that was broken off left object maps that are not those of grid.json; train it again", folder.root.display());
     }
     for camera in training {
         let map = folder.objects(&camera.name).with_context(advice)?;
         if (map.width, map.height) != (camera.width, camera.height) {
             let path = folder.objects_path(&camera.name);
-            bail!("{}: it is {}x{}, the photo {}x{}; {}", path.display(), map.width, map.height, camera.width, camera.height, advice());
+            let (path, map, photo) = (path.display(), [map.width, map.height], [camera.width, camera.height]);
+            bail!("{path}: it is {}x{}, the photo {}x{}; train the scene again", map[0], map[1], photo[0], photo[1]);
         }
         let highest = map.max();
         if highest > grid.highest() {
