@@ -46,6 +46,20 @@ fn partial_name(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
+/// Waits until no other process or thread changes `path`; they stay out until what is returned is dropped. A file beside it stands for the lock.
+///
+/// # Errors
+/// [`Error::Io`] with the path of that file.
+pub fn locked(path: &Path) -> Result<File> {
+    let path = path.with_added_extension("lock");
+    if let Some(parent) = path.parent() {
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    }
+    let lock = File::options().create(true).append(true).open(&path).map_err(Error::io(&path))?;
+    lock.lock().map_err(Error::io(&path))?;
+    Ok(lock)
+}
+
 /// The user's cache folder of this project: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else `~/.cache/fastlgs`.
 pub fn cache_dir() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
@@ -192,5 +206,21 @@ mod tests {
         write_atomic(&link, |file| file.write_all(b"new")).expect("written");
         assert!(link.symlink_metadata().expect("the link").is_symlink());
         assert_eq!(std::fs::read(&target).expect("the target"), b"new");
+    }
+
+    #[test]
+    fn what_two_change_at_once_is_changed_one_after_the_other() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("count");
+        let count = || std::fs::read_to_string(&path).map_or(0, |text| text.parse::<usize>().expect("a whole number"));
+        let up = || {
+            (0..50).for_each(|_| {
+                let _alone = locked(&path).expect("a lock");
+                let next = count() + 1;
+                std::fs::write(&path, next.to_string()).expect("a file");
+            });
+        };
+        std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(up))));
+        assert_eq!(count(), 200);
     }
 }

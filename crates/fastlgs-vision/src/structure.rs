@@ -16,6 +16,8 @@ use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::Duration;
 
 /// One camera took all photos of a size; its lens has one radial term, which the photos then lose.
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
@@ -62,11 +64,11 @@ impl Tool {
 }
 
 /// Finds the poses of the photos in `PHOTOS/images` and leaves them in `PHOTOS/sparse/0`. `say` is told each stage, and what
-/// the tool prints.
+/// the tool prints, at least once a second; it answers whether to go on.
 ///
 /// # Errors
-/// When the tool fails or no photo could be placed; what it said last is in the message.
-pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &str) + Sync) -> Result<()> {
+/// When the tool fails, no photo could be placed, or `say` ended it; what the tool said last is in the message.
+pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &str) -> bool + Sync) -> Result<()> {
     let images = photos.join("images");
     let entries = images.read_dir().map_err(fastlgs_core::Error::io(&images))?;
     let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
@@ -101,14 +103,14 @@ pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &st
 }
 
 /// By pycolmap, from what was planned in the work folder.
-fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str)) -> Result<()> {
+fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let script = work.join("reconstruct.py");
     std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
     run(Command::new(python).arg(&script).arg(work), "structure from motion", say)
 }
 
 /// Everything by COLMAP's own stages.
-fn by_program(program: &Path, images: &Path, work: &Path, models: &Path, count: usize, say: &impl Fn(&str, &str)) -> Result<()> {
+fn by_program(program: &Path, images: &Path, work: &Path, models: &Path, count: usize, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let matcher = if count <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
     let one_camera = ["--ImageReader.single_camera", "1", "--ImageReader.camera_model", CAMERA_MODEL];
     let stages: [(&str, &str, &[&str]); 3] =
@@ -144,9 +146,9 @@ fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option
 }
 
 /// Finds and matches key points, and leaves them in the work folder as `reconstruct.py` reads them.
-fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + Sync)) -> Result<()> {
+fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) -> bool + Sync)) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
-        say("features", &path.file_name().unwrap_or_default().to_string_lossy());
+        going(say("features", &path.file_name().unwrap_or_default().to_string_lossy()))?;
         let photo = image_io::load_photo(path, None)?.pixels;
         let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
         let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
@@ -155,7 +157,7 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) + 
         Ok((small.width(), small.height(), points))
     };
     let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
-    say("matches", "");
+    going(say("matches", ""))?;
     let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&photos[a].2, &photos[b].2) };
     let pairs: Vec<PairMatches> = pairs(files.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -186,7 +188,7 @@ fn write_plan(work: &Path, images: Vec<serde_json::Value>, points: &[&Keypoints]
 /// could not be placed. `photos` are their files; in the folder `work`, which is emptied, the tool keeps what it needs.
 ///
 /// # Errors
-/// When the tool fails.
+/// When the tool fails, or `say` ended it.
 pub fn placed_anew(
     python: &Path,
     photos: &[PathBuf],
@@ -194,11 +196,11 @@ pub fn placed_anew(
     points: &[Keypoints],
     work: &Path,
     seed: u64,
-    say: impl Fn(&str, &str) + Sync,
+    say: impl Fn(&str, &str) -> bool + Sync,
 ) -> Result<Vec<Option<Mat4>>> {
     let _ = std::fs::remove_dir_all(work);
     std::fs::create_dir_all(work).map_err(fastlgs_core::Error::io(work))?;
-    say("matches", "");
+    going(say("matches", ""))?;
     let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&points[a], &points[b]) };
     let pairs: Vec<PairMatches> = pairs(cameras.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
     let image = |((path, camera), points): ((&PathBuf, &Camera), &Keypoints)| {
@@ -239,19 +241,42 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
     folders.max_by_key(|p| (std::fs::metadata(p.join("images.bin")).map_or(0, |m| m.len()), std::cmp::Reverse(p.clone())))
 }
 
+/// An error where the search for poses was ended.
+fn going(on: bool) -> Result<()> {
+    if on { Ok(()) } else { Err(Error::Invalid("the search for poses was ended".to_owned())) }
+}
+
+/// How long a tool may be silent before `say` is asked again whether to go on.
+const SILENT: Duration = Duration::from_secs(1);
+
 /// Runs one stage and passes on what it prints.
-fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str)) -> Result<()> {
+fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let name = command.get_program().to_string_lossy().into_owned();
     let failed = |reason: String| Error::Missing(format!("{name} failed while finding poses ({stage}): {reason}"));
-    say(stage, "");
+    going(say(stage, ""))?;
     // Both streams are read, so that neither fills up and stops the tool.
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(|e| failed(e.to_string()))?;
     let errors = child.stderr.take().map(|stream| std::thread::spawn(move || lines(stream).last()));
-    let lines = child.stdout.take().into_iter().flat_map(lines);
+    let (speaker, printed) = mpsc::channel();
+    if let Some(stream) = child.stdout.take() {
+        std::thread::spawn(move || lines(stream).try_for_each(|line| speaker.send(line)));
+    }
     let mut last = String::new();
-    for line in lines.filter(|l| !l.trim().is_empty()) {
-        say(stage, line.trim());
-        last = line;
+    loop {
+        match printed.recv_timeout(SILENT) {
+            Ok(line) if line.trim().is_empty() => continue,
+            Ok(line) => {
+                tracing::debug!(stage, line, "COLMAP");
+                last = line;
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+        if !say(stage, last.trim()) {
+            let _ = child.kill();
+            let _ = child.wait();
+            return going(false);
+        }
     }
     let status = child.wait().map_err(|e| failed(e.to_string()))?;
     let complaint = errors.and_then(|thread| thread.join().ok().flatten());
@@ -291,7 +316,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let photos = photos(dir.path(), 4);
         let stages = Mutex::new(Vec::new());
-        reconstruct(&stand_in(dir.path(), MAPPER), &photos, 0, |stage, _| stages.lock().unwrap().push(stage.to_owned())).unwrap();
+        reconstruct(&stand_in(dir.path(), MAPPER), &photos, 0, |stage, _| {
+            stages.lock().unwrap().push(stage.to_owned());
+            true
+        })
+        .unwrap();
+        stages.lock().unwrap().dedup();
         assert_eq!(*stages.lock().unwrap(), ["features", "matches", "mapping"]);
         assert_eq!(std::fs::metadata(photos.join("sparse/0/images.bin")).unwrap().len(), 11);
         assert!(!photos.join("sparse.partial").exists());
@@ -304,12 +334,22 @@ mod tests {
     fn failures_are_told_in_the_tools_words() {
         let dir = tempfile::tempdir().unwrap();
         let broken = stand_in(dir.path(), "echo 'cannot open display' >&2; exit 1");
-        let error = reconstruct(&broken, &photos(dir.path(), 4), 0, |_, _| {}).unwrap_err().to_string();
+        let error = reconstruct(&broken, &photos(dir.path(), 4), 0, |_, _| true).unwrap_err().to_string();
         assert!(error.contains("cannot open display") && error.contains("features"), "{error}");
         let nothing = stand_in(dir.path(), "exit 0");
-        assert!(reconstruct(&nothing, &photos(dir.path(), 4), 0, |_, _| {}).unwrap_err().to_string().contains("place no photo"));
+        assert!(reconstruct(&nothing, &photos(dir.path(), 4), 0, |_, _| true).unwrap_err().to_string().contains("place no photo"));
         let few = tempfile::tempdir().unwrap();
-        assert!(reconstruct(&nothing, &photos(few.path(), 2), 0, |_, _| {}).unwrap_err().to_string().contains("at least 3"));
+        assert!(reconstruct(&nothing, &photos(few.path(), 2), 0, |_, _| true).unwrap_err().to_string().contains("at least 3"));
+    }
+
+    #[test]
+    fn a_silent_tool_ends_when_that_is_asked_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let asleep = stand_in(dir.path(), "exec sleep 600");
+        let began = std::time::Instant::now();
+        let error = reconstruct(&asleep, &photos(dir.path(), 4), 0, |_, _| began.elapsed() < SILENT).unwrap_err();
+        assert!(error.to_string().contains("ended"), "{error}");
+        assert!(began.elapsed() < 10 * SILENT);
     }
 
     #[test]

@@ -43,6 +43,19 @@ impl Names {
         if path.exists() { Self::read(&path) } else { Ok(Self::default()) }
     }
 
+    /// Changes the user's names; whoever else does waits, so that no lesson is lost.
+    ///
+    /// # Errors
+    /// A file that cannot be read or written, and what `change` returns; the names then stay as they were.
+    pub fn change<T>(change: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
+        let path = Self::path();
+        let _alone = fs::locked(&path)?;
+        let mut names = Self::load()?;
+        let out = change(&mut names)?;
+        names.write(&path)?;
+        Ok(out)
+    }
+
     /// The names of a file that [`Self::write`] wrote.
     ///
     /// # Errors

@@ -91,11 +91,11 @@ fn keep(scene: &Session, name: &str, object: Option<u16>, from: String, embeddin
     if embeddings.is_empty() {
         bail!("{from}: it was never seen well enough to be known again; show something larger");
     }
-    let mut names = Names::load()?;
     let views = embeddings.len();
-    names.add(&name, Example { encoder: eyes::identity_of(&scene.manifest), from, embeddings });
-    names.write(&Names::path())?;
-    let examples = names.of(&name).map_or(0, <[Example]>::len);
+    let examples = Names::change(|names| {
+        names.add(&name, Example { encoder: eyes::identity_of(&scene.manifest), from, embeddings });
+        Ok(names.of(&name).map_or(0, <[Example]>::len))
+    })?;
     Ok(Report { name, object, views, examples, kept: Names::path() })
 }
 

@@ -37,11 +37,10 @@ enum Action {
 }
 
 pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
-    let mut names = Names::load()?;
     match &args.action {
         Action::List if common.json.is_none() => {
             if !common.quiet {
-                let rows = names.rows();
+                let rows = Names::load()?.rows();
                 rows.iter().for_each(|row| say!("{}: {} views, from {}", row.name, row.views, row.from.join("; ")));
                 if rows.is_empty() {
                     say!("nothing was taught yet; 'fastlgs teach --help' says how");
@@ -49,20 +48,23 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             }
             Ok(Outcome::Done)
         }
-        Action::List => report::give(common, &json!({ "kept": Names::path(), "names": names.rows() })),
+        Action::List => report::give(common, &json!({ "kept": Names::path(), "names": Names::load()?.rows() })),
         Action::Remove { name } => {
-            names.remove(name)?;
-            names.write(&Names::path())?;
-            report::give(common, &json!({ "forgotten": name, "names": names.rows().len() }))
+            let left = Names::change(|names| {
+                names.remove(name)?;
+                Ok(names.rows().len())
+            })?;
+            report::give(common, &json!({ "forgotten": name, "names": left }))
         }
         Action::Export { file } => {
+            let names = Names::load()?;
             names.write(file)?;
             report::give(common, &json!({ "written": file, "names": names.rows().len() }))
         }
         Action::Import { file } => {
-            let came = names.extend(Names::read(file)?);
-            names.write(&Names::path())?;
-            report::give(common, &json!({ "came": came, "names": names.rows().len() }))
+            let others = Names::read(file)?;
+            let (came, all) = Names::change(|names| Ok((names.extend(others), names.rows().len())))?;
+            report::give(common, &json!({ "came": came, "names": all }))
         }
     }
 }

@@ -3,6 +3,7 @@
 use super::config::{Adjusted, Poses, Sfm};
 use super::photos::Known;
 use crate::cache::{self, Cache};
+use crate::progress::Work;
 use crate::{Error, Result, Run};
 use fastlgs_core::{Camera, SceneFolder, dataset, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
@@ -22,11 +23,15 @@ pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
     if !folders.is_empty() {
         run.warn(&format!("photos in folders within images/ are not read ({}): move them up", folders.join(", ")));
     }
-    structure::reconstruct(&tool, photos, run.seed, |stage, line| {
-        work.note(&format!("{stage}: {line}"));
-        tracing::debug!(stage, line, "COLMAP");
-    })?;
-    Ok(())
+    let found = structure::reconstruct(&tool, photos, run.seed, |stage, line| told(&work, stage, line));
+    work.check()?;
+    Ok(found?)
+}
+
+/// Passes on what a tool prints; whether to go on.
+fn told(work: &Work, stage: &str, line: &str) -> bool {
+    work.note(&format!("{stage}: {line}"));
+    work.check().is_ok()
 }
 
 /// Longer side of the pictures on which poses are checked. Its tolerances are pixels, and the coarser key points of small
@@ -102,10 +107,13 @@ fn anew(
     folder: &SceneFolder,
     run: &Run,
 ) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
-    let Tool::Pycolmap(python) = Tool::find(false)? else { return Ok(None) };
+    let Tool::Pycolmap(python) = Tool::find(false)? else {
+        let mend = "that needs pycolmap, and only the program 'colmap' is there; 'fastlgs models install-offline' installs pycolmap";
+        return Err(Error::Vision(fastlgs_vision::Error::Missing(mend.to_owned())));
+    };
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
-    let say = |stage: &str, line: &str| work.note(&format!("{stage}: {line}"));
+    let say = |stage: &str, line: &str| told(&work, stage, line);
     let partial = folder.root.join(PARTIAL);
     let found = structure::placed_anew(&python, &files, given, points, &partial, run.seed, say);
     let _ = std::fs::remove_dir_all(&partial);
