@@ -90,7 +90,7 @@ fn quick_suite() {
     written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
 
     let report = json(&["bench", "report", text(out), "-o", text(&out.join("report.html"))]);
-    assert_eq!(report["results"].as_array().map(Vec::len), Some(3));
+    assert_eq!(report["results"].as_array().map(Vec::len), Some(4));
     let page = std::fs::read_to_string(out.join("report.html")).expect("the report");
     assert!(page.matches("<svg").count() == 5 && page.contains("photos shuffled") && !page.contains("src=\"http"), "self-contained");
     if browser::installed() {

@@ -161,7 +161,7 @@ proptest! {
         prop_assert!((ssim(&x, &x) - 1.0).abs() < 1e-5);
         prop_assert!((ssim(&x, &y) - ssim(&y, &x)).abs() < 1e-9);
         prop_assert_eq!(metrics::psnr(&x, &y), metrics::psnr(&y, &x));
-        prop_assert_eq!(metrics::psnr(&x, &x), f64::INFINITY);
+        prop_assert_eq!(metrics::psnr(&x, &x), 100.0);
         prop_assert!((metrics::auroc(&p, &n) + metrics::auroc(&n, &p) - 1.0).abs() < 1e-9, "ties count half");
     }
 

@@ -16,8 +16,8 @@ fn row_of(s0: vec4<f32>, s1: vec4<f32>, dy: f32) -> Row {
     return Row(s0.w * dy, fma(s1.x * dy, dy, s1.y));
 }
 
-// Alpha of one Gaussian on a quad; 0 where it is not drawn.
+// Alpha of one Gaussian on a quad; 0 where it is not drawn. Far out on a long needle, rounding would lift it above any opacity.
 fn alphas(dx: vec4<f32>, qx: f32, row: Row) -> vec4<f32> {
-    let alpha = exp2(fma(dx, fma(vec4<f32>(qx), dx, vec4<f32>(row.c1)), vec4<f32>(row.c0)));
+    let alpha = min(exp2(fma(dx, fma(vec4<f32>(qx), dx, vec4<f32>(row.c1)), vec4<f32>(row.c0))), vec4<f32>(ALPHA_MAX));
     return select(vec4<f32>(0.0), alpha, alpha >= vec4<f32>(ALPHA_MIN));
 }

@@ -30,7 +30,7 @@ pub struct Args {
 }
 
 /// Benches in the order of the report: file name, title, and what a reader should know.
-const SECTIONS: [(&str, &str, &str); 5] = [
+const SECTIONS: [(&str, &str, &str); 7] = [
     (
         "chart",
         "Accuracy against time",
@@ -42,6 +42,8 @@ const SECTIONS: [(&str, &str, &str); 5] = [
         "No more model than a scene needs",
         "Models pruned, cut in colour degree and in precision; filled spots are what --budget auto chooses.",
     ),
+    ("paper", "The paper's way", "Its ablations of matching, field and codes; rows called all train anew."),
+    ("names", "Texts", "Each scene by what was chosen on the others, and by what was chosen with it."),
     ("speed", "Speed", "Training and rendering by Gaussians and resolution."),
     ("vision", "Masks and embeddings alone", "Best masks of the segmenter for each label, and the name that the encoder finds nearest."),
 ];

@@ -108,12 +108,20 @@ pub fn encode_png(picture: impl Into<DynamicImage>) -> Result<Vec<u8>> {
     Ok(data)
 }
 
+/// Most pixels of a picture that came as bytes: few of these may stand for very many.
+const MOST_PIXELS: u64 = 100_000_000;
+
 /// Decodes a photo that is already in memory as 8-bit RGB; `name` is what errors call it.
 ///
 /// # Errors
-/// [`Error::Format`] when it cannot be decoded.
+/// [`Error::Format`] when it cannot be decoded, or is larger than 100 million pixels.
 pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
-    Ok(decode_bytes(Path::new(name), data)?.into_rgb8())
+    let path = Path::new(name);
+    let sides = ImageReader::new(Cursor::new(data)).with_guessed_format().ok().and_then(|reader| reader.into_dimensions().ok());
+    if let Some((width, height)) = sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MOST_PIXELS) {
+        return Err(Error::format(path, format!("{width}x{height} is too large: at most {} million pixels", MOST_PIXELS / 1_000_000)));
+    }
+    Ok(decode_bytes(path, data)?.into_rgb8())
 }
 
 /// Writes a PNG atomically.

@@ -1,4 +1,4 @@
-//! Removal of lens distortion, for all of COLMAP's camera models: first the lens bends the ray (fisheyes), then come the
+//! Removal of lens distortion, for COLMAP's camera models (those of `dataset/colmap.rs`): first the lens bends the ray (fisheyes), then come the
 //! rational radial, tangential and thin-prism terms of Brown and Conrady, as OpenCV and COLMAP define them.
 
 use crate::Camera;

@@ -64,7 +64,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
     let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
     let of_object = |(object, share): (&Object, f32)| {
-        let Some(cosine) = mean_cosine(object, query).filter(|cosine| *cosine > mean_over_views(object, |e| query.negative(e))) else {
+        let Some(cosine) = mean_cosine(object, query).filter(|_| !is_refuted(object, query)) else {
             return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
         };
         if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
@@ -108,9 +108,15 @@ pub fn mean_cosine(object: &Object, query: &TextQuery) -> Option<f32> {
     is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e)))
 }
 
-/// By how much an object is more like what is meant than like anything: the mean over its views, weighted by area. Nothing where no view shows it.
+/// Whether an object is as near to a negative as to what is meant.
+fn is_refuted(object: &Object, query: &TextQuery) -> bool {
+    mean_over_views(object, |e| query.negative(e)) >= mean_over_views(object, |e| query.cosine(e))
+}
+
+/// By how much an object is more like what is meant than like anything: the mean over its views, weighted by area. Nothing where no view shows it,
+/// or where it is nearer to a negative.
 pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
-    is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
+    (is_seen(object) && !is_refuted(object, query)).then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
 }
 
 /// All objects, the likeliest first.

@@ -48,7 +48,9 @@ impl Camera {
         }
         let (cx, cy) = (cx.unwrap_or(width as f32 / 2.0), cy.unwrap_or(height as f32 / 2.0));
         let name = name.to_owned();
-        Ok(Self(fastlgs_core::Camera { name, width, height, fx, fy, cx, cy, world_to_camera: matrix(&world_to_camera)? }))
+        let camera = fastlgs_core::Camera { name, width, height, fx, fy, cx, cy, world_to_camera: matrix(&world_to_camera)? };
+        camera.check().map_err(Error::new_err)?;
+        Ok(Self(camera))
     }
 
     /// From a pose as nerfstudio and OpenGL have it: camera to world, x right, y up, looking along -z.

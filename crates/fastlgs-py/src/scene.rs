@@ -22,6 +22,7 @@ use pyo3::types::PyDict;
 use serde_json::json;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
 
 /// One pixel, or several of one thing.
 #[derive(FromPyObject)]
@@ -92,12 +93,13 @@ impl Opened {
         })
     }
 
-    /// What a view tells about objects; rendered unless it is the one that was asked last.
-    fn look(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<()> {
+    /// What a view tells about objects; rendered unless it is the one that was asked last. Returns the milliseconds that took.
+    fn look(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<f64> {
+        let started = Instant::now();
         if self.shown.as_ref().is_none_or(|(shown, _)| shown != camera) {
             self.shown = Some((camera.clone(), self.session.field(camera, None)?));
         }
-        Ok(())
+        Ok(started.elapsed().as_secs_f64() * 1e3)
     }
 }
 
@@ -181,11 +183,11 @@ impl Scene {
         let which = Which::of(view)?;
         let (camera, report, mask, relevancy) = self.with(py, |opened| {
             let camera = opened.camera(&which)?;
-            opened.look(&camera)?;
+            let render_ms = opened.look(&camera)?;
             let Opened { session, grid, shown } = opened;
             let Some((_, field)) = shown else { unreachable!("rendered above") };
             let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates: CANDIDATES };
-            let (answer, mut report) = question.put(session, grid, field, &camera, 0.0)?;
+            let (answer, mut report) = question.put(session, grid, field, &camera, render_ms)?;
             let relevancy = field.relevancy(grid, &answer.found.ranked);
             let mask = answer.mask;
             report.look_elsewhere(session, grid)?;
@@ -303,6 +305,9 @@ impl Scene {
     /// Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz, .sog or .glb; all of them without `ids`.
     #[pyo3(signature = (path, ids = None, *, rest = false))]
     fn export(&self, py: Python<'_>, path: PathBuf, ids: Option<Vec<u16>>, rest: bool) -> PyResult<()> {
+        if rest && ids.is_none() {
+            return Err(Error::new_err("rest leaves out some objects: give their ids"));
+        }
         self.with(py, |Opened { session: Session { gaussians, cameras, .. }, grid, .. }| match &ids {
             None => selection::write(&path, gaussians, cameras),
             Some(ids) => selection::export(&path, gaussians, cameras, &selection::gaussians(gaussians, grid, ids), !rest),

@@ -28,6 +28,9 @@ pub(crate) struct Course {
     /// Names and sizes of the training views.
     #[serde(default)]
     pub views: Vec<(String, [u32; 2])>,
+    /// Fingerprint of what these views show and of the first Gaussians.
+    #[serde(default)]
+    pub shown: u64,
     /// Poses of the training views, world to camera.
     pub poses: Vec<Mat4>,
     /// What the watched views gained by alignment, in dB, once that was looked at.

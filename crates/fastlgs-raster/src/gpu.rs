@@ -57,13 +57,17 @@ impl Gpu {
             let hardware = |a: &wgpu::Adapter| a.get_info().device_type != wgpu::DeviceType::Cpu;
             list.iter().position(hardware).or(if list.is_empty() { None } else { Some(0) })
         } else {
-            which.parse().ok().filter(|i| *i < list.len()).or_else(|| names.iter().position(|n| n.to_lowercase().contains(&wanted)))
+            match which.parse() {
+                Ok(index) => Some(index).filter(|index| *index < list.len()),
+                Err(_) => names.iter().position(|n| n.to_lowercase().contains(&wanted)),
+            }
         };
         let index = found.ok_or_else(|| {
             Error::Adapter(if names.is_empty() {
                 "no Vulkan device found; install a driver (on Debian: mesa-vulkan-drivers) or use --device cpu".to_owned()
             } else {
-                format!("no device '{which}'; there are: {}, and cpu", names.join(", "))
+                let listed = names.iter().enumerate().map(|(index, name)| format!("{index} ({name})")).collect::<Vec<_>>();
+                format!("no device '{which}'; there are: {}, and cpu", listed.join(", "))
             })
         })?;
         Self::from_adapter(&list.swap_remove(index))

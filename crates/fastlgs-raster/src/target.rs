@@ -132,13 +132,15 @@ impl Targets {
         Self::new(self.cameras, self.gains, unclipped)
     }
 
-    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours.
+    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours. And a fingerprint of all pictures.
     ///
     /// # Errors
     /// When a picture cannot be read.
-    pub(crate) fn contrast(&self) -> Result<f32> {
-        let each = (0..self.len()).into_par_iter().map(|id| Ok((self.read)(id)?.contrast())).collect::<Result<Vec<f64>>>()?;
-        Ok((each.iter().sum::<f64>() / each.len().max(1) as f64) as f32)
+    pub(crate) fn survey(&self) -> Result<(f32, u64)> {
+        let of_picture = |image: TargetImage| (image.contrast(), fingerprint(image.color.iter().chain(&image.feature).copied()));
+        let each = (0..self.len()).into_par_iter().map(|id| Ok(of_picture((self.read)(id)?))).collect::<Result<Vec<(f64, u64)>>>()?;
+        let contrast = each.iter().map(|(contrast, _)| contrast).sum::<f64>() / each.len().max(1) as f64;
+        Ok((contrast as f32, fingerprint(each.iter().flat_map(|(_, print)| [*print as u32, (print >> 32) as u32]))))
     }
 }
 
@@ -147,6 +149,11 @@ impl From<Vec<Target>> for Targets {
         let (cameras, gains) = targets.iter().map(|t| (t.camera.clone(), t.gain)).unzip();
         Self::new(cameras, gains, move |id| Ok(targets[id].image.clone()))
     }
+}
+
+/// A number that tells words from others, in their order (FNV-1a over words instead of bytes).
+pub(crate) fn fingerprint(words: impl Iterator<Item = u32>) -> u64 {
+    words.fold(0xcbf2_9ce4_8422_2325, |print, word| (print ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
 fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
@@ -172,7 +179,12 @@ mod tests {
         let target = Target { camera, image: TargetImage { size: [2, 2], color, feature: Vec::new() }, gain: [1.0; 3] };
         // Deviations of 0, 0.2, 0.4 and of 1, 0, 0.
         let expected = ((0.08f32 / 3.0).sqrt() + (2.0f32 / 9.0).sqrt()) / 3.0;
-        assert!((Targets::from(vec![target]).contrast().unwrap() - expected).abs() < 1e-5);
+        let mut other = target.clone();
+        let (contrast, print) = Targets::from(vec![target.clone()]).survey().unwrap();
+        assert!((contrast - expected).abs() < 1e-5);
+        other.image.feature = vec![0; 4];
+        assert_ne!(print, Targets::from(vec![other]).survey().unwrap().1);
+        assert_eq!(print, Targets::from(vec![target]).survey().unwrap().1);
     }
 
     #[test]

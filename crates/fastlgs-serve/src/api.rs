@@ -6,7 +6,7 @@ use crate::guard::LARGEST_BODY;
 use crate::shared::Shared;
 use axum::Json;
 use axum::body::Bytes;
-use axum::extract::rejection::{JsonRejection, QueryRejection};
+use axum::extract::rejection::{JsonRejection, PathRejection, QueryRejection};
 use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
@@ -79,14 +79,16 @@ pub async fn objects(State(app): App) -> Answer {
 }
 
 /// `GET /api/objects/{id}/thumbnail.png`
-pub async fn thumbnail(State(app): App, Path(id): Path<u16>) -> Answer<Response> {
+pub async fn thumbnail(State(app): App, id: Result<Path<u16>, PathRejection>) -> Answer<Response> {
+    let Path(id) = id?;
     let made = app.ready()?.ask(move |desk| Ok(desk.thumbnail(id)?)).await?;
     let data = made.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
 /// `GET /api/objects/{id}/view`: where to look at it from.
-pub async fn best_view(State(app): App, Path(id): Path<u16>) -> Answer {
+pub async fn best_view(State(app): App, id: Result<Path<u16>, PathRejection>) -> Answer {
+    let Path(id) = id?;
     let view = app.ready()?.ask(move |desk| Ok(desk.best_view(id)?)).await?;
     let view = view.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
     Ok(Json(json!({ "view": view })))
@@ -122,7 +124,8 @@ pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>)
 }
 
 /// `GET /api/photos/{view}`: the photo as it was trained on.
-pub async fn photo(State(app): App, Path(view): Path<String>) -> Answer<Response> {
+pub async fn photo(State(app): App, view: Result<Path<String>, PathRejection>) -> Answer<Response> {
+    let Path(view) = view?;
     let known = app.cameras().iter().find(|c| c.name == view).map(|c| app.folder.photo_path(&c.name)).filter(|p| p.is_file());
     let path = known.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("the scene has no photo '{view}'")))?;
     Ok(([(header::CONTENT_TYPE, "image/png")], fastlgs_core::fs::read(&path)?).into_response())
@@ -181,6 +184,10 @@ pub struct Asked {
     false_alarms: Option<f32>,
     /// Objects that are listed with their scores.
     candidates: Option<usize>,
+    /// Objects that are not looked at, as in `/api/render`.
+    hidden: Vec<u16>,
+    /// Objects that alone are looked at.
+    only: Vec<u16>,
     /// Whether mask and heat map come with the answer, as data URLs.
     mask: bool,
     heatmap: bool,
@@ -200,15 +207,22 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         },
         (None, None, Some(data)) => {
             let data = base64::engine::general_purpose::STANDARD.decode(data).map_err(|e| Failure::bad(format!("image: {e}")))?;
-            Ask::Image("image".into(), image_io::decode_rgb("image", &data).map_err(|e| Failure::bad(e.to_string()))?)
+            // Beside what answers others.
+            let decoded = tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
+            let decoded = decoded.map_err(|e| anyhow::anyhow!("image: {e}"))?;
+            Ask::Image("image".into(), decoded.map_err(|e| Failure::bad(e.to_string()))?)
         }
         _ => return Err(Failure::bad("ask for one of text, point and image")),
     };
+    if asked.false_alarms.is_some_and(|share| !(share > 0.0 && share < 1.0)) {
+        return Err(Failure::bad("false_alarms: a share between 0 and 1, like 0.05"));
+    }
     if asked.negative.len() > MOST_NEGATIVES {
         return Err(Failure::bad(format!("at most {MOST_NEGATIVES} negatives")));
     }
     let negatives = asked.negative.iter().map(|n| checked_text(n).map(str::to_owned)).collect::<Answer<Vec<_>>>()?;
     let (want_mask, want_heat) = (asked.mask, asked.heatmap);
+    let choice = Choice { hidden: asked.hidden, only: asked.only };
     let work = move |desk: &mut Desk| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
@@ -216,7 +230,7 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
             top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
         };
         let candidates = asked.candidates.unwrap_or(CANDIDATES);
-        let render_ms = desk.look(&camera)?;
+        let Some(render_ms) = desk.look(&camera, &choice)? else { return Err(Failure::bad("nothing would be left to look at")) };
         let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates };
         let (answer, mut report) = question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
         let mask = (want_mask && report.found).then(|| mask_picture(&answer.mask, camera.width, camera.height));
@@ -282,8 +296,10 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
             let ids = desk.scene.field(&camera, None)?.owners(&desk.grid);
             RgbImage::from_fn(ids.width, ids.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))))
         } else if let Some(text) = &text {
-            let ranked = query::rank(&desk.grid, &desk.scene.text_query(text)?);
-            heatmap(&color, &desk.scene.field(&camera, None)?.relevancy(&desk.grid, &ranked))
+            let field = desk.scene.field(&camera, None)?;
+            let meaning = Ask::Text(text.clone()).meaning(&desk.scene, &[])?;
+            let found = meaning.find(&desk.grid, &field, &camera, &QueryConfig::default())?;
+            heatmap(&color, &field.relevancy(&desk.grid, &found.ranked))
         } else if wanted.selected.is_empty() {
             color
         } else {

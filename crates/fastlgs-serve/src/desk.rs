@@ -30,8 +30,8 @@ pub struct Desk {
     pub grid: Grid,
     /// Pictures of the objects.
     thumbnails: Thumbnails,
-    /// The view that was last looked at, with what it tells about objects.
-    seen: Option<(Camera, Field)>,
+    /// The view that was last looked at, and what was shown there, with what it tells about objects.
+    seen: Option<(Camera, Choice, Field)>,
     /// Which Gaussians are on the device, and all of them while these are not.
     choice: Choice,
     all: Option<Gaussians>,
@@ -93,21 +93,24 @@ impl Desk {
         Ok(Bell(bell))
     }
 
-    /// What a view tells about objects, rendered unless it is the last one; with the milliseconds it took.
-    pub fn look(&mut self, camera: &Camera) -> Result<f64> {
-        self.choose(&Choice::default())?;
-        if self.seen.as_ref().is_some_and(|(seen, _)| seen == camera) {
-            return Ok(0.0);
+    /// What a view tells about some objects, rendered unless it is the last one; with the milliseconds it took. `None`, and all stays as it
+    /// was, where nothing would be left to look at.
+    pub fn look(&mut self, camera: &Camera, choice: &Choice) -> Result<Option<f64>> {
+        if !self.choose(choice)? {
+            return Ok(None);
+        }
+        if self.seen.as_ref().is_some_and(|(seen, shown, _)| (seen, shown) == (camera, choice)) {
+            return Ok(Some(0.0));
         }
         let started = Instant::now();
         let field = self.scene.field(camera, None)?;
-        self.seen = Some((camera.clone(), field));
-        Ok(started.elapsed().as_secs_f64() * 1e3)
+        self.seen = Some((camera.clone(), choice.clone(), field));
+        Ok(Some(started.elapsed().as_secs_f64() * 1e3))
     }
 
     /// What [`Self::look`] last saw.
     pub fn seen(&self) -> Result<&Field> {
-        self.seen.as_ref().map(|s| &s.1).context("no view was looked at")
+        self.seen.as_ref().map(|seen| &seen.2).context("no view was looked at")
     }
 
     /// Shows some objects in the pictures that follow; `false`, and all stays as it was, where nothing would be left to show.
@@ -115,20 +118,19 @@ impl Desk {
         if self.choice == *choice {
             return Ok(true);
         }
-        let all = self.all.take().unwrap_or_else(|| self.scene.gaussians.clone());
+        let all = &*self.all.get_or_insert_with(|| self.scene.gaussians.clone());
         if *choice == Choice::default() {
-            self.scene.show(all)?;
+            self.scene.show(all.clone())?;
+            self.all = None;
         } else {
             let (hidden, only) = (self.grid.members(&choice.hidden), self.grid.members(&choice.only));
             let among = |members: &[bool], i: usize| members.get(usize::from(all.object_ids[i])) == Some(&true);
             let shown = |i: &usize| !among(&hidden, *i) && (choice.only.is_empty() || among(&only, *i));
             let places: Vec<usize> = (0..all.len()).filter(shown).collect();
             if places.is_empty() {
-                self.all = Some(all);
                 return Ok(false);
             }
             self.scene.show(all.select(&places))?;
-            self.all = Some(all);
         }
         self.choice = choice.clone();
         Ok(true)

@@ -5,7 +5,7 @@ use crate::failure::Failure;
 use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::request::Parts;
-use axum::http::{HeaderValue, StatusCode, header};
+use axum::http::{HeaderName, HeaderValue, StatusCode, header};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use http_body_util::BodyExt;
@@ -49,11 +49,17 @@ impl Guard {
             let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
             let bare = name.trim_start_matches('[').trim_end_matches(']');
             let own = bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
-            return (!own).then(|| Failure::new(StatusCode::FORBIDDEN, format!("this server is not '{name}'; use its loopback address")));
+            if !own {
+                return Some(Failure::new(StatusCode::FORBIDDEN, format!("this server is not '{name}'; use its loopback address")));
+            }
+            // Browsers say whose page asks. One may lead here, and nothing more.
+            let from = request.headers.get("sec-fetch-site").and_then(|h| h.to_str().ok()).unwrap_or_default();
+            let foreign = matches!(from, "cross-site" | "same-site") && is_api(request);
+            return foreign.then(|| Failure::new(StatusCode::FORBIDDEN, "pages of other sites may not ask this server"));
         }
         let wanted = self.token.as_deref()?;
         // The page itself holds no secret; it passes the token on with what it asks for.
-        if !request.uri.path().starts_with("/api/") {
+        if !is_api(request) {
             return None;
         }
         let by_header = request.headers.get(header::AUTHORIZATION).and_then(|h| h.to_str().ok()).and_then(|h| h.strip_prefix("Bearer "));
@@ -63,6 +69,11 @@ impl Guard {
         let known = by_header.is_some_and(same) || by_query.is_some_and(same);
         (!known).then(|| Failure::new(StatusCode::UNAUTHORIZED, "the token is missing or wrong; open the address that the server printed"))
     }
+}
+
+/// Whether it asks for more than the page.
+fn is_api(request: &Parts) -> bool {
+    request.uri.path().starts_with("/api/")
 }
 
 /// The bytes of a body, or why it is not taken; what is more than `most` is listened to but not kept. An answer that is sent before
@@ -91,12 +102,13 @@ async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
 /// Checks a request, counts it, and adds what browsers need to know to every answer.
 pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let (parts, body) = request.into_parts();
-    // Who is refused takes no place.
+    // Who is refused takes no place, and the page, which everybody may have, needs none.
     let place = match guard.refusal(&parts) {
         Some(refusal) => Err(refusal),
-        None => guard.places.try_acquire().map_err(|_| Failure::busy()),
+        None if !is_api(&parts) => Ok(None),
+        None => guard.places.try_acquire().map(Some).map_err(|_| Failure::busy()),
     };
-    let body = receive(body, if place.is_ok() { LARGEST_BODY } else { 0 }).await;
+    let body = receive(body, if matches!(place, Ok(Some(_))) { LARGEST_BODY } else { 0 }).await;
     let mut response = match (place, body) {
         (Err(refusal), _) | (Ok(_), Err(refusal)) => refusal.into_response(),
         (Ok(_place), Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
@@ -107,6 +119,7 @@ pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
         (header::CACHE_CONTROL, "no-store"),
+        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
     ] {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
     }

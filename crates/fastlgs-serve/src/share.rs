@@ -60,7 +60,7 @@ pub struct Report {
     pub found: usize,
 }
 
-/// Writes the folder; an earlier one is replaced when the new one is whole.
+/// Writes the folder. What an earlier one had is replaced when the new one is whole; other files in it stay.
 ///
 /// # Errors
 /// A scene that cannot be asked, a folder that holds something else, and a place that cannot be written.
@@ -80,13 +80,27 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
     // Beside the folder, so that it can be renamed into place.
     let partial = tempfile::Builder::new().prefix(".share-").tempdir_in(&parent).with_context(|| parent.display().to_string())?;
     let (words, found) = fill(partial.path(), &mut desk, config, run)?;
-    let partial = partial.keep();
-    readable(&partial)?;
     if ours {
-        std::fs::remove_dir_all(root).with_context(|| root.display().to_string())?;
+        // Only what is ours: the folder may be somebody's repository.
+        for entry in std::fs::read_dir(partial.path())? {
+            let made = entry?.path();
+            let place = root.join(made.file_name().unwrap_or_default());
+            replace(&made, &place).with_context(|| place.display().to_string())?;
+        }
+    } else {
+        let partial = partial.keep();
+        readable(&partial)?;
+        std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
     }
-    std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
     Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: bytes(root), gaussians: desk.gaussians(), words, found })
+}
+
+/// Puts a file or a folder where there may be an earlier one.
+fn replace(made: &Path, place: &Path) -> std::io::Result<()> {
+    if place.is_dir() {
+        std::fs::remove_dir_all(place)?;
+    }
+    std::fs::rename(made, place)
 }
 
 /// Temporary folders are their owner's alone; this one is for a web server.

@@ -92,15 +92,34 @@ const bestView = async (id) => (await getJson(`/api/objects/${id}/view`)).view;
 // Nowhere, where no view shows it.
 const lookFrom = (name) => name && stage.lookFrom(scene.views.findIndex((view) => view.name === name));
 
+// How many questions were asked or taken back: an answer to an earlier one comes too late.
+let questions = 0;
+
 const find = guarded(async (text) => {
+  if (!objects) return;
   if (!text.trim()) return clear();
+  const number = ++questions;
+  const isLate = () => number !== questions;
   say(`looking for "${text}" ...`);
-  let answer = await ask(text);
-  const best = await elsewhere(answer);
-  if (best) {
-    lookFrom(best);
-    answer = await ask(text);
+  try {
+    const found = await answered(text, isLate);
+    if (!isLate()) show(text, found);
+  } catch (error) {
+    if (!isLate()) say("");
+    throw error;
   }
+});
+
+// The answer to a text as it is seen from here, or from the view that shows most of it, and which that is.
+async function answered(text, isLate) {
+  const answer = await ask(text);
+  const best = isLate() ? null : await elsewhere(answer);
+  if (!best || isLate()) return { answer };
+  lookFrom(best);
+  return { answer: await ask(text), best };
+}
+
+function show(text, { answer, best }) {
   recent.asked(text);
   state.text = text;
   state.ranked = answer.candidates;
@@ -117,7 +136,7 @@ const find = guarded(async (text) => {
     say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
   }
   select(answer.objects.map((o) => o.id));
-});
+}
 
 const nameIt = guarded(async (name) => {
   const [object] = state.selected;
@@ -128,6 +147,8 @@ const nameIt = guarded(async (name) => {
 });
 
 function clear() {
+  if (!objects) return;
+  questions += 1;
   Object.assign(state, { selected: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED });
   say("");
   update();
@@ -298,7 +319,8 @@ function listen() {
   stage.measured = measured;
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
-    if (!objects || id === 0) return select([]);
+    if (!objects) return;
+    if (id === 0) return select([]);
     const [only] = state.selected;
     select([state.selected.size === 1 ? objects.below(id, only) : objects.meant(id)]);
   };

@@ -6,6 +6,9 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const scaled = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
 const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
+// What lies nearer than this share of the distance at which a view's things are is not shown; and so near one may come.
+const NEAREST = 0.002;
+
 // Turns v about a unit axis (Rodrigues).
 function turned(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle);
@@ -59,9 +62,10 @@ export class Camera {
   turn(yaw, pitch) {
     const target = this.target();
     const both = (v) => turned(turned(v, this.right, pitch), this.up, yaw);
-    const tilted = turned(this.forward, this.right, pitch);
-    // Over the pole everything would stand on its head.
-    if (Math.abs(dot(unit(tilted), this.up)) > 0.985) return this.turn(yaw, 0);
+    const steep = (v) => Math.abs(dot(unit(v), this.up));
+    const tilted = steep(turned(this.forward, this.right, pitch));
+    // Over the pole everything would stand on its head; a photo that was taken towards it may be left.
+    if (pitch !== 0 && tilted > Math.max(0.985, steep(this.forward))) return this.turn(yaw, 0);
     [this.forward, this.down] = [unit(both(this.forward)), unit(both(this.down))];
     this.right = unit(cross(this.down, this.forward));
     this.down = unit(cross(this.forward, this.right));
@@ -78,7 +82,7 @@ export class Camera {
 
   zoom(factor) {
     const target = this.target();
-    this.distance = Math.max(this.distance * factor, 0.02);
+    this.distance = Math.max(this.distance * factor, NEAREST * this.view.focus);
     this.eye = add(target, this.forward, -this.distance);
     this.moved = true;
   }
@@ -116,7 +120,7 @@ export class Camera {
   project(point, lens) {
     const v = add(point, this.eye, -1);
     const z = dot(v, this.forward);
-    return z > 0.02 ? [lens.fx * dot(v, this.right) / z + lens.cx, lens.fy * dot(v, this.down) / z + lens.cy] : null;
+    return z > NEAREST * this.view.focus ? [lens.fx * dot(v, this.right) / z + lens.cx, lens.fy * dot(v, this.down) / z + lens.cy] : null;
   }
 }
 

@@ -46,7 +46,12 @@ function near(text, list) {
 // Answers a text from the table, in the form of the server's answer.
 export async function postJson(path, { text }) {
   const began = performance.now();
-  const { list, rows } = await (table ??= words());
+  // What could not be fetched is fetched again by the next question.
+  table ??= words().catch((error) => {
+    table = undefined;
+    throw error;
+  });
+  const { list, rows } = await table;
   const said = text.trim().toLowerCase().replace(/\s+/g, " ");
   const plain = list.has(said) ? said : said.replace(/^(a|an|the) /, "");
   const place = list.get(plain);

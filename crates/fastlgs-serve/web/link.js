@@ -21,5 +21,5 @@ export function follow(hash, stage) {
   const pose = parts.get("camera")?.split("_").map(Number);
   if (pose && !stage.camera.stand(pose)) throw new Error("the link's camera cannot be read; this is the view that it was near");
   stage.changed();
-  return { text: parts.get("text"), mode: SHOWN.find((mode) => mode === parts.get("show")) };
+  return { text: parts.get("text"), mode: SHOWN.find((mode) => mode === parts.get("show")) ?? "color" };
 }

@@ -55,7 +55,11 @@ export class Objects {
 
   async picture(id) {
     if (!this.pictures.has(id)) {
-      const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), () => null);
+      const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), () => {
+        // Whoever lists it again asks again.
+        this.pictures.delete(id);
+        return null;
+      });
       this.pictures.set(id, made);
     }
     return this.pictures.get(id);

@@ -39,7 +39,7 @@ export async function openPictures(canvas) {
       const camera = frame.camera.asJson(frame.width, frame.height, SIDE);
       const at = (v, size, own) => Math.min(own - 1, Math.floor((v + 0.5) / size * own));
       const point = [at(x, frame.width, camera.width), at(y, frame.height, camera.height)];
-      const answer = await postJson("/api/query", { point, camera });
+      const answer = await postJson("/api/query", { point, camera, hidden: frame.hidden, only: frame.only });
       return answer.candidates[0]?.id ?? 0;
     },
   };

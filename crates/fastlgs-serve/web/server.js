@@ -1,12 +1,15 @@
 // Requests to the program that serves this page.
 
 const address = new URL(location.href);
-const token = address.searchParams.get("token");
-// The token must not stay where others can read it over one's shoulder.
-if (token) {
+const given = address.searchParams.get("token");
+// The token must not stay where others can read it over one's shoulder; a page that is loaded again knows it still.
+if (given) {
+  sessionStorage.setItem("token", given);
   address.searchParams.delete("token");
   history.replaceState(null, "", address);
 }
+
+const token = sessionStorage.getItem("token");
 
 async function request(path, options = {}) {
   const headers = { ...options.headers };
@@ -24,11 +27,10 @@ async function request(path, options = {}) {
   return response;
 }
 
-const posted = (body, signal) => ({
+const posted = (body) => ({
   method: "POST",
   headers: { "Content-Type": "application/json" },
   body: JSON.stringify(body),
-  signal,
 });
 
 export const getJson = async (path) => (await request(path)).json();

@@ -224,23 +224,35 @@ export class Stage {
   }
 
   // The photo lies over the picture while the camera stands where it was taken.
-  async placePhoto() {
+  placePhoto() {
     const { photo, divider } = this.elements;
     const view = this.camera.view;
-    const shown = this.compare > 0 && !this.camera.moved && view.photo;
+    const wanted = this.compare > 0 && !this.camera.moved && view.photo;
+    if (wanted && this.photo?.view !== view) this.fetchPhoto(view);
+    const shown = wanted && this.photo.there;
     photo.hidden = divider.hidden = !shown;
     if (!shown) return;
-    if (photo.dataset.view !== view.name) {
-      photo.dataset.view = view.name;
-      URL.revokeObjectURL(photo.src);
-      photo.src = URL.createObjectURL(await getBlob(`/api/photos/${encodeURIComponent(view.name)}`));
-    }
     const { picture } = this.camera.lens(this.width, this.height);
     const css = (v) => `${v / this.ratio}px`;
     Object.assign(photo.style, { left: css(picture.left), top: css(picture.top), width: css(picture.width), height: css(picture.height) });
     photo.style.clipPath = `inset(0 ${100 - this.compare}% 0 0)`;
     const at = picture.left + picture.width * this.compare / 100;
     Object.assign(divider.style, { left: css(at), top: css(picture.top), height: css(picture.height) });
+  }
+
+  // Fetches the photo of a view, unless another one is wanted by the time it comes.
+  async fetchPhoto(view) {
+    const own = this.photo = { view, there: false };
+    try {
+      const blob = await getBlob(`/api/photos/${encodeURIComponent(view.name)}`);
+      if (this.photo !== own) return;
+      URL.revokeObjectURL(this.elements.photo.src);
+      this.elements.photo.src = URL.createObjectURL(blob);
+      own.there = true;
+      this.placePhoto();
+    } catch (error) {
+      this.failed(error);
+    }
   }
 
   // Mouse, touch and wheel. Keys are in app.js.
@@ -316,7 +328,8 @@ export class Stage {
       if (distances[nearest] < 12 * this.ratio) return this.lookFrom(nearest);
     }
     try {
-      this.picked(await this.renderer.pick(this.frame(), Math.floor(x), Math.floor(y)));
+      const within = (v, size) => Math.min(Math.max(Math.floor(v), 0), size - 1);
+      this.picked(await this.renderer.pick(this.frame(), within(x, this.width), within(y, this.height)));
     } catch (error) {
       this.failed(error);
     }

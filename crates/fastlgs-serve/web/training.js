@@ -9,13 +9,18 @@ export async function follow(elements, grown) {
   elements.training.hidden = false;
   let revision = 0;
   for (;;) {
-    const progress = await getJson("/api/training");
-    show(elements, progress);
-    if (progress.revision !== revision) {
-      revision = progress.revision;
-      await grown();
+    try {
+      const progress = await getJson("/api/training");
+      show(elements, progress, "steps are done; objects come next, then questions can be asked");
+      if (progress.revision !== revision) {
+        await grown();
+        revision = progress.revision;
+      }
+      if ((await getJson("/api/scene")).stage === "ready") return;
+    } catch (error) {
+      // A machine that slept or a server that is busy answers again.
+      elements.text.textContent = `${error.message}; trying again`;
     }
-    if ((await getJson("/api/scene")).stage === "ready") return;
     await new Promise((done) => setTimeout(done, EVERY_MS));
   }
 }
@@ -23,12 +28,12 @@ export async function follow(elements, grown) {
 // The curves of a run that is over.
 export async function recall(elements) {
   elements.training.hidden = false;
-  show(elements, await getJson("/api/training"));
+  show(elements, await getJson("/api/training"), "trained");
 }
 
-function show(elements, { curve, iterations, finished }) {
+function show(elements, { curve, iterations, finished }, over) {
   const last = curve.at(-1);
-  const state = finished ? "steps are done; objects come next, then questions can be asked" : `step ${last?.iteration ?? 0} of ${iterations}`;
+  const state = finished ? over : `step ${last?.iteration ?? 0} of ${iterations}`;
   elements.text.textContent = last
     ? `${state}: ${last.gaussians.toLocaleString("en")} Gaussians, ${last.psnr.toFixed(1)} dB, ${Math.round(last.seconds)} s`
     : "the first steps are on their way";

@@ -6,7 +6,9 @@ export async function openWebGpu(canvas, evenSlow) {
   const adapter = await navigator.gpu?.requestAdapter();
   if (!adapter) throw new Error("no adapter");
   if (adapter.info.isFallbackAdapter && !evenSlow) throw new Error("only a software adapter");
-  const device = await adapter.requestDevice();
+  // A row of the texture holds so many Gaussians that large scenes need all rows there are.
+  const { maxTextureDimension2D } = adapter.limits;
+  const device = await adapter.requestDevice({ requiredLimits: { maxTextureDimension2D } });
   const format = navigator.gpu.getPreferredCanvasFormat();
   const shader = async (path) => device.createShaderModule({ code: await (await fetch(path)).text() });
   const [module, present] = await Promise.all([shader("splat.wgsl"), shader("present.wgsl")]);

@@ -186,7 +186,8 @@ impl Import {
         if (proportions(list.width, list.height) / proportions(width, height) - 1.0).abs() > PROPORTIONS {
             let (w, h) = (list.width, list.height);
             return Err(Error::Invalid(format!(
-                "the masks of '{view}' are {w}x{h}, which does not fit a photo of {width}x{height}; were they cropped or rotated?"
+                "{}: the masks of '{view}' are {w}x{h}, which does not fit a photo of {width}x{height}; were they cropped or rotated?",
+                self.photos.display()
             )));
         }
         let lens = self.lenses.get(view).filter(|(_, distortion)| !distortion.is_none());
@@ -224,7 +225,11 @@ impl Import {
             }
         };
         if rows.shape.len() != 2 || rows.values.iter().any(|v| !v.is_finite()) {
-            return Err(Error::Invalid(format!("the embeddings of '{view}' have shape {:?}; one finite row a mask is needed", rows.shape)));
+            return Err(Error::Invalid(format!(
+                "{}: the embeddings of '{view}' have shape {:?}; one finite row a mask is needed",
+                self.photos.display(),
+                rows.shape
+            )));
         }
         Ok(Some(rows))
     }

@@ -85,7 +85,7 @@ pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &st
     let models = work.join("sparse");
     std::fs::create_dir_all(&models).map_err(fastlgs_core::Error::io(&models))?;
     match tool {
-        Tool::Colmap(program) => by_program(program, &images, &work, &models, files.len(), &say)?,
+        Tool::Colmap(program) => by_program(program, &images, &work, &models, &files, &say)?,
         Tool::Pycolmap(python) => {
             plan(&files, &work, seed, &say)?;
             by_script(python, &work, &say)?;
@@ -110,9 +110,19 @@ fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str) -> bool) -> R
 }
 
 /// Everything by COLMAP's own stages.
-fn by_program(program: &Path, images: &Path, work: &Path, models: &Path, count: usize, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
-    let matcher = if count <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
-    let one_camera = ["--ImageReader.single_camera", "1", "--ImageReader.camera_model", CAMERA_MODEL];
+fn by_program(
+    program: &Path,
+    images: &Path,
+    work: &Path,
+    models: &Path,
+    files: &[PathBuf],
+    say: &impl Fn(&str, &str) -> bool,
+) -> Result<()> {
+    let matcher = if files.len() <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
+    // One camera for photos of several sizes, and COLMAP passes over all that are not like the first.
+    let sizes: BTreeSet<_> = files.iter().filter_map(|file| image_io::dimensions(file).ok()).collect();
+    let single = if sizes.len() <= 1 { "1" } else { "0" };
+    let one_camera = ["--ImageReader.single_camera", single, "--ImageReader.camera_model", CAMERA_MODEL];
     let stages: [(&str, &str, &[&str]); 3] =
         [("features", "feature_extractor", &one_camera), ("matches", matcher, &[]), ("mapping", "mapper", &[])];
     for (stage, name, options) in stages {
@@ -345,7 +355,7 @@ mod tests {
     #[test]
     fn a_silent_tool_ends_when_that_is_asked_for() {
         let dir = tempfile::tempdir().unwrap();
-        let asleep = stand_in(dir.path(), "exec sleep 600");
+        let asleep = stand_in(dir.path(), "[ \"$2\" = --help ] || exec sleep 600");
         let began = std::time::Instant::now();
         let error = reconstruct(&asleep, &photos(dir.path(), 4), 0, |_, _| began.elapsed() < SILENT).unwrap_err();
         assert!(error.to_string().contains("ended"), "{error}");

@@ -1,11 +1,13 @@
 //! A trained scene for other programs, or a small folder with just what a query needs.
 
+use crate::aside::Aside;
+use crate::compared::Compared;
 use crate::error::{Context, bail};
 use crate::session::selection;
-use crate::{Result, Run, Session};
+use crate::{Result, Run, Session, train};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, image_io, ply, sog, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, ply, sog, spz};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -81,6 +83,9 @@ const PRECISION_VIEWS: usize = 4;
 /// What each group of values may lose there, in dB.
 const PRECISION_LOSS: f64 = 0.01;
 
+/// All that a small folder has, beside the manifest.
+const LEFT: [&str; 4] = ["scene.safetensors", "grid.json", "grid.safetensors", "cameras"];
+
 /// Whether a folder is meant, whatever the ending of its name.
 pub fn names_folder(path: &Path) -> bool {
     path.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || path.is_dir()
@@ -106,8 +111,10 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         );
     }
     let mut scene = Session::open(&config.scene, run.device)?;
-    let held_out = held_out(&scene);
-    let before = pictures(&mut scene, &held_out)?;
+    let held_out = scene.manifest.held_out(&scene.cameras);
+    // Also where none is held out, a picture tells what writing has cost.
+    let shown = if held_out.is_empty() { scene.cameras.iter().take(1).cloned().collect() } else { held_out.clone() };
+    let before = pictures(&mut scene, &shown)?;
     let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
     scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
     let (written, precision) = if file {
@@ -125,7 +132,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         (written, Some(precision.by_group().into_iter().map(|(group, bytes)| (group.to_owned(), bytes)).collect()))
     };
     scene.show(written)?;
-    let after = pictures(&mut scene, &held_out)?;
+    let after = pictures(&mut scene, &shown)?;
     // Both against each other, not against photos: an exported scene may have none.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
     Ok(Report::Scene(Box::new(SceneReport {
@@ -136,19 +143,10 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         gaussians: scene.gaussians.len(),
         sh_degree: scene.gaussians.sh_degree,
         bytes_a_value: precision,
-        psnr_held_out: Loss { before: against_photos(&scene, &held_out, &before), after: against_photos(&scene, &held_out, &after) },
+        psnr_held_out: Loss { before: against_photos(&scene, &held_out, &before)?, after: against_photos(&scene, &held_out, &after)? },
         psnr_against_original: same.iter().sum::<f64>() / same.len().max(1) as f64,
         adapter: scene.engine.name(),
     })))
-}
-
-/// The held-out views, or the first one where none is.
-fn held_out(scene: &Session) -> Vec<Camera> {
-    let mut views = scene.manifest.held_out(&scene.cameras);
-    if views.is_empty() {
-        views.extend(scene.cameras.first().cloned());
-    }
-    views
 }
 
 /// Colours of these views.
@@ -156,14 +154,23 @@ fn pictures(scene: &mut Session, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
     views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
 }
 
-/// Mean PSNR against the photos, where the scene still has them all.
-fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> Option<f64> {
-    let each = views.iter().zip(pictures).map(|(camera, picture)| {
-        let photo = scene.folder.photo(&camera.name).ok().map(|photo| image_io::to_planar(&photo));
-        photo.filter(|photo| photo.len() == picture.len()).map(|photo| psnr(picture, &photo))
-    });
-    let each: Vec<f64> = each.collect::<Option<_>>()?;
-    Some(each.iter().sum::<f64>() / each.len().max(1) as f64)
+/// Whether the photos of all these views are there: an exported scene has none.
+fn have_photos(scene: &Session, views: &[Camera]) -> bool {
+    views.iter().all(|view| scene.folder.photo_path(&view.name).is_file())
+}
+
+/// Mean PSNR against the photos, as far as these count; nothing where the scene has them no more.
+fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> Result<Option<f64>> {
+    if !have_photos(scene, views) {
+        return Ok(None);
+    }
+    let background = train::Background { color: scene.trained.background, learn: false };
+    let mut each = Vec::new();
+    for (camera, picture) in views.iter().zip(pictures) {
+        let target = train::target(&scene.folder, camera, None, &background)?;
+        each.extend(Compared::of(&target, picture).map(|compared| compared.psnr()));
+    }
+    Ok((!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64))
 }
 
 /// The precision that some training views show to be enough; the default where they have no photos.
@@ -171,13 +178,14 @@ fn precision(scene: &mut Session) -> Result<Precision> {
     let training = scene.manifest.training(&scene.cameras);
     let views: Vec<Camera> = training.iter().step_by(training.len().div_ceil(PRECISION_VIEWS).max(1)).cloned().collect();
     let original = scene.gaussians.clone();
-    if views.iter().any(|v| !scene.folder.photo_path(&v.name).is_file()) {
+    let before = pictures(scene, &views)?;
+    if against_photos(scene, &views, &before)?.is_none() {
         return Ok(Precision::default());
     }
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
         scene.show(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
-        against_photos(scene, &views, &pictures).context("a photo of the scene cannot be read; run 'fastlgs preprocess' again")
+        against_photos(scene, &views, &pictures)?.context("the scene's photos are there no more; run 'fastlgs preprocess' again")
     })?;
     scene.show(original)?;
     Ok(chosen)
@@ -192,16 +200,17 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
     if root.exists() && !is_empty && !SceneFolder::new(root).is_compact() {
         bail!("{}: not empty, and not what 'export' made of a scene; name a new folder", root.display());
     }
-    let folder = SceneFolder::new(root);
     let grid = scene.grid()?;
     if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
         bail!("the scene's features were trained by descent, which a small folder cannot hold; export FILE.ply instead");
     }
     let precision = precision(scene)?;
-    compact::write(&folder.compact_path(), &scene.gaussians, &precision)?;
-    grid.save(&folder)?;
-    folder.save_cameras(&scene.cameras)?;
-    folder.save_manifest(&scene.manifest).context("the manifest cannot be written")?;
+    let folder = SceneFolder::new(root);
+    let aside = Aside::new(&folder, "export")?;
+    compact::write(&aside.folder.compact_path(), &scene.gaussians, &precision)?;
+    grid.save(&aside.folder)?;
+    aside.folder.save_cameras(&scene.cameras)?;
+    aside.take_its_place(&folder, &LEFT, &scene.manifest)?;
     let mut written = folder.gaussians()?;
     grid.set_codes(&mut written);
     Ok((written, precision))

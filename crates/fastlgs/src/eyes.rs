@@ -92,7 +92,7 @@ pub struct Eyes {
     /// What embeds masks.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub encoder: EncoderKind,
-    /// Levels of masks that are kept, separated by commas; objects are made of the whole ones.
+    /// Levels of masks that are kept, separated by commas; Algorithm 1 makes objects of the whole ones alone.
     #[cfg_attr(feature = "clap", arg(long, value_delimiter = ',', default_value = "whole,part,subpart", value_parser = ["whole", "part", "subpart"]))]
     pub levels: Vec<String>,
     /// SAM by the name that `models pull` knows it by.

@@ -13,10 +13,12 @@
 //! Files are read and written in a scene folder ([`fastlgs_core::SceneFolder`]); a stage that fails leaves earlier results whole.
 
 mod absent;
+mod aside;
 mod cache;
 pub mod calibrate;
 pub mod calibrations;
 mod checkpoints;
+mod compared;
 mod error;
 pub mod eval;
 pub mod export;

@@ -134,7 +134,7 @@ impl Search {
         let best = self.index.search(&query, self.config.scenes)?;
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
         let least = 1.0 - self.config.false_alarms;
-        // As the scene itself would answer.
+        // As the scene itself answers the whole phrase; it tries the A of "A of B" as well.
         let row = |f: &Found| -> Result<Row> {
             let scene = self.index.scenes[f.scene].path.clone();
             let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
@@ -190,8 +190,8 @@ fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
     for entry in entries {
         let entry = entry?;
         let path = entry.path();
-        // Scenes may be linked.
-        if !path.is_dir() {
+        // Scenes may be linked; names with a dot are of what is not finished.
+        if !path.is_dir() || entry.file_name().to_string_lossy().starts_with('.') {
             continue;
         }
         if path.join("scene.json").is_file() {

@@ -84,8 +84,8 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
     let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, how, files(&photos)?]));
     let folder = SceneFolder::new(&preprocess.output);
-    let now = with()?;
-    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&now));
+    let mut made = with()?;
+    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
     let whole = [folder.ply_path(), folder.root.join("grid.json")].iter().all(|file| file.is_file());
     if let Some(report) = known.as_ref().filter(|_| whole).and_then(train::Report::of) {
         return Ok((State::Kept, report));
@@ -98,14 +98,16 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         crate::preprocess(preprocess, runs[0])?;
         let mut manifest: Manifest = folder.manifest()?;
         // Poses that were found now lie beside the photos.
-        manifest.notes.insert(train::MADE.to_owned(), with()?);
+        made = with()?;
+        manifest.notes.insert(train::MADE.to_owned(), made.clone());
         folder.save_manifest(&manifest)?;
     }
     // Minutes are those of all stages.
     let minutes = train.minutes.map(|minutes| minutes - started.elapsed().as_secs_f64() / 60.0);
     let report = crate::train(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, runs[1])?;
     let mut manifest = folder.manifest()?;
-    manifest.notes.insert(train::MADE.to_owned(), with()?);
+    // Photos that came or changed while it trained are not in it.
+    manifest.notes.insert(train::MADE.to_owned(), made);
     folder.save_manifest(&manifest)?;
     Ok((State::Made, report))
 }

@@ -64,7 +64,7 @@ impl Names {
         let names: Self = fs::read_json(path).with_context(|| format!("{}: no names that were exported", path.display()))?;
         let finite = |e: &Example| !e.embeddings.is_empty() && e.embeddings.iter().flatten().all(|v| v.is_finite());
         if let Some((name, _)) = names.0.iter().find(|(name, examples)| plain(name) != **name || !examples.iter().all(finite)) {
-            bail!("{}: the name '{name}' is damaged; teach it again", path.display());
+            bail!("{}: the name '{name}' is damaged; take it out of the file, or move the file away", path.display());
         }
         Ok(names)
     }

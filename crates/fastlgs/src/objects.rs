@@ -60,11 +60,9 @@ fn begin_maps(folder: &SceneFolder) -> Result<()> {
     Ok(fs::write_atomic(&unfinished(folder), |file| std::io::Write::write_all(file, why.as_bytes()))?)
 }
 
-/// Saves the table of the objects that the maps show.
-pub fn save(grid: &Grid, folder: &SceneFolder) -> Result<()> {
-    grid.save(folder)?;
+/// The table of the objects that the maps show is saved.
+pub fn end_maps(folder: &SceneFolder) {
     let _ = std::fs::remove_file(unfinished(folder));
-    Ok(())
 }
 
 /// The objects that an earlier run found, whose maps must be there for all training views.

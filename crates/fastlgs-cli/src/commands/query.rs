@@ -174,10 +174,17 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     if args.heatmap && args.output.is_none() {
         bail!("--heatmap is a picture: name a folder for it with -o");
     }
+    let exports = args.export.is_some() || args.export_rest.is_some();
+    if lines && exports {
+        bail!("--export and --export-rest write the answer to one question: leave out '-'");
+    }
     let Some(path) = &args.scene else { bail!("name a trained scene") };
     let mut scene = Session::open(path, run.device)?;
     let grid = scene.grid()?;
     let cameras = args.views.cameras(&scene.folder, &scene.cameras)?;
+    if exports && !args.point.is_empty() && cameras.len() > 1 {
+        bail!("--export and --export-rest write what a pixel of one view shows: name one --view");
+    }
     scene.clip_text.clone_from(&args.clip_text);
     let config = QueryConfig { false_alarms: args.false_alarms, top_k: args.top_k };
     if !args.text.is_empty() || !args.negative.is_empty() {
@@ -287,7 +294,7 @@ impl Asker<'_> {
         let mut tile = None;
         if let (Some(folder), Some(color)) = (&self.output, color) {
             let picture = answer.write(folder, color, args.heatmap, &mut report)?;
-            tile = Some(Tile { picture, title: report.text.clone(), note: in_short(&report) });
+            tile = Some(Tile::new(&picture, &report.text, in_short(&report)));
         }
         for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
             if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {

@@ -1,3 +1,4 @@
+import pathlib
 from os import PathLike
 from typing import Any, Callable, Dict, Iterable, List, Literal, Optional, Sequence, Tuple, Union
 
@@ -95,7 +96,7 @@ class Scene:
     ) -> None:
         """`embed_text` embeds texts where the masks were embedded by a model of the caller's: a list of str to (texts, numbers)."""
     @property
-    def path(self) -> str: ...
+    def path(self) -> pathlib.Path: ...
     @property
     def device(self) -> str: ...
     @property
@@ -140,7 +141,7 @@ def make(
     progress: Optional[Progress] = None,
     device: str = "auto",
     seed: int = 0,
-    effort: Optional[Literal["quick", "standard", "paper"]] = None,
+    effort: Optional[Literal["quick", "standard", "paper", "like-paper"]] = None,
     minutes: Optional[float] = None,
     **options: Any,
 ) -> Dict[str, Any]:

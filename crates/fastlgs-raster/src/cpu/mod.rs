@@ -85,7 +85,7 @@ pub(crate) fn chunk(n: usize, t: usize) -> std::ops::Range<usize> {
 /// Alpha of a splat at offset (dx, dy) from its mean; 0 where it is not drawn.
 pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32) -> f32 {
     let exponent = dx * (splat[0][2] * dx + splat[0][3] * dy) + (splat[1][0] * dy * dy + splat[1][1]);
-    let alpha = exponent.exp2();
+    let alpha = exponent.exp2().min(ALPHA_MAX);
     if alpha >= ALPHA_MIN { alpha } else { 0.0 }
 }
 

@@ -2,7 +2,7 @@
 
 use super::lists::{Band, Lists};
 use super::simd::{SUMS, Vector, dispatched};
-use crate::cpu::{ALPHA_MIN, BATCH, Splat};
+use crate::cpu::{ALPHA_MAX, ALPHA_MIN, BATCH, Splat};
 use crate::view::View;
 
 /// Pixels along a tile's edge.
@@ -116,7 +116,8 @@ impl<'a, V: Vector> Placed<'a, V> {
         let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *self.splat;
         let c0 = V::splat(qz).mul(dy).madd(dy, V::splat(log_opacity));
         let exponent = self.dx.madd(V::splat(qx).madd(self.dx, V::splat(qy).mul(dy)), c0);
-        exponent.exp2().at_least_or_zero(V::splat(ALPHA_MIN))
+        // Far out on a long needle, rounding would lift it above any opacity.
+        exponent.exp2().min(V::splat(ALPHA_MAX)).at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Colour and feature.

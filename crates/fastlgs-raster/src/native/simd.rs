@@ -39,6 +39,8 @@ pub trait Vector: Copy {
     fn madd(self, b: Self, c: Self) -> Self;
     /// The larger of both.
     fn max(self, b: Self) -> Self;
+    /// The smaller of both.
+    fn min(self, b: Self) -> Self;
     /// self, and 0 where it is below `least`.
     fn at_least_or_zero(self, least: Self) -> Self;
     /// self * 2^k, where `k`'s lowest bits hold a whole number.
@@ -122,6 +124,11 @@ impl<const N: usize> Vector for Portable<N> {
     }
 
     #[inline(always)]
+    fn min(self, b: Self) -> Self {
+        self.with(b, |a, b| if a < b { a } else { b })
+    }
+
+    #[inline(always)]
     fn at_least_or_zero(self, least: Self) -> Self {
         self.with(least, |a, least| if a >= least { a } else { 0.0 })
     }
@@ -185,6 +192,7 @@ mod x86 {
             fn div(b) = _mm256_div_ps;
             fn madd(b, c) = _mm256_fmadd_ps;
             fn max(b) = _mm256_max_ps;
+            fn min(b) = _mm256_min_ps;
             fn at_least_or_zero(least) = |a, least| _mm256_and_ps(a, _mm256_cmp_ps::<_CMP_GE_OQ>(a, least));
             fn times_power_of_two(k) = |a, k| {
                 let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(k));
@@ -243,6 +251,7 @@ mod x86 {
             fn div(b) = _mm512_div_ps;
             fn madd(b, c) = _mm512_fmadd_ps;
             fn max(b) = _mm512_max_ps;
+            fn min(b) = _mm512_min_ps;
             fn at_least_or_zero(least) = |a, least| _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, least), a);
             fn times_power_of_two(k) = |a, k| {
                 let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(k));

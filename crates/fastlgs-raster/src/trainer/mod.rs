@@ -12,7 +12,7 @@ use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
 use crate::schedule::{Budget, Strategy, TrainConfig};
-use crate::target::{Target, Targets};
+use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use fastlgs_core::camera::scene_extent;
@@ -101,6 +101,8 @@ impl Trainer {
         if config.exposure {
             targets = targets.without_clipped();
         }
+        let (contrast, pictures) = targets.survey()?;
+        let first = scene.to_channels().into_iter().map(f32::to_bits);
         let background = Learned::new(std::array::from_fn(|c| if c < 3 { config.background[c] } else { 0.0 }));
         let course = Course {
             iteration: 0,
@@ -112,11 +114,12 @@ impl Trainer {
             exposures: targets.gains().iter().filter(|_| config.exposure).map(|gain| LearnedExposure::from_gain(*gain)).collect(),
             background,
             views: targets.cameras.iter().map(|c| (c.name.clone(), [c.width, c.height])).collect(),
+            shown: fingerprint([pictures as u32, (pictures >> 32) as u32].into_iter().chain(first)),
             poses: targets.cameras.iter().map(|c| c.world_to_camera).collect(),
             alignment_gain: None,
             config,
         };
-        let (contrast, free) = (targets.contrast()?, FreeSpace::of(&targets.cameras, scene));
+        let free = FreeSpace::of(&targets.cameras, scene);
         Ok(Self { engine, extent: scene_extent(&targets.cameras), contrast, free, targets, course, shown: Shown::default() })
     }
 
@@ -372,6 +375,7 @@ impl Trainer {
         let other = match () {
             () if course.config != self.course.config => Some("with other options"),
             () if course.views != self.course.views => Some("from other photos"),
+            () if course.shown != self.course.shown => Some("from other pictures, objects or first Gaussians"),
             () => None,
         };
         if let Some(other) = other {

@@ -378,11 +378,12 @@ fn absent_scores(options: &Config, scene: &Session, grid: &Grid, views: &[Labell
         Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
         None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
     };
-    let named = |text: &String| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(text.as_str()));
+    let named = |text: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.to_lowercase().contains(&text.to_lowercase()));
     if views.is_empty() {
         return Ok(Vec::new());
     }
-    texts.iter().filter(|t| !t.trim().is_empty() && !named(t)).map(|text| scored(scene, grid, text.clone())).collect()
+    let texts = texts.iter().map(|text| text.trim());
+    texts.filter(|text| !text.is_empty() && !named(text)).map(|text| scored(scene, grid, text.to_owned())).collect()
 }
 
 /// The same for these texts with a colour before them.

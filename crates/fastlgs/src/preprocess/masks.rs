@@ -3,7 +3,7 @@
 use super::config::Config;
 use super::photos::Known;
 use crate::cache::{self, Cache};
-use crate::error::Context;
+use crate::error::{Context, bail};
 use crate::eyes::SegmenterKind;
 use crate::{Result, Run};
 use fastlgs_core::undistort::Distortion;
@@ -40,6 +40,9 @@ pub(super) fn segment(
         Ok(Level::ALL.map(|level| list.count(level)))
     };
     let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
+    if counts.iter().flatten().all(|count| *count == 0) {
+        bail!("{}: no mask was found in any photo to train on", config.photos.display());
+    }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
     let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));
     let means = kept.map(|level| (level.name().to_owned(), mean(level as usize))).collect();

@@ -1,6 +1,5 @@
 //! Everything that is done once, before training.
 
-mod aside;
 mod config;
 mod masks;
 mod matches;
@@ -8,11 +7,11 @@ mod photos;
 mod poses;
 mod video;
 
+use crate::aside::Aside;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::eyes::EncoderKind;
 use crate::{Result, Run, calibrations, checkpoints};
-use aside::Aside;
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
@@ -25,6 +24,10 @@ pub use photos::{Photo, load_photo};
 use std::collections::BTreeMap;
 use std::time::Instant;
 pub(crate) use video::fingerprint;
+
+/// All that preprocessing leaves, beside the manifest.
+const LEFT: [&str; 8] =
+    ["photos", "alpha", "ignore", "cameras", "masks", "points.safetensors", "pairs.safetensors", "embeddings.safetensors"];
 
 /// Photos to masks, embeddings, key points, poses and points, all in the scene folder `config.output`.
 ///
@@ -67,7 +70,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let models = config.eyes.files()?;
     let scene = SceneFolder::new(&config.output);
     let cache = Cache::new(&scene);
-    let aside = Aside::new(&scene)?;
+    let aside = Aside::new(&scene, "preprocess")?;
     let folder = aside.folder.clone();
     let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
     lap("photos");
@@ -146,7 +149,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     }
     manifest.seconds = seconds.clone();
     light.note(&mut manifest)?;
-    aside.take_its_place(&scene, &manifest)?;
+    aside.take_its_place(&scene, &LEFT, &manifest)?;
     // Steps of a training on other photos.
     checkpoints::forget(&scene);
     cache.tidy();

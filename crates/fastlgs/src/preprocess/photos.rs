@@ -114,13 +114,12 @@ fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
 pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder) -> Result<()> {
     photos.par_iter_mut().zip(k1).try_for_each(|(known, &k1)| {
         let (camera, lens) = (known.camera.clone(), Distortion { k1, ..Distortion::default() });
-        let mask = |path: PathBuf| -> Result<Option<GrayImage>> {
-            let mask = path.is_file().then(|| image_io::load_gray(&path)).transpose()?;
-            Ok(mask.map(|m| undistort_gray(&m, &camera, &lens)))
-        };
-        let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
-        let ignore = in_both(ignore, imaged(&camera, &lens));
-        let pixels = undistort(&folder.photo(&camera.name)?, &camera, &lens);
+        let known_mask = |path: PathBuf| path.is_file().then(|| image_io::load_gray(&path)).transpose();
+        let (alpha, ignore) = (known_mask(folder.alpha_path(&camera.name))?, known_mask(folder.ignore_path(&camera.name))?);
+        let mask = |mask: &GrayImage| undistort_gray(mask, &camera, &lens);
+        let ignore = in_both(ignore.as_ref().map(mask), imaged(&camera, &lens));
+        let color = |photo: &RgbImage| undistort(photo, &camera, &lens);
+        let (pixels, alpha) = resampled(&folder.photo(&camera.name)?, alpha.as_ref(), color, mask);
         (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
         known.points.positions.iter_mut().for_each(|p| *p = lens.straight_pixel(&camera, *p));
         save_photo(&Photo { camera, pixels, alpha, ignore }, folder)
@@ -143,8 +142,7 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, Some((posed.camera.width, posed.camera.height)))?;
     // The file decides the true size; some tools scale photos and leave the poses' file as it was.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
-    let aspect = f64::from(posed.camera.width) / f64::from(posed.camera.height) * f64::from(raw.height()) / f64::from(raw.width());
-    if (aspect - 1.0).abs() > 0.02 {
+    if !is_alike(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
         bail!(
             "{}: the photo is {}x{}, but its camera is {}x{}; was it rotated or cropped after the poses were made?",
             posed.path.display(),
@@ -154,10 +152,64 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
             posed.camera.height
         );
     }
-    let small = image_io::resize(&raw, camera.width, camera.height);
-    let pixels = if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) };
-    let mask = |mask: GrayImage| undistort_gray(&image_io::resize_gray(&mask, camera.width, camera.height), &camera, &posed.distortion);
-    let ignore = posed.ignore.as_ref().map(|path| image_io::load_gray(path).map(mask)).transpose()?;
+    let mask = |mask: &GrayImage| undistort_gray(&image_io::resize_gray(mask, camera.width, camera.height), &camera, &posed.distortion);
+    let color = |photo: &RgbImage| {
+        let small = image_io::resize(photo, camera.width, camera.height);
+        if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) }
+    };
+    let (pixels, alpha) = resampled(&raw, alpha.as_ref(), color, mask);
+    let mut ignore = None;
+    if let Some(path) = &posed.ignore {
+        let drawn = image_io::load_gray(path)?;
+        if !is_alike(drawn.dimensions(), raw.dimensions()) {
+            let ((w, h), (width, height)) = (drawn.dimensions(), raw.dimensions());
+            bail!("{}: the mask is {w}x{h}, its photo {width}x{height}; was it rotated or cropped?", path.display());
+        }
+        ignore = Some(mask(&drawn));
+    }
     let ignore = in_both(ignore, imaged(&camera, &posed.distortion));
-    Ok(Photo { pixels, alpha: alpha.map(mask), ignore, camera })
+    Ok(Photo { pixels, alpha, ignore, camera })
+}
+
+/// Whether two sizes have the same proportions, but for rounding.
+fn is_alike((w, h): (u32, u32), (width, height): (u32, u32)) -> bool {
+    (f64::from(w) / f64::from(h) * f64::from(height) / f64::from(width) - 1.0).abs() <= 0.02
+}
+
+/// A photo and its coverage, each resampled. Colours are weighted by coverage meanwhile: what is transparent has none to mix in.
+fn resampled(
+    pixels: &RgbImage,
+    alpha: Option<&GrayImage>,
+    color: impl Fn(&RgbImage) -> RgbImage,
+    mask: impl Fn(&GrayImage) -> GrayImage,
+) -> (RgbImage, Option<GrayImage>) {
+    let Some(alpha) = alpha else { return (color(pixels), None) };
+    let times = |photo: &mut RgbImage, alpha: &GrayImage, factor: fn(f32) -> f32| {
+        for (pixel, covered) in photo.pixels_mut().zip(alpha.pixels()) {
+            let factor = factor(f32::from(covered[0]) / 255.0);
+            pixel.0 = pixel.0.map(|v| (f32::from(v) * factor + 0.5) as u8);
+        }
+    };
+    let mut weighted = pixels.clone();
+    times(&mut weighted, alpha, |covered| covered);
+    let (mut pixels, alpha) = (color(&weighted), mask(alpha));
+    times(&mut pixels, &alpha, |covered| if covered > 0.0 { 1.0 / covered } else { 0.0 });
+    (pixels, Some(alpha))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{Luma, Rgb};
+
+    #[test]
+    fn what_is_transparent_has_no_colour_to_mix_in() {
+        // The left half is white; the right half is transparent, and black as files have it.
+        let pixels = RgbImage::from_fn(6, 2, |x, _| Rgb([if x < 3 { 255 } else { 0 }; 3]));
+        let alpha = GrayImage::from_fn(6, 2, |x, _| Luma([if x < 3 { 255 } else { 0 }]));
+        let (half, covered) = resampled(&pixels, Some(&alpha), |p| image_io::resize(p, 3, 1), |m| image_io::resize_gray(m, 3, 1));
+        let covered = covered.unwrap();
+        assert!((1..255).contains(&covered.get_pixel(1, 0)[0]), "{covered:?}");
+        assert!(half.pixels().zip(covered.pixels()).all(|(p, a)| a[0] == 0 || p[0] >= 254), "{half:?}");
+    }
 }

@@ -175,6 +175,8 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
     Ok(points)
 }
 
+/// Photos up to which all cameras are adjusted together: time grows with the third power of their number.
+const ADJUSTED: usize = 600;
 /// Pixels by which a lens may bend a photo's corners before the photos are straightened: resampling costs some sharpness.
 const BENT: f32 = 1.0;
 /// Adjusted poses are used where the error of the key points falls below this share of what it was: that of exact poses falls by some
@@ -191,6 +193,14 @@ pub(super) fn adjust(
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<Option<Adjusted>> {
+    if photos.len() > ADJUSTED {
+        let warning = format!(
+            "poses and lenses of more than {ADJUSTED} photos are not adjusted together, which would take hours; structure from motion has done so"
+        );
+        run.warn(&warning);
+        warnings.push(warning);
+        return Ok(None);
+    }
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
     let work = run.work("bundle adjustment", 0);

@@ -3,25 +3,38 @@
 use crate::{Result, Session};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_raster::lift;
+use glam::Vec3;
 
 /// Views that must have seen a Gaussian.
 const WITNESSES: u8 = 2;
 /// Pixels that it must have coloured in each, as its blending weights add up.
 const SHARE: f32 = 0.5;
 
-/// For each Gaussian whether two views show it outside the pixels that the thing may have coloured (`hidden`). The others are the thing's own,
-/// or lie in or under it, where training put whatever did no harm.
+/// For each Gaussian whether two views show it outside the pixels that the thing may have coloured (`hidden`), or none shows or has it within
+/// them. The others are the thing's own, or lie in or under it, where training put whatever did no harm.
 pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
     let mut witnesses = vec![0u8; session.gaussians.len()];
+    let mut within = vec![false; session.gaussians.len()];
     for (camera, hidden) in views {
         let labels = hidden.iter().map(|hidden| u16::from(!hidden)).collect();
         let map = LabelMap { width: camera.width, height: camera.height, labels };
         for vote in lift::votes(&session.gaussians, &session.view(camera), &map) {
+            within[vote.gaussian as usize] |= vote.label == 0;
             if vote.label == 1 && vote.weight >= SHARE {
                 let count = &mut witnesses[vote.gaussian as usize];
                 *count = count.saturating_add(1);
             }
         }
     }
-    Ok(witnesses.into_iter().map(|count| count >= WITNESSES).collect())
+    let is_within = |mean: Vec3| {
+        views.iter().any(|(camera, hidden)| {
+            let seen = camera.world_to_camera.transform_point3(mean);
+            let place = camera.to_pixel(seen);
+            let [w, h] = [camera.width, camera.height];
+            let shown = seen.z > 0.0 && place.x >= 0.0 && place.y >= 0.0 && place.x < w as f32 && place.y < h as f32;
+            shown && hidden[place.y as usize * w as usize + place.x as usize]
+        })
+    };
+    let stays = |((count, within), mean): ((u8, bool), &Vec3)| count >= WITNESSES || !(within || is_within(*mean));
+    Ok(witnesses.into_iter().zip(within).zip(&session.gaussians.means).map(stays).collect())
 }

@@ -1,7 +1,7 @@
 //! The scene folder that is left when a thing was removed.
 
 use crate::error::Context;
-use crate::{Result, Session};
+use crate::{Result, Session, train};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
@@ -70,6 +70,8 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
     if compact.is_file() {
         std::fs::remove_file(&compact).map_err(Error::io(&compact))?;
     }
+    // It is not what `make` made.
+    manifest.notes.remove(train::MADE);
     let removed = manifest.notes.entry("removed".to_owned()).or_insert_with(|| serde_json::json!([]));
     removed.as_array_mut().into_iter().for_each(|list| list.push(what.into()));
     if let Some(train) = manifest.notes.get_mut("train") {
@@ -112,10 +114,11 @@ fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
     for entry in std::fs::read_dir(from)? {
         let entry = entry?;
         let name = entry.file_name();
-        if LEFT_BEHIND.iter().any(|left| name == *left) {
+        if LEFT_BEHIND.iter().any(|left| name == *left) || entry.path().extension().is_some_and(|ending| ending == "partial") {
             continue;
         }
-        match entry.file_type()?.is_dir() {
+        // Folders may be linked.
+        match entry.path().is_dir() {
             true => copy(&entry.path(), &to.join(name))?,
             false => drop(std::fs::copy(entry.path(), to.join(name))?),
         }

@@ -20,7 +20,7 @@ use fastlgs_vision::inpaint::{self, Inpainter};
 use glam::Vec2;
 use membrane::Membrane;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// What is removed.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -91,9 +91,10 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     if config.output.exists() {
         bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
     }
-    let beside = config.output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")).canonicalize();
-    if let (Ok(beside), Ok(scene)) = (beside, config.scene.canonicalize())
-        && beside.starts_with(&scene)
+    // The nearest folder above that is there.
+    let above = std::path::absolute(&config.output)?.ancestors().find_map(|folder| folder.canonicalize().ok());
+    if let (Some(above), Ok(scene)) = (above, config.scene.canonicalize())
+        && above.starts_with(&scene)
     {
         bail!("{}: it lies in the scene itself; name a folder beside {}", config.output.display(), config.scene.display());
     }
@@ -166,6 +167,18 @@ fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hi
     Ok(found.targets)
 }
 
+/// Colours of what is there, without the background that shines through: at the rim of a gap that is up to half of the light.
+fn solid_colors(session: &mut Session, camera: &Camera) -> Result<Vec<f32>> {
+    let frame = session.render(camera)?;
+    let behind = session.trained.background;
+    let transmittance = frame.channels(6, 7);
+    let solid = |c: usize| {
+        let channel = frame.channels(c, c + 1).iter().zip(transmittance);
+        channel.map(move |(color, t)| if *t < EMPTY { (color - t * behind[c]) / (1.0 - t) } else { *color })
+    };
+    Ok((0..3).flat_map(solid).collect())
+}
+
 /// The hidden pixels of a view where nothing is left.
 fn gap(session: &mut Session, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
     let frame = session.engine.render(session.view(camera), Channels::Color)?;
@@ -196,7 +209,7 @@ fn fill(
         let depth = session.render_depth(camera)?;
         let mut inverse: Vec<f32> = depth.iter().map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 }).collect();
         Membrane::span(&mut inverse, &gap, width);
-        let mut colors = session.render(camera)?.channels(0, 3).to_vec();
+        let mut colors = solid_colors(session, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
         let ids = membrane::continued(&session.field(camera, None)?.ids(grid).labels, &gap, width);
         let to_world = camera.world_to_camera.inverse();

@@ -108,7 +108,8 @@ impl Report {
     /// # Errors
     /// When the device fails.
     pub fn look_elsewhere(&mut self, session: &mut Session, grid: &Grid) -> Result<()> {
-        if self.found && self.pixels < VISIBLE {
+        // Without what widening adds to the mask.
+        if self.found && self.objects.iter().map(|object| object.pixels).sum::<usize>() < VISIBLE {
             let ids: Vec<u16> = self.objects.iter().map(|o| o.id).collect();
             self.seen_best = session.seen_best(grid, &ids)?;
         }

@@ -48,8 +48,8 @@ impl Ask {
             Self::Text(text) => {
                 let embedded = |text: &str| with_negatives(session.text_query(text)?);
                 let split = part_of(text).filter(|_| !session.is_taught(text));
-                let split =
-                    split.map(|(part, object)| Ok::<_, crate::Error>(Box::new([embedded(object)?, embedded(part)?]))).transpose()?;
+                // What cannot be split, as half of it was taught and cannot be compared with a negative, is meant as a whole.
+                let split = split.and_then(|(part, object)| Some(Box::new([embedded(object).ok()?, embedded(part).ok()?])));
                 Meaning::Embedded(Box::new(embedded(text)?), split)
             }
         })

@@ -11,17 +11,21 @@ use image::{Rgb, RgbImage};
 
 /// A picture and what is said of it.
 pub struct Tile {
-    /// The picture, of any size.
-    pub picture: RgbImage,
-    /// What it is.
-    pub title: String,
-    /// What there is to know; may be empty.
-    pub note: String,
+    picture: RgbImage,
+    title: String,
+    note: String,
+}
+
+impl Tile {
+    /// A picture of any size, what it is, and what there is to know; may be empty.
+    pub fn new(picture: &RgbImage, title: impl Into<String>, note: impl Into<String>) -> Self {
+        Self { picture: fitted(picture), title: title.into(), note: note.into() }
+    }
 }
 
 /// What a view shows: its photo, where there is one, the render, and the objects.
 pub fn of_view(session: &Session, grid: &Grid, camera: &Camera, frame: &Frame, field: &Field) -> Vec<Tile> {
-    let tile = |picture: RgbImage, title: &str| Tile { picture, title: title.to_owned(), note: camera.name.clone() };
+    let tile = |picture: RgbImage, title: &str| Tile::new(&picture, title, &camera.name);
     let owners = field.owners(grid);
     let objects = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(owners.at(x, y))));
     let render = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
@@ -43,12 +47,11 @@ const INK: [Rgb<u8>; 2] = [Rgb([20; 3]), Rgb([90; 3])];
 /// Puts tiles into rows of `columns`.
 pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
     let columns = columns.clamp(1, tiles.len().max(1)) as u32;
-    let scaled: Vec<RgbImage> = tiles.iter().map(|tile| fitted(&tile.picture)).collect();
-    let width = scaled.iter().map(RgbImage::width).max().unwrap_or(SIDE) + GAP;
-    let height = scaled.iter().map(RgbImage::height).max().unwrap_or(0) + WORDS + GAP;
+    let width = tiles.iter().map(|tile| tile.picture.width()).max().unwrap_or(SIDE) + GAP;
+    let height = tiles.iter().map(|tile| tile.picture.height()).max().unwrap_or(0) + WORDS + GAP;
     let rows = (tiles.len() as u32).div_ceil(columns);
     let mut page = RgbImage::from_pixel(columns * width + GAP, rows * height + GAP, PAPER);
-    for (place, (tile, picture)) in (0..).zip(tiles.iter().zip(&scaled)) {
+    for (place, tile @ Tile { picture, .. }) in (0..).zip(tiles) {
         let (left, top) = (GAP + place % columns * width, GAP + place / columns * height);
         overlay(&mut page, picture, i64::from(left), i64::from(top));
         let base = (top + picture.height()) as f32;
@@ -99,11 +102,8 @@ mod tests {
 
     #[test]
     fn pictures_stand_in_rows_over_their_words() {
-        let tile = |color: [u8; 3], title: &str| Tile {
-            picture: RgbImage::from_pixel(64, 32, Rgb(color)),
-            title: title.to_owned(),
-            note: "0.98, 120 pixels, and more than there is room for on one line of a sheet".to_owned(),
-        };
+        let note = "0.98, 120 pixels, and more than there is room for on one line of a sheet";
+        let tile = |color: [u8; 3], title: &str| Tile::new(&RgbImage::from_pixel(64, 32, Rgb(color)), title, note);
         let page = sheet(&[tile([255, 0, 0], "photo"), tile([0, 255, 0], ""), tile([0, 0, 255], "Füchse")], 2);
         assert_eq!(page.dimensions(), (2 * (SIDE + GAP) + GAP, 2 * (SIDE / 2 + WORDS + GAP) + GAP));
         let [second_column, second_row] = [2 * GAP + SIDE, 2 * GAP + SIDE / 2 + WORDS].map(|v| v + 5);

@@ -4,6 +4,7 @@ mod config;
 mod pace;
 mod start;
 
+use crate::aside::Aside;
 use crate::error::{Context, bail};
 use crate::progress::{Message, TrainStep};
 use crate::{Result, Run, checkpoints, objects, preprocess};
@@ -22,6 +23,9 @@ pub(crate) const MADE: &str = "made";
 
 /// Difference of two photos in stops from which exposures are learned.
 const VARYING: f32 = 0.15;
+
+/// All that training leaves, beside the manifest and the objects' maps.
+const LEFT: [&str; 4] = ["grid.json", "grid.safetensors", "scene.ply", "cameras/trained.json"];
 
 /// Iterations from which it pays to find out first which kernels the device is fastest with.
 const WORTH_TUNING: u32 = 500;
@@ -129,9 +133,10 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         }
     };
     let mapping_seconds = started.elapsed().as_secs_f64();
-    objects::save(&grid, &folder)?;
-    folder.save_trained_cameras(aligned.then_some(&cameras))?;
-    ply::write(&folder.ply_path(), &scene).context("the trained scene cannot be written")?;
+    let aside = Aside::new(&folder, "train")?;
+    grid.save(&aside.folder)?;
+    aside.folder.save_trained_cameras(aligned.then_some(&cameras))?;
+    ply::write(&aside.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
     let report = Report {
         scene: config.scene.clone(),
@@ -162,7 +167,9 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     // It is no more what `make` once made; where that called, it says so again.
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
-    folder.save_manifest(&manifest)?;
+    manifest.notes.remove(pace::NOTE);
+    aside.take_its_place(&folder, &LEFT, &manifest)?;
+    objects::end_maps(&folder);
     // Checkpoints serve a broken run only.
     checkpoints::forget(&folder);
     Ok(report)
@@ -171,7 +178,11 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
 /// The device for so many iterations.
 fn device(iterations: u32, run: &Run) -> Result<Choice> {
     if iterations >= WORTH_TUNING {
-        fastlgs_raster::tuning::tune(run.device, false)?;
+        match fastlgs_raster::tuning::tune(run.device, false) {
+            // Where nothing was asked for, a device that cannot be opened is none.
+            Err(error) if run.device == "auto" => run.warn(&error.to_string()),
+            measured => drop(measured?),
+        }
     }
     Ok(fastlgs_raster::choice(run.device))
 }

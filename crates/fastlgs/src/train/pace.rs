@@ -3,7 +3,7 @@
 use super::config::{Config, Mapping, Preset};
 use super::{device, settings, start};
 use crate::preprocess::Brightness;
-use crate::{Result, Run, objects};
+use crate::{Result, Run, checkpoints, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};
 use fastlgs_raster::{Targets, Trainer};
@@ -19,7 +19,7 @@ const FEWEST: u32 = 500;
 const MOST: u32 = 30_000;
 
 /// Note of the manifest: what was decided, for a run that goes on after it was broken off.
-const NOTE: &str = "minutes";
+pub const NOTE: &str = "minutes";
 
 /// `config` with iterations, and the preset's limits, that fit into its minutes together with the mapping, of which those that have gone since
 /// `began` are no longer there; itself where it has none.
@@ -34,7 +34,7 @@ pub fn fitted(
 ) -> Result<Config> {
     let Some(minutes) = config.minutes else { return Ok(config.clone()) };
     let decided = manifest.notes.get(NOTE).and_then(|note| serde_json::from_value(note.clone()).ok());
-    let iterations = match decided.filter(|_| config.resume) {
+    let iterations = match decided.filter(|_| config.resume && checkpoints::is_begun(folder)) {
         Some(iterations) => iterations,
         None => {
             // Algorithm 1 is done by now, and so are objects that are kept.

@@ -18,7 +18,11 @@ const ENOUGH: usize = 5000;
 /// The given PLY, else the scene's points, with random ones where these are too few.
 pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
     if let Some(path) = &config.init_ply {
-        return Ok(ply::read(path)?);
+        let first = ply::read(path)?;
+        if first.is_empty() {
+            bail!("{}: it has no Gaussians; name the PLY of a trained scene", path.display());
+        }
+        return Ok(first);
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
