@@ -114,15 +114,17 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     // A click on the object selects something that it is part of, or that is part of it.
     let at = |p: &[u32; 2]| mask.get_pixel(p[0], p[1])[0] > 0;
     let own: Vec<[u32; 2]> = (0..mask.width() * mask.height()).map(|p| [p % mask.width(), p / mask.width()]).filter(at).collect();
-    // Where two objects of an answer meet, or a stray Gaussian lies before it, a pixel may be no one's.
-    let selects = |p: [u32; 2]| {
+    let place_of = |p: [u32; 2]| {
         let place = browser.run(&format!(
             "const box = fastlgs.stage.elements.canvas.getBoundingClientRect(); return [box.x + {} / fastlgs.stage.ratio, box.y + {} / fastlgs.stage.ratio];",
             p[0], p[1]
         ));
+        [0, 1].map(|k| place[k].as_f64().expect("a number") as i32)
+    };
+    // Where two objects of an answer meet, or a stray Gaussian lies before it, a pixel may be no one's.
+    let selects = |p: [u32; 2]| {
         browser.keys("\u{e00c}");
-        let place = [0, 1].map(|k| place[k].as_f64().expect("a number") as i32);
-        browser.drag(place, place);
+        browser.drag(place_of(p), place_of(p));
         let selected = || browser.run("await fastlgs.stage.settle(); return fastlgs.state.selected.size;") == 1;
         (0..10).any(|_| {
             std::thread::sleep(Duration::from_millis(200));
@@ -130,6 +132,13 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
         })
     };
     assert!((8..16).any(|k| selects(own[own.len() * k / 16])), "{way}: no click on the object selects anything");
+    // Several with Shift held are on one thing.
+    browser.keys("\u{e00c}");
+    let places = [4, 8, 12].map(|k| place_of(own[own.len() * k / 16]));
+    browser.holding("\u{e008}", || places.iter().for_each(|place| browser.drag(*place, *place)));
+    browser.wait_for(
+        "document.getElementById('answer').textContent.startsWith('3 clicks on one thing: #') && fastlgs.state.selected.size === 1",
+    );
 
     // Hiding, showing and isolating, by keys.
     browser.keys("x");

@@ -88,6 +88,18 @@ impl Browser {
         self.post("/actions", &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": actions }] }));
     }
 
+    /// Does something while a key is held.
+    pub fn holding<T>(&self, key: &str, work: impl FnOnce() -> T) -> T {
+        let turn = |kind: &str| {
+            let action = json!({ "type": kind, "value": key });
+            self.post("/actions", &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": [action] }] }));
+        };
+        turn("keyDown");
+        let done = work();
+        turn("keyUp");
+        done
+    }
+
     /// Presses the mouse at one place of the page and lets go at another.
     pub fn drag(&self, from: [i32; 2], to: [i32; 2]) {
         let to_place = |p: [i32; 2]| json!({ "type": "pointerMove", "duration": 50, "x": p[0], "y": p[1] });

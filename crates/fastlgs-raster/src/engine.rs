@@ -4,6 +4,7 @@ use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::density::State;
 
+use crate::shape::Shape;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
 use fastlgs_core::Shares;
@@ -123,6 +124,10 @@ pub struct Losses {
 pub trait Engine: Send {
     /// The adapter, for reports.
     fn name(&self) -> String;
+    /// How the blending kernels divide a tile; nothing where there are no kernels. The same bytes come of the same shape alone.
+    fn shape(&self) -> Option<Shape> {
+        None
+    }
     /// Number of Gaussians.
     fn len(&self) -> usize;
     /// Whether there are no Gaussians.

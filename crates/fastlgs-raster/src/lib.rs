@@ -41,7 +41,7 @@ pub use floaters::FEW_VIEWS;
 pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
-pub use open::{Choice, choice, open_engine};
+pub use open::{Choice, choice, open_engine, open_engine_as};
 
 pub use schedule::{Alignment, Budget, Strategy, TrainConfig};
 pub use shape::Shape;

@@ -4,7 +4,8 @@ use crate::engine::Engine;
 use crate::gpu::{Gpu, adapters};
 use crate::gpu_engine::GpuEngine;
 use crate::native::CpuEngine;
-use crate::{Result, tuning};
+use crate::shape::Shape;
+use crate::{Error, Result, tuning};
 use serde::{Deserialize, Serialize};
 
 /// What a device's name means here, and the reason.
@@ -52,14 +53,46 @@ pub fn choice(device: &str) -> Choice {
 /// # Errors
 /// When there is no such adapter.
 pub fn open_engine(device: &str) -> Result<Box<dyn Engine>> {
+    open_engine_as(device, None)
+}
+
+/// The same with kernels of a given shape, instead of the one that was fastest.
+///
+/// # Errors
+/// As [`open_engine`], and where the device does not have that shape.
+pub fn open_engine_as(device: &str, shape: Option<Shape>) -> Result<Box<dyn Engine>> {
     let Choice { device, why } = choice(device);
     tracing::debug!(device, why, "device");
     if device == "cpu" {
-        return Ok(Box::new(CpuEngine::new()));
+        return match shape {
+            None => Ok(Box::new(CpuEngine::new())),
+            Some(_) => Err(Error::Adapter("the cpu has no kernel shapes: name an adapter with --device, or leave out --shape".to_owned())),
+        };
     }
     let mut gpu = Gpu::open(&device)?;
-    if let Some(shape) = tuning::remembered(&gpu.identity).filter(|shape| gpu.shapes.contains(shape)) {
-        gpu.shape = shape;
+    if let Some(shape) = shape.filter(|shape| !gpu.shapes.contains(shape)) {
+        let known = gpu.shapes.iter().map(Shape::to_string).collect::<Vec<_>>().join(", ");
+        return Err(Error::Adapter(format!("'{}' cannot run the kernel shape {shape}; there are {known}", gpu.name)));
     }
+    let fastest = || tuning::remembered(&gpu.identity).filter(|shape| gpu.shapes.contains(shape));
+    gpu.shape = shape.or_else(fastest).unwrap_or(gpu.shape);
     Ok(Box::new(GpuEngine::new(gpu)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn kernels_have_the_shape_that_is_asked_for() {
+        let on_cpu = |shape| open_engine_as("cpu", shape);
+        assert_eq!(on_cpu(None).unwrap().shape(), None);
+        assert!(on_cpu(Some(Shape::Wide)).err().unwrap().to_string().contains("no kernel shapes"));
+        let Some(gpu) = crate::tests::gpu() else { return };
+        for shape in &gpu.shapes {
+            let named = shape.to_string().parse().unwrap();
+            assert_eq!(open_engine_as(&gpu.name, Some(named)).unwrap().shape(), Some(*shape));
+        }
+        assert!("narrow".parse::<Shape>().unwrap_err().contains("shared, subgroups, wide"));
+    }
 }

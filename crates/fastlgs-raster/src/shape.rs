@@ -1,6 +1,8 @@
 //! How the blending kernels divide a tile among invocations.
 
 use serde::{Deserialize, Serialize};
+use std::fmt::{Display, Formatter};
+use std::str::FromStr;
 
 /// How the blending kernels divide an 8x8 tile; `shaders/shared/lane.wgsl`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -12,6 +14,27 @@ pub enum Shape {
     Subgroups,
     /// One invocation a tile: for software rasterisers, whose invocations are vector lanes.
     Wide,
+}
+
+impl FromStr for Shape {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Self, String> {
+        let all = [Self::Shared, Self::Subgroups, Self::Wide];
+        all.into_iter()
+            .find(|shape| shape.to_string() == name)
+            .ok_or_else(|| format!("there are {}", all.map(|s| s.to_string()).join(", ")))
+    }
+}
+
+impl Display for Shape {
+    fn fmt(&self, out: &mut Formatter<'_>) -> std::fmt::Result {
+        out.write_str(match self {
+            Self::Shared => "shared",
+            Self::Subgroups => "subgroups",
+            Self::Wide => "wide",
+        })
+    }
 }
 
 impl Shape {

@@ -317,6 +317,7 @@ function listen() {
   for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
   document.addEventListener("keydown", pressed);
   stage.measured = measured;
+  stage.pickedTogether = (places) => objects && together(places);
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
     if (!objects) return;
@@ -325,6 +326,16 @@ function listen() {
     select([state.selected.size === 1 ? objects.below(id, only) : objects.meant(id)]);
   };
 }
+
+// The one thing that several places of the canvas show.
+const together = guarded(async (places) => {
+  const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
+  const at = ([x, y]) => [Math.floor((x + 0.5) / stage.width * camera.width), Math.floor((y + 0.5) / stage.height * camera.height)];
+  const answer = await postJson("/api/query", { point: places.map(at), camera, hidden: [...state.hidden], only: [...state.only] });
+  const ids = answer.objects.map((o) => o.id);
+  say(`${places.length} clicks on one thing: ${ids.map((id) => `#${id}`).join(", ") || "nothing is there"}`);
+  select(ids);
+});
 
 async function ready() {
   scene = Object.assign(stage.scene, await getJson("/api/scene"));

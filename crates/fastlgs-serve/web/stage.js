@@ -19,6 +19,8 @@ export class Stage {
     this.compare = 0;
     this.measure = new Measure(scene.name);
     this.picked = () => {};
+    this.pickedTogether = () => {};
+    this.clicks = [];
     this.measured = () => {};
     this.looked = () => {};
   }
@@ -286,7 +288,7 @@ export class Stage {
       this.changed();
     });
     const end = (event) => {
-      if (event.type === "pointerup" && pointers.size === 1 && travelled < 0.01 && event.button === 0) this.click(...place(event));
+      if (event.type === "pointerup" && pointers.size === 1 && travelled < 0.01 && event.button === 0) this.click(...place(event), event.shiftKey);
       pointers.delete(event.pointerId);
     };
     canvas.addEventListener("pointerup", end);
@@ -305,7 +307,8 @@ export class Stage {
     return pointAt(splats, this.camera, this.camera.lens(this.width, this.height), x, y, (id) => this.isShown(id));
   }
 
-  async click(x, y) {
+  // Clicks that follow each other `together` are on one thing.
+  async click(x, y, together = false) {
     if (this.measure.on) {
       try {
         const point = await this.point(x, y);
@@ -329,7 +332,13 @@ export class Stage {
     }
     try {
       const within = (v, size) => Math.min(Math.max(Math.floor(v), 0), size - 1);
-      this.picked(await this.renderer.pick(this.frame(), within(x, this.width), within(y, this.height)));
+      const place = [within(x, this.width), within(y, this.height)];
+      const from = [...this.camera.pose(), this.width, this.height].join();
+      this.clicks = together && this.clickedFrom === from ? [...this.clicks, place] : [place];
+      this.clickedFrom = from;
+      // Only the program that serves the page weighs several.
+      if (this.clicks.length > 1 && !this.scene.shared) return this.pickedTogether(this.clicks);
+      this.picked(await this.renderer.pick(this.frame(), ...place));
     } catch (error) {
       this.failed(error);
     }

@@ -14,6 +14,7 @@ use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, che
 use crate::pass::{Recorder, Typed};
 use crate::profile::Profile;
 use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, Ceiling as CeilingKernel, CeilingBuffers, PerturbBuffers};
+use crate::shape::Shape;
 use crate::view::{Ceiling, Perturb, Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
@@ -106,6 +107,10 @@ impl GpuEngine {
 impl Engine for GpuEngine {
     fn name(&self) -> String {
         self.gpu.name.clone()
+    }
+
+    fn shape(&self) -> Option<Shape> {
+        Some(self.gpu.shape)
     }
 
     fn len(&self) -> usize {

@@ -12,6 +12,7 @@ use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
 use crate::schedule::{Budget, Strategy, TrainConfig};
+use crate::shape::Shape;
 use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
@@ -61,6 +62,8 @@ pub struct TrainReport {
     pub alignment_gain: Option<f64>,
     /// Adapter.
     pub adapter: String,
+    /// Shape of its kernels, where it has any.
+    pub shape: Option<Shape>,
 }
 
 /// A training run; drive it with [`Trainer::run`].
@@ -324,6 +327,7 @@ impl Trainer {
             background: self.course.background.values,
             alignment_gain: self.course.alignment_gain,
             adapter: self.engine.name(),
+            shape: self.engine.shape(),
         })
     }
 

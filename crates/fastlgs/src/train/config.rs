@@ -8,7 +8,7 @@ use fastlgs_core::{Camera, Gaussians};
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::objects as chosen;
 use fastlgs_raster::budget::Removal;
-use fastlgs_raster::{Budget, Choice, FEW_VIEWS, View};
+use fastlgs_raster::{Budget, Choice, FEW_VIEWS, Shape, View};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -244,6 +244,10 @@ pub struct Config {
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
+    /// How the adapter's kernels divide a tile: shared, subgroups or wide; by default what was fastest here. The report of a training names its
+    /// shape, with which the same comes out again.
+    #[cfg_attr(feature = "clap", arg(long))]
+    pub shape: Option<Shape>,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
     pub curve: Option<u32>,
@@ -279,6 +283,7 @@ impl Default for Config {
             alpha: paper.alpha,
             cues: vec![Cue::Keypoints, Cue::Color],
             support: objects.min_support,
+            shape: None,
             curve: None,
             feature_weight: FEATURE_WEIGHT,
             resume: false,
@@ -374,6 +379,8 @@ pub struct Report {
     pub curve: Vec<CurvePoint>,
     /// The device's name.
     pub adapter: String,
+    /// Shape of its kernels, where it has any.
+    pub shape: Option<Shape>,
     /// What `--device` meant, and why.
     pub device: Choice,
 }

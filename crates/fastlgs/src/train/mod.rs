@@ -76,7 +76,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     }
     let settings = settings(config, &first, &targets, light.spread_stops, run.seed);
     let device = device(settings.iterations, run)?;
-    let engine = fastlgs_raster::open_engine(&device.device)?;
+    let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
     let checkpoint = checkpoints::path(&folder);
@@ -161,6 +161,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         psnr_held_out: psnr,
         curve,
         adapter: result.adapter,
+        shape: result.shape,
         device,
     };
     manifest.seconds.insert("train".to_owned(), result.seconds);

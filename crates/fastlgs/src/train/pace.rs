@@ -69,7 +69,7 @@ fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &T
     let first = start::gaussians(&short, folder, targets, run)?;
     let light = Brightness::of(manifest);
     let settings = settings(&short, &first, targets, light.spread_stops, run.seed);
-    let engine = fastlgs_raster::open_engine(&device(MOST, run)?.device)?;
+    let engine = fastlgs_raster::open_engine_as(&device(MOST, run)?.device, config.shape)?;
     let work = run.work("trial", u64::from(TRIAL));
     let mut trainer = Trainer::new(engine, &first, targets.clone(), settings)?;
     let result = trainer.run(None, |_, _| work.check())?;
