@@ -130,7 +130,7 @@ pub struct Report {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The mask has half of the oracle's IoU at least.
+    /// The mask has an IoU of [`RIGHT`] at least.
     Right,
     /// Said to be not found.
     Refused,
@@ -138,9 +138,12 @@ pub enum Outcome {
     WrongLevel,
     /// Something else was taken.
     WrongObject,
-    /// The best object was taken, with others that spoil its mask.
+    /// The best object was taken; its mask, or what others add to it, does not fit.
     WrongMask,
 }
+
+/// IoU from which an answer is right.
+const RIGHT: f64 = 0.5;
 
 /// A text that names nothing in the scene.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -330,7 +333,7 @@ fn score_label(
     sums.ranks.entry(label.category.clone()).or_default().push(ranked.iter().position(|h| h.id == id).map_or(ranked.len(), |k| k) + 1);
     let outcome = match targets.first() {
         None => Outcome::Refused,
-        _ if iou >= 0.5 * oracle && iou > 0.0 => Outcome::Right,
+        _ if iou >= RIGHT => Outcome::Right,
         Some(first) if first.id == id => Outcome::WrongMask,
         Some(first) if grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
         Some(_) => Outcome::WrongObject,
