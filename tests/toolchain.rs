@@ -125,6 +125,13 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
         "{own} {found}"
     );
 
+    // And so it does of a part of something.
+    let part = json(&["query", "--library", library, "nose of the cat"]);
+    let own = json(&["query", text(&scenes.join("room")), "nose of the cat", "--device", "cpu"]);
+    let row = part["scenes"].as_array().expect("rows").iter().find(|row| row["scene"] == "room").expect("the room");
+    let score = |answer: &Value| answer["score"].as_f64().expect("a score");
+    assert!((score(&own) - score(row)).abs() < 0.01 && row["found"] == own["found"], "{own} {part}");
+
     let absent = fastlgs(&["query", "--library", library, "aircraft carrier", "--json", "-"]);
     assert_eq!(absent.status.code(), Some(3), "{}", String::from_utf8_lossy(&absent.stdout));
 

@@ -136,7 +136,7 @@ impl School {
                     None => 0.0,
                     Some(shown) => {
                         let query = TextQuery::of_examples(shown.clone(), Calibrations::of(&self.scene.manifest).pictures);
-                        let found = Meaning::Embedded(Box::new(query), None).find(&self.grid, &view.field, &view.camera, config)?;
+                        let found = Meaning::Embedded(Box::new(query.into())).find(&self.grid, &view.field, &view.camera, config)?;
                         metrics::iou(&view.field.mask(&self.grid, &found.targets), &label.mask)
                     }
                 };

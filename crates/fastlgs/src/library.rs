@@ -2,12 +2,13 @@
 
 use crate::error::{Context, bail};
 use crate::session::Texts;
+use crate::session::ask::Embedded;
 use crate::{Result, Run, eyes, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
 use fastlgs_grid::library::{self, Entry, Found, Library};
-use fastlgs_grid::query;
+use fastlgs_grid::query::{self, QueryConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::{Instant, UNIX_EPOCH};
@@ -128,23 +129,28 @@ impl Search {
     /// A text that cannot be embedded.
     pub fn ask(&self, text: &str) -> Result<Report> {
         let started = Instant::now();
-        let query = self.texts.with_negatives(self.texts.query(text)?, &self.config.negatives)?;
+        let meant = Embedded::words(text, &self.texts, &self.config.negatives)?;
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
-        let best = self.index.search(&query, self.config.scenes)?;
+        let mut best: Vec<Found> = Vec::new();
+        for query in meant.sought() {
+            let found = self.index.search(query, self.config.scenes)?;
+            best.extend(found.into_iter().filter(|f| best.iter().all(|known| known.scene != f.scene)).collect::<Vec<_>>());
+        }
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
-        let least = 1.0 - self.config.false_alarms;
-        // As the scene itself answers the whole phrase; it tries the A of "A of B" as well.
+        let config = QueryConfig { false_alarms: self.config.false_alarms, ..QueryConfig::default() };
+        // As the scene itself would answer.
         let row = |f: &Found| -> Result<Row> {
             let scene = self.index.scenes[f.scene].path.clone();
             let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
-            let ranked = query::rank(&grid, &query);
-            let likeliest = ranked.iter().find(|hit| hit.score >= least).or(ranked.first());
-            let (object, score) = (likeliest.map_or(f.object, |hit| hit.id), query::best_score(&ranked));
-            Ok(Row { scene, object, score, support: grid.objects[usize::from(object) - 1].support, found: score >= least })
+            let answer = meant.find(&grid, &config);
+            let object = answer.targets.first().or(answer.ranked.first()).map_or(f.object, |hit| hit.id);
+            let (support, score) = (grid.objects[usize::from(object) - 1].support, query::best_score(&answer.ranked));
+            Ok(Row { scene, object, score, support, found: !answer.targets.is_empty() })
         };
         let mut rows = best.iter().map(row).collect::<Result<Vec<Row>>>()?;
         rows.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.scene.cmp(&b.scene)));
+        rows.truncate(self.config.scenes);
         Ok(Report {
             text: text.to_owned(),
             found: rows.iter().any(|r| r.found),

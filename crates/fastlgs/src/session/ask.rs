@@ -1,6 +1,6 @@
 //! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
 
-use super::{Pixels, Session};
+use super::{Pixels, Session, Texts};
 use crate::Result;
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
@@ -23,10 +23,16 @@ pub enum Ask {
 
 /// What a question means, before any view is looked at.
 pub enum Meaning {
-    /// Embedded words or pictures; for "A of B" also B and A.
-    Embedded(Box<TextQuery>, Option<Box<[TextQuery; 2]>>),
+    /// Words or a picture.
+    Embedded(Box<Embedded>),
     /// Pixels of the view that show one thing.
     Point(Pixels),
+}
+
+/// Embedded words or a picture; for "A of B" also B and A.
+pub struct Embedded {
+    whole: TextQuery,
+    split: Option<[TextQuery; 2]>,
 }
 
 impl Ask {
@@ -41,18 +47,56 @@ impl Ask {
 
     /// Embeds what needs embedding; `negatives` are texts that the object must not be nearer to.
     pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
-        let with_negatives = |query| if negatives.is_empty() { Ok(query) } else { session.texts()?.with_negatives(query, negatives) };
         Ok(match self {
             Self::Point(pixels) => Meaning::Point(pixels.clone()),
-            Self::Image(name, photo) => Meaning::Embedded(Box::new(with_negatives(picture(session, name, photo)?)?), None),
-            Self::Text(text) => {
-                let embedded = |text: &str| with_negatives(session.text_query(text)?);
-                let split = part_of(text).filter(|_| !session.is_taught(text));
-                // What cannot be split, as half of it was taught and cannot be compared with a negative, is meant as a whole.
-                let split = split.and_then(|(part, object)| Some(Box::new([embedded(object).ok()?, embedded(part).ok()?])));
-                Meaning::Embedded(Box::new(embedded(text)?), split)
+            Self::Image(name, photo) => {
+                let whole = picture(session, name, photo)?;
+                let whole = if negatives.is_empty() { whole } else { session.texts()?.with_negatives(whole, negatives)? };
+                Meaning::Embedded(Box::new(whole.into()))
             }
+            Self::Text(text) => Meaning::Embedded(Box::new(Embedded::words(text, session.texts()?, negatives)?)),
         })
+    }
+}
+
+impl From<TextQuery> for Embedded {
+    fn from(whole: TextQuery) -> Self {
+        Self { whole, split: None }
+    }
+}
+
+impl Embedded {
+    /// Words, or a name that was taught; `negatives` are texts that the object must not be nearer to.
+    ///
+    /// # Errors
+    /// Those of [`Texts::query`] and [`Texts::with_negatives`].
+    pub fn words(text: &str, texts: &Texts, negatives: &[String]) -> Result<Self> {
+        let embedded = |text: &str| texts.with_negatives(texts.query(text)?, negatives);
+        let split = part_of(text).filter(|_| !texts.is_taught(text));
+        // What cannot be split, as half of it was taught and cannot be compared with a negative, is meant as a whole.
+        let split = split.and_then(|(part, object)| Some([embedded(object).ok()?, embedded(part).ok()?]));
+        Ok(Self { whole: embedded(text)?, split })
+    }
+
+    /// What a scene must have something like: the whole phrase, or what the part is of.
+    pub fn sought(&self) -> impl Iterator<Item = &TextQuery> {
+        std::iter::once(&self.whole).chain(self.split.iter().map(|[object, _]| object))
+    }
+
+    /// The objects that are meant.
+    pub fn find(&self, grid: &Grid, config: &QueryConfig) -> Found {
+        let by = |query: &TextQuery| {
+            let ranked = query::rank(grid, query);
+            Found { targets: query::select(grid, &ranked, query, config), ranked }
+        };
+        let whole = by(&self.whole);
+        let Some([object, part]) = &self.split else { return whole };
+        let around = by(object);
+        match query::part(grid, &around.targets, part, config) {
+            Some(part) if query::best_score(&part.ranked) > query::best_score(&whole.ranked) => part,
+            _ if !whole.targets.is_empty() => whole,
+            _ => around,
+        }
     }
 }
 
@@ -79,7 +123,7 @@ impl Meaning {
     /// Whether what scores mean was measured with the encoder.
     pub fn is_calibrated(&self) -> bool {
         match self {
-            Self::Embedded(query, _) => query.calibration.measured,
+            Self::Embedded(meant) => meant.whole.calibration.measured,
             Self::Point(..) => true,
         }
     }
@@ -87,18 +131,7 @@ impl Meaning {
     /// The objects that are meant.
     pub fn find(&self, grid: &Grid, field: &Field, camera: &Camera, config: &QueryConfig) -> Result<Found> {
         match self {
-            Self::Embedded(query, split) => {
-                let ranked = query::rank(grid, query);
-                let whole = Found { targets: query::select(grid, &ranked, query, config), ranked };
-                let Some([object, part]) = split.as_deref() else { return Ok(whole) };
-                let ranked = query::rank(grid, object);
-                let around = Found { targets: query::select(grid, &ranked, object, config), ranked };
-                Ok(match query::part(grid, &around.targets, part, config) {
-                    Some(part) if query::best_score(&part.ranked) > query::best_score(&whole.ranked) => part,
-                    _ if !whole.targets.is_empty() => whole,
-                    _ => around,
-                })
-            }
+            Self::Embedded(meant) => Ok(meant.find(grid, config)),
             Self::Point(pixels) => {
                 if let Some((x, y)) = pixels.outside(camera) {
                     bail!("--point {x},{y} lies outside the view of {}x{}", camera.width, camera.height);
