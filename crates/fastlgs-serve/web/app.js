@@ -121,6 +121,7 @@ async function answered(text, isLate) {
 
 function show(text, { answer, best }) {
   recent.asked(text);
+  stage.clicks = [];
   state.text = text;
   state.ranked = answer.candidates;
   state.scores = new Map(answer.candidates.map(({ id, score }) => [id, score]));
@@ -149,6 +150,7 @@ const nameIt = guarded(async (name) => {
 function clear() {
   if (!objects) return;
   questions += 1;
+  stage.clicks = [];
   Object.assign(state, { selected: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED });
   say("");
   update();
@@ -317,7 +319,7 @@ function listen() {
   for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
   document.addEventListener("keydown", pressed);
   stage.measured = measured;
-  stage.pickedTogether = (places) => objects && together(places);
+  stage.pickedTogether = (rays) => objects && together(rays);
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
     if (!objects) return;
@@ -327,13 +329,14 @@ function listen() {
   };
 }
 
-// The one thing that several places of the canvas show.
-const together = guarded(async (places) => {
+// The one thing that several rays of the camera show.
+const together = guarded(async (rays) => {
   const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
-  const at = ([x, y]) => [Math.floor((x + 0.5) / stage.width * camera.width), Math.floor((y + 0.5) / stage.height * camera.height)];
-  const answer = await postJson("/api/query", { point: places.map(at), camera, hidden: [...state.hidden], only: [...state.only] });
+  const at = ([x, y]) => [Math.floor(x * camera.fx + camera.cx), Math.floor(y * camera.fy + camera.cy)];
+  const point = rays.map(at).filter(([x, y]) => x >= 0 && y >= 0 && x < camera.width && y < camera.height);
+  const answer = await postJson("/api/query", { point, camera, hidden: [...state.hidden], only: [...state.only] });
   const ids = answer.objects.map((o) => o.id);
-  say(`${places.length} clicks on one thing: ${ids.map((id) => `#${id}`).join(", ") || "nothing is there"}`);
+  say(`${rays.length} clicks on one thing: ${ids.map((id) => `#${id}`).join(", ") || "nothing is there"}`);
   select(ids);
 });
 

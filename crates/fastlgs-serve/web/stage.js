@@ -333,8 +333,11 @@ export class Stage {
     try {
       const within = (v, size) => Math.min(Math.max(Math.floor(v), 0), size - 1);
       const place = [within(x, this.width), within(y, this.height)];
-      const from = [...this.camera.pose(), this.width, this.height].join();
-      this.clicks = together && this.clickedFrom === from ? [...this.clicks, place] : [place];
+      // As rays: what a selection brings up may take room from the canvas.
+      const lens = this.camera.lens(this.width, this.height);
+      const ray = [(place[0] + 0.5 - lens.cx) / lens.fx, (place[1] + 0.5 - lens.cy) / lens.fy];
+      const from = this.camera.pose().join();
+      this.clicks = together && this.clickedFrom === from ? [...this.clicks, ray] : [ray];
       this.clickedFrom = from;
       // Only the program that serves the page weighs several.
       if (this.clicks.length > 1 && !this.scene.shared) return this.pickedTogether(this.clicks);
