@@ -60,7 +60,8 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             progress.note(&view.name);
             progress.check()?;
             let started = Instant::now();
-            let found = segmenter.segment(&view.name, &photo.pixels)?;
+            let mut found = segmenter.segment(&view.name, &photo.pixels)?;
+            found.masks.retain(|mask| args.eyes.keeps(mask.level));
             segment_seconds += started.elapsed().as_secs_f64();
             for level in Level::ALL {
                 *counts.entry(level.name()).or_default() += found.count(level) as f64;

@@ -130,7 +130,7 @@ pub struct Report {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The mask has an IoU of [`RIGHT`] at least.
+    /// The mask has an IoU of a half at least.
     Right,
     /// Said to be not found.
     Refused,
