@@ -149,7 +149,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     // Several with Shift held are on one thing.
     browser.keys("\u{e00c}");
     let places = [4, 8, 12].map(|k| place_of(own[own.len() * k / 16]));
-    browser.holding("\u{e008}", || places.iter().for_each(|place| browser.drag(*place, *place)));
+    browser.holding("\u{e008}", || places.iter().for_each(|[x, y]| browser.drag([*x, *y], [x + 1, *y])));
     browser.wait_for(
         "document.getElementById('answer').textContent.startsWith('3 clicks on one thing: #') && fastlgs.state.selected.size === 1",
     );

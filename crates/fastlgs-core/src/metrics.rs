@@ -71,7 +71,8 @@ const PSNR_MOST: f64 = 100.0;
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     let mse = sum / a.len().max(1) as f64;
-    (-10.0 * mse.log10()).min(PSNR_MOST)
+    // `min` would take a picture with holes of NaN for a perfect one.
+    if mse == 0.0 { PSNR_MOST } else { (-10.0 * mse.log10()).clamp(f64::MIN, PSNR_MOST) }
 }
 
 /// Half width of the SSIM window.

@@ -28,7 +28,7 @@ pub(crate) struct Course {
     /// Names and sizes of the training views.
     #[serde(default)]
     pub views: Vec<(String, [u32; 2])>,
-    /// Fingerprint of what these views show and of the first Gaussians.
+    /// Fingerprint of what these views show and of the first Gaussians; 0 in checkpoints of versions that kept none.
     #[serde(default)]
     pub shown: u64,
     /// Poses of the training views, world to camera.

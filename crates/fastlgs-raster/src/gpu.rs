@@ -57,9 +57,10 @@ impl Gpu {
             let hardware = |a: &wgpu::Adapter| a.get_info().device_type != wgpu::DeviceType::Cpu;
             list.iter().position(hardware).or(if list.is_empty() { None } else { Some(0) })
         } else {
-            match which.parse() {
-                Ok(index) => Some(index).filter(|index| *index < list.len()),
-                Err(_) => names.iter().position(|n| n.to_lowercase().contains(&wanted)),
+            match which.parse::<usize>() {
+                // "4090" is part of a name, and "1" of too many.
+                Ok(index) if which.len() < 3 => Some(index).filter(|index| *index < list.len()),
+                _ => names.iter().position(|n| n.to_lowercase().contains(&wanted)),
             }
         };
         let index = found.ok_or_else(|| {

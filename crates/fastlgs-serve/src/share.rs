@@ -80,27 +80,30 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
     // Beside the folder, so that it can be renamed into place.
     let partial = tempfile::Builder::new().prefix(".share-").tempdir_in(&parent).with_context(|| parent.display().to_string())?;
     let (words, found) = fill(partial.path(), &mut desk, config, run)?;
+    let size = bytes(partial.path());
     if ours {
         // Only what is ours: the folder may be somebody's repository.
-        for entry in std::fs::read_dir(partial.path())? {
-            let made = entry?.path();
+        let entries = std::fs::read_dir(partial.path())?.collect::<std::io::Result<Vec<_>>>()?;
+        for made in entries.into_iter().map(|entry| entry.path()) {
             let place = root.join(made.file_name().unwrap_or_default());
-            replace(&made, &place).with_context(|| place.display().to_string())?;
+            replace(&made, &place, &partial.path().join(".before")).with_context(|| place.display().to_string())?;
         }
     } else {
         let partial = partial.keep();
         readable(&partial)?;
         std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
     }
-    Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: bytes(root), gaussians: desk.gaussians(), words, found })
+    Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: size, gaussians: desk.gaussians(), words, found })
 }
 
-/// Puts a file or a folder where there may be an earlier one.
-fn replace(made: &Path, place: &Path) -> std::io::Result<()> {
-    if place.is_dir() {
-        std::fs::remove_dir_all(place)?;
+/// Puts a file or a folder where there may be an earlier one, which is kept `aside` until then.
+fn replace(made: &Path, place: &Path, aside: &Path) -> std::io::Result<()> {
+    if !place.is_dir() {
+        return std::fs::rename(made, place);
     }
-    std::fs::rename(made, place)
+    std::fs::rename(place, aside)?;
+    std::fs::rename(made, place).inspect_err(|_| drop(std::fs::rename(aside, place)))?;
+    std::fs::remove_dir_all(aside)
 }
 
 /// Temporary folders are their owner's alone; this one is for a web server.

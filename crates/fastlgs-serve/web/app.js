@@ -323,6 +323,7 @@ function listen() {
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
     if (!objects) return;
+    questions += 1;
     if (id === 0) return select([]);
     const [only] = state.selected;
     select([state.selected.size === 1 ? objects.below(id, only) : objects.meant(id)]);
@@ -331,10 +332,12 @@ function listen() {
 
 // The one thing that several rays of the camera show.
 const together = guarded(async (rays) => {
+  const number = ++questions;
   const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
   const at = ([x, y]) => [Math.floor(x * camera.fx + camera.cx), Math.floor(y * camera.fy + camera.cy)];
   const point = rays.map(at).filter(([x, y]) => x >= 0 && y >= 0 && x < camera.width && y < camera.height);
   const answer = await postJson("/api/query", { point, camera, hidden: [...state.hidden], only: [...state.only] });
+  if (number !== questions) return;
   const ids = answer.objects.map((o) => o.id);
   say(`${rays.length} clicks on one thing: ${ids.map((id) => `#${id}`).join(", ") || "nothing is there"}`);
   select(ids);

@@ -55,9 +55,9 @@ export class Objects {
 
   async picture(id) {
     if (!this.pictures.has(id)) {
-      const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), () => {
-        // Whoever lists it again asks again.
-        this.pictures.delete(id);
+      const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), ({ status }) => {
+        // Whoever lists it again asks again, unless there is none.
+        if (status !== 404) this.pictures.delete(id);
         return null;
       });
       this.pictures.set(id, made);

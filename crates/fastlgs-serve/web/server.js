@@ -4,12 +4,21 @@ const address = new URL(location.href);
 const given = address.searchParams.get("token");
 // The token must not stay where others can read it over one's shoulder; a page that is loaded again knows it still.
 if (given) {
-  sessionStorage.setItem("token", given);
+  remembered((place) => place.setItem("token", given));
   address.searchParams.delete("token");
   history.replaceState(null, "", address);
 }
 
-const token = sessionStorage.getItem("token");
+const token = given ?? remembered((place) => place.getItem("token"));
+
+// What the browser keeps for this tab; nothing where it keeps nothing.
+function remembered(use) {
+  try {
+    return use(sessionStorage);
+  } catch {
+    return null;
+  }
+}
 
 async function request(path, options = {}) {
   const headers = { ...options.headers };
@@ -22,7 +31,7 @@ async function request(path, options = {}) {
   }
   if (!response.ok) {
     const body = await response.json().catch(() => ({}));
-    throw new Error(body.error ?? `${path}: ${response.status}`);
+    throw Object.assign(new Error(body.error ?? `${path}: ${response.status}`), { status: response.status });
   }
   return response;
 }

@@ -261,20 +261,23 @@ export class Stage {
   listen() {
     const { canvas } = this.elements;
     const pointers = new Map();
-    let travelled = 0;
+    // A hand that clicks trembles: so far, in parts of the picture's height, nothing moves.
+    const STILL = 0.01;
+    let dragging = false;
     const place = (event) => [event.offsetX * this.ratio, event.offsetY * this.ratio];
     const spread = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, place(event));
-      travelled = 0;
+      dragging = pointers.size > 1;
     });
     canvas.addEventListener("pointermove", (event) => {
       const before = pointers.get(event.pointerId);
       if (!before) return;
       const now = place(event);
       const [dx, dy] = [(now[0] - before[0]) / this.height, (now[1] - before[1]) / this.height];
-      travelled += Math.abs(dx) + Math.abs(dy);
+      if (!dragging && Math.abs(dx) + Math.abs(dy) < STILL) return;
+      dragging = true;
       if (pointers.size === 2) {
         const old = spread([...pointers.values()]);
         pointers.set(event.pointerId, now);
@@ -288,7 +291,7 @@ export class Stage {
       this.changed();
     });
     const end = (event) => {
-      if (event.type === "pointerup" && pointers.size === 1 && travelled < 0.01 && event.button === 0) this.click(...place(event), event.shiftKey);
+      if (event.type === "pointerup" && pointers.size === 1 && !dragging && event.button === 0) this.click(...place(event), event.shiftKey);
       pointers.delete(event.pointerId);
     };
     canvas.addEventListener("pointerup", end);

@@ -167,16 +167,15 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) ->
         Ok((small.width(), small.height(), points))
     };
     let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
-    going(say("matches", ""))?;
-    let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&photos[a].2, &photos[b].2) };
-    let pairs: Vec<PairMatches> = pairs(files.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
+    let points: Vec<&Keypoints> = photos.iter().map(|p| &p.2).collect();
+    let pairs = matched(&points, say)?;
     let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let image = |(path, (width, height, points)): (&PathBuf, &(u32, u32, Keypoints))| {
         let path_text = std::path::absolute(path).unwrap_or_else(|_| path.clone());
         json!({ "name": name(path), "path": path_text, "width": width, "height": height, "keypoints": points.positions.len() })
     };
     let images = files.iter().zip(&photos).map(image).collect();
-    write_plan(work, images, &photos.iter().map(|p| &p.2).collect::<Vec<_>>(), &pairs, seed)
+    write_plan(work, images, &points, &pairs, seed)
 }
 
 /// Leaves photos, key points and matches in the work folder as `reconstruct.py` reads them.
@@ -210,9 +209,8 @@ pub fn placed_anew(
 ) -> Result<Vec<Option<Mat4>>> {
     let _ = std::fs::remove_dir_all(work);
     std::fs::create_dir_all(work).map_err(fastlgs_core::Error::io(work))?;
-    going(say("matches", ""))?;
-    let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: matches(&points[a], &points[b]) };
-    let pairs: Vec<PairMatches> = pairs(cameras.len()).into_par_iter().map(matched).filter(|m| m.pairs.len() >= FEW).collect();
+    let points: Vec<&Keypoints> = points.iter().collect();
+    let pairs = matched(&points, &say)?;
     let image = |((path, camera), points): ((&PathBuf, &Camera), &Keypoints)| {
         let path = std::path::absolute(path).unwrap_or_else(|_| path.clone());
         json!({
@@ -220,14 +218,24 @@ pub fn placed_anew(
             "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
         })
     };
-    let images = photos.iter().zip(cameras).zip(points).map(image).collect();
-    write_plan(work, images, &points.iter().collect::<Vec<_>>(), &pairs, seed)?;
+    let images = photos.iter().zip(cameras).zip(points.iter().copied()).map(image).collect();
+    write_plan(work, images, &points, &pairs, seed)?;
     by_script(python, work, &say)?;
     // Rows of [R t], of the model that explains most.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
     let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
     let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose)).collect();
     if found.len() == cameras.len() { Ok(found) } else { Err(Error::Invalid("structure from motion lost count of its photos".to_owned())) }
+}
+
+/// Matches of the photos' key points, where there are enough.
+fn matched(points: &[&Keypoints], say: &(impl Fn(&str, &str) -> bool + Sync)) -> Result<Vec<PairMatches>> {
+    let of_pair = |(a, b): (usize, usize)| {
+        going(say("matches", ""))?;
+        Ok(PairMatches { a, b, pairs: matches(points[a], points[b]) })
+    };
+    let all = pairs(points.len()).into_par_iter().map(of_pair).collect::<Result<Vec<_>>>()?;
+    Ok(all.into_iter().filter(|m| m.pairs.len() >= FEW).collect())
 }
 
 /// Which photos are matched, by their places in the order of names.

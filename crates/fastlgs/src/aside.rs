@@ -3,10 +3,12 @@
 use crate::Result;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Error, SceneFolder};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// What the earlier scene had, until it is removed with the rest.
 const BEFORE: &str = "before";
+/// What makes a folder a scene.
+const MANIFEST: &str = "scene.json";
 
 /// A folder within the scene's, which is gone with this.
 pub(crate) struct Aside {
@@ -31,22 +33,38 @@ impl Aside {
     /// # Errors
     /// The system's refusal; the earlier scene is then put back.
     pub fn take_its_place(mut self, scene: &SceneFolder, names: &[&str], manifest: &Manifest) -> Result<()> {
-        let earlier = scene.manifest().ok();
-        scene.remove_manifest()?;
+        self.folder.save_manifest(manifest)?;
+        let before = self.folder.root.join(BEFORE);
+        let (made, place) = (|name: &str| self.folder.root.join(name), |name: &str| scene.root.join(name));
+        let away = std::iter::once(&MANIFEST).chain(names).map(|name| (place(name), before.join(name)));
+        let into = names.iter().chain([&MANIFEST]).map(|name| (made(name), place(name)));
         let mut moved = Vec::new();
-        let mut put = |name: &&str| -> Result<()> {
-            let (made, place) = (self.folder.root.join(name), scene.root.join(name));
-            moved.extend(rename_if_there(&place, &self.folder.root.join(BEFORE).join(name))?);
-            moved.extend(rename_if_there(&made, &place)?);
+        let done = away.chain(into).try_for_each(|(from, to)| {
+            if rename_if_there(&from, &to)? {
+                moved.push((from, to));
+            }
             Ok(())
-        };
-        let done = names.iter().try_for_each(&mut put).and_then(|()| Ok(scene.save_manifest(manifest)?));
+        });
         if done.is_err() {
-            let back = moved.iter().rev().try_for_each(|(from, to)| std::fs::rename(to, from));
-            let manifest = earlier.map_or(Ok(()), |manifest| scene.save_manifest(&manifest));
-            self.stays = back.is_err() || manifest.is_err();
+            self.stays = moved.iter().rev().any(|(from, to)| std::fs::rename(to, from).is_err());
         }
         done
+    }
+
+    /// Puts the earlier scene back where a run was killed between the first and the last of these moves.
+    pub fn recover(scene: &SceneFolder, stage: &str, names: &[&str]) -> Result<()> {
+        let before = scene.root.join(format!("{stage}.partial")).join(BEFORE);
+        if !before.join(MANIFEST).is_file() || scene.root.join(MANIFEST).exists() {
+            return Ok(());
+        }
+        for name in names.iter().chain([&MANIFEST]) {
+            let (place, old) = (scene.root.join(name), before.join(name));
+            if old.exists() && place.exists() {
+                rename_if_there(&place, &before.join("new").join(name))?;
+            }
+            rename_if_there(&old, &place)?;
+        }
+        Ok(())
     }
 }
 
@@ -58,16 +76,16 @@ impl Drop for Aside {
     }
 }
 
-/// Renames what is there; returns both names where it did.
-fn rename_if_there(from: &Path, to: &Path) -> Result<Option<(PathBuf, PathBuf)>> {
+/// Renames what is there; whether there was anything.
+fn rename_if_there(from: &Path, to: &Path) -> Result<bool> {
     if !from.exists() {
-        return Ok(None);
+        return Ok(false);
     }
     if let Some(parent) = to.parent() {
         std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }
     std::fs::rename(from, to).map_err(Error::io(from))?;
-    Ok(Some((from.to_owned(), to.to_owned())))
+    Ok(true)
 }
 
 #[cfg(test)]
@@ -115,6 +133,17 @@ mod tests {
         std::fs::create_dir_all(aside.folder.root.join(BEFORE).join("scene.ply")).unwrap();
         aside.take_its_place(&scene, &["photos", "scene.ply"], &manifest("import")).unwrap_err();
         assert_eq!((read("photos/b.png").as_deref(), read("scene.ply").as_deref()), (Some("new"), Some("old")));
+        assert_eq!(scene.manifest().unwrap().segmenter, "sam");
+        // Killed in between: as the first run left it, with the manifest away.
+        let aside = begun();
+        std::fs::create_dir_all(aside.folder.root.join(BEFORE)).unwrap();
+        std::fs::rename(scene.root.join("photos"), aside.folder.root.join(BEFORE).join("photos")).unwrap();
+        std::fs::rename(aside.folder.root.join("photos"), scene.root.join("photos")).unwrap();
+        std::fs::rename(scene.root.join(MANIFEST), aside.folder.root.join(BEFORE).join(MANIFEST)).unwrap();
+        write(&scene, "photos/c.png", "newer");
+        std::mem::forget(aside);
+        Aside::recover(&scene, "preprocess", &["photos", "alpha"]).unwrap();
+        assert_eq!((read("photos/b.png").as_deref(), read("photos/c.png")), (Some("new"), None));
         assert_eq!(scene.manifest().unwrap().segmenter, "sam");
     }
 }

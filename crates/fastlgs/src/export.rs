@@ -196,7 +196,8 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
     if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
         bail!("{}: this is the scene itself; name another folder", root.display());
     }
-    let is_empty = root.read_dir().is_ok_and(|mut entries| entries.next().is_none());
+    // But for what a run that was killed left.
+    let is_empty = root.read_dir().is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == "export.partial"));
     if root.exists() && !is_empty && !SceneFolder::new(root).is_compact() {
         bail!("{}: not empty, and not what 'export' made of a scene; name a new folder", root.display());
     }

@@ -45,7 +45,7 @@ fn print(answer: &Report) {
     let found = answer.scenes.iter().filter(|row| row.found);
     let (count, asked, all) = (found.clone().count(), answer.scenes.len(), answer.searched.scenes);
     // The others may hold it, too.
-    let of = if count == asked && asked < all { format!("the {asked} likeliest of {all}") } else { all.to_string() };
+    let of = if count > 0 && count == asked && asked < all { format!("the {asked} likeliest of {all}") } else { all.to_string() };
     say!("\"{}\": in {count} of {of} scenes ({:.1} ms)", answer.text, answer.ms.search);
     for row in found {
         say!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);

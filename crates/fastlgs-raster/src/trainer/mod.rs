@@ -379,7 +379,7 @@ impl Trainer {
         let other = match () {
             () if course.config != self.course.config => Some("with other options"),
             () if course.views != self.course.views => Some("from other photos"),
-            () if course.shown != self.course.shown => Some("from other pictures, objects or first Gaussians"),
+            () if course.shown != 0 && course.shown != self.course.shown => Some("from other pictures, objects or first Gaussians"),
             () => None,
         };
         if let Some(other) = other {

@@ -70,6 +70,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let models = config.eyes.files()?;
     let scene = SceneFolder::new(&config.output);
     let cache = Cache::new(&scene);
+    Aside::recover(&scene, "preprocess", &LEFT)?;
     let aside = Aside::new(&scene, "preprocess")?;
     let folder = aside.folder.clone();
     let mut known = photos::load(&dataset, config, &folder, &cache, run)?;

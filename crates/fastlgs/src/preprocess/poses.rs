@@ -193,9 +193,9 @@ pub(super) fn adjust(
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<Option<Adjusted>> {
-    if photos.len() > ADJUSTED {
+    if photos.len() > ADJUSTED && asked != Poses::Refine {
         let warning = format!(
-            "poses and lenses of more than {ADJUSTED} photos are not adjusted together, which would take hours; structure from motion has done so"
+            "poses and lenses of more than {ADJUSTED} photos are adjusted only if that is asked for (--poses refine), as it takes long"
         );
         run.warn(&warning);
         warnings.push(warning);

@@ -47,6 +47,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
         );
     }
+    Aside::recover(&SceneFolder::new(&config.scene), "train", &LEFT)?;
     let folder = SceneFolder::open(&config.scene)?;
     let mut manifest = folder.manifest()?;
     let given = folder.given_cameras()?;
@@ -180,8 +181,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
 fn device(iterations: u32, run: &Run) -> Result<Choice> {
     if iterations >= WORTH_TUNING {
         match fastlgs_raster::tuning::tune(run.device, false) {
-            // Where nothing was asked for, a device that cannot be opened is none.
-            Err(error) if run.device == "auto" => run.warn(&error.to_string()),
+            // Where nothing was asked for, a device that fails is none.
+            Err(error) if run.device == "auto" => return Ok(Choice { device: "cpu".to_owned(), why: error.to_string() }),
             measured => drop(measured?),
         }
     }
