@@ -344,7 +344,10 @@ export class Stage {
       this.clickedFrom = from;
       // Only the program that serves the page weighs several.
       if (this.clicks.length > 1 && !this.scene.shared) return this.pickedTogether(this.clicks);
-      this.picked(await this.renderer.pick(this.frame(), ...place));
+      const own = this.clicks;
+      const id = await this.renderer.pick(this.frame(), ...place);
+      // Unless there was another click, or something else was asked, meanwhile.
+      if (this.clicks === own) this.picked(id);
     } catch (error) {
       this.failed(error);
     }
