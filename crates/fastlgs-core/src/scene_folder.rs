@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// What makes a folder a scene.
+pub const MANIFEST: &str = "scene.json";
+
 /// A model file that took part in making a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ModelFile {
@@ -104,7 +107,7 @@ impl SceneFolder {
     }
 
     fn manifest_path(&self) -> PathBuf {
-        self.root.join("scene.json")
+        self.root.join(MANIFEST)
     }
 
     /// The trained scene.
@@ -126,17 +129,6 @@ impl SceneFolder {
     /// The system's refusal.
     pub fn save_manifest(&self, manifest: &Manifest) -> Result<()> {
         fs::write_json(&self.manifest_path(), manifest)
-    }
-
-    /// Forgets what made the folder, which is no scene until it is saved again.
-    ///
-    /// # Errors
-    /// The system's refusal.
-    pub fn remove_manifest(&self) -> Result<()> {
-        match std::fs::remove_file(self.manifest_path()) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(Error::io(&self.manifest_path())(error)),
-            _ => Ok(()),
-        }
     }
 
     /// The trained scene in compact form.

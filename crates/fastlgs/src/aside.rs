@@ -1,14 +1,12 @@
 //! What a run makes lies aside until all of it is there: one that fails or is killed leaves the earlier scene as it was.
 
 use crate::Result;
-use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::scene_folder::{MANIFEST, Manifest};
 use fastlgs_core::{Error, SceneFolder};
 use std::path::Path;
 
 /// What the earlier scene had, until it is removed with the rest.
 const BEFORE: &str = "before";
-/// What makes a folder a scene.
-const MANIFEST: &str = "scene.json";
 
 /// A folder within the scene's, which is gone with this.
 pub(crate) struct Aside {
