@@ -30,7 +30,7 @@ pub struct Args {
     output: PathBuf,
 }
 
-/// Shares of the Gaussians that are kept, those first that some view sees best.
+/// Shares of the Gaussians that are kept, those first without which the photos would change most.
 const KEPT: [f64; 7] = [0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05];
 
 /// What `--budget auto` may lose against the full model: dB, and points of oracle mIoU.
@@ -83,7 +83,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             ply::write(&folder.ply_path(), &whole.clone().with_sh_degree(degree))?;
             add(format!("degree {degree}"), &trial.eval(&[])?, 0.0)?;
         }
-        let order = by_largest_weight(&folder, &whole)?;
+        let order = by_change(&folder, &whole)?;
         for share in &kept {
             let most = (share * whole.len() as f64).round() as usize;
             let mut keep = order[..most].to_vec();
@@ -113,14 +113,14 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
-/// Gaussians by their largest blending weight over all training views, greatest first.
-fn by_largest_weight(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
+/// Gaussians by how much the training views would change without them, most first.
+fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
     let trained = fastlgs::train::Report::of(&manifest).unwrap_or_default();
     let views: Vec<View> = manifest.training(&folder.cameras()?).iter().map(|camera| trained.view(camera, scene)).collect();
-    let largest = budget::largest_weights(scene, &views, 0.0);
+    let changes = budget::changes(scene, &views);
     let mut order: Vec<usize> = (0..scene.len()).collect();
-    order.sort_by(|a, b| largest[*b].total_cmp(&largest[*a]).then(a.cmp(b)));
+    order.sort_by(|a, b| changes[*b].total_cmp(&changes[*a]).then(a.cmp(b)));
     Ok(order)
 }
 

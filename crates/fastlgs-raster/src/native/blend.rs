@@ -240,23 +240,36 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
 }
 
 dispatched! {
-    /// Largest blending weight of each Gaussian of a tile over its pixels: `[Gaussian of the list]`, as far as the list is walked.
-    fn by_peak(job: &Job<'_>, transmittance: &mut Tile, peaks: &mut Vec<f32>) = by_peak_body
+    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour they would gain or lose without it,
+    /// `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
+    fn by_change(job: &Job<'_>, behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>) = by_change_body
 }
 
 #[inline(always)]
-fn by_peak_body<V: Vector>(job: &Job<'_>, transmittance: &mut Tile, peaks: &mut Vec<f32>) {
-    peaks.clear();
+fn by_change_body<V: Vector>(job: &Job<'_>, behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>) {
+    changes.clear();
+    let one = V::splat(1.0);
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
             let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
-            let mut largest = V::splat(0.0);
+            let values = placed.values();
+            let mut squares = V::splat(0.0);
             for p in placed.pixels.clone() {
-                largest = largest.max(taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]));
+                let alpha = placed.alphas(placed.dy(p));
+                let w = taken(alpha, &mut transmittance[p..]);
+                // What lies behind is seen as if the Gaussian let all light through.
+                let brighter = alpha.div(one.sub(alpha));
+                for (behind, value) in behind.iter_mut().zip(values) {
+                    let own = w.mul(value);
+                    let rest = V::load(&behind[p..]).sub(own);
+                    rest.store(&mut behind[p..]);
+                    let change = rest.mul(brighter).sub(own);
+                    squares = change.madd(change, squares);
+                }
             }
             let mut lanes = EMPTY;
-            largest.store(&mut lanes);
-            peaks.push(lanes[..V::LANES].iter().copied().fold(0.0, f32::max));
+            squares.store(&mut lanes);
+            changes.push(lanes[..V::LANES].iter().sum());
         }
         if finished(job, transmittance) {
             break;
@@ -340,20 +353,21 @@ mod tests {
             let shown = shown(view, &job);
             let mut blended = Blended { sums: [EMPTY; 6], transmittance: shown, walked: 0 };
             forward_body::<V, true, true>(&job, &mut blended);
+            let mut colours: [Tile; 3] = std::array::from_fn(|c| blended.sums[c]);
             let mut given = Given { gradient: blended.sums, r_dot_g: blended.transmittance, transmittance: shown, walked: blended.walked };
             let mut slots = vec![[0.0; SUMS]; job.band.gaussians.len()];
             backward_body::<V, true, true, true>(&job, &mut given, &mut slots);
-            let (mut shares, mut inside, mut peaks) = (Vec::new(), Vec::new(), Vec::new());
+            let (mut shares, mut inside, mut changes) = (Vec::new(), Vec::new(), Vec::new());
             by_id_body::<V>(&job, ids, &mut shown.clone(), &mut shares);
             by_mask_body::<V>(&job, masks, &mut shown.clone(), &mut inside);
-            by_peak_body::<V>(&job, &mut shown.clone(), &mut peaks);
+            by_change_body::<V>(&job, &mut colours, &mut shown.clone(), &mut changes);
             out.extend(blended.sums.concat());
             out.extend(blended.transmittance);
             out.extend(slots.concat());
             shares.sort_by_key(|share| share.0);
             out.extend(shares.iter().flat_map(|share| share.1));
             out.extend(inside);
-            out.extend(peaks);
+            out.extend(changes);
         }
         out
     }

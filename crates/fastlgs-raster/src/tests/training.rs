@@ -75,7 +75,7 @@ fn strategies_keep_the_budget() {
 }
 
 #[test]
-fn an_automatic_budget_removes_what_nobody_sees() {
+fn an_automatic_budget_removes_what_changes_little() {
     let (_, report) = run(TrainConfig { iterations: 800, budget: Budget::Auto(1000), ..TrainConfig::default() });
     assert_eq!(report.removals.len(), 2);
     assert!(report.removals.iter().all(|r| r.after <= r.before));

@@ -43,19 +43,22 @@ impl Trainer {
         Ok(highest)
     }
 
-    /// Removes what no training view sees.
+    /// Removes that without which the training views would hardly change.
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut state = self.engine.state()?;
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        let views: Vec<View> = self.targets.cameras.iter().map(|camera| view_of(&self.course, scene.len(), camera, 0)).collect();
-        let largest = budget::largest_weights(&scene, &views, budget::MIN_WEIGHT);
         let judges = self.judges();
+        // Where no pixel counts, nothing is known to be right.
         let psnr_before = self.quality(&judges, None)?;
-        state.keep(&budget::reaching(&largest, budget::MIN_WEIGHT));
+        let error = psnr_before.map_or(0.0, |psnr| 10f64.powf(-0.1 * psnr));
+        let degree = self.course.config.degree(self.course.iteration);
+        let views: Vec<View> = self.targets.cameras.iter().map(|camera| view_of(&self.course, scene.len(), camera, degree)).collect();
+        let values: f64 = views.iter().map(|view| 3.0 * f64::from(view.size[0]) * f64::from(view.size[1])).sum();
+        state.keep(&budget::needed(&budget::changes(&scene, &views), error * values));
         self.replace(&state)?;
         let psnr_after = self.quality(&judges, None)?;
         let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: state.len(), psnr_before, psnr_after };
-        tracing::info!(?removal, "unseen Gaussians removed");
+        tracing::info!(?removal, "Gaussians removed that change little");
         self.course.removals.push(removal);
         Ok(())
     }
