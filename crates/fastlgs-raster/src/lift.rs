@@ -80,9 +80,8 @@ pub fn changes(scene: &Gaussians, view: &View) -> Vec<f32> {
         let shown = blend::shown(view, &job);
         let mut blended = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
         blend::forward::<true, false>(&job, &mut blended);
-        let mut behind: [Tile; 3] = std::array::from_fn(|c| {
-            std::array::from_fn(|p| blended.sums[c][p] + view.background_color[c] * blended.transmittance[p])
-        });
+        let mut behind: [Tile; 3] =
+            std::array::from_fn(|c| std::array::from_fn(|p| blended.sums[c][p] + view.background_color[c] * blended.transmittance[p]));
         blend::by_change(&job, &mut behind, &mut shown.clone(), changes);
         job.gaussians().zip(changes.iter().copied()).collect::<Vec<_>>()
     };
