@@ -7,7 +7,7 @@ use crate::trial::{self, Trial, text};
 use anyhow::Result;
 use fastlgs::Run;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
-use fastlgs_raster::{View, budget};
+use fastlgs_raster::change::Changes;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -117,10 +117,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
     let trained = fastlgs::train::Report::of(&manifest).unwrap_or_default();
-    let views: Vec<View> = manifest.training(&folder.cameras()?).iter().map(|camera| trained.view(camera, scene)).collect();
-    let changes = budget::changes(scene, &views);
+    let mut changes = Changes::of(scene);
+    manifest.training(&folder.cameras()?).iter().for_each(|camera| changes.see(&trained.view(camera, scene), None));
     let mut order: Vec<usize> = (0..scene.len()).collect();
-    order.sort_by(|a, b| changes[*b].total_cmp(&changes[*a]).then(a.cmp(b)));
+    order.sort_by(|a, b| changes.each[*b].total_cmp(&changes.each[*a]).then(a.cmp(b)));
     Ok(order)
 }
 

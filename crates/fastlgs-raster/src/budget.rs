@@ -6,13 +6,10 @@
 //!
 //! *Pruning* then removes Gaussians without which the photos would hardly change: each is judged by what the training views would gain or lose
 //! without it alone (as weights of a network are in Optimal Brain Damage, LeCun et al. 1990), and those that change least go, as many as together
-//! change no more than a share, [`AFFORDABLE`], of the error that is left. So a scene that shows its photos nearly without error keeps what is faint in
+//! change no more than a share, [`AFFORDABLE`], of the squared error that is left. So a scene that shows its photos nearly without error keeps what is faint in
 //! it, and what could only fit the noise of others goes. The rest of the run refines what is left, which takes over what went: together
 //! they cost more at once than one by one, and in the end next to nothing.
 
-use crate::lift;
-use crate::view::View;
-use fastlgs_core::Gaussians;
 use serde::{Deserialize, Serialize};
 
 /// Relative growth that has to show an effect.
@@ -70,22 +67,13 @@ pub struct Removal {
     pub before: usize,
     /// Gaussians after it.
     pub after: usize,
-    /// PSNR in dB of the watched views before it; none where no view is watched.
+    /// PSNR in dB of the watched views before it, or of every tenth where none is watched; none where no pixel counts.
     pub psnr_before: Option<f64>,
     /// The same right after it, before what is left was refined.
     pub psnr_after: Option<f64>,
 }
 
-/// How much each Gaussian changes the views: the sum over all their pixels of the squares of what colour these would gain or lose without it.
-pub fn changes(scene: &Gaussians, views: &[View]) -> Vec<f32> {
-    let mut sums = vec![0.0f32; scene.len()];
-    for view in views {
-        sums.iter_mut().zip(lift::changes(scene, view)).for_each(|(sum, change)| *sum += change);
-    }
-    sums
-}
-
-/// Places of those that stay where the views' squared error is so large.
+/// Places of those that stay where so much squared error is left; all, if none were to.
 pub(crate) fn needed(changes: &[f32], squared_error: f64) -> Vec<usize> {
     let mut places: Vec<usize> = (0..changes.len()).collect();
     places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
@@ -94,7 +82,8 @@ pub(crate) fn needed(changes: &[f32], squared_error: f64) -> Vec<usize> {
         sum += f64::from(changes[i]);
         sum <= AFFORDABLE * squared_error
     });
-    let mut stay = places.split_off(removed.count());
+    let removed = removed.count();
+    let mut stay = places.split_off(if removed < changes.len() { removed } else { 0 });
     stay.sort_unstable();
     stay
 }
@@ -102,7 +91,9 @@ pub(crate) fn needed(changes: &[f32], squared_error: f64) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fastlgs_core::Camera;
+    use crate::change::Changes;
+    use crate::view::View;
+    use fastlgs_core::{Camera, Gaussians};
     use glam::Vec3;
 
     #[test]
@@ -127,7 +118,11 @@ mod tests {
         scene.push_sphere(Vec3::Z * 0.3, 0.05, 0.99, [0.9; 3]);
         scene.push_sphere(Vec3::new(0.5, 0.5, 0.0), 0.05, 0.01, [0.5; 3]);
         let [camera, other] = [camera, other].map(|c| View::new(&c, scene.len(), 0));
-        let (one, both) = (changes(&scene, &[camera]), changes(&scene, &[camera, other]));
+        let mut changes = Changes::of(&scene);
+        changes.see(&camera, None);
+        let one = changes.each.clone();
+        changes.see(&other, None);
+        let both = changes.each;
         // From one side the small one is hidden; the faint one is seen from both, but hardly.
         assert!(one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3], "{one:?} {both:?}");
         let error = f64::from(both[4]) / AFFORDABLE;
@@ -142,5 +137,6 @@ mod tests {
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], error), [0, 4]);
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "what nobody sees goes in any case");
         assert_eq!(needed(&[0.3; 5], error), [3, 4], "of equals the first");
+        assert_eq!(needed(&[0.3; 3], error), [0, 1, 2], "where all could go, it is the judgement that is wrong");
     }
 }

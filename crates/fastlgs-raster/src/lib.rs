@@ -9,6 +9,7 @@
 
 pub mod align;
 pub mod budget;
+pub mod change;
 mod channels;
 mod checkpoint;
 pub mod cpu;

@@ -1,6 +1,6 @@
 //! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
 
-use crate::native::blend::{self, Blended, Job, Tile};
+use crate::native::blend::{self, Job, Tile};
 use crate::native::{self, Lists};
 use crate::view::{TILE, View};
 use fastlgs_core::{Gaussians, LabelMap};
@@ -72,33 +72,9 @@ fn lists_of(scene: &Gaussians, view: &View) -> Lists {
     Lists::new(view, &native::transposed(&scene.to_channels(), scene.len()))
 }
 
-/// How much each Gaussian changes a view: the sum over its pixels of the squares of what colour they would gain or lose without it.
-pub fn changes(scene: &Gaussians, view: &View) -> Vec<f32> {
-    let lists = lists_of(scene, view);
-    let of_tile = |changes: &mut Vec<f32>, tile: usize| {
-        let job = Job::new(view, tile, &lists);
-        let shown = blend::shown(view, &job);
-        let mut blended = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
-        blend::forward::<true, false>(&job, &mut blended);
-        let mut behind: [Tile; 3] =
-            std::array::from_fn(|c| std::array::from_fn(|p| blended.sums[c][p] + view.background_color[c] * blended.transmittance[p]));
-        blend::by_change(&job, &mut behind, &mut shown.clone(), changes);
-        job.gaussians().zip(changes.iter().copied()).collect::<Vec<_>>()
-    };
-    let tiles: Vec<Vec<(u32, f32)>> = (0..view.tile_count() as usize).into_par_iter().map_init(Vec::new, of_tile).collect();
-    let mut sums = vec![0.0f32; scene.len()];
-    for (gaussian, change) in tiles.into_iter().flatten() {
-        sums[gaussian as usize] += change;
-    }
-    sums
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::density::State;
-    use crate::tests::{camera, cloud};
-    use crate::{Channels, CpuEngine, Engine};
     use fastlgs_core::Camera;
     use glam::Vec3;
 
@@ -114,25 +90,5 @@ mod tests {
         let of = |g: u32, l: u16| votes.iter().find(|v| (v.gaussian, v.label) == (g, l)).map_or(0.0, |v| v.weight);
         assert!((of(0, 1) - of(0, 2)).abs() < 0.01 * of(0, 1), "the border cuts it in halves");
         assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden one has little to say");
-    }
-
-    #[test]
-    fn a_change_is_what_a_picture_loses_without_one_of_its_gaussians() {
-        let scene = cloud(60, 3, 1, false);
-        let view = |gaussians| View { background_color: [0.2, 0.4, 0.6, 0.0], ..View::new(&camera(61, 45), gaussians, 1) };
-        let rendered = |scene: &Gaussians| {
-            let mut engine = CpuEngine::new();
-            engine.set_state(&State::of(scene)).unwrap();
-            engine.render(view(scene.len()), Channels::Color).unwrap().channels(0, 3).to_vec()
-        };
-        let whole = rendered(&scene);
-        let changes = changes(&scene, &view(scene.len()));
-        assert!(changes.iter().filter(|c| **c > 0.1).count() > 20, "{changes:?}");
-        for (i, told) in changes.iter().enumerate() {
-            let others: Vec<usize> = (0..scene.len()).filter(|k| *k != i).collect();
-            let without = rendered(&scene.select(&others));
-            let square: f32 = whole.iter().zip(&without).map(|(a, b)| (a - b).powi(2)).sum();
-            assert!((told - square).abs() <= 1e-3 * square + 1e-4, "Gaussian {i}: {told} told, {square} measured");
-        }
     }
 }

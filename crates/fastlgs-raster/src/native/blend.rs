@@ -6,7 +6,7 @@ use crate::cpu::{ALPHA_MAX, ALPHA_MIN, BATCH, Splat};
 use crate::view::View;
 
 /// Pixels along a tile's edge.
-const EDGE: usize = crate::view::TILE as usize;
+pub const EDGE: usize = crate::view::TILE as usize;
 
 /// A value for each pixel of a tile, row by row.
 pub type Tile = [f32; EDGE * EDGE];
@@ -240,13 +240,20 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
 }
 
 dispatched! {
-    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour they would gain or lose without it,
-    /// `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
-    fn by_change(job: &Job<'_>, behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>) = by_change_body
+    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour they would gain or lose without it, times
+    /// `brightness`, `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
+    fn by_change(job: &Job<'_>, brightness: &[Tile; 3], behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>)
+        = by_change_body
 }
 
 #[inline(always)]
-fn by_change_body<V: Vector>(job: &Job<'_>, behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>) {
+fn by_change_body<V: Vector>(
+    job: &Job<'_>,
+    brightness: &[Tile; 3],
+    behind: &mut [Tile; 3],
+    transmittance: &mut Tile,
+    changes: &mut Vec<f32>,
+) {
     changes.clear();
     let one = V::splat(1.0);
     for batch in job.list.chunks(BATCH) {
@@ -258,12 +265,12 @@ fn by_change_body<V: Vector>(job: &Job<'_>, behind: &mut [Tile; 3], transmittanc
                 let alpha = placed.alphas(placed.dy(p));
                 let w = taken(alpha, &mut transmittance[p..]);
                 // What lies behind is seen as if the Gaussian let all light through.
-                let brighter = alpha.div(one.sub(alpha));
-                for (behind, value) in behind.iter_mut().zip(values) {
+                let more = alpha.div(one.sub(alpha));
+                for ((behind, brightness), value) in behind.iter_mut().zip(brightness).zip(values) {
                     let own = w.mul(value);
                     let rest = V::load(&behind[p..]).sub(own);
                     rest.store(&mut behind[p..]);
-                    let change = rest.mul(brighter).sub(own);
+                    let change = rest.mul(more).sub(own).mul(V::load(&brightness[p..]));
                     squares = change.madd(change, squares);
                 }
             }
@@ -360,7 +367,7 @@ mod tests {
             let (mut shares, mut inside, mut changes) = (Vec::new(), Vec::new(), Vec::new());
             by_id_body::<V>(&job, ids, &mut shown.clone(), &mut shares);
             by_mask_body::<V>(&job, masks, &mut shown.clone(), &mut inside);
-            by_change_body::<V>(&job, &mut colours, &mut shown.clone(), &mut changes);
+            by_change_body::<V>(&job, &[shown; 3], &mut colours, &mut shown.clone(), &mut changes);
             out.extend(blended.sums.concat());
             out.extend(blended.transmittance);
             out.extend(slots.concat());

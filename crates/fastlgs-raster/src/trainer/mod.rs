@@ -56,6 +56,8 @@ pub struct TrainReport {
     pub gaussians: usize,
     /// What the automatic budget removed.
     pub removals: Vec<Removal>,
+    /// Seconds, of those above, in which it was chosen.
+    pub removal_seconds: f64,
     /// Colour and feature behind everything.
     pub background: [f32; 6],
     /// What the watched views gained by aligning their poses, in dB, where that was looked at.
@@ -278,6 +280,7 @@ impl Trainer {
         let mut started = Instant::now();
         // Time of what `report` does is not the run's.
         let mut aside = 0.0;
+        let mut removal_seconds = 0.0;
         while self.course.iteration < self.course.config.iterations {
             self.step()?;
             let iteration = self.course.iteration;
@@ -300,7 +303,9 @@ impl Trainer {
                 self.align()?;
             }
             if self.course.config.prunes(iteration) {
+                let removing = Instant::now();
                 self.prune()?;
+                removal_seconds += removing.elapsed().as_secs_f64();
             }
             if iteration.is_multiple_of(20) {
                 let losses = self.engine.losses()?;
@@ -324,6 +329,7 @@ impl Trainer {
             iterations_per_second: f64::from(steps.saturating_sub(1)) / seconds.max(1e-9),
             gaussians: self.engine.len(),
             removals: self.course.removals.clone(),
+            removal_seconds,
             background: self.course.background.values,
             alignment_gain: self.course.alignment_gain,
             adapter: self.engine.name(),

@@ -4,9 +4,9 @@
 use super::{Trainer, view_of};
 use crate::Result;
 use crate::budget::{self, Removal};
+use crate::change::Changes;
 use crate::schedule::Budget;
 use crate::target::Targets;
-use crate::view::View;
 use fastlgs_core::Gaussians;
 
 impl Trainer {
@@ -46,15 +46,17 @@ impl Trainer {
     /// Removes that without which the training views would hardly change.
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut state = self.engine.state()?;
+        state.keep_finite();
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        let judges = self.judges();
-        // Where no pixel counts, nothing is known to be right.
-        let psnr_before = self.quality(&judges, None)?;
-        let error = psnr_before.map_or(0.0, |psnr| 10f64.powf(-0.1 * psnr));
         let degree = self.course.config.degree(self.course.iteration);
-        let views: Vec<View> = self.targets.cameras.iter().map(|camera| view_of(&self.course, scene.len(), camera, degree)).collect();
-        let values: f64 = views.iter().map(|view| 3.0 * f64::from(view.size[0]) * f64::from(view.size[1])).sum();
-        state.keep(&budget::needed(&budget::changes(&scene, &views), error * values));
+        let mut changes = Changes::of(&scene);
+        for id in 0..self.targets.len() {
+            let target = self.targets.get(id)?;
+            changes.see(&view_of(&self.course, scene.len(), &target.camera, degree), Some((&target.image, self.exposure(id))));
+        }
+        let judges = self.judges();
+        let psnr_before = self.quality(&judges, None)?;
+        state.keep(&budget::needed(&changes.each, changes.error));
         self.replace(&state)?;
         let psnr_after = self.quality(&judges, None)?;
         let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: state.len(), psnr_before, psnr_after };

@@ -39,12 +39,12 @@ pub fn fitted(
         None => {
             // Algorithm 1 is done by now, and so are objects that are kept.
             let mapping = if config.mapping == Mapping::Global { objects::seconds_of_embedding(folder, training)? } else { 0.0 };
-            let step = GROWTH * trial(config, folder, manifest, targets, run)?;
+            let [step, removals] = trial(config, folder, manifest, targets, run)?.map(|seconds| GROWTH * seconds);
             // What the trial took is gone as well.
-            let fit = (60.0 * minutes - began.elapsed().as_secs_f64() - mapping) / step;
-            tracing::info!(minutes, mapping, milliseconds_a_step = 1e3 * step, fit, "what fits");
+            let fit = (60.0 * minutes - began.elapsed().as_secs_f64() - mapping - removals) / step;
+            tracing::info!(minutes, mapping, removals, milliseconds_a_step = 1e3 * step, fit, "what fits");
             if fit < f64::from(FEWEST) {
-                let (left, needed) = (minutes.max(0.0), (mapping + step * f64::from(FEWEST)) / 60.0);
+                let (left, needed) = (minutes.max(0.0), (mapping + removals + step * f64::from(FEWEST)) / 60.0);
                 run.warn(&format!(
                     "{left:.1} minutes are left for training, too few for these photos on this machine: {FEWEST} iterations take about {needed:.1}"
                 ));
@@ -63,8 +63,8 @@ fn rounded(iterations: f64) -> u32 {
     ((iterations / 100.0).floor() as u32 * 100).clamp(FEWEST, MOST)
 }
 
-/// Seconds that an iteration of the trial takes.
-fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &Targets, run: &Run) -> Result<f64> {
+/// Seconds that an iteration of the trial takes, and those in which it was chosen what to remove: that is done twice a run, however long it is.
+fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &Targets, run: &Run) -> Result<[f64; 2]> {
     let short = Config { iterations: Some(TRIAL), ..config.clone() };
     let first = start::gaussians(&short, folder, targets, run)?;
     let light = Brightness::of(manifest);
@@ -73,7 +73,7 @@ fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &T
     let work = run.work("trial", u64::from(TRIAL));
     let mut trainer = Trainer::new(engine, &first, targets.clone(), settings)?;
     let result = trainer.run(None, |_, _| work.check())?;
-    Ok(1.0 / result.iterations_per_second)
+    Ok([(result.seconds - result.removal_seconds) / f64::from(result.steps_here), result.removal_seconds])
 }
 
 #[cfg(test)]
