@@ -6,7 +6,7 @@
 //!
 //! *Pruning* then removes Gaussians without which the photos would hardly change: each is judged by what the training views would gain or lose
 //! without it alone (as weights of a network are in Optimal Brain Damage, LeCun et al. 1990), and those that change least go, as many as together
-//! change no more than a share, [`AFFORDABLE`], of the squared error that is left. So a scene that shows its photos nearly without error keeps what is faint in
+//! change no more than a share, `AFFORDABLE`, of the squared error that is left. So a scene that shows its photos nearly without error keeps what is faint in
 //! it, and what could only fit the noise of others goes. The rest of the run refines what is left, which takes over what went: together
 //! they cost more at once than one by one, and in the end next to nothing.
 
