@@ -16,8 +16,11 @@ use serde::{Deserialize, Serialize};
 const GROWTH: f64 = 0.1;
 /// Least gain on the watched views, in dB, for twice as many Gaussians.
 const GAIN: f64 = 0.5;
-/// How much all that is removed at once may change the training views, as a share of their squared error.
-const AFFORDABLE: f64 = 0.05;
+/// How much all that is removed at once may change the training views, one by one, as a share of their squared error.
+pub(crate) const AFFORDABLE: f64 = 0.05;
+/// How many dB a removal may cost at once: as much as twice the squared error. Where a scene shows its photos badly nearly all of it would be
+/// affordable, and what each of many hides or holds back adds up to more than each alone.
+pub(crate) const AT_ONCE: f64 = 3.01;
 /// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
 pub const DEGREE_LOSS: f64 = 0.02;
 /// Every so many training views one is watched.
@@ -73,14 +76,14 @@ pub struct Removal {
     pub psnr_after: Option<f64>,
 }
 
-/// Places of those that stay where so much squared error is left; all, if none were to.
-pub(crate) fn needed(changes: &[f32], squared_error: f64) -> Vec<usize> {
+/// Places of those that stay where so much squared error is affordable; all, if none were to.
+pub(crate) fn needed(changes: &[f32], affordable: f64) -> Vec<usize> {
     let mut places: Vec<usize> = (0..changes.len()).collect();
     places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
     let mut sum = 0.0;
     let removed = places.iter().take_while(|&&i| {
         sum += f64::from(changes[i]);
-        sum <= AFFORDABLE * squared_error
+        sum <= affordable
     });
     let removed = removed.count();
     let mut stay = places.split_off(if removed < changes.len() { removed } else { 0 });
@@ -125,7 +128,7 @@ mod tests {
         let both = changes.each;
         // From one side the small one is hidden; the faint one is seen from both, but hardly.
         assert!(one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3], "{one:?} {both:?}");
-        let error = f64::from(both[4]) / AFFORDABLE;
+        let error = f64::from(both[4]);
         assert_eq!(needed(&one, 2.0 * error), [0, 1, 2]);
         assert_eq!(needed(&both, 2.0 * error), [0, 1, 2, 3]);
         assert_eq!(needed(&both, 0.5 * error), [0, 1, 2, 3, 4]);
@@ -133,7 +136,7 @@ mod tests {
 
     #[test]
     fn what_goes_adds_up_to_what_is_affordable() {
-        let error = 1.0 / AFFORDABLE;
+        let error = 1.0;
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], error), [0, 4]);
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "what nobody sees goes in any case");
         assert_eq!(needed(&[0.3; 5], error), [3, 4], "of equals the first");

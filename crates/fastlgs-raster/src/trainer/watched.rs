@@ -56,9 +56,20 @@ impl Trainer {
         }
         let judges = self.judges();
         let psnr_before = self.quality(&judges, None)?;
-        state.keep(&budget::needed(&changes.each, changes.error));
-        self.replace(&state)?;
-        let psnr_after = self.quality(&judges, None)?;
+        let whole = state.clone();
+        let mut affordable = budget::AFFORDABLE * changes.error;
+        let psnr_after = loop {
+            state.keep(&budget::needed(&changes.each, affordable));
+            self.replace(&state)?;
+            let psnr_after = self.quality(&judges, None)?;
+            let lost = psnr_before.zip(psnr_after).map_or(0.0, |(before, after)| before - after);
+            if lost <= budget::AT_ONCE || state.len() == whole.len() {
+                break psnr_after;
+            }
+            state = whole.clone();
+            // In the end nothing goes.
+            affordable = if affordable < 1e-4 * changes.error { -1.0 } else { 0.5 * affordable };
+        };
         let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: state.len(), psnr_before, psnr_after };
         tracing::info!(?removal, "Gaussians removed that change little");
         self.course.removals.push(removal);
