@@ -6,7 +6,7 @@
 //!
 //! *Pruning* then removes Gaussians without which the photos would hardly change: each is judged by what the training views would gain or lose
 //! without it alone (as weights of a network are in Optimal Brain Damage, LeCun et al. 1990), and those that change least go, as many as together
-//! change no more than a share, `AFFORDABLE`, of the squared error that is left. So a scene that shows its photos nearly without error keeps what is faint in
+//! change no more than a share, `AFFORDABLE`, of the squared error that is left, or fewer where that costs more than `AT_ONCE`. So a scene that shows its photos nearly without error keeps what is faint in
 //! it, and what could only fit the noise of others goes. The rest of the run refines what is left, which takes over what went: together
 //! they cost more at once than one by one, and in the end next to nothing.
 
@@ -17,10 +17,12 @@ const GROWTH: f64 = 0.1;
 /// Least gain on the watched views, in dB, for twice as many Gaussians.
 const GAIN: f64 = 0.5;
 /// How much all that is removed at once may change the training views, one by one, as a share of their squared error.
-pub(crate) const AFFORDABLE: f64 = 0.05;
+const AFFORDABLE: f64 = 0.05;
 /// How many dB a removal may cost at once: as much as twice the squared error. Where a scene shows its photos badly nearly all of it would be
 /// affordable, and what each of many hides or holds back adds up to more than each alone.
-pub(crate) const AT_ONCE: f64 = 3.01;
+const AT_ONCE: f64 = 3.01;
+/// How often the share is halved until nothing goes.
+const HALVINGS: usize = 9;
 /// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
 pub const DEGREE_LOSS: f64 = 0.02;
 /// Every so many training views one is watched.
@@ -76,8 +78,21 @@ pub struct Removal {
     pub psnr_after: Option<f64>,
 }
 
+impl Removal {
+    /// Whether it cost no more than it may at once, as far as that is known.
+    pub(crate) fn is_bearable(&self) -> bool {
+        self.psnr_before.zip(self.psnr_after).is_none_or(|(before, after)| before - after <= AT_ONCE)
+    }
+}
+
+/// Places of those that may stay where so much squared error is left: the fewest first, in the end all.
+pub(crate) fn candidates(changes: &[f32], squared_error: f64) -> impl Iterator<Item = Vec<usize>> {
+    let shares = std::iter::successors(Some(AFFORDABLE), |share| Some(0.5 * share)).take(1 + HALVINGS);
+    shares.map(move |share| needed(changes, share * squared_error)).chain(std::iter::once_with(|| (0..changes.len()).collect()))
+}
+
 /// Places of those that stay where so much squared error is affordable; all, if none were to.
-pub(crate) fn needed(changes: &[f32], affordable: f64) -> Vec<usize> {
+fn needed(changes: &[f32], affordable: f64) -> Vec<usize> {
     let mut places: Vec<usize> = (0..changes.len()).collect();
     places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
     let mut sum = 0.0;
@@ -135,11 +150,22 @@ mod tests {
     }
 
     #[test]
+    fn less_and_less_goes_until_a_removal_is_bearable() {
+        let changes: Vec<f32> = (0..100).map(|i| 0.01 * i as f32).collect();
+        let stay: Vec<usize> = candidates(&changes, 100.0).map(|places| places.len()).collect();
+        assert_eq!(stay.len(), 2 + HALVINGS);
+        assert!(stay.is_sorted() && stay[0] < stay[1], "{stay:?}");
+        assert_eq!(stay[1 + HALVINGS], 100, "in the end nothing goes");
+        let removal = |psnr_after| Removal { iteration: 1, before: 2, after: 1, psnr_before: Some(20.0), psnr_after };
+        let bearable = [Some(17.5), Some(16.5), None].map(|after| removal(after).is_bearable());
+        assert_eq!(bearable, [true, false, true]);
+    }
+
+    #[test]
     fn what_goes_adds_up_to_what_is_affordable() {
-        let error = 1.0;
-        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], error), [0, 4]);
+        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 1.0), [0, 4]);
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "what nobody sees goes in any case");
-        assert_eq!(needed(&[0.3; 5], error), [3, 4], "of equals the first");
-        assert_eq!(needed(&[0.3; 3], error), [0, 1, 2], "where all could go, it is the judgement that is wrong");
+        assert_eq!(needed(&[0.3; 5], 1.0), [3, 4], "of equals the first");
+        assert_eq!(needed(&[0.3; 3], 1.0), [0, 1, 2], "where all could go, it is the judgement that is wrong");
     }
 }

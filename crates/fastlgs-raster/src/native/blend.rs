@@ -240,8 +240,8 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
 }
 
 dispatched! {
-    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour they would gain or lose without it, times
-    /// `brightness`, `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
+    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour, times `brightness`, they would gain or lose without
+    /// it, `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
     fn by_change(job: &Job<'_>, brightness: &[Tile; 3], behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>)
         = by_change_body
 }

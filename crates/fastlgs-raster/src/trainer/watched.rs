@@ -1,10 +1,11 @@
-//! What views that are watched, and not trained on while the scene grows, decide: whether it may grow on, what may be removed, and how
+//! What views that are watched, and not trained on while the scene grows, decide: whether it may grow on, whether a removal is bearable, and how
 //! many SH degrees it needs.
 
 use super::{Trainer, view_of};
 use crate::Result;
 use crate::budget::{self, Removal};
 use crate::change::Changes;
+use crate::density::State;
 use crate::schedule::Budget;
 use crate::target::Targets;
 use fastlgs_core::Gaussians;
@@ -45,8 +46,29 @@ impl Trainer {
 
     /// Removes that without which the training views would hardly change.
     pub(super) fn prune(&mut self) -> Result<()> {
-        let mut state = self.engine.state()?;
-        state.keep_finite();
+        let mut whole = self.engine.state()?;
+        whole.keep_finite();
+        let changes = self.changes(&whole)?;
+        let judges = self.judges();
+        let psnr_before = self.quality(&judges, None)?;
+        let mut removal =
+            Removal { iteration: self.course.iteration, before: whole.len(), after: whole.len(), psnr_before, psnr_after: None };
+        for places in budget::candidates(&changes.each, changes.error) {
+            let mut state = whole.clone();
+            state.keep(&places);
+            self.replace(&state)?;
+            (removal.after, removal.psnr_after) = (state.len(), self.quality(&judges, None)?);
+            if removal.is_bearable() {
+                break;
+            }
+        }
+        tracing::info!(?removal, "Gaussians removed that change little");
+        self.course.removals.push(removal);
+        Ok(())
+    }
+
+    /// What the training views tell of each Gaussian.
+    fn changes(&self, state: &State) -> Result<Changes> {
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let degree = self.course.config.degree(self.course.iteration);
         let mut changes = Changes::of(&scene);
@@ -54,31 +76,39 @@ impl Trainer {
             let target = self.targets.get(id)?;
             changes.see(&view_of(&self.course, scene.len(), &target.camera, degree), Some((&target.image, self.exposure(id))));
         }
-        let judges = self.judges();
-        let psnr_before = self.quality(&judges, None)?;
-        let whole = state.clone();
-        let mut affordable = budget::AFFORDABLE * changes.error;
-        let psnr_after = loop {
-            state.keep(&budget::needed(&changes.each, affordable));
-            self.replace(&state)?;
-            let psnr_after = self.quality(&judges, None)?;
-            let lost = psnr_before.zip(psnr_after).map_or(0.0, |(before, after)| before - after);
-            if lost <= budget::AT_ONCE || state.len() == whole.len() {
-                break psnr_after;
-            }
-            state = whole.clone();
-            // In the end nothing goes.
-            affordable = if affordable < 1e-4 * changes.error { -1.0 } else { 0.5 * affordable };
-        };
-        let removal = Removal { iteration: self.course.iteration, before: scene.len(), after: state.len(), psnr_before, psnr_after };
-        tracing::info!(?removal, "Gaussians removed that change little");
-        self.course.removals.push(removal);
-        Ok(())
+        Ok(changes)
     }
 
     /// The views that tell what a removal costs: the watched ones, else some of all.
     pub(super) fn judges(&self) -> Targets {
         let watched = self.watched();
         if watched.is_empty() { self.targets.some((0..self.targets.len()).step_by(budget::WATCHED).collect()) } else { watched }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{CpuEngine, Target, TargetImage, TrainConfig, pack};
+    use fastlgs_core::Camera;
+    use glam::Vec3;
+
+    #[test]
+    fn of_two_that_hide_each_other_one_stays() {
+        let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let mut scene = Gaussians::default();
+        // Alone, neither of the large ones is missed, and both could afford to go; the small one is.
+        scene.push_sphere(Vec3::ZERO, 3.0, 0.99, [0.5; 3]);
+        scene.push_sphere(Vec3::ZERO, 3.0, 0.99, [0.5; 3]);
+        scene.push_sphere(Vec3::NEG_Z, 0.1, 0.99, [0.9; 3]);
+        let counts = |p: i32| (p % 64 - 32).pow(2) + (p / 64 - 24).pow(2) < 12 * 12;
+        let color = (0..64 * 48).map(|p| pack([180; 3], counts(p))).collect();
+        let target = Target { camera, image: TargetImage { size: [64, 48], color, feature: Vec::new() }, gain: [1.0; 3] };
+        let config = TrainConfig { budget: Budget::Auto(10), ..TrainConfig::default() };
+        let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &scene, vec![target], config).unwrap();
+        trainer.prune().unwrap();
+        let removal = trainer.course.removals[0];
+        assert_eq!((removal.before, removal.after), (3, 2), "{removal:?}");
+        assert!((removal.psnr_before.unwrap() - removal.psnr_after.unwrap()).abs() < 1.0, "{removal:?}");
     }
 }
