@@ -1,20 +1,36 @@
-// Histogram of one 8-bit digit for each chunk: histogram [256][CHUNKS].
+// Histogram of one 8-bit digit for each chunk: histogram [256][chunks].
 #import chunks
+#import flat
 
 @group(0) @binding(0) var<uniform> job: Job;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read_write> histogram: array<u32>;
 
+#ifdef WIDE
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    let t = id.x;
+    let chunk = chunk_of(id.x, job);
     for (var d = 0u; d < 256u; d++) {
-        histogram[d * CHUNKS + t] = 0u;
+        histogram[d * job.chunks + chunk.number] = 0u;
     }
-    let length = chunk_length(job.n);
-    let end = min(job.n, (t + 1u) * length);
-    for (var i = t * length; i < end; i++) {
-        let d = (keys[i] >> job.shift) & 255u;
-        histogram[d * CHUNKS + t] += 1u;
+    for (var i = chunk.start; i < chunk.end; i++) {
+        histogram[digit_of(keys[i], job) * job.chunks + chunk.number] += 1u;
     }
 }
+#else
+var<workgroup> counts: array<atomic<u32>, 256>;
+
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let chunk = chunk_of(flat_group(group, groups), job);
+    atomicStore(&counts[lane], 0u);
+    workgroupBarrier();
+    for (var i = chunk.start + lane; i < chunk.end; i += 256u) {
+        atomicAdd(&counts[digit_of(keys[i], job)], 1u);
+    }
+    workgroupBarrier();
+    if chunk.number < job.chunks {
+        histogram[lane * job.chunks + chunk.number] = atomicLoad(&counts[lane]);
+    }
+}
+#endif

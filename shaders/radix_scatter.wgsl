@@ -1,5 +1,6 @@
 // Moves each (key, value) to its place for one digit; stable. `histogram` holds exclusive prefix sums on entry.
 #import chunks
+#import flat
 
 @group(0) @binding(0) var<uniform> job: Job;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
@@ -8,17 +9,71 @@
 @group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(5) var<storage, read_write> values_out: array<u32>;
 
+fn move_item(i: u32, key: u32, to: u32) {
+    keys_out[to] = key;
+    values_out[to] = select(values[i], i, job.first == 1u);
+}
+
+#ifdef WIDE
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    let t = id.x;
-    let length = chunk_length(job.n);
-    let end = min(job.n, (t + 1u) * length);
-    for (var i = t * length; i < end; i++) {
+    let chunk = chunk_of(id.x, job);
+    for (var i = chunk.start; i < chunk.end; i++) {
         let key = keys[i];
-        let slot = ((key >> job.shift) & 255u) * CHUNKS + t;
+        let slot = digit_of(key, job) * job.chunks + chunk.number;
         let to = histogram[slot];
         histogram[slot] = to + 1u;
-        keys_out[to] = key;
-        values_out[to] = select(values[i], i, job.first == 1u);
+        move_item(i, key, to);
     }
 }
+#else
+// Where the next key of each digit goes.
+var<workgroup> next: array<u32, 256>;
+// The invocations that hold a key of each digit, as 256 bits.
+var<workgroup> holders: array<atomic<u32>, 2048>;
+
+// 256 keys at a time, one for each invocation: its place among those of its digit is the number of invocations before it that hold one.
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let chunk = chunk_of(flat_group(group, groups), job);
+    if chunk.number >= job.chunks {
+        return;
+    }
+    next[lane] = histogram[lane * job.chunks + chunk.number];
+    for (var word = 0u; word < 8u; word++) {
+        atomicStore(&holders[8u * lane + word], 0u);
+    }
+    let own_word = lane / 32u;
+    let own_bit = 1u << (lane % 32u);
+    for (var start = chunk.start; start < chunk.end; start += 256u) {
+        workgroupBarrier();
+        let i = start + lane;
+        let holds = i < chunk.end;
+        var key = 0u;
+        if holds {
+            key = keys[i];
+            atomicOr(&holders[8u * digit_of(key, job) + own_word], own_bit);
+        }
+        workgroupBarrier();
+        let digit = digit_of(key, job);
+        var before = 0u;
+        var all = 0u;
+        for (var word = 0u; word < 8u; word++) {
+            let bits = atomicLoad(&holders[8u * digit + word]);
+            before += countOneBits(select(select(0u, bits & (own_bit - 1u), word == own_word), bits, word < own_word));
+            all += countOneBits(bits);
+        }
+        if holds {
+            move_item(i, key, next[digit] + before);
+        }
+        workgroupBarrier();
+        // The last of a digit makes way for the next round.
+        if holds && before + 1u == all {
+            next[digit] += all;
+            for (var word = 0u; word < 8u; word++) {
+                atomicStore(&holders[8u * digit + word], 0u);
+            }
+        }
+    }
+}
+#endif

@@ -1,25 +1,65 @@
-// Second step: replaces items by their exclusive prefix sums; the grand total goes to totals[CHUNKS].
-// Each invocation adds up the totals before it: cheaper than a third pass.
-#import chunks
+// Second step: replaces items by their exclusive prefix sums; the grand total goes to totals[chunks].
+// Each chunk adds up the totals before it: cheaper than a third pass.
+#import prefix
+#import flat
 
 @group(0) @binding(0) var<uniform> job: Job;
 @group(0) @binding(1) var<storage, read_write> items: array<u32>;
 @group(0) @binding(2) var<storage, read_write> totals: array<u32>;
 
+// Replaces the items of [start, end), before which there is `sum`; returns what there is before the one after.
+fn replace(start: u32, end: u32, sum: u32) -> u32 {
+    var before = sum;
+    for (var i = start; i < end; i++) {
+        let item = items[i];
+        items[i] = before;
+        before = saturating(before, item);
+    }
+    return before;
+}
+
+#ifdef WIDE
 @compute @workgroup_size(64)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    let length = chunk_length(job.n);
-    let end = min(job.n, (id.x + 1u) * length);
+    let chunk = chunk_of(id.x, job);
     var sum = 0u;
-    for (var t = 0u; t < id.x; t++) {
+    for (var t = 0u; t < chunk.number; t++) {
         sum = saturating(sum, totals[t]);
     }
-    for (var i = id.x * length; i < end; i++) {
-        let item = items[i];
-        items[i] = sum;
-        sum = saturating(sum, item);
-    }
-    if id.x == CHUNKS - 1u {
-        totals[CHUNKS] = sum;
+    sum = replace(chunk.start, chunk.end, sum);
+    if chunk.number == job.chunks - 1u {
+        totals[job.chunks] = sum;
     }
 }
+#else
+@compute @workgroup_size(256)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    let chunk = chunk_of(flat_group(group, groups), job);
+    if chunk.number >= job.chunks {
+        return;
+    }
+    var sum = 0u;
+    for (var t = lane; t < chunk.number; t += 256u) {
+        sum = saturating(sum, totals[t]);
+    }
+    let before = group_sum(sum, lane);
+    // Each invocation has a run of the chunk.
+    let length = (chunk.end - chunk.start + 255u) / 256u;
+    let start = min(chunk.end, chunk.start + lane * length);
+    let end = min(chunk.end, start + length);
+    var own = 0u;
+    for (var i = start; i < end; i++) {
+        own = saturating(own, items[i]);
+    }
+    add_up(own, lane);
+    // What lies before a run is the sum of those up to the one before it.
+    var earlier = 0u;
+    if lane > 0u {
+        earlier = prefix_sums[lane - 1u];
+    }
+    let after = replace(start, end, saturating(before, earlier));
+    if lane == 255u && chunk.number == job.chunks - 1u {
+        totals[job.chunks] = after;
+    }
+}
+#endif

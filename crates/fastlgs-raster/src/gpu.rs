@@ -5,6 +5,11 @@ use crate::shape::Shape;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
 
+/// Bytes between two uniforms: what every adapter can bind at.
+pub(crate) const UNIFORM_SLOT: u64 = 256;
+/// Uniforms of one submission.
+pub(crate) const UNIFORM_SLOTS: u64 = 256;
+
 /// An opened device.
 pub struct Gpu {
     /// The logical device.
@@ -25,6 +30,8 @@ pub struct Gpu {
     pub max_binding: u64,
     /// Times of the passes, where asked for.
     pub(crate) profile: Option<Profile>,
+    /// Uniforms of the passes of one submission, in slots.
+    pub(crate) uniforms: wgpu::Buffer,
     /// Where the last reading went through.
     staging: Mutex<Option<wgpu::Buffer>>,
     /// First error that no one caught (out of memory, lost device).
@@ -101,6 +108,12 @@ impl Gpu {
         };
         let failed = |reason: String| Error::Device { device: info.name.clone(), reason };
         let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|e| failed(e.to_string()))?;
+        let uniforms = device.create_buffer(&wgpu::BufferDescriptor {
+            label: Some("uniforms"),
+            size: UNIFORM_SLOTS * UNIFORM_SLOT,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
         let failure = Arc::new(Mutex::new(None));
         let slot = failure.clone();
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
@@ -120,6 +133,7 @@ impl Gpu {
             software,
             max_binding: limits.max_storage_buffer_binding_size,
             profile: None,
+            uniforms,
             staging: Mutex::new(None),
             failure,
         })
@@ -157,18 +171,6 @@ impl Gpu {
         let buffer = self.storage(what, bytes.len() as u64)?;
         self.queue.write_buffer(&buffer, 0, bytes);
         Ok(buffer)
-    }
-
-    /// A uniform buffer with the given content.
-    pub fn uniform<T: bytemuck::Pod>(&self, value: &T) -> wgpu::Buffer {
-        let buffer = self.device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("uniform"),
-            size: size_of::<T>() as u64,
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
-        self.queue.write_buffer(&buffer, 0, bytemuck::bytes_of(value));
-        buffer
     }
 
     /// Starts recording.

@@ -1,7 +1,7 @@
 //! A compute pass made from an assembled shader, and the recording of passes one after the other.
 
 use crate::channels::Channels;
-use crate::gpu::Gpu;
+use crate::gpu::{Gpu, UNIFORM_SLOT, UNIFORM_SLOTS};
 use crate::shader::{Binding, Kernel, Shader};
 use crate::{Result, cpu};
 use std::marker::PhantomData;
@@ -31,25 +31,39 @@ impl<K: Kernel> Typed<K> {
 pub(crate) struct Recorder<'a> {
     gpu: &'a Gpu,
     encoder: wgpu::CommandEncoder,
+    /// What the recorded passes find in [`Gpu::uniforms`]: written at once, when they are submitted.
+    uniforms: Vec<u8>,
     on_cpu: usize,
 }
 
 impl<'a> Recorder<'a> {
     pub fn new(gpu: &'a Gpu, on_cpu: usize) -> Self {
-        Self { gpu, encoder: gpu.encoder(), on_cpu }
+        Self { gpu, encoder: gpu.encoder(), uniforms: Vec::new(), on_cpu }
     }
 
     /// One pass over its uniform and storage buffers.
     pub fn run<K: Kernel>(&mut self, pass: &Typed<K>, uniform: &K::Uniform, buffers: K::Buffers<'_>, groups: u32) -> Result<()> {
         let storages = K::in_order(&buffers);
+        let uniform = bytemuck::bytes_of(uniform);
         if self.on_cpu > 0 {
             self.on_cpu -= 1;
-            return self.run_twin(&pass.pass, bytemuck::bytes_of(uniform), &storages);
+            return self.run_twin(&pass.pass, uniform, &storages);
         }
-        let uniform = self.gpu.uniform(uniform);
-        let all: Vec<_> = std::iter::once(&uniform).chain(storages).collect();
-        pass.pass.record(self.gpu, &mut self.encoder, &all, groups);
+        self.record(&pass.pass, uniform, &storages, groups);
         Ok(())
+    }
+
+    /// The same for a pass that does not know its buffers.
+    pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: u32) {
+        if self.uniforms.len() as u64 == UNIFORM_SLOTS * UNIFORM_SLOT {
+            self.flush();
+        }
+        let place = self.uniforms.len();
+        self.uniforms.extend_from_slice(uniform);
+        self.uniforms.resize(place + UNIFORM_SLOT as usize, 0);
+        let size = std::num::NonZeroU64::new(uniform.len() as u64);
+        let uniform = wgpu::BufferBinding { buffer: &self.gpu.uniforms, offset: place as u64, size };
+        pass.record(self.gpu, &mut self.encoder, uniform, storages, groups);
     }
 
     fn run_twin(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer]) -> Result<()> {
@@ -76,12 +90,15 @@ impl<'a> Recorder<'a> {
     }
 
     fn flush(&mut self) {
+        // The queue writes before what is submitted next, and after what was submitted before.
+        self.gpu.queue.write_buffer(&self.gpu.uniforms, 0, &self.uniforms);
+        self.uniforms.clear();
         self.gpu.submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
     }
 
     /// Submits what was recorded; returns how many passes may still run on the CPU.
-    pub fn submit(self) -> usize {
-        self.gpu.submit(self.encoder);
+    pub fn submit(mut self) -> usize {
+        self.flush();
         self.on_cpu
     }
 }
@@ -137,12 +154,19 @@ impl Pass {
     }
 
     /// Records one dispatch of `groups` workgroups, split over y above the limit.
-    pub fn record(&self, gpu: &Gpu, encoder: &mut wgpu::CommandEncoder, buffers: &[&wgpu::Buffer], groups: u32) {
+    fn record(
+        &self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        uniform: wgpu::BufferBinding<'_>,
+        storages: &[&wgpu::Buffer],
+        groups: u32,
+    ) {
         if groups == 0 {
             return;
         }
-        let entries: Vec<_> =
-            buffers.iter().enumerate().map(|(i, b)| wgpu::BindGroupEntry { binding: i as u32, resource: b.as_entire_binding() }).collect();
+        let resources = std::iter::once(wgpu::BindingResource::Buffer(uniform)).chain(storages.iter().map(|b| b.as_entire_binding()));
+        let entries: Vec<_> = resources.enumerate().map(|(i, resource)| wgpu::BindGroupEntry { binding: i as u32, resource }).collect();
         let bindings = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(self.shader.name),
             layout: &self.layout,

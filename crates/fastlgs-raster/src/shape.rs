@@ -47,6 +47,18 @@ impl Shape {
         }
     }
 
+    /// Chunks in which `n` items are sorted and added up, and the workgroups that do it; `shaders/shared/chunks.wgsl`.
+    pub fn chunks(self, n: u32) -> (u32, u32) {
+        // An invocation of a software adapter owns a chunk: enough of them for its threads, few enough to add up their totals.
+        const SERIAL: u32 = 256;
+        const SHARED: u32 = 2048;
+        if self == Shape::Wide {
+            return (SERIAL, SERIAL / 64);
+        }
+        let chunks = n.div_ceil(SHARED).max(1);
+        (chunks, chunks)
+    }
+
     /// Workgroups that blend `tiles` tiles.
     pub fn groups(self, tiles: u32) -> u32 {
         if self == Shape::Wide { tiles.div_ceil(8) } else { tiles }

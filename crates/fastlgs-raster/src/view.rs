@@ -245,8 +245,8 @@ pub struct Job {
     pub shift: u32,
     /// 1: values are 0, 1, 2, ... instead of read.
     pub first: u32,
-    /// Padding.
-    pub unused: u32,
+    /// Number of chunks that the items are divided into.
+    pub chunks: u32,
 }
 
 /// Distance between the channels of a page of `n` Gaussians; `shaders/shared/channels.wgsl`.

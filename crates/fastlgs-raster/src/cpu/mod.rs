@@ -60,10 +60,7 @@ pub use ssim_rows::ssim_rows;
 pub use tile_load::tile_load;
 pub use tile_ranges::tile_ranges;
 
-use crate::view::Plane;
-
-/// Invocations of the serial-chunk passes; `shaders/shared/chunks.wgsl`.
-pub const CHUNKS: usize = 256;
+use crate::view::{Job, Plane};
 
 /// Outputs of one invocation of the loss passes; `shaders/shared/window.wgsl`.
 pub const RUN: usize = 8;
@@ -76,10 +73,10 @@ pub(crate) const ALPHA_MAX: f32 = 0.99;
 pub(crate) const DILATION: f32 = 0.3;
 pub(crate) const NEAR: f32 = 0.5;
 
-/// The contiguous part of `n` items that invocation `t` owns.
-pub(crate) fn chunk(n: usize, t: usize) -> std::ops::Range<usize> {
-    let length = n.div_ceil(CHUNKS);
-    (t * length).min(n)..((t + 1) * length).min(n)
+/// The chunks of a job, in order; `shaders/shared/chunks.wgsl`.
+pub(crate) fn chunks(job: &Job) -> impl Iterator<Item = std::ops::Range<usize>> {
+    let (n, length) = (job.n as usize, job.n.div_ceil(job.chunks) as usize);
+    (0..job.chunks as usize).map(move |t| (t * length).min(n)..((t + 1) * length).min(n))
 }
 
 /// Alpha of a splat at offset (dx, dy) from its mean; 0 where it is not drawn.

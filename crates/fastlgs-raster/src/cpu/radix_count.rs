@@ -1,12 +1,13 @@
-use super::{CHUNKS, chunk};
+use super::chunks;
 use crate::view::Job;
 
 /// Twin of `shaders/radix_count.wgsl`.
 pub fn radix_count(job: &Job, keys: &[u32], histogram: &mut [u32]) {
-    histogram[..256 * CHUNKS].fill(0);
-    for t in 0..CHUNKS {
-        for i in chunk(job.n as usize, t) {
-            histogram[((keys[i] >> job.shift) & 255) as usize * CHUNKS + t] += 1;
+    let count = job.chunks as usize;
+    histogram[..256 * count].fill(0);
+    for (t, chunk) in chunks(job).enumerate() {
+        for i in chunk {
+            histogram[((keys[i] >> job.shift) & 255) as usize * count + t] += 1;
         }
     }
 }

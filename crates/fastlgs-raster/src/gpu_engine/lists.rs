@@ -2,7 +2,7 @@
 
 use super::kernels::{GROUP, Kernels, Kind};
 use super::pages::Gaussians;
-use super::sorting::{Scratch, Sort};
+use super::sorting::Sort;
 use crate::engine::{Memory, tile_bits};
 use crate::pass::Recorder;
 use crate::shader::shaders::{EmitBuffers, GatherCountsBuffers, ProjectBuffers, TileLoadBuffers, TileRangesBuffers};
@@ -49,19 +49,14 @@ struct Pairs {
 }
 
 /// Makes lists, and keeps those of views whose geometry is frozen.
+#[derive(Default)]
 pub struct ListMaker {
-    scratch: Scratch,
     tiles: Option<Tiles>,
     pairs: Option<Pairs>,
     frozen: HashMap<usize, Lists>,
 }
 
 impl ListMaker {
-    /// Without any lists.
-    pub fn new(gpu: &Gpu) -> Self {
-        Self { scratch: Scratch::new(gpu), tiles: None, pairs: None, frozen: HashMap::new() }
-    }
-
     /// Other Gaussians make all kept lists wrong.
     pub fn forget(&mut self) {
         self.frozen.clear();
@@ -81,13 +76,13 @@ impl ListMaker {
         let Gaussians { touched, offsets, footprints, first_pair, .. } = g;
         let mut r = Recorder::new(gpu, *on_cpu);
         project(kernels, &mut r, g, &view, kind)?;
-        let side = self.scratch.sort(sorting, &mut r, &g.sort, n, 24)?;
+        let side = g.sort.record(gpu, sorting, &mut r, n, 24)?;
         let order = &g.sort.values[side];
         r.run(&listing.gather_counts, &view, GatherCountsBuffers { order, touched, offsets }, groups)?;
-        self.scratch.scan(sorting, &mut r, offsets, n)?;
+        g.scan.record(gpu, sorting, &mut r, offsets, n)?;
         *on_cpu = r.submit();
         // Counted before anything is written, so that no list can overflow.
-        view.pairs = self.scratch.total(gpu)?;
+        view.pairs = g.scan.total(gpu, n)?;
         if view.pairs == u32::MAX {
             let reason = "more than 4 billion pairs of tiles and Gaussians: the scene has huge Gaussians; prune them or lower --size";
             return Err(Error::TooLarge(reason.to_owned()));
@@ -98,13 +93,13 @@ impl ListMaker {
         let (pair_tiles, pair_gaussians, ranges) = (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
         let emitted = EmitBuffers { order, offsets, footprints, touched, pair_tiles, pair_gaussians, first_pair };
         r.run(&listing.emit, &view, emitted, groups)?;
-        let sorted = self.scratch.sort(sorting, &mut r, &pairs.sort, view.pairs, tile_bits(&view))?;
+        let sorted = pairs.sort.record(gpu, sorting, &mut r, view.pairs, tile_bits(&view))?;
         r.clear(ranges);
         let sorted_tiles = &pairs.sort.keys[sorted];
         r.run(&listing.tile_ranges, &view, TileRangesBuffers { sorted_tiles, ranges }, view.pairs.div_ceil(GROUP))?;
         let keys = &tiles.sort.keys[0];
         r.run(&listing.tile_load, &view, TileLoadBuffers { ranges, keys }, view.tile_count().div_ceil(GROUP))?;
-        let ordered = self.scratch.sort(sorting, &mut r, &tiles.sort, view.tile_count(), 8)?;
+        let ordered = tiles.sort.record(gpu, sorting, &mut r, view.tile_count(), 8)?;
         *on_cpu = r.submit();
         Ok(Lists {
             view,

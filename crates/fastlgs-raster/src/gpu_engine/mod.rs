@@ -49,7 +49,7 @@ impl GpuEngine {
     pub fn new(gpu: Gpu) -> Self {
         Self {
             kernels: Kernels::new(&gpu),
-            lists: ListMaker::new(&gpu),
+            lists: ListMaker::default(),
             gpu,
             gaussians: None,
             picture: None,

@@ -1,6 +1,6 @@
 //! Buffers with one item a Gaussian. Trained values lie in pages, because 48 SH coefficients exceed a binding at 700,000 Gaussians.
 
-use super::sorting::Sort;
+use super::sorting::{Scan, Sort};
 use crate::density::State;
 use crate::engine::Memory;
 use crate::view::stride;
@@ -30,6 +30,7 @@ pub struct Gaussians {
     pub touched: Buffer,
     pub first_pair: Buffer,
     pub sort: Sort,
+    pub scan: Scan,
 }
 
 impl Gaussians {
@@ -61,6 +62,7 @@ impl Gaussians {
             offsets: storage("tile offsets", n)?,
             first_pair: storage("first pairs", n)?,
             sort: Sort::new(gpu, "the depth sort", n)?,
+            scan: Scan::new(gpu, "tile offsets", n as u32)?,
         })
     }
 

@@ -2,8 +2,8 @@
 
 use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
 use crate::Shape;
-use crate::cpu::{self, CHUNKS};
-use crate::pass::Pass;
+use crate::cpu;
+use crate::pass::{Pass, Recorder};
 use crate::shader::{Kernel, Shader, shaders};
 use crate::view::{Ceiling, Job, Perturb, Plane, Step, View, stride};
 use crate::{Channels, Gpu};
@@ -16,12 +16,10 @@ const SIZES: [(usize, u32, u32); 5] = [(1, 17, 13), (300, 64, 48), (5000, 97, 61
 
 /// Runs one pass on the device; `buffers` hold the storage buffers in the order of their bindings and are replaced.
 fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mut [Vec<u32>], groups: u32) {
-    let uniform = gpu.uniform(uniform);
     let storages: Vec<_> = buffers.iter().map(|b| gpu.storage_with("test", b).unwrap()).collect();
-    let all: Vec<_> = std::iter::once(&uniform).chain(&storages).collect();
-    let mut encoder = gpu.encoder();
-    pass.record(gpu, &mut encoder, &all, groups);
-    gpu.submit(encoder);
+    let mut r = Recorder::new(gpu, 0);
+    r.record(pass, bytemuck::bytes_of(uniform), &storages.iter().collect::<Vec<_>>(), groups);
+    r.submit();
     for (buffer, storage) in buffers.iter_mut().zip(&storages) {
         *buffer = gpu.read(storage, buffer.len()).unwrap();
     }
@@ -95,11 +93,11 @@ fn lists(n: usize, w: u32, h: u32, sh_degree: u32, antialias: bool) -> Lists {
     twin(&mut b, "project", &view, &["params", "splats", "keys", "footprints", "touched"]);
     sort_twin(&mut b, "keys", "order");
     twin(&mut b, "gather_counts", &view, &["order", "touched", "offsets"]);
-    b.insert("totals", zeros(CHUNKS + 1));
-    let job = Job { n: n as u32, shift: 0, first: 0, unused: 0 };
+    b.insert("totals", zeros(2));
+    let job = Job { n: n as u32, shift: 0, first: 0, chunks: 1 };
     twin(&mut b, "scan_chunks", &job, &["offsets", "totals"]);
     twin(&mut b, "scan_apply", &job, &["offsets", "totals"]);
-    view.pairs = b["totals"][CHUNKS];
+    view.pairs = b["totals"][1];
     b.insert("tiles", zeros(view.pairs as usize));
     b.insert("gaussians", zeros(view.pairs as usize));
     twin(&mut b, "emit", &view, &["order", "offsets", "footprints", "touched", "tiles", "gaussians", "first"]);
@@ -138,31 +136,37 @@ fn project() {
 
 #[test]
 fn sorting_and_scanning() {
-    let Some(gpu) = gpu() else { return };
+    let Some(mut gpu) = gpu() else { return };
     let mut rng = Rng::new(3, "sort");
-    for n in [1usize, 255, 256, 257, 100_003] {
+    for (shape, n) in [Shape::Wide, Shape::Shared].into_iter().flat_map(|shape| [1usize, 255, 256, 257, 2048, 2049, 600_003].map(|n| (shape, n))) {
+        gpu.shape = shape;
         let keys: Vec<u32> = (0..n).map(|_| rng.next_u64() as u32 & 0xffff).collect();
         let values: Vec<u32> = (0..n as u32).rev().collect();
-        let job = Job { n: n as u32, shift: 8, first: 0, unused: 0 };
-        let exact = |shader: &'static Shader, job: &Job, buffers: &[&[u32]]| {
-            let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, 4);
-            assert_eq!(device, twin, "{} of {n}", shader.name);
+        let (chunks, groups) = shape.chunks(n as u32);
+        let job = Job { n: n as u32, shift: 8, first: 0, chunks };
+        // Results of the buffers from `judged` on are the twin's.
+        let exact = |shader: &'static Shader, job: &Job, buffers: &[&[u32]], groups: u32, judged: usize| {
+            let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, groups);
+            assert_eq!(device[judged..], twin[judged..], "{} of {n} in the shape {shape}", shader.name);
             device
         };
-        let histogram = exact(shaders::RadixCount::SHADER, &job, &[&keys, &vec![7; 256 * CHUNKS]]).remove(1);
-        let scan = Job { n: histogram.len() as u32, ..job };
-        let totals = exact(shaders::ScanChunks::SHADER, &scan, &[&histogram, &zeros(CHUNKS + 1)]).remove(1);
-        let scanned = exact(shaders::ScanApply::SHADER, &scan, &[&histogram, &totals]);
-        assert_eq!(scanned[1][CHUNKS] as usize, n);
-        let sorted = exact(shaders::RadixScatter::SHADER, &job, &[&keys, &values, &scanned[0], &zeros(n), &zeros(n)]);
+        let histogram = exact(shaders::RadixCount::SHADER, &job, &[&keys, &vec![7; 256 * chunks as usize]], groups, 0).remove(1);
+        let scanned = |items: &[u32]| {
+            let (chunks, groups) = shape.chunks(items.len() as u32);
+            let job = Job { n: items.len() as u32, chunks, ..job };
+            let totals = exact(shaders::ScanChunks::SHADER, &job, &[items, &zeros(chunks as usize + 1)], groups, 0).remove(1);
+            let mut scanned = exact(shaders::ScanApply::SHADER, &job, &[items, &totals], groups, 0);
+            (scanned.swap_remove(0), scanned[0][chunks as usize])
+        };
+        let (places, total) = scanned(&histogram);
+        assert_eq!(total as usize, n);
+        // What a chunk leaves behind in its places is its own affair.
+        let sorted = exact(shaders::RadixScatter::SHADER, &job, &[&keys, &values, &places, &zeros(n), &zeros(n)], groups, 3);
         assert!(sorted[3].windows(2).all(|p| p[0] >> 8 <= p[1] >> 8));
         // Ties keep their order, which here is that of falling values.
         assert!((1..n).all(|i| sorted[3][i - 1] >> 8 != sorted[3][i] >> 8 || sorted[4][i - 1] > sorted[4][i]));
         // Sums beyond 32 bits stay at the largest value instead of starting anew.
-        let huge = vec![u32::MAX / 2; 3 * CHUNKS];
-        let job = Job { n: huge.len() as u32, ..job };
-        let totals = exact(shaders::ScanChunks::SHADER, &job, &[&huge, &zeros(CHUNKS + 1)]).remove(1);
-        assert_eq!(exact(shaders::ScanApply::SHADER, &job, &[&huge, &totals])[1][CHUNKS], u32::MAX);
+        assert_eq!(scanned(&vec![u32::MAX / 2; 3 * n.max(2)]).1, u32::MAX);
     }
 }
 
