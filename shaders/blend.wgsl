@@ -1,7 +1,7 @@
 // Front-to-back blending of colour and feature in one pass (paper, rendering features; 3DGS eq. 3).
 //
 // frame [8][tile rows * 8][tile columns * 8]: r, g, b, f0, f1, f2 with the background blended in, transmittance left,
-//       and number of pairs walked through before the pixel's invocation was finished.
+//       and number of pairs walked through before the tile was finished.
 #import view
 #import flat
 #import lane
@@ -57,18 +57,31 @@ fn store_quad(quad: Quad, x: u32, y: u32, walked: f32) {
     frame[quad_at(7u, x, y, view)] = vec4<f32>(walked);
 }
 
-// Gaussians between two looks at whether the block is finished.
+// Gaussians between two looks at whether the tile is finished.
 const BATCH: u32 = 8u;
 
-@compute @workgroup_size(8)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let block = lane_of(flat_group(group, groups), lane);
-    if block.place >= view.tiles.x * view.tiles.y {
-        return;
+#ifdef WIDE
+#else
+#import stage
+
+// The workgroup's tiles through which light still passes, as bits; batches take turns with the two words.
+var<workgroup> open: array<atomic<u32>, 2>;
+#endif
+
+@compute @workgroup_size(LANES)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
+    let lane = lane_of(flat_group(group, groups), index);
+    let exists = lane.place < view.tiles.x * view.tiles.y;
+    var tile = 0u;
+    var start = 0u;
+    var length = 0u;
+    if exists {
+        tile = tile_order[lane.place];
+        start = ranges[2u * tile];
+        length = ranges[2u * tile + 1u] - start;
     }
-    let tile = tile_order[block.place];
-    let x = (tile % view.tiles.x) * TILE + block.x;
-    let y = (tile / view.tiles.x) * TILE + block.y;
+    let x = (tile % view.tiles.x) * TILE + lane.x;
+    let y = (tile / view.tiles.x) * TILE + lane.y;
     let px = vec4<f32>(f32(x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let py = f32(y) + 0.5;
 #each Q
@@ -76,13 +89,12 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // Nothing reaches the pixels outside the picture.
     q$Q.transmittance = inside(x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X, view);
 #end
-    let start = ranges[2u * tile];
-    let end = ranges[2u * tile + 1u];
-    var k = start;
-    while k < end {
-        let stop = min(k + BATCH, end);
-        for (; k < stop; k++) {
-            let i = 3u * pair_gaussians[sorted_pairs[k]];
+    var walked = 0u;
+#ifdef WIDE
+    while walked < length {
+        let stop = min(walked + BATCH, length);
+        for (; walked < stop; walked++) {
+            let i = 3u * pair_gaussians[sorted_pairs[start + walked]];
             let s0 = splats[i];
             let s1 = splats[i + 1u];
             let s2 = splats[i + 2u];
@@ -100,7 +112,43 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             break;
         }
     }
+#else
+    var fetched = fetch(start, lane.number, length);
+    if index == 0u {
+        atomicStore(&open[0], 0u);
+    }
+    var goes_on = length > 0u;
+    for (var batch = 0u; ; batch++) {
+        let k = BATCH * batch;
+        if k % TILE_LANES == 0u {
+            put_down(fetched, lane.tile, k + lane.number);
+            fetched = fetch(start, k + TILE_LANES + lane.number, length);
+        }
+        workgroupBarrier();
+        if goes_on {
+            walked = min(k + BATCH, length);
+            for (var i = k; i < walked; i++) {
+                let s = staged_splats[staged_at(lane.tile, i)];
+                add(&q0, px - s[0].x, py - s[0].y, s[0], s[1], s[2]);
+            }
+            if walked < length && any(q0.transmittance >= vec4<f32>(view.finished)) {
+                atomicOr(&open[batch % 2u], 1u << lane.tile);
+            }
+        }
+        workgroupBarrier();
+        let still_open = atomicLoad(&open[batch % 2u]);
+        if still_open == 0u {
+            break;
+        }
+        goes_on = (still_open & (1u << lane.tile)) != 0u;
+        if index == 0u {
+            atomicStore(&open[(batch + 1u) % 2u], 0u);
+        }
+    }
+#endif
+    if exists {
 #each Q
-    store_quad(q$Q, x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X, f32(k - start));
+        store_quad(q$Q, x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X, f32(walked));
 #end
+    }
 }

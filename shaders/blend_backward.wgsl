@@ -103,84 +103,85 @@ fn sum4(v: vec4<f32>) -> f32 {
     return (v.x + v.y) + (v.z + v.w);
 }
 
+struct Slot {
+    a: vec4<f32>,
+    b: vec4<f32>,
+    c: vec4<f32>,
+}
+
+// What the quads of an invocation add up for one Gaussian. Shapes with one column of quads leave the second at zero.
+fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
+    var slot: Slot;
+#ifdef WITH_COLOR
+    let right = dx + 4.0;
+    let px0 = c0.p * dx;
+    let px1 = c1.p * right;
+    let pxx = fma(px0, dx, px1 * right);
+    let pxy = fma(c0.py, dx, c1.py * right);
+    slot.a = vec4<f32>(sum4(px0 + px1), sum4(c0.py + c1.py), sum4(pxx), sum4(pxy));
+    slot.b = vec4<f32>(sum4(c0.pyy + c1.pyy), sum4(c0.p + c1.p), sum4(sums.r), sum4(sums.g));
+    slot.c.x = sum4(sums.b);
+#endif
+#ifdef WITH_FEATURE
+    slot.c = vec4<f32>(slot.c.x, sum4(sums.f0), sum4(sums.f1), sum4(sums.f2));
+#endif
+    return slot;
+}
+
 #ifdef WIDE
-fn over_lanes(v: vec4<f32>, lane: u32) -> vec4<f32> {
-    return v;
-}
-fn last_of(walked: u32, lane: u32) -> u32 {
-    return walked;
-}
-fn writes(lane: u32) -> bool {
-    return true;
-}
 #else
-fn writes(lane: u32) -> bool {
-    return lane == 0u;
+#import stage
+
+// Gaussians between two sums over the invocations of a tile, and the numbers that are added up for each.
+const ROUND: u32 = 4u;
+const NUMBERS: u32 = 4u * SLOT;
+
+// [tile][Gaussian of the round][number][invocation], the invocations of each row turned by its number, so that those who write a column and those
+// who read a row both find all banks.
+var<workgroup> exchange: array<f32, TILES * ROUND * NUMBERS * TILE_LANES>;
+// The longest walk of the workgroup's tiles.
+var<workgroup> longest: atomic<u32>;
+
+fn exchange_at(tile: u32, row: u32, number: u32) -> u32 {
+    return (tile * ROUND * NUMBERS + row) * TILE_LANES + (number + row) % TILE_LANES;
 }
 
-// How far the forward pass walked in each lane's block.
-var<workgroup> walked_of: array<u32, 8>;
-var<workgroup> walked_most: u32;
-
-fn last_of(walked: u32, lane: u32) -> u32 {
-    walked_of[lane] = walked;
-    workgroupBarrier();
-    if lane == 0u {
-        walked_most = 0u;
-        for (var k = 0u; k < 8u; k++) {
-            walked_most = max(walked_most, walked_of[k]);
-        }
-    }
-    return workgroupUniformLoad(&walked_most);
-}
-#ifdef SUBGROUPS
-fn over_lanes(v: vec4<f32>, lane: u32) -> vec4<f32> {
-    return subgroupAdd(v);
-}
-#else
-var<workgroup> exchange: array<vec4<f32>, 8>;
-fn over_lanes(v: vec4<f32>, lane: u32) -> vec4<f32> {
-    exchange[lane] = v;
-    workgroupBarrier();
-    var sum = exchange[0];
-    for (var k = 1u; k < 8u; k++) {
-        sum += exchange[k];
-    }
-    workgroupBarrier();
-    return sum;
+fn exchange_put(tile: u32, row: u32, number: u32, v: vec4<f32>) {
+    exchange[exchange_at(tile, row, number)] = v.x;
+    exchange[exchange_at(tile, row + 1u, number)] = v.y;
+    exchange[exchange_at(tile, row + 2u, number)] = v.z;
+    exchange[exchange_at(tile, row + 3u, number)] = v.w;
 }
 #endif
-#endif
 
-@compute @workgroup_size(8)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let block = lane_of(flat_group(group, groups), lane);
-    if block.place >= view.tiles.x * view.tiles.y {
-        return;
+@compute @workgroup_size(LANES)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
+    let lane = lane_of(flat_group(group, groups), index);
+    let exists = lane.place < view.tiles.x * view.tiles.y;
+    var tile = 0u;
+    var start = 0u;
+    var end = 0u;
+    if exists {
+        tile = tile_order[lane.place];
+        start = ranges[2u * tile];
+        end = ranges[2u * tile + 1u];
     }
-    let tile = tile_order[block.place];
-    let x = (tile % view.tiles.x) * TILE + block.x;
-    let y = (tile / view.tiles.x) * TILE + block.y;
+    let x = (tile % view.tiles.x) * TILE + lane.x;
+    let y = (tile / view.tiles.x) * TILE + lane.y;
     let px = vec4<f32>(f32(x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let py = f32(y) + 0.5;
 #each Q
     var q$Q = load_quad(x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X);
 #end
-    let start = ranges[2u * tile];
-    let walked = u32(frame[quad_at(7u, x, y, view)].x);
-    let stop = start + last_of(walked, lane);
-    let own_stop = start + walked;
-    for (var k = start; k < stop; k++) {
-        let e = sorted_pairs[k];
+    // How far the forward pass walked.
+    let length = select(0u, u32(frame[quad_at(7u, x, y, view)].x), exists);
+#ifdef WIDE
+    for (var k = 0u; k < length; k++) {
+        let e = sorted_pairs[start + k];
         let i = 3u * pair_gaussians[e];
         let s0 = splats[i];
-        var s1 = splats[i + 1u];
+        let s1 = splats[i + 1u];
         let s2 = splats[i + 2u];
-#ifdef WIDE
-#else
-        // The forward pass was finished with this lane's block: the Gaussian is as good as transparent here.
-        s1.y = select(-1e9, s1.y, k < own_stop);
-#endif
         let dx = px - s0.x;
         let dy = py - s0.y;
         var c0: Column;
@@ -189,36 +190,65 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #each Q
         add(&q$Q, &c$C, &sums, dx + f32(4u * ($Qu % QUADS_X)), dy + f32($Qu / QUADS_X), s0, s1, s2);
 #end
-#ifdef WITH_COLOR
-        // Shapes with one column of quads leave the second at zero.
-        let right = dx + 4.0;
-        let px0 = c0.p * dx;
-        let px1 = c1.p * right;
-        let pxx = fma(px0, dx, px1 * right);
-        let pxy = fma(c0.py, dx, c1.py * right);
-        let a = over_lanes(vec4<f32>(sum4(px0 + px1), sum4(c0.py + c1.py), sum4(pxx), sum4(pxy)), lane);
-        let b = over_lanes(vec4<f32>(sum4(c0.pyy + c1.pyy), sum4(c0.p + c1.p), sum4(sums.r), sum4(sums.g)), lane);
-        var last = vec4<f32>(sum4(sums.b), 0.0, 0.0, 0.0);
-#else
-        var last = vec4<f32>(0.0);
-#endif
-#ifdef WITH_FEATURE
-        last = vec4<f32>(last.x, sum4(sums.f0), sum4(sums.f1), sum4(sums.f2));
-#endif
-        let c = over_lanes(last, lane);
-        if writes(lane) && in_window(e, view) {
+        if in_window(e, view) {
+            let slot = slot_of(c0, c1, sums, dx);
             let s = SLOT * (e - view.slot_first);
 #ifdef WITH_COLOR
-            slots[s] = a;
-            slots[s + 1u] = b;
+            slots[s] = slot.a;
+            slots[s + 1u] = slot.b;
 #endif
-            slots[s + SLOT - 1u] = c;
+            slots[s + SLOT - 1u] = slot.c;
         }
     }
+#else
+    var fetched = fetch(start, lane.number, length);
+    if index == 0u {
+        atomicStore(&longest, 0u);
+    }
+    workgroupBarrier();
+    atomicMax(&longest, length);
+    workgroupBarrier();
+    let most = atomicLoad(&longest);
+    for (var k = 0u; k < most; k += ROUND) {
+        if k % TILE_LANES == 0u {
+            put_down(fetched, lane.tile, k + lane.number);
+            fetched = fetch(start, k + TILE_LANES + lane.number, length);
+        }
+        workgroupBarrier();
+        for (var i = 0u; i < ROUND && k + i < length; i++) {
+            let s = staged_splats[staged_at(lane.tile, k + i)];
+            let dx = px - s[0].x;
+            var column: Column;
+            var none: Column;
+            var sums: Sums;
+            add(&q0, &column, &sums, dx, py - s[0].y, s[0], s[1], s[2]);
+            let slot = slot_of(column, none, sums, dx);
+            let row = NUMBERS * i;
+#ifdef WITH_COLOR
+            exchange_put(lane.tile, row, lane.number, slot.a);
+            exchange_put(lane.tile, row + 4u, lane.number, slot.b);
+#endif
+            exchange_put(lane.tile, row + NUMBERS - 4u, lane.number, slot.c);
+        }
+        workgroupBarrier();
+        let rows = NUMBERS * min(ROUND, max(length, k) - k);
+        for (var row = lane.number; row < rows; row += TILE_LANES) {
+            let e = staged_pairs[staged_pair_at(lane.tile, k + row / NUMBERS)];
+            if in_window(e, view) {
+                var sum = 0.0;
+                for (var number = 0u; number < TILE_LANES; number++) {
+                    sum += exchange[exchange_at(lane.tile, row, number)];
+                }
+                let at = row % NUMBERS;
+                slots[SLOT * (e - view.slot_first) + at / 4u][at % 4u] = sum;
+            }
+        }
+    }
+#endif
     // Pairs that no pixel of the tile reached.
-    for (var k = stop; k < ranges[2u * tile + 1u]; k++) {
+    for (var k = start + length + lane.number; k < end; k += TILE_LANES) {
         let e = sorted_pairs[k];
-        if writes(lane) && in_window(e, view) {
+        if in_window(e, view) {
             for (var s = 0u; s < SLOT; s++) {
                 slots[SLOT * (e - view.slot_first) + s] = vec4<f32>(0.0);
             }

@@ -55,9 +55,10 @@ fn packed(id: vec4<u32>, weight: vec4<f32>) -> vec4<u32> {
 const BATCH: u32 = 8u;
 
 // Eight invocations of two quads, one above the other, share a tile: none of them needs the others.
-@compute @workgroup_size(8)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let tile = flat_group(group, groups);
+@compute @workgroup_size(64)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
+    let tile = flat_group(group, groups) * 8u + index / 8u;
+    let lane = index % 8u;
     if tile >= view.tiles.x * view.tiles.y {
         return;
     }

@@ -5,10 +5,10 @@
 //!
 //! * `#import NAME`: the text of `shared/NAME.wgsl`, the first time that it is asked for;
 //! * `#ifdef FLAG` ... `#else` ... `#endif`: one of both, by the flags of the permutation. Flags are `WITH_COLOR`, `WITH_FEATURE`,
-//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `SUBGROUPS` or `WIDE` (`Shape`; none of them: shared memory);
+//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `LANES64` or `WIDE` (`Shape`; none of them: workgroups of 32);
 //! * `#each K 8` ... `#end`: the lines 8 times, with 0 to 7 for `$K`: loops that must be unrolled for their values to stay in registers;
 //! * `#each Q` ... `#end`: once for each quad (four pixels of a row) of an invocation, with its number for `$Q` and its column of quads for
-//!   `$C`: 16 quads in 2 columns where one invocation owns the 8x8 tile (`WIDE`), else 2 in one column.
+//!   `$C`: 16 quads in 2 columns where one invocation owns the 8x8 tile (`WIDE`), else one.
 //!
 //! Blocks of `#ifdef` may be nested, those of `#each` may not. `shared/lane.wgsl` says which pixels a lane's quads are.
 
@@ -51,7 +51,7 @@ fn main() {
 }
 
 /// Flags of `Shape` in `src/gpu.rs`.
-const SHAPES: [&[&str]; 3] = [&[], &["SUBGROUPS"], &["WIDE"]];
+const SHAPES: [&[&str]; 3] = [&[], &["LANES64"], &["WIDE"]];
 /// Flags of `Channels` in `src/pass.rs`.
 const CHANNELS: [&[&str]; 4] =
     [&["WITH_COLOR"], &["WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"]];
@@ -69,8 +69,8 @@ fn assemble(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String
 
 fn expand(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>, seen: &mut BTreeSet<String>, out: &mut String) {
     let text = fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    // An 8x8 tile has 16 quads; it is one invocation's, or shared by eight.
-    let (quads, columns) = if flags.contains(&"WIDE") { (16, 2) } else { (2, 1) };
+    // An 8x8 tile has 16 quads; it is one invocation's, or shared by sixteen.
+    let (quads, columns) = if flags.contains(&"WIDE") { (16, 2) } else { (1, 1) };
     let mut active = vec![true];
     let mut repeated: Option<(&str, usize, String)> = None;
     for line in text.lines() {
@@ -128,8 +128,6 @@ struct Bound {
 fn validate(name: &str, source: &str) -> Vec<Bound> {
     let module = naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
     let info = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
-        .subgroup_stages(naga::valid::ShaderStages::COMPUTE)
-        .subgroup_operations(naga::valid::SubgroupOperationSet::all())
         .validate(&module)
         .unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
     translate(name, &module, &info);
@@ -171,7 +169,6 @@ fn translate(name: &str, module: &naga::Module, info: &naga::valid::ModuleInfo) 
         failed("Metal", e);
     }
 
-    // Waves, as Direct3D calls subgroups, came with 6.0.
     let options = hlsl::Options { shader_model: hlsl::ShaderModel::V6_0, ..hlsl::Options::default() };
     let (mut out, pipeline) = (String::new(), hlsl::PipelineOptions::default());
     let direct3d = hlsl::Writer::new(&mut out, &options, &pipeline).write(module, info, None).unwrap_or_else(|e| failed("HLSL", &e));

@@ -20,8 +20,6 @@ pub struct Gpu {
     pub name: String,
     /// How the blending kernels divide a tile: a guess, until [`crate::tuning`] knows better.
     pub shape: Shape,
-    /// Shapes that the adapter can run.
-    pub shapes: Vec<Shape>,
     /// The adapter with its driver's version: what measurements hold for.
     pub identity: String,
     /// Whether it is a software rasteriser.
@@ -84,16 +82,10 @@ impl Gpu {
     fn from_adapter(adapter: &wgpu::Adapter) -> Result<Self> {
         let info = adapter.get_info();
         let limits = adapter.limits();
-        let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && info.subgroup_min_size >= 8;
         let software = info.device_type == wgpu::DeviceType::Cpu;
-        let mut shapes = vec![Shape::Wide, Shape::Shared];
-        if subgroups {
-            shapes.push(Shape::Subgroups);
-        }
-        let guess = if software { Shape::Wide } else { shapes[shapes.len() - 1] };
+        let guess = if software { Shape::Wide } else { Shape::Lanes32 };
         let identity = format!("{} ({} {})", info.name, info.driver, info.driver_info);
-        let mut features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
-        features.set(wgpu::Features::SUBGROUP, subgroups);
+        let features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fastlgs"),
             required_features: features,
@@ -128,7 +120,6 @@ impl Gpu {
             queue,
             name: info.name,
             shape: guess,
-            shapes,
             identity,
             software,
             max_binding: limits.max_storage_buffer_binding_size,

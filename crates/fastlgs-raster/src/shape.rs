@@ -1,17 +1,18 @@
-//! How the blending kernels divide a tile among invocations.
+//! How the kernels divide their work among invocations.
 
 use serde::{Deserialize, Serialize};
 use std::fmt::{Display, Formatter};
 use std::str::FromStr;
 
-/// How the blending kernels divide an 8x8 tile; `shaders/shared/lane.wgsl`.
+/// How the kernels divide their work; `shaders/shared/lane.wgsl` and `chunks.wgsl`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shape {
-    /// Eight invocations a tile, which add up their gradients in shared memory.
-    Shared,
-    /// The same with subgroup operations.
-    Subgroups,
+    /// Sixteen invocations an 8x8 tile, in workgroups of 32: two tiles. The aliases are what shapes of eight were called.
+    #[serde(alias = "shared", alias = "subgroups")]
+    Lanes32,
+    /// The same in workgroups of 64.
+    Lanes64,
     /// One invocation a tile: for software rasterisers, whose invocations are vector lanes.
     Wide,
 }
@@ -20,34 +21,37 @@ impl FromStr for Shape {
     type Err = String;
 
     fn from_str(name: &str) -> Result<Self, String> {
-        let all = [Self::Shared, Self::Subgroups, Self::Wide];
-        all.into_iter()
+        Self::ALL
+            .into_iter()
             .find(|shape| shape.to_string() == name)
-            .ok_or_else(|| format!("there are {}", all.map(|s| s.to_string()).join(", ")))
+            .ok_or_else(|| format!("there are {}", Self::ALL.map(|s| s.to_string()).join(", ")))
     }
 }
 
 impl Display for Shape {
     fn fmt(&self, out: &mut Formatter<'_>) -> std::fmt::Result {
         out.write_str(match self {
-            Self::Shared => "shared",
-            Self::Subgroups => "subgroups",
+            Self::Lanes32 => "lanes32",
+            Self::Lanes64 => "lanes64",
             Self::Wide => "wide",
         })
     }
 }
 
 impl Shape {
+    /// All there are: every adapter can run each of them.
+    pub const ALL: [Self; 3] = [Self::Lanes32, Self::Lanes64, Self::Wide];
+
     /// Flag of the shaders' permutations.
     pub(crate) fn flag(self) -> Option<&'static str> {
         match self {
-            Shape::Shared => None,
-            Shape::Subgroups => Some("SUBGROUPS"),
+            Shape::Lanes32 => None,
+            Shape::Lanes64 => Some("LANES64"),
             Shape::Wide => Some("WIDE"),
         }
     }
 
-    /// Chunks in which `n` items are sorted and added up, and the workgroups that do it; `shaders/shared/chunks.wgsl`.
+    /// Chunks in which `n` items are sorted and added up, and the workgroups that do it.
     pub fn chunks(self, n: u32) -> (u32, u32) {
         // An invocation of a software adapter owns a chunk: enough of them for its threads, few enough to add up their totals.
         const SERIAL: u32 = 256;
@@ -61,6 +65,10 @@ impl Shape {
 
     /// Workgroups that blend `tiles` tiles.
     pub fn groups(self, tiles: u32) -> u32 {
-        if self == Shape::Wide { tiles.div_ceil(8) } else { tiles }
+        tiles.div_ceil(match self {
+            Shape::Lanes32 => 2,
+            Shape::Lanes64 => 4,
+            Shape::Wide => 8,
+        })
     }
 }

@@ -34,7 +34,7 @@ const CLEARLY: f64 = 1.25;
 pub struct Tuning {
     /// The one that is used: the fastest, or the one before it where that is hardly slower.
     pub shape: Shape,
-    /// All that the adapter can run.
+    /// With each.
     pub step_ms: BTreeMap<Shape, f64>,
     /// The CPU backend on the same machine, where the adapter is a software one.
     #[serde(default)]
@@ -95,10 +95,10 @@ fn tune_at(path: &Path, device: &str, again: bool) -> Result<Option<Tuning>> {
     }
     tracing::info!("measuring which kernels '{}' is fastest with; this is done once", gpu.name);
     let mut step_ms = BTreeMap::new();
-    for shape in &gpu.shapes {
+    for shape in Shape::ALL {
         let mut gpu = Gpu::open(device)?;
-        gpu.shape = *shape;
-        step_ms.insert(*shape, measure(&mut GpuEngine::new(gpu))?);
+        gpu.shape = shape;
+        step_ms.insert(shape, measure(&mut GpuEngine::new(gpu))?);
     }
     let cpu_ms = if gpu.software { Some(measure(&mut CpuEngine::new())?) } else { None };
     let present = known.map_or(gpu.shape, |t| t.shape);
@@ -159,7 +159,7 @@ mod tests {
         let path = dir.path().join("shapes.json");
         std::fs::write(&path, "{").unwrap();
         let first = tune_at(&path, "auto", false).unwrap().unwrap();
-        assert_eq!(first.step_ms.len(), gpu.shapes.len());
+        assert_eq!(first.step_ms.len(), Shape::ALL.len());
         assert!(first.step_ms.values().all(|ms| CLEARLY * ms >= first.step_ms[&first.shape]));
         assert_eq!(first.cpu_ms.is_some(), gpu.software, "a software adapter competes with the processor that it runs on");
         let known = table(&path).remove(&key(&gpu.identity)).unwrap();
@@ -170,9 +170,9 @@ mod tests {
 
     #[test]
     fn a_shape_stays_unless_another_is_clearly_faster() {
-        let ms = |wide, subgroups| BTreeMap::from([(Shape::Wide, wide), (Shape::Subgroups, subgroups)]);
+        let ms = |wide, lanes| BTreeMap::from([(Shape::Wide, wide), (Shape::Lanes32, lanes)]);
         assert_eq!(chosen(Shape::Wide, &ms(140.5, 139.5)), Shape::Wide);
-        assert_eq!(chosen(Shape::Subgroups, &ms(74.0, 107.0)), Shape::Wide);
-        assert_eq!(chosen(Shape::Shared, &ms(74.0, 70.0)), Shape::Subgroups, "what the adapter cannot run does not stay");
+        assert_eq!(chosen(Shape::Lanes32, &ms(74.0, 107.0)), Shape::Wide);
+        assert_eq!(chosen(Shape::Lanes64, &ms(74.0, 70.0)), Shape::Lanes32, "what was not measured does not stay");
     }
 }

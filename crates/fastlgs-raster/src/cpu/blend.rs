@@ -18,7 +18,7 @@ pub(crate) fn shown(x: u32, y: u32, view: &View) -> f32 {
     if x < view.size[0] && y < view.size[1] { 1.0 } else { 0.0 }
 }
 
-/// Twin of `shaders/blend.wgsl` in its wide shape.
+/// Twin of `shaders/blend.wgsl`.
 pub fn blend(
     view: &View,
     channels: Channels,

@@ -191,7 +191,7 @@ impl Engine for GpuEngine {
         let mut r = Recorder::new(&self.gpu, on_cpu);
         let Lists { ranges, sorted_pairs, pair_gaussians, .. } = &lists;
         let buffers = BlendIdsBuffers { ranges, sorted_pairs, pair_gaussians, splats, ids, shares };
-        r.run(&self.kernels.blend_ids, &lists.view, buffers, view.tile_count())?;
+        r.run(&self.kernels.blend_ids, &lists.view, buffers, view.tile_count().div_ceil(8))?;
         r.submit();
         let [width, height] = view.size;
         let plane = view.padded_pixels();
