@@ -31,6 +31,8 @@ impl<K: Kernel> Typed<K> {
 pub(crate) struct Recorder<'a> {
     gpu: &'a Gpu,
     encoder: wgpu::CommandEncoder,
+    /// The compute pass that goes on: beginning one for each of our passes costs more than recording it.
+    open: Option<wgpu::ComputePass<'static>>,
     /// What the recorded passes find in [`Gpu::uniforms`]: written at once, when they are submitted.
     uniforms: Vec<u8>,
     on_cpu: usize,
@@ -38,7 +40,7 @@ pub(crate) struct Recorder<'a> {
 
 impl<'a> Recorder<'a> {
     pub fn new(gpu: &'a Gpu, on_cpu: usize) -> Self {
-        Self { gpu, encoder: gpu.encoder(), uniforms: Vec::new(), on_cpu }
+        Self { gpu, encoder: gpu.encoder(), open: None, uniforms: Vec::new(), on_cpu }
     }
 
     /// One pass over its uniform and storage buffers.
@@ -55,6 +57,9 @@ impl<'a> Recorder<'a> {
 
     /// The same for a pass that does not know its buffers.
     pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: u32) {
+        if groups == 0 {
+            return;
+        }
         if self.uniforms.len() as u64 == UNIFORM_SLOTS * UNIFORM_SLOT {
             self.flush();
         }
@@ -63,7 +68,16 @@ impl<'a> Recorder<'a> {
         self.uniforms.resize(place + UNIFORM_SLOT as usize, 0);
         let size = std::num::NonZeroU64::new(uniform.len() as u64);
         let uniform = wgpu::BufferBinding { buffer: &self.gpu.uniforms, offset: place as u64, size };
-        pass.record(self.gpu, &mut self.encoder, uniform, storages, groups);
+        // Times are taken at the ends of compute passes, so that each needs its own.
+        let timestamp_writes = self.gpu.profile.as_ref().and_then(|p| p.next(pass.shader.name));
+        if timestamp_writes.is_some() {
+            self.open = None;
+        }
+        let encoder = &mut self.encoder;
+        let open = self.open.get_or_insert_with(|| {
+            encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(pass.shader.name), timestamp_writes }).forget_lifetime()
+        });
+        pass.record(self.gpu, open, uniform, storages, groups);
     }
 
     fn run_twin(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer]) -> Result<()> {
@@ -81,15 +95,18 @@ impl<'a> Recorder<'a> {
 
     /// Sets a buffer to zero.
     pub fn clear(&mut self, buffer: &wgpu::Buffer) {
+        self.open = None;
         self.encoder.clear_buffer(buffer, 0, None);
     }
 
     /// Copies the start of one buffer.
     pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
+        self.open = None;
         self.encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size().min(from.size()));
     }
 
     fn flush(&mut self) {
+        self.open = None;
         // The queue writes before what is submitted next, and after what was submitted before.
         self.gpu.queue.write_buffer(&self.gpu.uniforms, 0, &self.uniforms);
         self.uniforms.clear();
@@ -157,14 +174,11 @@ impl Pass {
     fn record(
         &self,
         gpu: &Gpu,
-        encoder: &mut wgpu::CommandEncoder,
+        open: &mut wgpu::ComputePass<'_>,
         uniform: wgpu::BufferBinding<'_>,
         storages: &[&wgpu::Buffer],
         groups: u32,
     ) {
-        if groups == 0 {
-            return;
-        }
         let resources = std::iter::once(wgpu::BindingResource::Buffer(uniform)).chain(storages.iter().map(|b| b.as_entire_binding()));
         let entries: Vec<_> = resources.enumerate().map(|(i, resource)| wgpu::BindGroupEntry { binding: i as u32, resource }).collect();
         let bindings = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
@@ -172,11 +186,9 @@ impl Pass {
             layout: &self.layout,
             entries: &entries,
         });
-        let timestamp_writes = gpu.profile.as_ref().and_then(|p| p.next(self.shader.name));
-        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(self.shader.name), timestamp_writes });
-        pass.set_pipeline(&self.pipeline);
-        pass.set_bind_group(0, &bindings, &[]);
+        open.set_pipeline(&self.pipeline);
+        open.set_bind_group(0, &bindings, &[]);
         let rows = groups.div_ceil(MAX_GROUPS);
-        pass.dispatch_workgroups(groups.div_ceil(rows), rows, 1);
+        open.dispatch_workgroups(groups.div_ceil(rows), rows, 1);
     }
 }
