@@ -56,8 +56,8 @@ pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussia
         *scene.opacity_logits.last_mut().unwrap() = -40.0; // opacity 0
         scene.push_sphere(at(0.5), 0.1, 0.5, [1.0; 3]);
         *scene.rotations.last_mut().unwrap() = [0.0; 4]; // no rotation at all
-        // No spheres: of their gradient by rotation only rounding is left, which no two devices have in common.
-        scene.log_scales[n..].iter_mut().for_each(|s| *s += Vec3::new(0.2, 0.0, -0.2));
+        // Black is where colour is cut off: its gradient there is a matter of rounding, which devices have not in common.
+        scene.sh_dc[n..].iter_mut().for_each(|c| *c = c.max(Vec3::splat(-1.7)));
     }
     scene
 }
