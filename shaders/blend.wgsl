@@ -127,10 +127,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         workgroupBarrier();
         if goes_on {
             walked = min(k + BATCH, length);
-            for (var i = k; i < walked; i++) {
-                let s = staged_splats[staged_at(lane.tile, i)];
-                add(&q0, px - s[0].x, py - s[0].y, s[0], s[1], s[2]);
-            }
+#each K 8
+            let at$K = staged_at(lane.tile, k + $Ku);
+            add(&q0, px - staged_splats[at$K][0].x, py - staged_splats[at$K][0].y, staged_splats[at$K][0], staged_splats[at$K][1], staged_splats[at$K][2]);
+#end
             if walked < length && any(q0.transmittance >= vec4<f32>(view.finished)) {
                 atomicOr(&open[batch % 2u], 1u << lane.tile);
             }

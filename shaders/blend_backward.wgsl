@@ -109,7 +109,7 @@ struct Slot {
     c: vec4<f32>,
 }
 
-// What the quads of an invocation add up for one Gaussian. Shapes with one column of quads leave the second at zero.
+// What the quads of an invocation add up for one Gaussian, in two columns; where there is one, the second is zero.
 fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
     var slot: Slot;
 #ifdef WITH_COLOR
@@ -215,30 +215,33 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             fetched = fetch(start, k + TILE_LANES + lane.number, length);
         }
         workgroupBarrier();
-        for (var i = 0u; i < ROUND && k + i < length; i++) {
-            let s = staged_splats[staged_at(lane.tile, k + i)];
-            let dx = px - s[0].x;
-            var column: Column;
-            var none: Column;
-            var sums: Sums;
-            add(&q0, &column, &sums, dx, py - s[0].y, s[0], s[1], s[2]);
-            let slot = slot_of(column, none, sums, dx);
-            let row = NUMBERS * i;
+        // Written out, so that the four are computed side by side.
+#each K 4
+        let s0_$K = staged_splats[staged_at(lane.tile, k + $Ku)][0];
+        let s1_$K = staged_splats[staged_at(lane.tile, k + $Ku)][1];
+        let s2_$K = staged_splats[staged_at(lane.tile, k + $Ku)][2];
+        let dx$K = px - s0_$K.x;
+        var column$K: Column;
+        var sums$K: Sums;
+        add(&q0, &column$K, &sums$K, dx$K, py - s0_$K.y, s0_$K, s1_$K, s2_$K);
+#end
+#each K 4
+        let slot$K = slot_of(column$K, Column(), sums$K, dx$K);
 #ifdef WITH_COLOR
-            exchange_put(lane.tile, row, lane.number, slot.a);
-            exchange_put(lane.tile, row + 4u, lane.number, slot.b);
+        exchange_put(lane.tile, NUMBERS * $Ku, lane.number, slot$K.a);
+        exchange_put(lane.tile, NUMBERS * $Ku + 4u, lane.number, slot$K.b);
 #endif
-            exchange_put(lane.tile, row + NUMBERS - 4u, lane.number, slot.c);
-        }
+        exchange_put(lane.tile, NUMBERS * $Ku + NUMBERS - 4u, lane.number, slot$K.c);
+#end
         workgroupBarrier();
-        let rows = NUMBERS * min(ROUND, max(length, k) - k);
-        for (var row = lane.number; row < rows; row += TILE_LANES) {
-            let e = staged_pairs[staged_pair_at(lane.tile, k + row / NUMBERS)];
-            if in_window(e, view) {
-                var sum = 0.0;
-                for (var number = 0u; number < TILE_LANES; number++) {
-                    sum += exchange[exchange_at(lane.tile, row, number)];
-                }
+        for (var row = lane.number; row < NUMBERS * ROUND; row += TILE_LANES) {
+            var sum = 0.0;
+#each K 16
+            sum += exchange[exchange_at(lane.tile, row, $Ku)];
+#end
+            let i = k + row / NUMBERS;
+            let e = staged_pairs[staged_pair_at(lane.tile, i)];
+            if i < length && in_window(e, view) {
                 let at = row % NUMBERS;
                 slots[SLOT * (e - view.slot_first) + at / 4u][at % 4u] = sum;
             }

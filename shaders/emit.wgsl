@@ -20,30 +20,46 @@
 @group(0) @binding(6) var<storage, read_write> pair_gaussians: array<u32>;
 @group(0) @binding(7) var<storage, read_write> first_pair: array<u32>;
 
+// Invocations of a Gaussian: on real GPUs several write its tiles, as those of large ones are thousands.
+#ifdef WIDE
+const WRITERS: u32 = 1u;
+#else
+const WRITERS: u32 = 8u;
+#endif
+
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-    let rank = flat_group(group, groups) * 64u + lane;
+    let invocation = flat_group(group, groups) * 64u + lane;
+    let rank = invocation / WRITERS;
+    let writer = invocation % WRITERS;
     if rank >= view.gaussians {
         return;
     }
     let g = order[rank];
-    var e = offsets[rank];
-    first_pair[g] = e;
+    let start = offsets[rank];
+    first_pair[g] = start;
     if touched[g] == 0u {
         return;
     }
-    let end = e + touched[g];
+    // The first writer may have lowered it already: to the end of what there is to write.
+    let end = start + touched[g];
+    var e = start;
     let f0 = footprints[2u * g];
     let f1 = footprints[2u * g + 1u];
     for (var row = u32(f1.z); row < u32(f1.w); row++) {
         let span = footprint_span(f0, f1, row, view.tiles.x);
-        for (var x = span.x; x < span.y && e < end; x++) {
-            pair_tiles[e] = row * view.tiles.x + x;
+        let first = e;
+        let next = min(first + span.y - span.x, end);
+        for (e = first + writer; e < next; e += WRITERS) {
+            pair_tiles[e] = row * view.tiles.x + span.x + (e - first);
             pair_gaussians[e] = g;
-            e++;
         }
+        e = next;
     }
-    touched[g] = e - first_pair[g];
+    if writer > 0u {
+        return;
+    }
+    touched[g] = e - start;
     for (; e < end; e++) {
         pair_tiles[e] = view.tiles.x * view.tiles.y;
         pair_gaussians[e] = g;

@@ -1,12 +1,12 @@
 // Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for the loss and the exposure.
 //
-// rows     [3][padded rows][quads]    from ssim_backward_rows
-// gradient [6][padded rows][quads]    dL/d frame
-// sums     [4][6][tile rows][quads]   sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
+// rows     [planes][5][padded rows][quads]  three maps from ssim_backward_rows
+// gradient [6][padded rows][quads]          dL/d frame
+// sums     [4][6][tile rows][quads]         sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
 #import columns
 #import flat
 
-@group(0) @binding(0) var<uniform> plane: Plane;
+@group(0) @binding(0) var<uniform> planes: Planes;
 @group(0) @binding(1) var<storage, read> frame: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> targets: array<vec4<u32>>;
 @group(0) @binding(3) var<storage, read> rows: array<vec4<f32>>;
@@ -41,6 +41,7 @@ fn add(totals: ptr<function, Totals>, quad: u32, row: u32, by_mean: vec4<f32>, b
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    take_plane(group);
     let id = flat_group(group, groups) * 64u + lane;
     let runs = plane.rows / 8u;
     if id >= runs * plane.quads {

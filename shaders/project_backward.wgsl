@@ -97,32 +97,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     var sum0 = vec4<f32>(0.0);
     var sum1 = vec4<f32>(0.0);
     var sum2 = vec4<f32>(0.0);
-    let first = SLOT * (start - view.slot_first);
-    var e = 0u;
-    // Four slots are on their way at once: of large Gaussians there are thousands, and each would be waited for.
-    for (; e + 4u <= count; e += 4u) {
-#each K 4
-        let at$K = first + SLOT * (e + $Ku);
+    // Of slots that were folded, the first of the Gaussian counts, and then those that begin a run.
+    let first = start - view.slot_first;
+    let end = first + count;
+    var e = first;
+    while e < end {
 #ifdef WITH_COLOR
-        let a$K = slots[at$K];
-        let b$K = slots[at$K + 1u];
+        sum0 += slots[SLOT * e];
+        sum1 += slots[SLOT * e + 1u];
 #endif
-        let c$K = slots[at$K + SLOT - 1u];
-#end
-#each K 4
-#ifdef WITH_COLOR
-        sum0 += a$K;
-        sum1 += b$K;
-#endif
-        sum2 += c$K;
-#end
-    }
-    for (; e < count; e++) {
-#ifdef WITH_COLOR
-        sum0 += slots[first + SLOT * e];
-        sum1 += slots[first + SLOT * e + 1u];
-#endif
-        sum2 += slots[first + SLOT * e + SLOT - 1u];
+        sum2 += slots[SLOT * e + SLOT - 1u];
+        e = (e / view.fold + 1u) * view.fold;
     }
     put3(FEATURE, i, sum2.yzw);
 #ifdef WITH_COLOR

@@ -1,12 +1,12 @@
 // Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments of x.
 //
-// rows     [5][padded rows][quads]  from ssim_rows
-// partials [3][padded rows][quads]  d SSIM / d (mean x, mean x^2, mean x y)
-// sums     [6][tile rows][quads]    sum of SSIM over eight rows, for the loss
+// rows     [planes][5][padded rows][quads]  from ssim_rows
+// partials [planes][3][padded rows][quads]  d SSIM / d (mean x, mean x^2, mean x y)
+// sums     [6][tile rows][quads]            sum of SSIM over eight rows, for the loss
 #import columns
 #import flat
 
-@group(0) @binding(0) var<uniform> plane: Plane;
+@group(0) @binding(0) var<uniform> planes: Planes;
 @group(0) @binding(1) var<storage, read> rows: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read_write> partials: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> sums: array<vec4<f32>>;
@@ -21,7 +21,7 @@ fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, xx: vec4<f32>, yy: ve
     let inverse = 1.0 / (c * d);
     let value = a * b * inverse;
     let size = plane.rows * plane.quads;
-    let place = row * plane.quads + quad;
+    let place = 3u * number * size + row * plane.quads + quad;
     // sigma terms depend on the mean too: b and d lose 2 mx my and mx^2.
     partials[place] = weight * (2.0 * my * (b - a) * inverse - 2.0 * mx * value * (d - c) * inverse);
     partials[size + place] = -weight * value / d;
@@ -31,6 +31,7 @@ fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, xx: vec4<f32>, yy: ve
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    take_plane(group);
     let id = flat_group(group, groups) * 64u + lane;
     let runs = plane.rows / 8u;
     if id >= runs * plane.quads {

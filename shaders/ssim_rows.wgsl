@@ -2,11 +2,11 @@
 //
 // frame  [..][padded rows][quads]  rendered x
 // targets [2][padded rows][quads]   8-bit y of colour and feature; where a pixel does not count, y := x
-// rows   [5][padded rows][quads]
+// rows   [planes][5][padded rows][quads]
 #import rows
 #import flat
 
-@group(0) @binding(0) var<uniform> plane: Plane;
+@group(0) @binding(0) var<uniform> planes: Planes;
 @group(0) @binding(1) var<storage, read> frame: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> targets: array<vec4<u32>>;
 @group(0) @binding(3) var<storage, read_write> rows: array<vec4<f32>>;
@@ -27,13 +27,14 @@ fn load(quad: i32, row: u32) -> Pair {
 }
 
 fn store(map: u32, quad: u32, row: u32, values: array<vec4<f32>, 2>) {
-    let place = (map * plane.rows + row) * plane.quads + quad;
+    let place = ((5u * number + map) * plane.rows + row) * plane.quads + quad;
     rows[place] = values[0];
     rows[place + 1u] = values[1];
 }
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+    take_plane(group);
     let id = flat_group(group, groups) * 64u + lane;
     let runs = plane.quads / 2u;
     if id >= runs * plane.rows {

@@ -11,9 +11,10 @@ struct Staged {
 var<workgroup> staged_pairs: array<u32, 2u * LANES>;
 var<workgroup> staged_splats: array<array<vec4<f32>, 3>, LANES>;
 
-// The k-th of the list, or nothing after its end.
+// The k-th of the list; after its end, one that is not drawn, so that nobody needs to ask where it ends.
 fn fetch(start: u32, k: u32, length: u32) -> Staged {
     var out: Staged;
+    out.s1.y = -1e9;
     if k < length {
         out.pair = sorted_pairs[start + k];
         let i = 3u * pair_gaussians[out.pair];

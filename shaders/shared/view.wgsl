@@ -29,6 +29,11 @@ struct View {
     // A step leaves out each Gaussian with the probability dropped / 2^32, by a draw of its own for each `draw`.
     dropped: u32,
     draw: u32,
+    // Pairs of a run, within which fold_slots adds up a Gaussian's slots; 1 where it does not run.
+    fold: u32,
+    unused0: u32,
+    unused1: u32,
+    unused2: u32,
 }
 
 // Tile edge in pixels. Pictures on the device are padded to whole tiles; what is outside the picture is zero.

@@ -1,5 +1,13 @@
-// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the job of its passes: one channel at a time, in quads of four
-// neighbouring pixels, over pictures padded to whole tiles. What is outside the picture is zero.
+// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the job of its passes: some channels at once, one for each z of the workgroups, in quads of
+// four neighbouring pixels, over pictures padded to whole tiles. What is outside the picture is zero.
+struct Planes {
+    each: array<Plane, 6>,
+    count: u32,
+    unused0: u32,
+    unused1: u32,
+    unused2: u32,
+}
+
 struct Plane {
     // Pixels of the picture.
     size: vec2<u32>,
@@ -18,6 +26,15 @@ struct Plane {
     unused0: u32,
     unused1: u32,
     unused2: u32,
+}
+
+// The invocation's plane, and its number among those that are done at once: each of these has maps of its own.
+var<private> plane: Plane;
+var<private> number: u32;
+
+fn take_plane(group: vec3<u32>) {
+    number = group.z;
+    plane = planes.each[number];
 }
 
 // One output from the middle input and the sums of the pairs beside it, from near to far.

@@ -5,8 +5,8 @@ use crate::shape::Shape;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
 
-/// Bytes between two uniforms: what every adapter can bind at.
-pub(crate) const UNIFORM_SLOT: u64 = 256;
+/// Bytes between two uniforms: room for each of them, and a multiple of what every adapter can bind at.
+pub(crate) const UNIFORM_SLOT: u64 = 512;
 /// Uniforms of one submission.
 pub(crate) const UNIFORM_SLOTS: u64 = 256;
 

@@ -27,6 +27,19 @@ impl<K: Kernel> Typed<K> {
     }
 }
 
+/// Workgroups of a dispatch: any number of them in one line, for each z.
+#[derive(Clone, Copy)]
+pub(crate) struct Groups {
+    pub flat: u32,
+    pub z: u32,
+}
+
+impl From<u32> for Groups {
+    fn from(flat: u32) -> Self {
+        Self { flat, z: 1 }
+    }
+}
+
 /// Records passes one after the other. The first `on_cpu` of them run as their twins instead, which finds a wrong one.
 pub(crate) struct Recorder<'a> {
     gpu: &'a Gpu,
@@ -44,20 +57,26 @@ impl<'a> Recorder<'a> {
     }
 
     /// One pass over its uniform and storage buffers.
-    pub fn run<K: Kernel>(&mut self, pass: &Typed<K>, uniform: &K::Uniform, buffers: K::Buffers<'_>, groups: u32) -> Result<()> {
+    pub fn run<K: Kernel>(
+        &mut self,
+        pass: &Typed<K>,
+        uniform: &K::Uniform,
+        buffers: K::Buffers<'_>,
+        groups: impl Into<Groups>,
+    ) -> Result<()> {
         let storages = K::in_order(&buffers);
         let uniform = bytemuck::bytes_of(uniform);
         if self.on_cpu > 0 {
             self.on_cpu -= 1;
             return self.run_twin(&pass.pass, uniform, &storages);
         }
-        self.record(&pass.pass, uniform, &storages, groups);
+        self.record(&pass.pass, uniform, &storages, groups.into());
         Ok(())
     }
 
     /// The same for a pass that does not know its buffers.
-    pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: u32) {
-        if groups == 0 {
+    pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: Groups) {
+        if groups.flat == 0 {
             return;
         }
         if self.uniforms.len() as u64 == UNIFORM_SLOTS * UNIFORM_SLOT {
@@ -177,7 +196,7 @@ impl Pass {
         open: &mut wgpu::ComputePass<'_>,
         uniform: wgpu::BufferBinding<'_>,
         storages: &[&wgpu::Buffer],
-        groups: u32,
+        groups: Groups,
     ) {
         let resources = std::iter::once(wgpu::BindingResource::Buffer(uniform)).chain(storages.iter().map(|b| b.as_entire_binding()));
         let entries: Vec<_> = resources.enumerate().map(|(i, resource)| wgpu::BindGroupEntry { binding: i as u32, resource }).collect();
@@ -188,7 +207,7 @@ impl Pass {
         });
         open.set_pipeline(&self.pipeline);
         open.set_bind_group(0, &bindings, &[]);
-        let rows = groups.div_ceil(MAX_GROUPS);
-        open.dispatch_workgroups(groups.div_ceil(rows), rows, 1);
+        let rows = groups.flat.div_ceil(MAX_GROUPS);
+        open.dispatch_workgroups(groups.flat.div_ceil(rows), rows, groups.z);
     }
 }

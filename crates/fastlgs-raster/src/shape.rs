@@ -63,6 +63,17 @@ impl Shape {
         (chunks, chunks)
     }
 
+    /// Invocations that write the tiles of one Gaussian; `shaders/emit.wgsl`.
+    pub fn writers(self) -> u32 {
+        if self == Shape::Wide { 1 } else { 8 }
+    }
+
+    /// Pairs of the runs within which gradient slots are added up before they are gathered; `shaders/fold_slots.wgsl`. A software adapter has
+    /// too few invocations to gain by it.
+    pub fn fold(self) -> u32 {
+        if self == Shape::Wide { 1 } else { 32 }
+    }
+
     /// Workgroups that blend `tiles` tiles.
     pub fn groups(self, tiles: u32) -> u32 {
         tiles.div_ceil(match self {

@@ -56,6 +56,10 @@ pub struct View {
     pub dropped: u32,
     /// Number of the draw that says which.
     pub draw: u32,
+    /// Pairs of a run, within which `fold_slots` adds up a Gaussian's slots; 1 where it does not run.
+    pub fold: u32,
+    /// Padding to 16 bytes.
+    pub unused: [u32; 3],
 }
 
 impl View {
@@ -82,6 +86,8 @@ impl View {
             finished: TRANSMITTANCE_MIN,
             dropped: 0,
             draw: 0,
+            fold: 1,
+            unused: [0; 3],
         }
     }
 
@@ -233,6 +239,27 @@ pub struct Plane {
     pub offset: f32,
     /// Padding to 16 bytes.
     pub unused: [u32; 3],
+}
+
+/// Planes that the passes of the loss take at once; `shaders/shared/window.wgsl`.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct Planes {
+    /// One for each z of the workgroups.
+    pub each: [Plane; 6],
+    /// How many there are.
+    pub count: u32,
+    /// Padding to 16 bytes.
+    pub unused: [u32; 3],
+}
+
+impl Planes {
+    /// At most six.
+    pub(crate) fn new(planes: &[Plane]) -> Self {
+        let mut all: Self = Zeroable::zeroed();
+        all.each[..planes.len()].copy_from_slice(planes);
+        Self { count: planes.len() as u32, ..all }
+    }
 }
 
 /// Uniform of sorting and scanning; `shaders/shared/chunks.wgsl`.

@@ -29,8 +29,10 @@ pub fn project_backward(
         }
         let i = (g - view.first) as usize;
         let put = |c: usize, value: f32| gradients[c * page + i] = value;
-        let pairs = (start - view.slot_first) as usize..(start - view.slot_first + touched[g as usize]) as usize;
-        let slot = sum_of(slots, floats, pairs);
+        let first = start - view.slot_first;
+        let runs = (first / view.fold + 1) * view.fold;
+        let pairs = std::iter::once(first).chain((runs..first + touched[g as usize]).step_by(view.fold as usize));
+        let slot = sum_of(slots, floats, pairs.take(touched[g as usize] as usize));
         match backward_one(view, channels, |c| params[c * page + i], touched[g as usize] > 0, &splats[g as usize], &slot, put) {
             Some(length) if channels.color() => {
                 stats[g as usize] += length;
@@ -42,10 +44,10 @@ pub fn project_backward(
 }
 
 /// Sum of the slots of `pairs`; slots of four floats are the last four of the twelve.
-fn sum_of(slots: &[f32], floats: usize, pairs: std::ops::Range<usize>) -> [f32; 12] {
+fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f32; 12] {
     let mut slot = [0.0; 12];
-    for pair in slots[pairs.start * floats..pairs.end * floats].chunks_exact(floats) {
-        for (sum, value) in slot[12 - floats..].iter_mut().zip(pair) {
+    for pair in pairs {
+        for (sum, value) in slot[12 - floats..].iter_mut().zip(&slots[pair as usize * floats..]) {
             *sum += value;
         }
     }

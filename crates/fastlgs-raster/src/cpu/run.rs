@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::channels::Channels;
+use crate::view::Planes;
 use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
 
 /// Runs the twin of the pass `name` on its uniform and its storage buffers, in the order of the bindings.
@@ -14,7 +15,16 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
     }
     let view = || uniform_of::<crate::View>(uniform);
     let job = || uniform_of::<crate::view::Job>(uniform);
-    let plane = || uniform_of::<Plane>(uniform);
+    // Planes that are done at once have maps of their own, one after the other.
+    let each_plane = |rows: &mut [u32], other: &mut [u32], twin: &mut dyn FnMut(&Plane, &mut [u32], &mut [u32])| {
+        let planes = uniform_of::<Planes>(uniform);
+        for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
+            let size = (4 * plane.quads * plane.rows) as usize;
+            let own = |maps: usize, all: &[u32]| number * maps * size..all.len().min((number + 1) * maps * size);
+            let (rows_of, other_of) = (own(5, rows), own(3, other));
+            twin(plane, &mut rows[rows_of], other.get_mut(other_of).unwrap_or_default());
+        }
+    };
     match (name, buffers) {
         ("project", [params, splats, depths, footprints, touched]) => {
             project(&view(), read(params), write(splats), depths, write(footprints), touched);
@@ -38,12 +48,21 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         ("blend_ids", [ranges, sorted, gaussians, splats, ids, shares]) => {
             blend_ids(&view(), ranges, sorted, gaussians, read(splats), ids, shares);
         }
-        ("ssim_rows", [frame, targets, rows]) => ssim_rows(&plane(), read(frame), targets, write(rows)),
-        ("ssim_columns", [rows, partials, sums]) => ssim_columns(&plane(), read(rows), write(partials), write(sums)),
-        ("ssim_backward_rows", [partials, rows]) => ssim_backward_rows(&plane(), read(partials), write(rows)),
-        ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
-            loss_gradient(&plane(), read(frame), targets, read(rows), write(gradient), write(sums));
+        ("ssim_rows", [frame, targets, rows]) => {
+            each_plane(rows, &mut [], &mut |plane, rows, _| ssim_rows(plane, read(frame), targets, write(rows)));
         }
+        ("ssim_columns", [rows, partials, sums]) => {
+            each_plane(rows, partials, &mut |plane, rows, partials| ssim_columns(plane, read(rows), write(partials), write(sums)));
+        }
+        ("ssim_backward_rows", [partials, rows]) => {
+            each_plane(rows, partials, &mut |plane, rows, partials| ssim_backward_rows(plane, read(partials), write(rows)));
+        }
+        ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
+            let mut twin =
+                |plane: &Plane, rows: &mut [u32]| loss_gradient(plane, read(frame), targets, read(rows), write(gradient), write(sums));
+            each_plane(rows, &mut [], &mut |plane, rows, _| twin(plane, rows));
+        }
+        ("fold_slots", [touched, first, gaussians, slots]) => fold_slots(&view(), channels, touched, first, gaussians, write(slots)),
         ("blend_backward", [ranges, order, sorted, gaussians, splats, frame, gradient, slots]) => {
             let order = &order[..view().tile_count() as usize];
             let (frame, gradient) = (read(frame), read(gradient));

@@ -5,7 +5,7 @@ use super::lists::Lists;
 use super::pages::Gaussians;
 use crate::channels::Channels;
 use crate::pass::Recorder;
-use crate::shader::shaders::{AdamBuffers, BlendBackwardBuffers, ProjectBackwardBuffers};
+use crate::shader::shaders::{AdamBuffers, BlendBackwardBuffers, FoldSlotsBuffers, ProjectBackwardBuffers};
 use crate::view::{Step, View, stride};
 use crate::{Error, Gpu, Result};
 use wgpu::Buffer;
@@ -63,9 +63,14 @@ impl Slots {
         let Gaussians { splats, stats, .. } = g;
         let (slots, windows) = self.windows(gpu, view, channels)?;
         for (slot_first, slot_count) in windows {
-            let view = View { slot_first, slot_count, ..*view };
+            let view = View { slot_first, slot_count, fold: gpu.shape.fold(), ..*view };
             let of_frame = BlendBackwardBuffers { ranges, tile_order, sorted_pairs, pair_gaussians, splats, frame, gradient, slots };
             r.run(&passes.blend_backward, &view, of_frame, gpu.shape.groups(view.tile_count()))?;
+            if view.fold > 1 {
+                let folded = FoldSlotsBuffers { touched, first_pair, pair_gaussians, slots };
+                let pairs = (view.pairs - slot_first).min(slot_count.saturating_add(view.tile_count()));
+                r.run(&passes.fold_slots, &view, folded, pairs.div_ceil(view.fold).div_ceil(GROUP))?;
+            }
             for page in &g.pages {
                 let view = View { first: page.first as u32, page: page.n as u32, ..view };
                 let (params, gradients) = (&page.params, &page.gradients);

@@ -41,6 +41,7 @@ pub struct Blending {
     pub project: Typed<shaders::Project>,
     pub blend: Typed<shaders::Blend>,
     pub blend_backward: Typed<shaders::BlendBackward>,
+    pub fold_slots: Typed<shaders::FoldSlots>,
     pub project_backward: Typed<shaders::ProjectBackward>,
 }
 
@@ -92,6 +93,7 @@ impl Kernels {
             project: Typed::new(gpu, channels, harmonics),
             blend: Typed::new(gpu, channels, harmonics),
             blend_backward: Typed::new(gpu, channels, harmonics),
+            fold_slots: Typed::new(gpu, channels, harmonics),
             project_backward: Typed::new(gpu, channels, harmonics),
         });
     }

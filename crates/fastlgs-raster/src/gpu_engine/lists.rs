@@ -92,7 +92,7 @@ impl ListMaker {
         let mut r = Recorder::new(gpu, *on_cpu);
         let (pair_tiles, pair_gaussians, ranges) = (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
         let emitted = EmitBuffers { order, offsets, footprints, touched, pair_tiles, pair_gaussians, first_pair };
-        r.run(&listing.emit, &view, emitted, groups)?;
+        r.run(&listing.emit, &view, emitted, (n * gpu.shape.writers()).div_ceil(GROUP))?;
         let sorted = pairs.sort.record(gpu, sorting, &mut r, view.pairs, tile_bits(&view))?;
         r.clear(ranges);
         let sorted_tiles = &pairs.sort.keys[sorted];

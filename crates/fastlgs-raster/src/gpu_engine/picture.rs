@@ -4,9 +4,10 @@ use super::kernels::{GROUP, Training};
 use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::engine::{Losses, Memory, StepOptions, losses_of, planes};
-use crate::pass::Recorder;
+use crate::pass::{Groups, Recorder};
 use crate::shader::shaders::{LossGradientBuffers, SsimBackwardRowsBuffers, SsimColumnsBuffers, SsimRowsBuffers};
-use crate::view::View;
+use crate::shape::Shape;
+use crate::view::{Planes, View};
 use crate::{Gpu, Result};
 use wgpu::Buffer;
 
@@ -26,9 +27,14 @@ impl Picture {
     }
 }
 
+/// What every adapter binds at once, in bytes.
+const LARGEST: u64 = 128 << 20;
+
 /// Buffers of the loss.
 pub struct Loss {
     size: [u32; 2],
+    /// Planes that are done at once.
+    at_once: usize,
     pub gradient: Buffer,
     rows: Buffer,
     partials: Buffer,
@@ -43,12 +49,16 @@ impl Loss {
             return Ok(loss);
         }
         let pixels = view.padded_pixels() as u64;
+        // Real GPUs have room for all; a software adapter's cache has not.
+        let rows = 20 * pixels;
+        let at_once = if gpu.shape == Shape::Wide { 1 } else { (LARGEST.min(gpu.max_binding) / rows).clamp(1, 6) };
         let sums = 24 * u64::from(RUN as u32 * view.tile_count());
         Ok(Self {
             size: view.size,
+            at_once: at_once as usize,
             gradient: gpu.storage("the frame's gradient", 24 * pixels)?,
-            rows: gpu.storage("SSIM rows", 20 * pixels)?,
-            partials: gpu.storage("SSIM partials", 12 * pixels)?,
+            rows: gpu.storage("SSIM rows", at_once * rows)?,
+            partials: gpu.storage("SSIM partials", at_once * 12 * pixels)?,
             ssim_sums: gpu.storage("SSIM sums", sums)?,
             sums: gpu.storage("loss sums", 4 * sums)?,
         })
@@ -65,13 +75,14 @@ impl Loss {
         targets: &Buffer,
     ) -> Result<()> {
         let Self { gradient, rows, partials, ssim_sums, sums, .. } = self;
-        for plane in planes(view, options) {
-            let row_groups = (plane.quads / 2 * plane.rows).div_ceil(GROUP);
-            let column_groups = (plane.rows / 8 * plane.quads).div_ceil(GROUP);
-            r.run(&passes.ssim_rows, &plane, SsimRowsBuffers { frame, targets, rows }, row_groups)?;
-            r.run(&passes.ssim_columns, &plane, SsimColumnsBuffers { rows, partials, sums: ssim_sums }, column_groups)?;
-            r.run(&passes.ssim_backward_rows, &plane, SsimBackwardRowsBuffers { partials, rows }, row_groups)?;
-            r.run(&passes.loss_gradient, &plane, LossGradientBuffers { frame, targets, rows, gradient, sums }, column_groups)?;
+        for some in planes(view, options).chunks(self.at_once) {
+            let (planes, plane) = (Planes::new(some), some[0]);
+            let by_row = Groups { flat: (plane.quads / 2 * plane.rows).div_ceil(GROUP), z: planes.count };
+            let by_column = Groups { flat: (plane.rows / 8 * plane.quads).div_ceil(GROUP), z: planes.count };
+            r.run(&passes.ssim_rows, &planes, SsimRowsBuffers { frame, targets, rows }, by_row)?;
+            r.run(&passes.ssim_columns, &planes, SsimColumnsBuffers { rows, partials, sums: ssim_sums }, by_column)?;
+            r.run(&passes.ssim_backward_rows, &planes, SsimBackwardRowsBuffers { partials, rows }, by_row)?;
+            r.run(&passes.loss_gradient, &planes, LossGradientBuffers { frame, targets, rows, gradient, sums }, by_column)?;
         }
         Ok(())
     }

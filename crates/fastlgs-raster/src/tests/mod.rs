@@ -6,7 +6,7 @@ mod gradients;
 mod passes;
 mod training;
 
-use crate::{Channels, Gpu, TargetImage, pack};
+use crate::{Channels, Gpu, Shape, TargetImage, pack};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
 use glam::Vec3;
@@ -21,6 +21,15 @@ pub(crate) fn gpu() -> Option<Gpu> {
             None
         }
     }
+}
+
+/// The adapter in each kernel shape, as it would be opened for it.
+pub(crate) fn shaped() -> impl Iterator<Item = Gpu> {
+    Shape::ALL.into_iter().filter_map(|shape| {
+        let mut gpu = gpu()?;
+        gpu.shape = shape;
+        Some(gpu)
+    })
 }
 
 pub(crate) fn camera(width: u32, height: u32) -> Camera {

@@ -3,9 +3,9 @@
 use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
 use crate::Shape;
 use crate::cpu;
-use crate::pass::{Pass, Recorder};
+use crate::pass::{Groups, Pass, Recorder};
 use crate::shader::{Kernel, Shader, shaders};
-use crate::view::{Ceiling, Job, Perturb, Plane, Step, View, stride};
+use crate::view::{Ceiling, Job, Perturb, Plane, Planes, Step, View, stride};
 use crate::{Channels, Gpu};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::rng::Rng;
@@ -15,7 +15,7 @@ use std::collections::BTreeMap;
 const SIZES: [(usize, u32, u32); 5] = [(1, 17, 13), (300, 64, 48), (5000, 97, 61), (20_000, 270, 480), (200_000, 480, 360)];
 
 /// Runs one pass on the device; `buffers` hold the storage buffers in the order of their bindings and are replaced.
-fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mut [Vec<u32>], groups: u32) {
+fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mut [Vec<u32>], groups: Groups) {
     let storages: Vec<_> = buffers.iter().map(|b| gpu.storage_with("test", b).unwrap()).collect();
     let mut r = Recorder::new(gpu, 0);
     r.record(pass, bytemuck::bytes_of(uniform), &storages.iter().collect::<Vec<_>>(), groups);
@@ -33,11 +33,11 @@ fn both<U: bytemuck::Pod>(
     harmonics: bool,
     uniform: &U,
     buffers: &[&[u32]],
-    groups: u32,
+    groups: impl Into<Groups>,
 ) -> [Vec<Vec<u32>>; 2] {
     let mut device: Vec<Vec<u32>> = buffers.iter().map(|b| b.to_vec()).collect();
     let mut twin = device.clone();
-    on_device(gpu, &Pass::new(gpu, shader, channels, harmonics), uniform, &mut device, groups);
+    on_device(gpu, &Pass::new(gpu, shader, channels, harmonics), uniform, &mut device, groups.into());
     cpu::run(shader.name, channels, bytemuck::bytes_of(uniform), &mut twin);
     [device, twin]
 }
@@ -138,7 +138,9 @@ fn project() {
 fn sorting_and_scanning() {
     let Some(mut gpu) = gpu() else { return };
     let mut rng = Rng::new(3, "sort");
-    for (shape, n) in [Shape::Wide, Shape::Lanes32].into_iter().flat_map(|shape| [1usize, 255, 256, 257, 2048, 2049, 600_003].map(|n| (shape, n))) {
+    for (shape, n) in
+        [Shape::Wide, Shape::Lanes32].into_iter().flat_map(|shape| [1usize, 255, 256, 257, 2048, 2049, 600_003].map(|n| (shape, n)))
+    {
         gpu.shape = shape;
         let keys: Vec<u32> = (0..n).map(|_| rng.next_u64() as u32 & 0xffff).collect();
         let values: Vec<u32> = (0..n as u32).rev().collect();
@@ -172,8 +174,9 @@ fn sorting_and_scanning() {
 
 #[test]
 fn listing() {
-    let Some(gpu) = gpu() else { return };
-    for (n, w, h) in SIZES {
+    let Some(mut gpu) = gpu() else { return };
+    for (shape, (n, w, h)) in [Shape::Wide, Shape::Lanes32].into_iter().flat_map(|shape| SIZES.map(|size| (shape, size))) {
+        gpu.shape = shape;
         let l = lists(n, w, h, 0, false);
         let b = |name: &str| &l.buffers[name][..];
         let exact = |shader: &'static Shader, buffers: &[&[u32]], items: u32| {
@@ -184,7 +187,7 @@ fn listing() {
         let (pairs, blank) = (l.view.pairs as usize, zeros((l.view.pairs + l.view.gaussians) as usize));
         let inputs =
             [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
-        exact(shaders::Emit::SHADER, &inputs, l.view.gaussians);
+        exact(shaders::Emit::SHADER, &inputs, l.view.gaussians * gpu.shape.writers());
         exact(shaders::TileRanges::SHADER, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
         // log2 may differ in its last bit, and with it the key by one.
         let [device, twin] = both(
@@ -226,8 +229,17 @@ fn blending_and_its_gradients() {
             let gradient: Vec<u32> = (0..6 * pixels).map(|_| rng.normal().to_bits()).collect();
             let slots = vec![9.0f32.to_bits(); 4 * channels.slot() * view.pairs as usize];
             let buffers = [&listed[..], &[frame, &gradient, &slots]].concat();
-            let [device, twin] = both(&gpu, shaders::BlendBackward::SHADER, channels, false, &view, &buffers, groups);
+            let [device, mut twin] = both(&gpu, shaders::BlendBackward::SHADER, channels, false, &view, &buffers, groups);
             assert_close(&format!("slots, {what}"), floats(&device[7]), floats(&twin[7]), 0.02, 0.005);
+
+            let view = View { fold: shape.fold(), ..view };
+            if view.fold > 1 {
+                let buffers = [b("touched"), b("first"), b("gaussians"), &twin[7]];
+                let runs = view.pairs.div_ceil(view.fold).div_ceil(64);
+                let [device, mut folded] = both(&gpu, shaders::FoldSlots::SHADER, channels, false, &view, &buffers, runs);
+                assert_close(&format!("folded slots, {what}"), floats(&device[3]), floats(&folded[3]), 1e-4, 0.0);
+                twin[7] = folded.swap_remove(3);
+            }
 
             let count = view.gaussians as usize;
             let (gradients, stats) = (zeros(l.params.len()), zeros(2 * count));
@@ -284,17 +296,18 @@ fn loss() {
         let targets: Vec<u32> = (0..2 * n).map(|i| rng.next_u64() as u32 | if i % 31 == 0 { 0 } else { 0x8000_0000 }).collect();
         let (quads, rows) = (2 * view.tiles[0], 8 * view.tiles[1]);
         let plane = Plane { size: view.size, quads, rows, channel: 2, scale: 0.5, lambda: 0.2, gain: 1.1, offset: -0.05, unused: [0; 3] };
-        let (row_groups, column_groups) = ((quads / 2 * rows).div_ceil(64), (rows / 8 * quads).div_ceil(64));
+        let planes = Planes::new(&[plane, Plane { channel: 3, gain: 1.0, offset: 0.0, ..plane }]);
+        let [row_groups, column_groups] = [quads / 2 * rows, rows / 8 * quads].map(|items| Groups { flat: items.div_ceil(64), z: 2 });
         let sums = zeros(24 * (rows / 8 * quads * 4) as usize);
-        let run = |shader: &'static Shader, buffers: &[&[u32]], groups: u32, tolerances: &[(usize, f32)]| {
-            let [device, twin] = both(&gpu, shader, Channels::Both, false, &plane, buffers, groups);
+        let run = |shader: &'static Shader, buffers: &[&[u32]], groups: Groups, tolerances: &[(usize, f32)]| {
+            let [device, twin] = both(&gpu, shader, Channels::Both, false, &planes, buffers, groups);
             for (k, tolerance) in tolerances {
                 assert_close(&format!("{} {k} at {w}x{h}", shader.name), floats(&device[*k]), floats(&twin[*k]), *tolerance, 0.0);
             }
             twin
         };
-        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(5 * n)], row_groups, &[(2, 1e-4)]);
-        let ssim = run(shaders::SsimColumns::SHADER, &[&blurred[2], &zeros(3 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
+        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(10 * n)], row_groups, &[(2, 1e-4)]);
+        let ssim = run(shaders::SsimColumns::SHADER, &[&blurred[2], &zeros(6 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
         let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
         run(shaders::LossGradient::SHADER, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
     }
