@@ -107,7 +107,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         sum1 += slots[SLOT * e + 1u];
 #endif
         sum2 += slots[SLOT * e + SLOT - 1u];
+#ifdef WIDE
+        e++;
+#else
         e = (e / view.fold + 1u) * view.fold;
+#endif
     }
     put3(FEATURE, i, sum2.yzw);
 #ifdef WITH_COLOR
