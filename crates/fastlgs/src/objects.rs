@@ -12,6 +12,7 @@ use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
 use fastlgs_vision::photo_quality::{self, Impression};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -202,10 +203,11 @@ fn embed(
 ) -> Result<(Vec<Mask>, Vec<u16>)> {
     let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
     let work = run.work("embeddings", training.len() as u64);
-    let (mut found, mut object_of, mut impressions) = (Vec::new(), Vec::new(), Vec::new());
-    for (view, camera) in training.iter().enumerate() {
+    // All views at once: the masks of one are too few for many cores.
+    let of_view = |(view, camera): (usize, &Camera)| -> Result<(Vec<Mask>, Impression)> {
         let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
+        let mut found = Vec::new();
         for layer in layers {
             let wanted: BTreeSet<u16> = layer.iter().copied().filter(|id| shown[usize::from(*id) - 1].contains(&view)).collect();
             if wanted.is_empty() {
@@ -213,13 +215,15 @@ fn embed(
             }
             let on_layer: Vec<u16> = lists.iter().map(|list| list.iter().find(|id| wanted.contains(id)).copied().unwrap_or(0)).collect();
             let labels = map.labels.iter().map(|l| on_layer[usize::from(*l)]).collect();
-            let masks = masks::described(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?;
-            object_of.extend(masks.iter().map(|m| m.label));
-            found.extend(masks);
+            found.extend(masks::described(&camera.name, &photo, view, &LabelMap { labels, ..map }, encoder.as_ref())?);
         }
-        impressions.push(Impression::of(&photo));
         work.advance()?;
-    }
+        Ok((found, Impression::of(&photo)))
+    };
+    let (found, impressions): (Vec<Vec<Mask>>, Vec<Impression>) =
+        training.par_iter().enumerate().map(of_view).collect::<Result<Vec<_>>>()?.into_iter().unzip();
+    let mut found = found.concat();
+    let object_of = found.iter().map(|mask| mask.label).collect();
     let sharpness = photo_quality::weights(&impressions);
     found.iter_mut().for_each(|mask: &mut Mask| mask.area *= sharpness[mask.view]);
     Ok((found, object_of))
