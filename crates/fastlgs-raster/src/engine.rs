@@ -3,11 +3,11 @@
 use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::density::State;
-
 use crate::shape::Shape;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
 use fastlgs_core::Shares;
+use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// A rendered frame, planar.
@@ -25,15 +25,15 @@ pub struct Frame {
 
 impl Frame {
     /// The frame of a view from rows (of a channel and y) that begin at its left border; only what was rendered is copied.
-    pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32]) -> Self {
+    pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32] + Sync) -> Self {
         let [w, h] = view.size.map(|s| s as usize);
         let mut data = vec![0.0; 8 * w * h];
-        let rendered = |c: &usize| (*c >= 3 || channels.color()) && (!(3..6).contains(c) || channels.feature());
-        for channel in (0..8).filter(rendered) {
-            for (y, out) in data[channel * w * h..][..w * h].chunks_exact_mut(w).enumerate() {
+        let rendered = |c: usize| (c >= 3 || channels.color()) && (!(3..6).contains(&c) || channels.feature());
+        data.par_chunks_exact_mut(w * h).enumerate().filter(|(channel, _)| rendered(*channel)).for_each(|(channel, plane)| {
+            for (y, out) in plane.chunks_exact_mut(w).enumerate() {
                 out.copy_from_slice(&row(channel, y as u32)[..w]);
             }
-        }
+        });
         Self { width: view.size[0], height: view.size[1], data, pairs: view.pairs }
     }
 
