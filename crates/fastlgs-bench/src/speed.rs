@@ -238,9 +238,11 @@ fn resampled(scene: &Gaussians, count: usize, seed: u64) -> Gaussians {
     let mut rng = Rng::new(seed, "bench resampling");
     let mut order: Vec<usize> = (0..scene.len()).collect();
     rng.shuffle(&mut order);
-    let chosen: Vec<usize> = (0..count).map(|i| order[i % order.len()]).collect();
+    let mut chosen: Vec<usize> = (0..count).map(|i| order[i % order.len()]).collect();
+    // In the scene's order, as training holds them.
+    chosen.sort_unstable();
     let mut out = scene.select(&chosen);
-    for i in scene.len().min(count)..count {
+    for i in (1..count).filter(|&i| chosen[i] == chosen[i - 1]) {
         // A copy beside its original, no farther than its own size.
         let noise = Vec3::new(rng.normal(), rng.normal(), rng.normal());
         out.means[i] += noise * out.log_scales[i].max_element().exp().min(1.0);

@@ -70,6 +70,11 @@ impl State {
         self.params.is_empty()
     }
 
+    /// Centre of Gaussian `i`.
+    pub(crate) fn mean(&self, i: usize) -> Vec3 {
+        self.vec3(0, i)
+    }
+
     fn vec3(&self, channel: usize, i: usize) -> Vec3 {
         let n = self.len();
         Vec3::new(self.params[channel * n + i], self.params[(channel + 1) * n + i], self.params[(channel + 2) * n + i])
