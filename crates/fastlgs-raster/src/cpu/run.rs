@@ -10,21 +10,8 @@ use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
 /// # Panics
 /// If there is no such pass, or a buffer is too small.
 pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut [Vec<u32>]) {
-    fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
-        bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
-    }
     let view = || uniform_of::<crate::View>(uniform);
     let job = || uniform_of::<crate::view::Job>(uniform);
-    // Planes that are done at once have maps of their own, one after the other.
-    let each_plane = |rows: &mut [u32], other: &mut [u32], twin: &mut dyn FnMut(&Plane, &mut [u32], &mut [u32])| {
-        let planes = uniform_of::<Planes>(uniform);
-        for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
-            let size = (4 * plane.quads * plane.rows) as usize;
-            let own = |maps: usize, all: &[u32]| number * maps * size..all.len().min((number + 1) * maps * size);
-            let (rows_of, other_of) = (own(5, rows), own(3, other));
-            twin(plane, &mut rows[rows_of], other.get_mut(other_of).unwrap_or_default());
-        }
-    };
     match (name, buffers) {
         ("project", [params, splats, depths, footprints, touched]) => {
             project(&view(), read(params), write(splats), depths, write(footprints), touched);
@@ -49,18 +36,22 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
             blend_ids(&view(), ranges, sorted, gaussians, read(splats), ids, shares);
         }
         ("ssim_rows", [frame, targets, rows]) => {
-            each_plane(rows, &mut [], &mut |plane, rows, _| ssim_rows(plane, read(frame), targets, write(rows)));
+            each_plane(&uniform_of(uniform), rows, &mut [], |plane, rows, _| ssim_rows(plane, read(frame), targets, write(rows)));
         }
         ("ssim_columns", [rows, partials, sums]) => {
-            each_plane(rows, partials, &mut |plane, rows, partials| ssim_columns(plane, read(rows), write(partials), write(sums)));
+            each_plane(&uniform_of(uniform), rows, partials, |plane, rows, partials| {
+                ssim_columns(plane, read(rows), write(partials), write(sums))
+            });
         }
         ("ssim_backward_rows", [partials, rows]) => {
-            each_plane(rows, partials, &mut |plane, rows, partials| ssim_backward_rows(plane, read(partials), write(rows)));
+            each_plane(&uniform_of(uniform), rows, partials, |plane, rows, partials| {
+                ssim_backward_rows(plane, read(partials), write(rows))
+            });
         }
         ("loss_gradient", [frame, targets, rows, gradient, sums]) => {
             let mut twin =
                 |plane: &Plane, rows: &mut [u32]| loss_gradient(plane, read(frame), targets, read(rows), write(gradient), write(sums));
-            each_plane(rows, &mut [], &mut |plane, rows, _| twin(plane, rows));
+            each_plane(&uniform_of(uniform), rows, &mut [], |plane, rows, _| twin(plane, rows));
         }
         ("fold_slots", [touched, first, gaussians, slots]) => fold_slots(&view(), channels, touched, first, gaussians, write(slots)),
         ("blend_backward", [ranges, order, sorted, gaussians, splats, frame, gradient, slots]) => {
@@ -78,5 +69,18 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         ("ceiling", [out]) => ceiling(&uniform_of(uniform), write(out)),
         ("perturb", [params]) => perturb(&uniform_of(uniform), write(params)),
         (name, buffers) => panic!("no twin '{name}' of {} buffers", buffers.len()),
+    }
+}
+
+fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
+    bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
+}
+
+/// Hands each plane to a twin with its own maps: five of `rows`, and three of `partials` where there are any.
+fn each_plane(planes: &Planes, rows: &mut [u32], partials: &mut [u32], mut twin: impl FnMut(&Plane, &mut [u32], &mut [u32])) {
+    for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
+        let size = (4 * plane.quads * plane.rows) as usize;
+        let own = |maps: usize| number * maps * size..(number + 1) * maps * size;
+        twin(plane, &mut rows[own(5)], partials.get_mut(own(3)).unwrap_or_default());
     }
 }
