@@ -64,8 +64,11 @@ const BATCH: u32 = 8u;
 #else
 #import stage
 
-// The workgroup's tiles through which light still passes, as bits; batches take turns with the two words.
-var<workgroup> open: array<atomic<u32>, 2>;
+// What is written out below goes by this, and Gaussians are put down every second batch.
+const_assert BATCH == 8u && TILE_LANES == 2u * BATCH;
+
+// The workgroup's tiles through which light still passes, as bits.
+var<workgroup> open: atomic<u32>;
 #endif
 
 @compute @workgroup_size(LANES)
@@ -114,12 +117,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
 #else
     var fetched = fetch(start, lane.number, length);
-    if index == 0u {
-        atomicStore(&open[0], 0u);
-    }
     var goes_on = length > 0u;
-    for (var batch = 0u; ; batch++) {
-        let k = BATCH * batch;
+    for (var k = 0u; ; k += BATCH) {
+        if index == 0u {
+            atomicStore(&open, 0u);
+        }
         if k % TILE_LANES == 0u {
             put_down(fetched, lane.tile, k + lane.number);
             fetched = fetch(start, k + TILE_LANES + lane.number, length);
@@ -132,18 +134,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             add(&q0, px - staged_splats[at$K][0].x, py - staged_splats[at$K][0].y, staged_splats[at$K][0], staged_splats[at$K][1], staged_splats[at$K][2]);
 #end
             if walked < length && any(q0.transmittance >= vec4<f32>(view.finished)) {
-                atomicOr(&open[batch % 2u], 1u << lane.tile);
+                atomicOr(&open, 1u << lane.tile);
             }
         }
-        workgroupBarrier();
-        let still_open = atomicLoad(&open[batch % 2u]);
+        let still_open = workgroupUniformLoad(&open);
         if still_open == 0u {
             break;
         }
         goes_on = (still_open & (1u << lane.tile)) != 0u;
-        if index == 0u {
-            atomicStore(&open[(batch + 1u) % 2u], 0u);
-        }
     }
 #endif
     if exists {

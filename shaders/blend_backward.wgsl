@@ -19,7 +19,12 @@
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(6) var<storage, read> frame: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read> gradient: array<vec4<f32>>;
+#ifdef WIDE
 @group(0) @binding(8) var<storage, read_write> slots: array<vec4<f32>>;
+#else
+// Number by number, as several invocations write a slot: to some languages a part of a vector is the whole of it, read, changed and written back.
+@group(0) @binding(8) var<storage, read_write> slots: array<f32>;
+#endif
 
 struct Quad {
     transmittance: vec4<f32>,
@@ -134,6 +139,8 @@ fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
 
 // Gaussians between two sums over the invocations of a tile, and the numbers that are added up for each.
 const ROUND: u32 = 4u;
+// What is written out below goes by these.
+const_assert ROUND == 4u && TILE_LANES == 16u;
 const NUMBERS: u32 = 4u * SLOT;
 
 // [tile][Gaussian of the round][number][invocation], the invocations of each row turned by its number, so that those who write a column and those
@@ -207,8 +214,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     workgroupBarrier();
     atomicMax(&longest, length);
-    workgroupBarrier();
-    let most = atomicLoad(&longest);
+    let most = workgroupUniformLoad(&longest);
     for (var k = 0u; k < most; k += ROUND) {
         if k % TILE_LANES == 0u {
             put_down(fetched, lane.tile, k + lane.number);
@@ -242,8 +248,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             let i = k + row / NUMBERS;
             let e = staged_pairs[staged_pair_at(lane.tile, i)];
             if i < length && in_window(e, view) {
-                let at = row % NUMBERS;
-                slots[SLOT * (e - view.slot_first) + at / 4u][at % 4u] = sum;
+                slots[NUMBERS * (e - view.slot_first) + row % NUMBERS] = sum;
             }
         }
     }
@@ -252,9 +257,15 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var k = start + length + lane.number; k < end; k += TILE_LANES) {
         let e = sorted_pairs[k];
         if in_window(e, view) {
+#ifdef WIDE
             for (var s = 0u; s < SLOT; s++) {
                 slots[SLOT * (e - view.slot_first) + s] = vec4<f32>(0.0);
             }
+#else
+            for (var s = 0u; s < NUMBERS; s++) {
+                slots[NUMBERS * (e - view.slot_first) + s] = 0.0;
+            }
+#endif
         }
     }
 }

@@ -37,12 +37,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let g = order[rank];
     let start = offsets[rank];
-    first_pair[g] = start;
-    if touched[g] == 0u {
+    // The first writer may have lowered it already, to what there is to write: that changes nothing for the others.
+    let end = start + touched[g];
+    if writer == 0u {
+        first_pair[g] = start;
+    }
+    if start == end {
         return;
     }
-    // The first writer may have lowered it already: to the end of what there is to write.
-    let end = start + touched[g];
     var e = start;
     let f0 = footprints[2u * g];
     let f1 = footprints[2u * g + 1u];

@@ -50,9 +50,12 @@ fn main() {
     fs::write(Path::new(&env::var("OUT_DIR").expect("cargo sets OUT_DIR")).join("shaders.rs"), out).expect("writable OUT_DIR");
 }
 
-/// Flags of `Shape` in `src/gpu.rs`.
+/// Workgroup memory that every adapter of WebGPU grants.
+const WORKGROUP_BYTES: u32 = 16_384;
+
+/// Flags of `Shape` in `src/shape.rs`.
 const SHAPES: [&[&str]; 3] = [&[], &["LANES64"], &["WIDE"]];
-/// Flags of `Channels` in `src/pass.rs`.
+/// Flags of `Channels` in `src/channels.rs`.
 const CHANNELS: [&[&str]; 4] =
     [&["WITH_COLOR"], &["WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"]];
 
@@ -131,6 +134,9 @@ fn validate(name: &str, source: &str) -> Vec<Bound> {
         .validate(&module)
         .unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
     translate(name, &module, &info);
+    let shared = module.global_variables.iter().filter(|(_, v)| v.space == naga::AddressSpace::WorkGroup);
+    let bytes: u32 = shared.map(|(_, v)| module.types[v.ty].inner.size(module.to_ctx()).next_multiple_of(16)).sum();
+    assert!(bytes <= WORKGROUP_BYTES, "shaders/{name}.wgsl: {bytes} bytes of workgroup memory");
     let mut bound: Vec<Bound> = module
         .global_variables
         .iter()
@@ -203,6 +209,7 @@ impl Kernel for {title} {{
     }}
 }}
 const _: () = assert!(size_of::<crate::view::{uniform}>() == {bytes}, \"{uniform} has another size in shaders/{name}.wgsl\");
+const _: () = assert!({bytes} <= crate::gpu::UNIFORM_SLOT, \"{uniform} needs larger slots\");
 ",
         sources = sources.join(", "),
         kinds = kinds.join(", "),

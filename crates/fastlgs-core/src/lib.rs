@@ -10,6 +10,7 @@ pub mod camera;
 pub mod camera_path;
 pub mod color;
 pub mod compact;
+pub mod curve;
 pub mod dataset;
 pub mod error;
 pub mod exr_image;

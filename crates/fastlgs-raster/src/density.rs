@@ -2,6 +2,7 @@
 //! (section 5), and relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024).
 
 use fastlgs_core::Gaussians;
+use fastlgs_core::curve::along_curve;
 use fastlgs_core::gaussians::{channels, logit, sigmoid};
 use fastlgs_core::rng::Rng;
 use glam::{Quat, Vec3};
@@ -70,11 +71,6 @@ impl State {
         self.params.is_empty()
     }
 
-    /// Centre of Gaussian `i`.
-    pub(crate) fn mean(&self, i: usize) -> Vec3 {
-        self.vec3(0, i)
-    }
-
     fn vec3(&self, channel: usize, i: usize) -> Vec3 {
         let n = self.len();
         Vec3::new(self.params[channel * n + i], self.params[(channel + 1) * n + i], self.params[(channel + 2) * n + i])
@@ -92,10 +88,13 @@ impl State {
     fn gathered(&self, sources: &[(usize, bool)]) -> Self {
         let n = self.len();
         let pick = |values: &[f32], keep_fresh: bool| {
-            (0..channels(self.sh_degree))
-                .flat_map(|c| sources.iter().map(move |&(i, fresh)| (c, i, fresh)))
-                .map(|(c, i, fresh)| if fresh && !keep_fresh { 0.0 } else { values[c * n + i] })
-                .collect()
+            let mut picked = vec![0.0; channels(self.sh_degree) * sources.len()];
+            picked.par_chunks_mut(sources.len().max(1)).zip(values.par_chunks(n.max(1))).for_each(|(out, values)| {
+                for (value, &(i, fresh)) in out.iter_mut().zip(sources) {
+                    *value = if fresh && !keep_fresh { 0.0 } else { values[i] };
+                }
+            });
+            picked
         };
         let (params, moment1, moment2) = (pick(&self.params, true), pick(&self.moment1, false), pick(&self.moment2, false));
         Self { sh_degree: self.sh_degree, params, moment1, moment2 }
@@ -105,6 +104,13 @@ impl State {
     pub fn keep(&mut self, places: &[usize]) {
         let sources: Vec<(usize, bool)> = places.iter().map(|&i| (i, false)).collect();
         *self = self.gathered(&sources);
+    }
+
+    /// Puts the Gaussians along a curve through space: neighbours on the device are then neighbours in pictures as well, and what a step asks for
+    /// lies together.
+    pub(crate) fn sort_along_curve(&mut self) {
+        let means: Vec<Vec3> = (0..self.len()).map(|i| self.vec3(0, i)).collect();
+        self.keep(&along_curve(&means));
     }
 
     /// Removes Gaussians whose mean lies where nothing is; returns how many.

@@ -124,7 +124,7 @@ pub struct Losses {
 pub trait Engine: Send {
     /// The adapter, for reports.
     fn name(&self) -> String;
-    /// How the blending kernels divide a tile; nothing where there are no kernels. The same bytes come of the same shape alone.
+    /// How the kernels divide their work; nothing where there are no kernels. The same bytes come of the same shape alone.
     fn shape(&self) -> Option<Shape> {
         None
     }

@@ -18,7 +18,7 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name of the adapter.
     pub name: String,
-    /// How the blending kernels divide a tile: a guess, until [`crate::tuning`] knows better.
+    /// How the kernels divide their work: a guess, until [`crate::tuning`] knows better.
     pub shape: Shape,
     /// The adapter with its driver's version: what measurements hold for.
     pub identity: String,

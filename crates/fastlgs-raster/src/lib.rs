@@ -13,7 +13,6 @@ pub mod change;
 mod channels;
 mod checkpoint;
 pub mod cpu;
-mod curve;
 pub mod density;
 mod engine;
 mod exposure;

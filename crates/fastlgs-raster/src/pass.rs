@@ -89,7 +89,7 @@ impl<'a> Recorder<'a> {
         let uniform = wgpu::BufferBinding { buffer: &self.gpu.uniforms, offset: place as u64, size };
         // Times are taken at the ends of compute passes, so that each needs its own.
         let timestamp_writes = self.gpu.profile.as_ref().and_then(|p| p.next(pass.shader.name));
-        if timestamp_writes.is_some() {
+        if self.gpu.profile.is_some() {
             self.open = None;
         }
         let encoder = &mut self.encoder;

@@ -8,7 +8,8 @@ use std::str::FromStr;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shape {
-    /// Sixteen invocations an 8x8 tile, in workgroups of 32: two tiles. The aliases are what shapes of eight were called.
+    /// Sixteen invocations an 8x8 tile, in workgroups of 32: two tiles.
+    // Reports of earlier trainings name shapes of eight invocations, which are no more.
     #[serde(alias = "shared", alias = "subgroups")]
     Lanes32,
     /// The same in workgroups of 64.

@@ -89,7 +89,7 @@ fn tune_at(path: &Path, device: &str, again: bool) -> Result<Option<Tuning>> {
     let gpu = Gpu::open(device)?;
     let key = key(&gpu.identity);
     let known = table(path).remove(&key);
-    let complete = |t: &Tuning| t.cpu_ms.is_some() || !gpu.software;
+    let complete = |t: &Tuning| (t.cpu_ms.is_some() || !gpu.software) && Shape::ALL.iter().all(|shape| t.step_ms.contains_key(shape));
     if let Some(known) = known.clone().filter(|t| complete(t) && !again) {
         return Ok(Some(known));
     }
@@ -158,6 +158,11 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("shapes.json");
         std::fs::write(&path, "{").unwrap();
+        tune_at(&path, "auto", false).unwrap();
+        // What an earlier version measured can be read, and is measured again.
+        let old = std::fs::read_to_string(&path).unwrap().replace("lanes32", "shared").replace("lanes64", "subgroups");
+        std::fs::write(&path, old).unwrap();
+        assert_eq!(table(&path).remove(&key(&gpu.identity)).unwrap().step_ms.len(), 2);
         let first = tune_at(&path, "auto", false).unwrap().unwrap();
         assert_eq!(first.step_ms.len(), Shape::ALL.len());
         assert!(first.step_ms.values().all(|ms| CLEARLY * ms >= first.step_ms[&first.shape]));

@@ -221,7 +221,7 @@ fn embed(
         Ok((found, Impression::of(&photo)))
     };
     let (found, impressions): (Vec<Vec<Mask>>, Vec<Impression>) =
-        training.par_iter().enumerate().map(of_view).collect::<Result<Vec<_>>>()?.into_iter().unzip();
+        training.par_iter().enumerate().map(of_view).collect::<Vec<_>>().into_iter().collect::<Result<Vec<_>>>()?.into_iter().unzip();
     let mut found = found.concat();
     let object_of = found.iter().map(|mask| mask.label).collect();
     let sharpness = photo_quality::weights(&impressions);

@@ -8,6 +8,7 @@
 mod codebook;
 mod palette;
 
+use crate::curve::along_curve;
 use crate::gaussians::{MAX_SH_DEGREE, logit, rest_len, sigmoid};
 use crate::{Error, Gaussians, Result, fs};
 use codebook::{CODES, codebook, nearest};
@@ -102,7 +103,7 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     if scene.is_empty() {
         return Err(Error::Invalid(format!("{}: there are no Gaussians to write", path.display())));
     }
-    let scene = &scene.select(&spatial_order(scene));
+    let scene = &scene.select(&along_curve(&scene.means));
     let n = scene.len();
     // Whole blocks of four pixels, as the specification's own encoder has them.
     let width = ((n as f64).sqrt() / 4.0).ceil() as usize * 4;
@@ -185,23 +186,6 @@ fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
     }
     let data = archive.finish().map_err(|e| damaged(&e))?.into_inner();
     fs::write_atomic(path, |file| file.write_all(&data))
-}
-
-/// Places of the Gaussians along a curve that fills space (Morton's), so that neighbours in the pictures are alike.
-fn spatial_order(scene: &Gaussians) -> Vec<usize> {
-    let low = scene.means.iter().copied().reduce(Vec3::min).unwrap_or_default();
-    let high = scene.means.iter().copied().reduce(Vec3::max).unwrap_or_default();
-    let size = (high - low).max(Vec3::splat(1e-6));
-    // Every third bit.
-    let spread = |v: u32| (0..10).fold(0u32, |bits, k| bits | (v >> k & 1) << (3 * k));
-    let place = |m: &Vec3| {
-        let [x, y, z] = ((*m - low) / size * 1023.0).to_array().map(|v| spread(v as u32));
-        x | y << 1 | z << 2
-    };
-    let codes: Vec<u32> = scene.means.iter().map(place).collect();
-    let mut order: Vec<usize> = (0..scene.len()).collect();
-    order.sort_by_key(|i| codes[*i]);
-    order
 }
 
 /// The three smallest of (w, x, y, z), between -1 and 1 after a stretch by the square root of 2, and which one is left out.
@@ -328,7 +312,7 @@ mod tests {
         let before = sample(3000);
         write(&path, &before).unwrap();
         let after = read(&path).unwrap();
-        let before = before.select(&spatial_order(&before));
+        let before = before.select(&along_curve(&before.means));
         assert_eq!((after.len(), after.sh_degree), (3000, 2));
         for i in 0..before.len() {
             assert!((after.means[i] - before.means[i]).length() < 2e-3);

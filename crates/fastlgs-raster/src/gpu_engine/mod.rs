@@ -10,7 +10,7 @@ mod sorting;
 use crate::channels::Channels;
 use crate::cpu::CHAINS;
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids};
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
 use crate::pass::{Recorder, Typed};
 use crate::profile::Profile;
 use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, Ceiling as CeilingKernel, CeilingBuffers, PerturbBuffers};
@@ -210,7 +210,7 @@ impl Engine for GpuEngine {
         let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
         let lists = self.forward(view, channels, frozen, &mut on_cpu)?;
         let view = lists.view;
-        self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view)?);
+        self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view, planes(&view, options).len())?);
         let target = self.targets.get(&id).filter(|t| t.0 == view.size).map(|t| &t.1);
         let target = target.ok_or_else(|| Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])))?;
         let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss) else { unreachable!("prepared above") };

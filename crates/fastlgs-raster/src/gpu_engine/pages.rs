@@ -97,7 +97,7 @@ impl Gaussians {
             memory.gaussians += page.gradients.size();
         }
         memory.gaussians += bytes(&[&self.stats, &self.splats, &self.footprints, &self.offsets, &self.touched, &self.first_pair]);
-        memory.lists += self.sort.bytes();
+        memory.lists += self.sort.bytes() + self.scan.bytes();
     }
 }
 

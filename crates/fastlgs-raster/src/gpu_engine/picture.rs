@@ -43,15 +43,17 @@ pub struct Loss {
 }
 
 impl Loss {
-    /// Buffers for frames of the view's size: `known`, if they are.
-    pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View) -> Result<Self> {
-        if let Some(loss) = known.filter(|l| l.size == view.size) {
-            return Ok(loss);
-        }
+    /// Buffers for frames of the view's size and that many planes: `known`, if they are.
+    pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View, planes: usize) -> Result<Self> {
         let pixels = view.padded_pixels() as u64;
         // Real GPUs have room for all; a software adapter's cache has not.
         let rows = 20 * pixels;
         let at_once = if gpu.shape == Shape::Wide { 1 } else { (LARGEST.min(gpu.max_binding) / rows).clamp(1, 6) };
+        // As many each time.
+        let at_once = (planes as u64).div_ceil((planes as u64).div_ceil(at_once));
+        if let Some(loss) = known.filter(|l| l.size == view.size && l.at_once as u64 == at_once) {
+            return Ok(loss);
+        }
         let sums = 24 * u64::from(RUN as u32 * view.tile_count());
         Ok(Self {
             size: view.size,

@@ -30,7 +30,7 @@ impl Sort {
     /// What it takes.
     pub fn bytes(&self) -> u64 {
         let lists: u64 = self.keys.iter().chain(&self.values).map(Buffer::size).sum();
-        lists + self.histogram.size() + self.scan.totals.size()
+        lists + self.histogram.size() + self.scan.bytes()
     }
 
     /// Sorts the first `n` keys by the lowest `bits`; returns the side that holds the result. Values come out as former places.
@@ -60,6 +60,11 @@ impl Scan {
     /// For at most `n` items.
     pub fn new(gpu: &Gpu, what: &str, n: u32) -> Result<Self> {
         Ok(Self { totals: gpu.storage(what, 4 * (u64::from(gpu.shape.chunks(n).0) + 1))? })
+    }
+
+    /// What it takes.
+    pub fn bytes(&self) -> u64 {
+        self.totals.size()
     }
 
     /// Replaces `items` by their sums; [`Self::total`] then reads that of all.

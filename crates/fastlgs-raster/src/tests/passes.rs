@@ -3,6 +3,7 @@
 use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
 use crate::Shape;
 use crate::cpu;
+use crate::gpu::UNIFORM_SLOTS;
 use crate::pass::{Groups, Pass, Recorder};
 use crate::shader::{Kernel, Shader, shaders};
 use crate::view::{Ceiling, Job, Perturb, Plane, Planes, Step, View, stride};
@@ -200,6 +201,60 @@ fn listing() {
             l.view.tile_count().div_ceil(64),
         );
         assert!(device[1].iter().zip(&twin[1]).all(|(a, b)| a.abs_diff(*b) <= 1));
+    }
+}
+
+#[test]
+fn more_passes_than_uniforms_fit_a_submission() {
+    let Some(gpu) = gpu() else { return };
+    let pass = Pass::new(&gpu, shaders::Perturb::SHADER, Channels::Both, false);
+    let params = page(&cloud(5, 1, 0, false).to_channels(), 5);
+    let storage = gpu.storage_with("test", &params).unwrap();
+    let (mut r, mut twin) = (Recorder::new(&gpu, 0), vec![params]);
+    for seed in 0..2 * UNIFORM_SLOTS as u32 + 3 {
+        let job = Perturb { n: 5, first: 0, seed, amount: 0.1 };
+        r.record(&pass, bytemuck::bytes_of(&job), &[&storage], Groups::from(1));
+        cpu::run("perturb", Channels::Both, bytemuck::bytes_of(&job), &mut twin);
+    }
+    r.submit();
+    // Each has its own seed: what another's uniform did would be elsewhere.
+    assert_close("means", floats(&gpu.read(&storage, twin[0].len()).unwrap()), floats(&twin[0]), 1e-2, 0.0);
+}
+
+#[test]
+fn room_that_emit_leaves_over_is_nobodys() {
+    let Some(mut gpu) = gpu() else { return };
+    gpu.shape = Shape::Lanes32;
+    let l = lists(300, 64, 48, 0, false);
+    let b = |name: &str| &l.buffers[name][..];
+    let n = l.view.gaussians as usize;
+    // As if `project` had counted three tiles more than `emit` finds.
+    let touched: Vec<u32> = b("touched").iter().map(|t| if *t > 0 { t + 3 } else { 0 }).collect();
+    let mut offsets: Vec<u32> = b("order").iter().map(|g| touched[*g as usize]).collect();
+    let pairs = offsets.iter_mut().fold(0, |sum, own| sum + std::mem::replace(own, sum));
+    let view = View { pairs, fold: gpu.shape.fold(), ..l.view };
+    let blank = zeros(pairs as usize);
+    let inputs = [b("order"), &offsets, b("footprints"), &touched, &blank, &blank, &zeros(n)];
+    let groups = (n as u32 * gpu.shape.writers()).div_ceil(64);
+    let [device, emitted] = both(&gpu, shaders::Emit::SHADER, Channels::Both, false, &view, &inputs, groups);
+    assert_eq!(device, emitted);
+    assert_eq!(emitted[3], b("touched"), "what is counted is what was found");
+    let nowhere = emitted[4].iter().filter(|tile| **tile == view.tile_count()).count();
+    assert_eq!(nowhere, 3 * touched.iter().filter(|t| **t > 0).count());
+    // Slots of leftover room are never written, and must not be added up.
+    let slots: Vec<u32> =
+        emitted[4].iter().flat_map(|tile| [if *tile == view.tile_count() { f32::NAN } else { 1.0 }; 12]).map(f32::to_bits).collect();
+    let inputs = [&emitted[3][..], &emitted[6], &emitted[5], &slots];
+    let [device, folded] =
+        both(&gpu, shaders::FoldSlots::SHADER, Channels::Both, false, &view, &inputs, pairs.div_ceil(view.fold).div_ceil(64));
+    for (what, all) in [("device", device), ("twin", folded)] {
+        let slots = floats(&all[3]);
+        for (g, count) in emitted[3].iter().enumerate().filter(|(_, count)| **count > 0) {
+            let (first, end) = (emitted[6][g], emitted[6][g] + count);
+            let runs = (first / view.fold + 1) * view.fold;
+            let sum: f32 = std::iter::once(first).chain((runs..end).step_by(view.fold as usize)).map(|e| slots[12 * e as usize]).sum();
+            assert_eq!(sum, *count as f32, "{what}: each slot counts once");
+        }
     }
 }
 

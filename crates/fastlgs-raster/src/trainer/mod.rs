@@ -210,7 +210,7 @@ impl Trainer {
                 tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), moved, added, "density control");
             }
         }
-        state.along_curve();
+        state.sort_along_curve();
         self.replace(&state)
     }
 

@@ -244,7 +244,7 @@ pub struct Config {
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
-    /// How the adapter's kernels divide a tile: lanes32, lanes64 or wide; by default what was fastest here. The report of a training names its
+    /// How the adapter's kernels divide their work: lanes32, lanes64 or wide; by default what was fastest here. The report of a training names its
     /// shape, with which the same comes out again.
     #[cfg_attr(feature = "clap", arg(long))]
     pub shape: Option<Shape>,
