@@ -254,18 +254,22 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
 #endif
     // Pairs that no pixel of the tile reached.
-    for (var k = start + length + lane.number; k < end; k += TILE_LANES) {
+#ifdef WIDE
+    for (var k = start + length; k < end; k++) {
         let e = sorted_pairs[k];
         if in_window(e, view) {
-#ifdef WIDE
             for (var s = 0u; s < SLOT; s++) {
                 slots[SLOT * (e - view.slot_first) + s] = vec4<f32>(0.0);
             }
-#else
-            for (var s = 0u; s < NUMBERS; s++) {
-                slots[NUMBERS * (e - view.slot_first) + s] = 0.0;
-            }
-#endif
         }
     }
+#else
+    // Neighbours write what lies side by side: of dense scenes these are most of all pairs.
+    for (var i = lane.number; i < NUMBERS * (end - start - length); i += TILE_LANES) {
+        let e = sorted_pairs[start + length + i / NUMBERS];
+        if in_window(e, view) {
+            slots[NUMBERS * (e - view.slot_first) + i % NUMBERS] = 0.0;
+        }
+    }
+#endif
 }
