@@ -74,17 +74,10 @@ var<workgroup> open: atomic<u32>;
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
     let lane = lane_of(flat_group(group, groups), index);
-    let exists = lane.place < view.tiles.x * view.tiles.y;
-    var tile = 0u;
-    var start = 0u;
-    var length = 0u;
-    if exists {
-        tile = tile_order[lane.place];
-        start = ranges[2u * tile];
-        length = ranges[2u * tile + 1u] - start;
-    }
-    let x = (tile % view.tiles.x) * TILE + lane.x;
-    let y = (tile / view.tiles.x) * TILE + lane.y;
+    let start = lane.start;
+    let length = lane.end - start;
+    let x = lane.x;
+    let y = lane.y;
     let px = vec4<f32>(f32(x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let py = f32(y) + 0.5;
 #each Q
@@ -144,7 +137,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         goes_on = (still_open & (1u << lane.tile)) != 0u;
     }
 #endif
-    if exists {
+    if lane.exists {
 #each Q
         store_quad(q$Q, x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X, f32(walked));
 #end

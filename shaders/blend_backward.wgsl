@@ -164,24 +164,16 @@ fn exchange_put(tile: u32, row: u32, number: u32, v: vec4<f32>) {
 @compute @workgroup_size(LANES)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
     let lane = lane_of(flat_group(group, groups), index);
-    let exists = lane.place < view.tiles.x * view.tiles.y;
-    var tile = 0u;
-    var start = 0u;
-    var end = 0u;
-    if exists {
-        tile = tile_order[lane.place];
-        start = ranges[2u * tile];
-        end = ranges[2u * tile + 1u];
-    }
-    let x = (tile % view.tiles.x) * TILE + lane.x;
-    let y = (tile / view.tiles.x) * TILE + lane.y;
+    let start = lane.start;
+    let x = lane.x;
+    let y = lane.y;
     let px = vec4<f32>(f32(x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
     let py = f32(y) + 0.5;
 #each Q
     var q$Q = load_quad(x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X);
 #end
     // How far the forward pass walked.
-    let length = select(0u, u32(frame[quad_at(7u, x, y, view)].x), exists);
+    let length = select(0u, u32(frame[quad_at(7u, x, y, view)].x), lane.exists);
 #ifdef WIDE
     for (var k = 0u; k < length; k++) {
         let e = sorted_pairs[start + k];
@@ -255,7 +247,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #endif
     // Pairs that no pixel of the tile reached.
 #ifdef WIDE
-    for (var k = start + length; k < end; k++) {
+    for (var k = start + length; k < lane.end; k++) {
         let e = sorted_pairs[k];
         if in_window(e, view) {
             for (var s = 0u; s < SLOT; s++) {
@@ -265,7 +257,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
 #else
     // Neighbours write what lies side by side: of dense scenes these are most of all pairs.
-    for (var i = lane.number; i < NUMBERS * (end - start - length); i += TILE_LANES) {
+    for (var i = lane.number; i < NUMBERS * (lane.end - start - length); i += TILE_LANES) {
         let e = sorted_pairs[start + length + i / NUMBERS];
         if in_window(e, view) {
             slots[NUMBERS * (e - view.slot_first) + i % NUMBERS] = 0.0;

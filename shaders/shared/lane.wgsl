@@ -26,15 +26,30 @@ struct Lane {
     // Which of the workgroup's tiles, and which of its invocations.
     tile: u32,
     number: u32,
-    // Place in `tile_order`.
-    place: u32,
-    // Upper left pixel of the invocation's quads in the tile.
+    // Whether there is such a tile; where not, its list is empty.
+    exists: bool,
+    // First and end pair of the tile's list.
+    start: u32,
+    end: u32,
+    // Upper left pixel of the invocation's quads.
     x: u32,
     y: u32,
 }
 
-fn lane_of(group: u32, lane: u32) -> Lane {
-    let tile = lane / TILE_LANES;
-    let number = lane % TILE_LANES;
-    return Lane(tile, number, group * TILES + tile, (number & 1u) * 4u, number >> 1u);
+// By `view`, `tile_order` and `ranges`, which the pass declares.
+fn lane_of(group: u32, index: u32) -> Lane {
+    var lane: Lane;
+    lane.tile = index / TILE_LANES;
+    lane.number = index % TILE_LANES;
+    let place = group * TILES + lane.tile;
+    lane.exists = place < view.tiles.x * view.tiles.y;
+    var tile = 0u;
+    if lane.exists {
+        tile = tile_order[place];
+        lane.start = ranges[2u * tile];
+        lane.end = ranges[2u * tile + 1u];
+    }
+    lane.x = (tile % view.tiles.x) * TILE + (lane.number & 1u) * 4u;
+    lane.y = (tile / view.tiles.x) * TILE + (lane.number >> 1u);
+    return lane;
 }

@@ -1,5 +1,5 @@
 // Gaussians of a tile's list on their way through workgroup memory: each invocation of a tile fetches one of the next 16 while the present 16 are
-// blended, so that nobody waits for the three reads that lead to a splat.
+// blended, so that nobody waits for the three reads that lead to a splat. The pass declares `sorted_pairs`, `pair_gaussians` and `splats`.
 struct Staged {
     pair: u32,
     s0: vec4<f32>,
