@@ -7,8 +7,7 @@ const BITS: u32 = 10;
 /// Share of the points on either side that may lie beyond what the curve tells apart: a few far ones must not make cells of the rest too large.
 const BEYOND: f64 = 0.01;
 
-/// Places of the points along a Morton curve (Morton 1966); points of one cell keep their order. Values that are no finite numbers are taken for the
-/// least.
+/// Places of the points along a Morton curve (Morton 1966); points of one cell keep their order, and what is no number counts as the least.
 pub fn along_curve(points: &[Vec3]) -> Vec<usize> {
     let ranges = [0, 1, 2].map(|axis| range(points.iter().map(|p| p[axis])));
     let cells = (1u32 << BITS) as f32;
