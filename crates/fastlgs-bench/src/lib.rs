@@ -40,7 +40,7 @@ enum What {
     Baseline(baseline::Args),
     /// Accuracy against time, for the ways from masks to a field that answers.
     Chart(chart::Args),
-    /// What accuracy and colour lose as a model gets smaller, and where `--budget auto` stops.
+    /// What accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
     Size(size::Args),
     /// What remains of accuracy when the input is disturbed, and on scenes that methods fail at.
     Stability(stability::Args),

@@ -1,4 +1,4 @@
-//! `fastlgs bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` stops.
+//! `fastlgs bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
 
 use crate::command::call;
 use crate::plot::{self, Axes, Scatter, Spot};

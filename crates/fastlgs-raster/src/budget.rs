@@ -1,10 +1,7 @@
 //! No more Gaussians than the scene needs (`--budget auto`).
 //!
-//! *Growth* stops when it no longer pays: some training views are kept aside and watched; now and then, if
-//! the scene has grown by at least `GROWTH` since the last look and the watched views gained less than `GAIN` dB a
-//! doubling, it may grow no further, and the watched views join the training.
-//!
-//! *Pruning* then removes Gaussians without which the photos would hardly change: each is judged by what the training views would gain or lose
+//! The scene grows as far as its gradients ask and the limit allows; once it has grown, Gaussians are removed without which the photos would
+//! hardly change: each is judged by what the training views would gain or lose
 //! without it alone (as weights of a network are in Optimal Brain Damage, LeCun et al. 1990), and those that change least go, as many as together
 //! change no more than a share, `AFFORDABLE`, of the squared error that is left, or fewer where that costs more than `AT_ONCE`. So a scene that shows its photos nearly without error keeps what is faint in
 //! it, and what could only fit the noise of others goes. The rest of the run refines what is left, which takes over what went: together
@@ -12,10 +9,6 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Relative growth that has to show an effect.
-const GROWTH: f64 = 0.1;
-/// Least gain on the watched views, in dB, for twice as many Gaussians.
-const GAIN: f64 = 0.5;
 /// How much all that is removed at once may change the training views, one by one, as a share of their squared error.
 const AFFORDABLE: f64 = 0.05;
 /// How many dB a removal may cost at once: as much as twice the squared error. Where a scene shows its photos badly nearly all of it would be
@@ -33,34 +26,6 @@ const FEW: usize = 40;
 /// Whether training view `index` of `count` is watched and not trained on while the scene grows.
 pub(crate) fn is_watched(index: usize, count: usize) -> bool {
     count >= FEW + count / WATCHED && index % WATCHED == WATCHED / 2
-}
-
-/// The rule that ends growth.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(crate) struct Growth {
-    /// The scene may grow no further.
-    pub stopped: bool,
-    /// Gaussians and PSNR of the watched views at the last look.
-    last: Option<(usize, f64)>,
-}
-
-impl Growth {
-    /// Takes a look: so many Gaussians give so many dB.
-    pub fn look(&mut self, gaussians: usize, psnr: f64) {
-        if let Some((before, then)) = self.last {
-            let grown = gaussians as f64 / before as f64;
-            if grown < 1.0 + GROWTH {
-                return;
-            }
-            self.stopped |= psnr - then < GAIN * grown.log2();
-        }
-        self.last = Some((gaussians, psnr));
-    }
-
-    /// Forgets the last look, with which the next would say nothing.
-    pub fn forget(&mut self) {
-        self.last = None;
-    }
 }
 
 /// What a removal cost, for reports.
@@ -113,17 +78,6 @@ mod tests {
     use crate::view::View;
     use fastlgs_core::{Camera, Gaussians};
     use glam::Vec3;
-
-    #[test]
-    fn growth_stops_when_it_does_not_pay() {
-        let mut growth = Growth::default();
-        growth.look(1000, 20.0);
-        growth.look(2000, 22.0);
-        growth.look(2050, 22.01); // hardly grown: no verdict
-        assert!(!growth.stopped);
-        growth.look(3000, 22.05);
-        assert!(growth.stopped);
-    }
 
     #[test]
     fn what_no_photo_shows_goes_and_what_makes_a_difference_stays() {

@@ -1,7 +1,7 @@
 //! Checkpoints: a JSON header that names a file of tensors, so that either the old or the new one is whole.
 
 use crate::Result;
-use crate::budget::{Growth, Removal};
+use crate::budget::Removal;
 use crate::density::State;
 use crate::exposure::{Learned, LearnedExposure};
 use crate::schedule::TrainConfig;
@@ -21,7 +21,6 @@ pub(crate) struct Course {
     pub gaussians: usize,
     pub order: Vec<usize>,
     pub rng: Rng,
-    pub growth: Growth,
     pub removals: Vec<Removal>,
     pub exposures: Vec<LearnedExposure>,
     pub background: Learned<6>,

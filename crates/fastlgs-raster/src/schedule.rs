@@ -17,7 +17,7 @@ pub enum Strategy {
 /// How many Gaussians there may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Budget {
-    /// As many as held-out quality gains from, and no more than this; see `budget.rs`.
+    /// Growth up to this number, and then as many as the training views would miss; see `budget.rs`.
     Auto(usize),
     /// Growth up to this number; nothing is removed for being unimportant.
     Fixed(usize),
@@ -109,8 +109,6 @@ const REFINE_FROM: f32 = 0.05;
 const ROUNDS: u32 = 16;
 /// Fewest and most steps between two rounds: fewer tell little about gradients, more waste a long run.
 const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
-/// How often a run looks at its watched views, if it grew to its end.
-const LOOKS: u32 = 16;
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
 /// Shares of the iterations after the end of growth at which unimportant Gaussians are removed under an automatic budget.
@@ -209,11 +207,6 @@ impl TrainConfig {
         self.channels.color() && due && iteration > 0 && iteration <= until
     }
 
-    /// Whether the watched views are looked at then.
-    pub(crate) fn looks(&self, iteration: u32) -> bool {
-        matches!(self.budget, Budget::Auto(_)) && iteration.is_multiple_of((self.iterations / LOOKS).max(1))
-    }
-
     /// Whether opacities are reset then: not so late that they could not recover before growth ends.
     pub(crate) fn resets_opacity(&self, iteration: u32) -> bool {
         self.strategy == Strategy::Classic
@@ -270,7 +263,6 @@ mod tests {
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config.clone() };
         assert_eq!(frozen.left_out(8000, 24), 0.0, "lists that are kept hold all");
         assert_ne!(config.draw(5), TrainConfig { seed: 1, ..config.clone() }.draw(5));
-        assert!(config.looks(500) && !config.looks(400));
         assert!(!config.resets_opacity(3000), "too late to recover");
         let long = TrainConfig { iterations: 30_000, ..config.clone() };
         assert!(long.resets_opacity(3000) && long.resets_opacity(9000) && !long.resets_opacity(12_000));

@@ -4,7 +4,7 @@ mod alignment;
 mod shown;
 mod watched;
 
-use crate::budget::{self, Growth, Removal};
+use crate::budget::{self, Removal};
 use crate::channels::Channels;
 use crate::checkpoint::{self, Course};
 use crate::density::{self, State};
@@ -114,7 +114,6 @@ impl Trainer {
             gaussians: scene.len(),
             order: Vec::new(),
             rng: Rng::new(config.seed, "train"),
-            growth: Growth::default(),
             removals: Vec::new(),
             exposures: targets.gains().iter().filter(|_| config.exposure).map(|gain| LearnedExposure::from_gain(*gain)).collect(),
             background,
@@ -128,9 +127,9 @@ impl Trainer {
         Ok(Self { engine, extent: scene_extent(&targets.cameras), contrast, free, targets, course, shown: Shown::default() })
     }
 
-    /// The next training view: every view once in random order, then again. Watched views wait until growth is over.
+    /// The next training view: every view once in random order, then again. Under an automatic budget watched views wait until growth is over.
     fn next_view(&mut self) -> usize {
-        let growing = matches!(self.course.config.budget, Budget::Auto(_)) && !self.growth_is_over();
+        let growing = matches!(self.course.config.budget, Budget::Auto(_)) && self.grows();
         if self.course.order.is_empty() {
             let count = self.targets.len();
             self.course.order = (0..count).filter(|&i| !(growing && budget::is_watched(i, count))).collect();
@@ -139,9 +138,9 @@ impl Trainer {
         self.course.order.pop().expect("filled above")
     }
 
-    fn growth_is_over(&self) -> bool {
+    fn grows(&self) -> bool {
         let config = &self.course.config;
-        self.course.growth.stopped || !config.channels.color() || !config.grows(self.course.iteration)
+        config.channels.color() && config.grows(self.course.iteration)
     }
 
     fn view(&self, camera: &Camera, sh_degree: u32) -> View {
@@ -196,7 +195,7 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let config = &self.course.config;
         let before = state.len();
-        let budget = if self.growth_is_over() { before } else { config.budget.most() };
+        let budget = if self.grows() { config.budget.most() } else { before };
         match config.strategy {
             Strategy::Classic => {
                 let limits = density::Config { budget, ..density::Config::default() };
@@ -219,10 +218,7 @@ impl Trainer {
         let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
         density::reset_opacity(&mut state, 0.01);
         self.engine.set_state(&state)?;
-        self.engine.set_stats(&stats)?;
-        // The watched views are dark now: what they gain or lose by it says nothing about growth.
-        self.course.growth.forget();
-        Ok(())
+        self.engine.set_stats(&stats)
     }
 
     fn replace(&mut self, state: &State) -> Result<()> {
@@ -290,9 +286,6 @@ impl Trainer {
                 self.engine.losses()?;
                 started = Instant::now();
                 self.shown.reading = 0.0;
-            }
-            if self.course.config.looks(iteration) && !self.growth_is_over() {
-                self.watch()?;
             }
             if self.course.config.refines(iteration) {
                 self.refine()?;

@@ -1,5 +1,5 @@
-//! What views that are watched, and not trained on while the scene grows, decide: whether it may grow on, whether a removal is bearable, and how
-//! many SH degrees it needs.
+//! What views that are watched, and not trained on while the scene grows, decide: whether a removal is bearable, and how many SH degrees the
+//! scene needs.
 
 use super::{Trainer, view_of};
 use crate::Result;
@@ -11,16 +11,6 @@ use crate::target::Targets;
 use fastlgs_core::Gaussians;
 
 impl Trainer {
-    /// Looks at the watched views and decides whether the scene may grow on.
-    pub(super) fn watch(&mut self) -> Result<()> {
-        let degree = self.course.config.degree(self.course.iteration);
-        if let Some(db) = self.quality(&self.watched(), Some(degree))? {
-            self.course.growth.look(self.engine.len(), db);
-            tracing::debug!(iteration = self.course.iteration, db, gaussians = self.engine.len(), growth = ?self.course.growth, "watched views");
-        }
-        Ok(())
-    }
-
     /// The training views that are kept aside while the scene grows.
     pub(super) fn watched(&self) -> Targets {
         let count = self.targets.len();
