@@ -73,7 +73,7 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
     }
 }
 
-/// Masks of an object that are more alike than this stand for each other.
+/// Masks that are more alike than this stand for each other, and what is so much less like a mask than another is as like it.
 const ALIKE: f32 = 0.98;
 
 /// What Algorithm 1 made of the masks.
@@ -91,7 +91,7 @@ pub struct Mapped {
 ///
 /// Photos are taken in sequence; masks of the first photo are objects of their own. Key points decide first, and a photo may show several masks
 /// of an object that they find. Similarity is for what is left, and one to one, the most alike first: an object that the photo shows already is
-/// no candidate, so that two things of one look stay two. A mask is compared not with every earlier one but with each object's representatives, of
+/// no candidate, so that two things of one look stay two; which is which, key points tell, though they be fewer than tau. A mask is compared not with every earlier one but with each object's representatives, of
 /// which none is more than 0.98 like another one. An object that is seen for the hundredth time adds none, so that the work grows with the photos,
 /// not with their square.
 ///
@@ -108,7 +108,8 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
         mapped.comparisons += photo.len() * representatives.len();
         let alike = similarities(&looks, first..first + photo.len(), &representatives, &mapped);
         let mut object_of = by_key_points;
-        for (_, mask, object) in most_alike_first(&alike, config.theta) {
+        let key_points = |mask: usize, object: u16| shared_with(first + mask, object, first, pairs, &mapped, config);
+        for (mask, object) in most_alike_first(&alike, config.theta, key_points) {
             if object_of[mask].is_none() && !object_of.contains(&Some(object)) {
                 object_of[mask] = Some(object);
             }
@@ -137,6 +138,12 @@ fn most_corresponding(j: usize, first: usize, pairs: &Correspondences, mapped: &
     Some(mapped.object_of[most.1.0]).filter(|_| config.key_points && most.0 >= config.tau)
 }
 
+/// Key points that mask `j` shares with all masks of an object, in photos before that of mask `first`.
+fn shared_with(j: usize, object: u16, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> u32 {
+    let of_object = pairs.range((j, 0)..(j, first)).filter(|((_, k), _)| config.key_points && mapped.object_of[*k] == object);
+    of_object.map(|(_, n)| n).sum()
+}
+
 /// How much each mask of a photo is like each object: like its most similar representative.
 fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usize], mapped: &Mapped) -> Vec<BTreeMap<u16, f32>> {
     // The photo's own vectors stay at hand while each of the many representatives comes by once.
@@ -157,14 +164,19 @@ fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usiz
     (0..photo.len()).into_par_iter().map(best).collect()
 }
 
-/// Pairs (similarity, mask, object) from theta on.
-fn most_alike_first(alike: &[BTreeMap<u16, f32>], theta: f32) -> Vec<(f32, usize, u16)> {
-    let of_mask = |(mask, objects): (usize, &BTreeMap<u16, f32>)| {
-        objects.iter().map(|(object, sim)| (*sim, mask, *object)).filter(|p| p.0 >= theta).collect::<Vec<_>>()
-    };
-    let mut pairs: Vec<(f32, usize, u16)> = alike.iter().enumerate().flat_map(of_mask).collect();
-    pairs.sort_by(|a, b| b.0.total_cmp(&a.0).then((a.1, a.2).cmp(&(b.1, b.2))));
-    pairs
+/// Pairs (mask, object) from theta on. Those come first that share key points, if the mask is as like that object as the one it is most like: looks
+/// do not tell such objects apart.
+fn most_alike_first(alike: &[BTreeMap<u16, f32>], theta: f32, key_points: impl Fn(usize, u16) -> u32) -> Vec<(usize, u16)> {
+    let mut pairs: Vec<(u32, f32, usize, u16)> = Vec::new();
+    for (mask, objects) in alike.iter().enumerate() {
+        let most = objects.values().copied().fold(f32::MIN, f32::max);
+        for (&object, &sim) in objects.iter().filter(|(_, sim)| **sim >= theta) {
+            let shared = if most - sim <= 1.0 - ALIKE { key_points(mask, object) } else { 0 };
+            pairs.push((shared, sim, mask, object));
+        }
+    }
+    pairs.sort_by(|a, b| b.0.cmp(&a.0).then(b.1.total_cmp(&a.1)).then((a.2, a.3).cmp(&(b.2, b.3))));
+    pairs.into_iter().map(|(_, _, mask, object)| (mask, object)).collect()
 }
 
 #[cfg(test)]
@@ -196,6 +208,22 @@ mod tests {
         let mut similarity = [0.0];
         products(&masks[1].look(0.3), &[masks[3].look(0.3)], &mut similarity);
         assert!((similarity[0] - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
+    }
+
+    /// Two mugs of one look, and the second photo's left one shares a key point with the first photo's right one; a third thing that
+    /// is less like it shares more, which does not count.
+    #[test]
+    fn key_points_tell_twins_apart() {
+        let masks = [
+            mask(0, 1, [1.0, 0.0], [1.0, 0.0]),
+            mask(0, 2, [1.0, 0.0], [1.0, 0.0]),
+            mask(0, 3, [0.96, 0.28], [1.0, 0.0]),
+            mask(1, 1, [1.0, 0.0], [1.0, 0.0]),
+            mask(1, 2, [1.0, 0.0], [1.0, 0.0]),
+        ];
+        let pairs = Correspondences::from([((3, 1), 1), ((3, 2), 3)]);
+        let map = |key_points| paper(&masks, &pairs, &PaperConfig { key_points, ..PaperConfig::default() }).unwrap().object_of;
+        assert_eq!([map(false), map(true)], [vec![1, 2, 3, 1, 2], vec![1, 2, 3, 2, 1]]);
     }
 
     /// `views` photos of 40 things, of which each shows ten; how a thing looks wavers from photo to photo.

@@ -1,11 +1,15 @@
 //! Matching of key points: mutual nearest neighbours that pass Lowe's ratio test. Every descriptor of one photo is compared with every one of
-//! the other; squared distances are |a|^2 + |b|^2 - 2 a.b, whose products processors add up many at a time.
+//! the other; squared distances are |a|^2 + |b|^2 - 2 a.b, whose products processors add up many at a time. Where poses are known, only what
+//! lies on the other's epipolar line is compared: what repeats elsewhere is then no rival, and twice as much is recognised.
 
 use crate::keypoints::Keypoints;
 use fastlgs_core::vectorised;
+use glam::{Mat3, Vec3};
 
 /// Ratio of the best to the second-best distance.
 const RATIO: f32 = 0.8;
+/// Largest distance of two descriptors, whose lengths are 512, that may show the same where few others are there to compare with.
+const FAR: i32 = 300;
 /// Descriptors of the first photo that are compared with one of the second while that is at hand.
 const BLOCK: usize = 4;
 
@@ -103,6 +107,28 @@ pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
     of_a.iter().enumerate().filter_map(mutual).collect()
 }
 
+/// Mutual nearest neighbours among those that lie within `tolerance` pixels of each other's epipolar lines (`f`: fundamental matrix from a to
+/// b), if they pass the ratio test there and are alike: pairs (index in a, index in b).
+pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(usize, usize)> {
+    let [lines_b, lines_a] = [(a, *f), (b, f.transpose())].map(|(points, f)| {
+        let line = |p: &glam::Vec2| f * p.extend(1.0);
+        points.positions.iter().map(line).map(|line| (line, tolerance * line.truncate().length())).collect::<Vec<(Vec3, f32)>>()
+    });
+    let (rows_a, rows_b) = (Descriptors::of(a), Descriptors::of(b));
+    let (mut of_a, mut of_b) = (vec![Nearest::NONE; lines_b.len()], vec![Nearest::NONE; lines_a.len()]);
+    for (i, (line, room)) in lines_b.iter().enumerate() {
+        for (j, (point, (_, other_room))) in b.positions.iter().zip(&lines_a).enumerate() {
+            if point.extend(1.0).dot(*line).abs() < room.min(*other_room) {
+                let distance = rows_a.squares[i] + rows_b.squares[j] - 2 * dot(&rows_a.rows[i], &rows_b.rows[j]);
+                of_a[i].see(distance, j);
+                of_b[j].see(distance, i);
+            }
+        }
+    }
+    let alike = |(i, nearest): (usize, &Nearest)| (nearest.distance < FAR * FAR).then_some(i).zip(nearest.distinct());
+    of_a.iter().enumerate().filter_map(alike).filter(|&(i, j)| of_b[j].distinct() == Some(i)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -144,5 +170,25 @@ mod tests {
             assert_eq!(found, by_definition(&a, &b), "{n} and {m}");
             assert!(n < 100 || found.len() > 50, "{} matches", found.len());
         }
+    }
+
+    #[test]
+    fn poses_tell_what_repeats_apart() {
+        // A photo and its twin moved along rows: a pattern that repeats from row to row is found in its own, and nowhere without the poses.
+        let mut rng = Rng::new(4, "rows");
+        let pattern: [u8; 128] = std::array::from_fn(|_| rng.below(200) as u8);
+        let wavering = |rng: &mut Rng| pattern.map(|v| v + rng.below(20) as u8);
+        let photo = |shift: f32, rng: &mut Rng| Keypoints {
+            positions: (0..20).map(|row| Vec2::new(10.0 + shift, 10.0 * row as f32)).collect(),
+            descriptors: (0..20).map(|_| wavering(rng)).collect(),
+        };
+        let (a, b) = (photo(0.0, &mut rng), photo(7.0, &mut rng));
+        let along_rows = Mat3::from_cols(Vec3::ZERO, Vec3::Z, Vec3::NEG_Y);
+        assert!(matches(&a, &b).is_empty());
+        assert_eq!(guided(&a, &b, &along_rows, 2.0), (0..20).map(|row| (row, row)).collect::<Vec<_>>());
+        assert_eq!(guided(&a, &b, &along_rows, 11.0), matches(&a, &b), "where several rows may be meant the pattern is no evidence");
+        let mut other = b.clone();
+        other.descriptors[3] = std::array::from_fn(|_| rng.below(256) as u8);
+        assert!(!guided(&a, &other, &along_rows, 2.0).contains(&(3, 3)), "a lone rival is not enough");
     }
 }

@@ -121,7 +121,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     lap("masks");
     let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
     let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
-    let matches = matches::between(&kept, &matches, &poses, &keypoints);
+    let matches = matches::guided(&kept, &matches, &poses, &keypoints);
     if let Some(warning) = matches::warn_of_gaps(&poses, &matches) {
         run.warn(&warning);
         warnings.push(warning);
