@@ -31,15 +31,22 @@ pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, 
     chosen.into_par_iter().map(match_pair).collect()
 }
 
-/// The same photos matched again as their poses, which are right now, tell where to look: those that are kept, by their new places.
-pub(super) fn guided(kept: &[usize], matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
+/// The matches between photos that are kept, by their new places, as far as they obey the poses.
+pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
     let place: BTreeMap<usize, usize> = kept.iter().enumerate().map(|(new, old)| (*old, new)).collect();
+    let renumbered = |m: &PairMatches| Some(PairMatches { a: *place.get(&m.a)?, b: *place.get(&m.b)?, pairs: m.pairs.clone() });
+    let obeying = |m: PairMatches| m.obeying(cameras, points, tracks::TOLERANCE);
+    matches.iter().filter_map(renumbered).map(obeying).collect()
+}
+
+/// The same photos matched again, as their poses tell where to look. This is for masks, of which several key points have to agree: of two photos
+/// alone, whatever lies on the epipolar line agrees with the poses, and such points are no good start.
+pub(super) fn guided(matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
     let match_pair = |m: &PairMatches| {
-        let (a, b) = (*place.get(&m.a)?, *place.get(&m.b)?);
-        let f = keypoints::fundamental(&cameras[a], &cameras[b]);
-        Some(PairMatches { a, b, pairs: matching::guided(&points[a], &points[b], &f, tracks::TOLERANCE) })
+        let f = keypoints::fundamental(&cameras[m.a], &cameras[m.b]);
+        PairMatches { pairs: matching::guided(&points[m.a], &points[m.b], &f, tracks::TOLERANCE), ..*m }
     };
-    matches.par_iter().filter_map(match_pair).collect()
+    matches.par_iter().map(match_pair).collect()
 }
 
 /// Fewest matches by which a photo is held to share something with another.

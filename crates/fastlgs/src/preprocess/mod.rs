@@ -121,7 +121,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     lap("masks");
     let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
     let (keypoints, colors): (Vec<Keypoints>, Vec<_>) = training.into_iter().map(|p| (p.points, p.colors)).unzip();
-    let matches = matches::guided(&kept, &matches, &poses, &keypoints);
+    let matches = matches::between(&kept, &matches, &poses, &keypoints);
     if let Some(warning) = matches::warn_of_gaps(&poses, &matches) {
         run.warn(&warning);
         warnings.push(warning);
@@ -142,7 +142,8 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     drop(work);
     lap("depths");
     folder.save_points(&points)?;
-    evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &matches)?)?;
+    let guided = matches::guided(&matches, &poses, &keypoints);
+    evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &guided)?)?;
     lap("points");
     if let Some(encoder) = imported {
         crate::masks::describe(&folder, &poses, encoder.as_ref(), None, run)?;
