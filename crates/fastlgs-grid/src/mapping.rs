@@ -91,9 +91,9 @@ pub struct Mapped {
 ///
 /// Photos are taken in sequence; masks of the first photo are objects of their own. Key points decide first, and a photo may show several masks
 /// of an object that they find. Similarity is for what is left, and one to one, the most alike first: an object that the photo shows already is
-/// no candidate, so that two things of one look stay two; which is which, key points tell, though they be fewer than tau. A mask is compared not with every earlier one but with each object's representatives, of
-/// which none is more than 0.98 like another one. An object that is seen for the hundredth time adds none, so that the work grows with the photos,
-/// not with their square.
+/// no candidate, so that two things of one look stay two; which is which, key points tell, though they be fewer than tau. A mask is compared not
+/// with every earlier one but with each object's representatives, of which none is more than 0.98 like another one. An object that is seen for the
+/// hundredth time adds none, so that the work grows with the photos, not with their square.
 ///
 /// # Errors
 /// More than 65,535 objects: a Gaussian's id has 16 bits.
