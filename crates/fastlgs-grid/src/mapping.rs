@@ -73,7 +73,8 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
     }
 }
 
-/// Masks that are more alike than this stand for each other, and what is so much less like a mask than another is as like it.
+/// Masks that are more alike than this stand for each other. Where two objects differ by no more in how like a mask they are, looks do not tell them
+/// apart.
 const ALIKE: f32 = 0.98;
 
 /// What Algorithm 1 made of the masks.

@@ -4,7 +4,7 @@
 
 use crate::keypoints::Keypoints;
 use fastlgs_core::vectorised;
-use glam::{Mat3, Vec3};
+use glam::{Mat3, Vec2, Vec3};
 
 /// Ratio of the best to the second-best distance.
 const RATIO: f32 = 0.8;
@@ -100,18 +100,20 @@ pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
     let (a, b) = (Descriptors::of(a), Descriptors::of(b));
     let (mut of_a, mut of_b) = (vec![Nearest::NONE; a.rows.len()], vec![Nearest::NONE; b.rows.len()]);
     compare(&a, &b, &mut of_a, &mut of_b);
-    let mutual = |(i, nearest): (usize, &Nearest)| {
-        let j = nearest.distinct()?;
-        (of_b[j].distinct() == Some(i)).then_some((i, j))
-    };
-    of_a.iter().enumerate().filter_map(mutual).collect()
+    mutual(&of_a, &of_b).collect()
 }
 
-/// Mutual nearest neighbours among those that lie within `tolerance` pixels of each other's epipolar lines (`f`: fundamental matrix from a to
-/// b), if they pass the ratio test there and are alike: pairs (index in a, index in b).
+/// Those that are each other's nearest, and distinct on both sides.
+fn mutual(of_a: &[Nearest], of_b: &[Nearest]) -> impl Iterator<Item = (usize, usize)> {
+    let distinct = |(i, nearest): (usize, &Nearest)| Some((i, nearest.distinct()?));
+    of_a.iter().enumerate().filter_map(distinct).filter(|&(i, j)| of_b[j].distinct() == Some(i))
+}
+
+/// Mutual nearest neighbours among those within `tolerance` pixels of each other's epipolar lines, as `keypoints::epipolar_error` measures it (`f`:
+/// fundamental matrix from a to b), if they pass the ratio test there and are alike: pairs (index in a, index in b).
 pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(usize, usize)> {
     let [lines_b, lines_a] = [(a, *f), (b, f.transpose())].map(|(points, f)| {
-        let line = |p: &glam::Vec2| f * p.extend(1.0);
+        let line = |p: &Vec2| f * p.extend(1.0);
         points.positions.iter().map(line).map(|line| (line, tolerance * line.truncate().length())).collect::<Vec<(Vec3, f32)>>()
     });
     let (rows_a, rows_b) = (Descriptors::of(a), Descriptors::of(b));
@@ -125,15 +127,13 @@ pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(us
             }
         }
     }
-    let alike = |(i, nearest): (usize, &Nearest)| (nearest.distance < FAR * FAR).then_some(i).zip(nearest.distinct());
-    of_a.iter().enumerate().filter_map(alike).filter(|&(i, j)| of_b[j].distinct() == Some(i)).collect()
+    mutual(&of_a, &of_b).filter(|&(i, _)| of_a[i].distance < FAR * FAR).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use fastlgs_core::rng::Rng;
-    use glam::Vec2;
 
     fn points(descriptors: Vec<[u8; 128]>) -> Keypoints {
         Keypoints { positions: vec![Vec2::ZERO; descriptors.len()], descriptors }
