@@ -271,15 +271,19 @@ impl SceneFolder {
         LabelMap::load(&self.objects_path(view))
     }
 
-    /// Writes the initial points (x y z r g b a line).
+    /// Writes the initial points: `position` and `color` (x y z and r g b a row), and `seen`, a row (point, training view) for each view that shows one.
     ///
     /// # Errors
     /// The system's refusal.
     pub fn save_points(&self, points: &[SfmPoint]) -> Result<()> {
         let position: Vec<f32> = points.iter().flat_map(|p| p.position.to_array()).collect();
         let color: Vec<f32> = points.iter().flat_map(|p| p.color.map(f32::from)).collect();
-        let shape = vec![points.len(), 3];
-        save_tensors(&self.root.join("points.safetensors"), &[("position", shape.clone(), &position), ("color", shape, &color)])
+        let seen = points.iter().enumerate().flat_map(|(k, p)| p.seen_by.iter().map(move |view| [k as f32, *view as f32]));
+        let seen: Vec<f32> = seen.flatten().collect();
+        let (shape, pairs) = (vec![points.len(), 3], vec![seen.len() / 2, 2]);
+        let tensors: [(&str, Vec<usize>, &[f32]); 3] =
+            [("position", shape.clone(), &position), ("color", shape, &color), ("seen", pairs, &seen)];
+        save_tensors(&self.root.join("points.safetensors"), &tensors)
     }
 
     /// Reads the initial points.
@@ -287,10 +291,22 @@ impl SceneFolder {
     /// # Errors
     /// Missing or damaged file.
     pub fn points(&self) -> Result<Vec<SfmPoint>> {
-        let tensors = load_tensors(&self.root.join("points.safetensors"))?;
+        let path = self.root.join("points.safetensors");
+        let tensors = load_tensors(&path)?;
         let get = |name: &str| tensors.get(name).map(|t| t.1.as_slice()).unwrap_or_default();
         let rows = get("position").chunks_exact(3).zip(get("color").chunks_exact(3));
-        Ok(rows.map(|(p, c)| SfmPoint { position: glam::Vec3::from_slice(p), color: [c[0] as u8, c[1] as u8, c[2] as u8] }).collect())
+        let point = |(p, c): (&[f32], &[f32])| {
+            let color = [c[0] as u8, c[1] as u8, c[2] as u8];
+            SfmPoint { position: glam::Vec3::from_slice(p), color, seen_by: Vec::new() }
+        };
+        let mut points: Vec<SfmPoint> = rows.map(point).collect();
+        for pair in get("seen").chunks_exact(2) {
+            let Some(point) = points.get_mut(pair[0] as usize) else {
+                return Err(Error::format(&path, "a view shows a point that is not there; run 'fastlgs preprocess' again"));
+            };
+            point.seen_by.push(pair[1] as u32);
+        }
+        Ok(points)
     }
 }
 
@@ -361,6 +377,24 @@ mod tests {
         let data = std::fs::read(&path).unwrap();
         std::fs::write(&path, &data[..data.len() - 3]).unwrap();
         assert!(load_tensors(&path).unwrap_err().to_string().contains("t.safetensors"));
+    }
+
+    #[test]
+    fn points_come_back_with_who_sees_them() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = SceneFolder::new(dir.path());
+        let point = |x: f32, seen_by: &[u32]| SfmPoint { position: glam::Vec3::X * x, color: [1, 2, 255], seen_by: seen_by.to_vec() };
+        let points = [point(0.5, &[0, 7, 3]), point(-1.0, &[]), point(2.0, &[12])];
+        folder.save_points(&points).unwrap();
+        assert_eq!(folder.points().unwrap(), points);
+        let path = dir.path().join("points.safetensors");
+        let one = [0.0f32; 3];
+        let earlier: [(&str, Vec<usize>, &[f32]); 2] = [("position", vec![1, 3], &one), ("color", vec![1, 3], &one)];
+        save_tensors(&path, &earlier).unwrap();
+        assert!(folder.points().unwrap()[0].seen_by.is_empty(), "of an earlier version");
+        save_tensors(&path, &[("seen", vec![1, 2], &[5.0, 0.0])]).unwrap();
+        let message = folder.points().unwrap_err().to_string();
+        assert!(message.contains("points.safetensors") && message.contains("preprocess"), "{message}");
     }
 
     #[test]

@@ -59,7 +59,7 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
             let ray = camera.ray(glam::Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
             let [r, g, b, _] = image.color[pixel[1] * width + pixel[0]].to_le_bytes();
-            out.push(SfmPoint { position: inverse.transform_point3(ray * depth), color: [r, g, b] });
+            out.push(SfmPoint { position: inverse.transform_point3(ray * depth), color: [r, g, b], seen_by: Vec::new() });
         }
     }
     Ok(out)
@@ -85,7 +85,7 @@ mod tests {
 
     #[test]
     fn points_in_one_place_are_one() {
-        let point = |x: f32| SfmPoint { position: Vec3::X * x, color: [9; 3] };
+        let point = |x: f32| SfmPoint { position: Vec3::X * x, color: [9; 3], seen_by: Vec::new() };
         let mut points = vec![point(0.0); 100];
         points.extend([point(1.0), point(2.0)]);
         let scene = from_points(&points);

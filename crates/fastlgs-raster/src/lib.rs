@@ -38,7 +38,7 @@ mod tests;
 
 pub use channels::Channels;
 pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, pack};
-pub use floaters::FEW_VIEWS;
+pub use floaters::{FEW_VIEWS, FreeSpace};
 pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;

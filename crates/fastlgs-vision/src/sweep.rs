@@ -294,7 +294,7 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
                 continue;
             }
             let point = view.point(pixel, depths[v][pixel]);
-            let (mut sum, mut count) = (point, 1);
+            let (mut sum, mut seen_by) = (point, vec![v as u32]);
             for &other in &neighbours[v] {
                 let Some((there, _)) = views[other].see(point) else { continue };
                 let seen = views[other].point(there, depths[other][there]);
@@ -302,13 +302,14 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
                 // The same pixel, or one that touches it.
                 let touches = [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
                 if depths[other][there] > 0.0 && touches {
-                    (sum, count) = (sum + seen, count + 1);
+                    sum += seen;
+                    seen_by.push(other as u32);
                 }
             }
-            if count > WITNESSES {
-                let position = sum / count as f32;
+            if seen_by.len() > WITNESSES {
+                let position = sum / seen_by.len() as f32;
                 let color = view.color.get_pixel((pixel % view.width()) as u32, (pixel / view.width()) as u32).0;
-                out.push(SfmPoint { position, color });
+                out.push(SfmPoint { position, color, seen_by });
                 views.iter().zip(depths).zip(&mut used).for_each(|((view, depths), used)| cover(view, depths, position, used));
             }
         }
@@ -363,6 +364,12 @@ mod tests {
         assert!(near as f32 > 0.98 * found.len() as f32, "{near} of {} points lie on the wall", found.len());
         let bare = found.iter().filter(|p| p.position.x > 1.1).count();
         assert!(bare < found.len() / 50, "{bare} points where there is nothing to see");
+        let shows = |p: &SfmPoint, view: u32| {
+            let camera = &cameras[view as usize];
+            let pixel = camera.to_pixel(camera.world_to_camera.transform_point3(p.position));
+            (0.0..160.0).contains(&pixel.x) && (0.0..120.0).contains(&pixel.y)
+        };
+        assert!(found.iter().all(|p| p.seen_by.len() > WITNESSES && p.seen_by.iter().all(|view| shows(p, *view))), "who agreed sees it");
         let right = |p: &&SfmPoint| (f32::from(p.color[0]) - texture(p.position)).abs() < 25.0;
         assert!(found.iter().filter(right).count() as f32 > 0.95 * found.len() as f32, "points have the wall's colours");
         assert!(

@@ -99,7 +99,8 @@ pub fn points(tracks: &[Track], colors: &[Vec<[u8; 3]>]) -> Vec<SfmPoint> {
         let sum = track.seen.iter().fold([0u32; 3], |sum, &(photo, k)| std::array::from_fn(|c| sum[c] + u32::from(colors[photo][k][c])));
         sum.map(|s| (s / track.seen.len() as u32) as u8)
     };
-    tracks.iter().map(|track| SfmPoint { position: track.position, color: color(track) }).collect()
+    let seen_by = |track: &Track| track.seen.iter().map(|(photo, _)| *photo as u32).collect();
+    tracks.iter().map(|track| SfmPoint { position: track.position, color: color(track), seen_by: seen_by(track) }).collect()
 }
 
 #[cfg(test)]
@@ -112,6 +113,13 @@ mod tests {
         // Key point 0 of all photos is one point; photo 2's key point 7 claims to be it as well, over photo 1.
         let matches = [pair(0, 1, &[(0, 0), (5, 5)]), pair(0, 2, &[(0, 0)]), pair(1, 2, &[(0, 7), (5, 6)])];
         assert_eq!(merged(&matches), [vec![(0, 0), (1, 0), (2, 0)], vec![(0, 5), (1, 5), (2, 6)]]);
+    }
+
+    #[test]
+    fn a_point_knows_the_photos_of_its_track() {
+        let track = Track { seen: vec![(1, 0), (3, 1)], position: Vec3::ONE, error: 0.1 };
+        let colors = [vec![], vec![[10; 3]], vec![], vec![[0; 3], [20; 3]]];
+        assert_eq!(points(&[track], &colors), [SfmPoint { position: Vec3::ONE, color: [15; 3], seen_by: vec![1, 3] }]);
     }
 
     #[test]

@@ -183,7 +183,7 @@ fn points_bin(path: &Path) -> Result<Vec<SfmPoint>> {
             bytes.f64()?;
             let track = bytes.count(8)?;
             bytes.take(track * 8)?;
-            Ok(SfmPoint { position, color: [rgb[0], rgb[1], rgb[2]] })
+            Ok(SfmPoint { position, color: [rgb[0], rgb[1], rgb[2]], seen_by: Vec::new() })
         })
         .collect()
 }
@@ -245,7 +245,11 @@ fn points_txt(path: &Path) -> Result<Vec<SfmPoint>> {
         .map(|(line, f)| {
             let number = |i| parse::<f32>(path, line, &f, i);
             let byte = |i| parse::<u8>(path, line, &f, i);
-            Ok(SfmPoint { position: Vec3::new(number(1)?, number(2)?, number(3)?), color: [byte(4)?, byte(5)?, byte(6)?] })
+            Ok(SfmPoint {
+                position: Vec3::new(number(1)?, number(2)?, number(3)?),
+                color: [byte(4)?, byte(5)?, byte(6)?],
+                seen_by: Vec::new(),
+            })
         })
         .collect()
 }

@@ -23,12 +23,14 @@ pub struct PosedPhoto {
 }
 
 /// A reconstructed 3-D point (structure from motion).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct SfmPoint {
     /// Position in the world.
     pub position: Vec3,
     /// Colour, 0 to 255.
     pub color: [u8; 3],
+    /// Numbers of the training views that are known to show it.
+    pub seen_by: Vec<u32>,
 }
 
 /// Posed photos, sorted by name, and what else their folder offered.

@@ -75,7 +75,7 @@ pub struct Trainer {
     extent: f32,
     /// Standard deviation of the photos' brightness.
     contrast: f32,
-    /// Where nothing is, by what the run starts from.
+    /// Where nothing may be.
     free: FreeSpace,
     course: Course,
     shown: Shown,
@@ -123,8 +123,13 @@ impl Trainer {
             alignment_gain: None,
             config,
         };
-        let free = FreeSpace::of(&targets.cameras, scene);
-        Ok(Self { engine, extent: scene_extent(&targets.cameras), contrast, free, targets, course, shown: Shown::default() })
+        let extent = scene_extent(&targets.cameras);
+        Ok(Self { engine, extent, contrast, free: FreeSpace::default(), targets, course, shown: Shown::default() })
+    }
+
+    /// Tells what the views look through: density control removes what it finds there.
+    pub fn keep_free(&mut self, free: FreeSpace) {
+        self.free = free;
     }
 
     /// The next training view: every view once in random order, then again. Under an automatic budget watched views wait until growth is over.

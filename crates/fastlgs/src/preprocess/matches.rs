@@ -39,8 +39,8 @@ pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera
     matches.iter().filter_map(renumbered).map(obeying).collect()
 }
 
-/// The same photos matched again, as their poses tell where to look. This is for masks, of which several key points have to agree: of two photos
-/// alone, whatever lies on the epipolar line agrees with the poses, and such points are no good start.
+/// The same photos matched again, as their poses tell where to look: for points and masks, and not for the poses, with which whatever lies on an
+/// epipolar line agrees.
 pub(super) fn guided(matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
     let match_pair = |m: &PairMatches| {
         let f = keypoints::fundamental(&cameras[m.a], &cameras[m.b]);

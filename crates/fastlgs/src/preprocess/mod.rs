@@ -131,6 +131,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let gains = poses.iter().map(|c| c.name.clone()).zip(compared.gains).collect();
     let light = Brightness { spread_stops: compared.spread_stops, gains };
 
+    let matches = matches::guided(&matches, &poses, &keypoints);
     let tracks = tracks::tracks(&poses, &keypoints, &matches, tracks::TOLERANCE);
     // Those that came with the poses lie where these were.
     let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
@@ -142,8 +143,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     drop(work);
     lap("depths");
     folder.save_points(&points)?;
-    let guided = matches::guided(&matches, &poses, &keypoints);
-    evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &guided)?)?;
+    evidence::save_pairs(&folder, &matches::between_masks(&folder, &poses, &keypoints, &matches)?)?;
     lap("points");
     if let Some(encoder) = imported {
         crate::masks::describe(&folder, &poses, encoder.as_ref(), None, run)?;

@@ -14,7 +14,7 @@ pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureM
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
-use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
+use fastlgs_raster::{Alignment, Channels, Choice, FreeSpace, Targets, TrainConfig, Trainer};
 pub(crate) use start::target;
 use std::time::Instant;
 
@@ -80,6 +80,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
+    trainer.keep_free(FreeSpace::of(&training, &folder.points()?));
     let checkpoint = checkpoints::path(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
         run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
