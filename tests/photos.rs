@@ -151,6 +151,18 @@ fn preprocessing_does_again_only_what_changed() {
     let results = || ["points.safetensors", "pairs.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"));
     let before = results();
     assert_eq!([counts(&first, "masks"), counts(&first, "poses")], [[0, 8], [0, 1]]);
+    // Views 0 and 8 are held out: points are seen by training views, by the numbers that these have in training.
+    let folder = fastlgs_core::SceneFolder::open(&scene).expect("a scene");
+    let training = folder.manifest().expect("a manifest").training(&folder.cameras().expect("cameras"));
+    let points = folder.points().expect("points");
+    let inside = |camera: &fastlgs_core::Camera, place| {
+        let pixel = camera.to_pixel(camera.world_to_camera.transform_point3(place));
+        (-1.0..161.0).contains(&pixel.x) && (-1.0..121.0).contains(&pixel.y)
+    };
+    let seen: Vec<(usize, bool)> =
+        points.iter().flat_map(|p| p.seen_by.iter().map(|view| (*view as usize, inside(&training[*view as usize], p.position)))).collect();
+    assert!(seen.len() > 1000 && seen.iter().all(|(_, inside)| *inside), "{} sights of {} points", seen.len(), points.len());
+    assert!((0..8).all(|view| seen.iter().any(|(of, _)| *of == view)), "every view sees some");
     let second = run();
     for stage in ["masks", "poses", "key points", "matches"] {
         let [there, all] = counts(&second, stage);

@@ -271,7 +271,7 @@ impl SceneFolder {
         LabelMap::load(&self.objects_path(view))
     }
 
-    /// Writes the initial points: `position` and `color` (x y z and r g b a row), and `seen`, a row (point, training view) for each view that shows one.
+    /// Writes the initial points: `position` (rows x y z), `color` (rows r g b), and `seen`: a row (point, training view) for each view that shows one.
     ///
     /// # Errors
     /// The system's refusal.

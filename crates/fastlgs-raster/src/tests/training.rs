@@ -1,8 +1,9 @@
 //! Whole runs: resumed ones, all strategies, and what is learned beside the Gaussians.
 
 use super::{camera, cloud, gpu, target};
-use crate::{Budget, CpuEngine, Engine, Gpu, GpuEngine, Strategy, Target, TrainConfig, TrainReport, Trainer};
+use crate::{Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Strategy, Target, TrainConfig, TrainReport, Trainer};
 use fastlgs_core::Camera;
+use fastlgs_core::dataset::SfmPoint;
 use glam::Vec3;
 
 fn views(count: usize) -> Vec<Target> {
@@ -62,6 +63,27 @@ fn resumes_to_the_same_bytes() {
         let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
         assert!(message.contains("other options"), "{message}");
     }
+}
+
+#[test]
+fn what_views_look_through_stays_empty() {
+    let config = TrainConfig { iterations: 100, refine_until: 0.8, budget: Budget::Fixed(400), ..TrainConfig::default() };
+    let cameras: Vec<Camera> = views(24).into_iter().map(|view| view.camera).collect();
+    // A wall behind the cloud, which three cameras are known to see.
+    let steps = || (-20..=20).map(|k| 0.1 * k as f32);
+    let wall = steps().flat_map(|x| steps().map(move |y| Vec3::new(x, y, 3.0)));
+    let wall: Vec<SfmPoint> = wall.map(|position| SfmPoint { position, color: [0; 3], seen_by: vec![0, 1, 2] }).collect();
+    let free = FreeSpace::of(&cameras, &[], &wall);
+    let left = |keep_free: bool| {
+        let mut trainer = trainer(Box::new(CpuEngine::new()), config.clone());
+        if keep_free {
+            trainer.keep_free(free.clone());
+        }
+        trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
+        trainer.gaussians().unwrap().means.iter().filter(|mean| free.holds(**mean)).count()
+    };
+    let [as_it_is, kept_free] = [false, true].map(left);
+    assert!(as_it_is > 20 && 10 * kept_free < as_it_is, "{as_it_is} before the wall, and {kept_free}");
 }
 
 #[test]

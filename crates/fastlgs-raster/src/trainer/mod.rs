@@ -127,7 +127,7 @@ impl Trainer {
         Ok(Self { engine, extent, contrast, free: FreeSpace::default(), targets, course, shown: Shown::default() })
     }
 
-    /// Tells what the views look through: density control removes what it finds there.
+    /// Tells what the views look through, as their cameras are now: the classic strategy's density control removes what it finds there.
     pub fn keep_free(&mut self, free: FreeSpace) {
         self.free = free;
     }

@@ -118,7 +118,7 @@ pub struct Report {
     pub masks: usize,
     /// Mean number of masks a photo, by level.
     pub masks_per_photo: BTreeMap<String, f64>,
-    /// Pairs of key points that matched.
+    /// Pairs of key points that matched, once poses were right.
     pub key_point_matches: usize,
     /// Points to start Gaussians from.
     pub points: usize,

@@ -14,7 +14,7 @@ pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureM
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
-use fastlgs_raster::{Alignment, Channels, Choice, FreeSpace, Targets, TrainConfig, Trainer};
+use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
 pub(crate) use start::target;
 use std::time::Instant;
 
@@ -66,6 +66,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     held_out.check()?;
     let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, began, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
+    let free = start::free_space(config, &folder, &training, &first)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
         // What most views say: where they disagree, descent from elsewhere ends between their codes.
         objects::lift(&mut first, &folder, &training, codes, config.antialias)?;
@@ -80,7 +81,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    trainer.keep_free(FreeSpace::of(&training, &folder.points()?));
+    trainer.keep_free(free);
     let checkpoint = checkpoints::path(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
         run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));

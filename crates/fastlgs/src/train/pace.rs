@@ -6,7 +6,7 @@ use crate::preprocess::Brightness;
 use crate::{Result, Run, checkpoints, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};
-use fastlgs_raster::{FreeSpace, Targets, Trainer};
+use fastlgs_raster::{Targets, Trainer};
 use serde_json::json;
 use std::time::Instant;
 
@@ -72,7 +72,7 @@ fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &T
     let engine = fastlgs_raster::open_engine_as(&device(MOST, run)?.device, config.shape)?;
     let work = run.work("trial", u64::from(TRIAL));
     let mut trainer = Trainer::new(engine, &first, targets.clone(), settings)?;
-    trainer.keep_free(FreeSpace::of(&targets.cameras, &folder.points()?));
+    trainer.keep_free(start::free_space(&short, folder, &targets.cameras, &first)?);
     let result = trainer.run(None, |_, _| work.check())?;
     // The first step is not in these seconds.
     Ok([(result.seconds - result.removal_seconds) / f64::from(TRIAL - 1), result.removal_seconds])

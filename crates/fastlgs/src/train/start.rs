@@ -6,7 +6,7 @@ use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{Target, TargetImage, Targets, init, pack};
+use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -41,6 +41,14 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
         first.log_scales.iter_mut().for_each(|s| *s += MCMC_SCALE.ln());
     }
     Ok(first)
+}
+
+/// What the views of `cameras` look through, where density control asks for it.
+pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], first: &Gaussians) -> Result<FreeSpace> {
+    if cameras.len() >= FEW_VIEWS || config.strategy != Strategy::Classic || config.iterations() == 0 {
+        return Ok(FreeSpace::default());
+    }
+    Ok(FreeSpace::of(cameras, &first.means, &folder.points()?))
 }
 
 /// The code of each id that object maps show, 0 included, as pictures have it.
