@@ -2,7 +2,7 @@
 //! training starts from does.
 //!
 //! From a camera to a point that it and two others agree on there is nothing: two choices of 17 photos of the generated table, 1,000 steps, gain 12 points of
-//! oracle mIoU by it. Where a camera knows no point, what is nearer than a fifth of the median depth of the first Gaussians is none of the scene: a larger
+//! oracle mIoU by it. Also where a camera knows no point, what is nearer than a fifth of the median depth of the first Gaussians is none of the scene: a larger
 //! share takes the near ends of bare surfaces. Nor is there anything around a camera, in what it does not see: a haze of the wall's colour that photos from
 //! the other side see before that wall hides all from a view between two cameras (of 17 photos of the table 29 dB instead of 33).
 //!
@@ -57,7 +57,7 @@ impl Free {
         if depths.len() >= FEW {
             let share = NEAR * depths[depths.len() / 2];
             near = share.min(depths[depths.len() / OUTLIER]);
-            // What a camera does not see may be well known by others: few of these points can be wrong.
+            // What a camera does not see may be well known by others: few of these Gaussians can be wrong.
             radius = share.min(distances[(distances.len() / OUTLIER).min(FEW)]);
         }
         let pixels = (camera.width * camera.height) as usize;
