@@ -269,10 +269,12 @@ pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed embeddings");
     let mut grid = Grid::load(scene)?;
     for embedding in grid.objects.iter_mut().flat_map(|o| &mut o.embeddings) {
-        let deviation = noise / (embedding.len() as f32).sqrt();
+        let length = |e: &[f32]| e.iter().map(|v| v * v).sum::<f32>().sqrt();
+        let own = length(embedding);
+        let deviation = noise * own / (embedding.len() as f32).sqrt();
         embedding.iter_mut().for_each(|v| *v += deviation * rng.normal());
-        let length = embedding.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-        embedding.iter_mut().for_each(|v| *v /= length);
+        let factor = own / length(embedding).max(f32::MIN_POSITIVE);
+        embedding.iter_mut().for_each(|v| *v *= factor);
     }
     Ok(grid.save(scene)?)
 }

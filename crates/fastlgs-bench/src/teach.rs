@@ -10,7 +10,7 @@ use fastlgs::calibrations::Calibrations;
 use fastlgs::eval::best_object;
 use fastlgs::session::Pixels;
 use fastlgs::session::ask::{Ask, Meaning};
-use fastlgs::{Run, Session};
+use fastlgs::{Run, Session, eyes};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
@@ -129,7 +129,10 @@ impl School {
     /// Asks for a name, wherever it labels something here, that was taught by an object of another scene or of this one.
     fn exam(&self, teacher: &Self, lesson: &str, name: &str, object: Option<u16>, config: &QueryConfig) -> Result<Vec<Value>> {
         let mut rows = Vec::new();
-        let shown = object.map(|id| teacher.grid.objects[usize::from(id) - 1].embeddings.clone()).filter(|shown| !shown.is_empty());
+        let embedded = |id: u16| teacher.grid.objects[usize::from(id) - 1].embeddings.iter();
+        let shown: Option<Vec<_>> =
+            object.map(|id| embedded(id).map(|e| eyes::without_words(&teacher.scene.manifest, e.clone())).collect());
+        let shown = shown.filter(|shown| !shown.is_empty());
         for view in &self.seen {
             for label in view.labels.iter().filter(|label| label.name == name) {
                 let iou = match &shown {

@@ -64,6 +64,14 @@ impl Camera {
         Vec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy)
     }
 
+    /// Number of the pixel in which a point of the world lies, row by row, and its depth; nothing behind the camera or beside its picture.
+    pub fn see(&self, point: Vec3) -> Option<(usize, f32)> {
+        let q = self.world_to_camera.transform_point3(point);
+        let pixel = self.to_pixel(q);
+        let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < self.width as f32 && pixel.y < self.height as f32;
+        (q.z > 0.0 && inside).then(|| (pixel.y as usize * self.width as usize + pixel.x as usize, q.z))
+    }
+
     /// Direction of a pixel's ray in camera space, with z = 1.
     pub fn ray(&self, pixel: Vec2) -> Vec3 {
         Vec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
@@ -147,6 +155,17 @@ mod tests {
         assert!(camera.to_pixel(above).y < 24.0, "world up must be image up");
         assert!((camera.centre() - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-4);
         assert!(camera.check().is_ok());
+    }
+
+    #[test]
+    fn what_lies_behind_or_beside_is_not_seen() {
+        let camera = Camera::look_at("a", -4.0 * Vec3::Z, Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let at = |x: f32, y: f32, depth: f32| camera.world_to_camera.inverse().transform_point3(camera.ray(Vec2::new(x, y)) * depth);
+        let (pixel, depth) = camera.see(at(3.5, 7.5, 2.0)).unwrap();
+        assert!(pixel == 7 * 64 + 3 && (depth - 2.0).abs() < 1e-5);
+        for (x, y, depth) in [(-0.1, 5.0, 2.0), (5.0, -0.1, 2.0), (64.1, 5.0, 2.0), (5.0, 48.1, 2.0), (5.0, 5.0, -2.0)] {
+            assert_eq!(camera.see(at(x, y, depth)), None);
+        }
     }
 
     #[test]

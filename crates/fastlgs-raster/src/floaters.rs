@@ -51,7 +51,7 @@ impl Free {
     /// That of a camera which is known to see `seen`, where training starts from Gaussians at `means`.
     fn of(camera: &Camera, means: &[Vec3], seen: &[Vec3]) -> Self {
         let camera = camera.shrunk_to(SIDE);
-        let depths = sorted(means.iter().filter_map(|mean| look(&camera, *mean)).map(|(_, depth)| depth));
+        let depths = sorted(means.iter().filter_map(|mean| camera.see(*mean)).map(|(_, depth)| depth));
         let distances = sorted(means.iter().map(|mean| mean.distance(camera.centre())));
         let [mut near, mut radius] = [0.0; 2];
         if depths.len() >= FEW {
@@ -62,7 +62,7 @@ impl Free {
         }
         let pixels = (camera.width * camera.height) as usize;
         let (mut known, mut nearest) = (vec![false; pixels], vec![f32::INFINITY; pixels]);
-        for (pixel, depth) in seen.iter().filter_map(|point| look(&camera, *point)) {
+        for (pixel, depth) in seen.iter().filter_map(|point| camera.see(*point)) {
             around(&camera, pixel, AROUND).for_each(|at| known[at] = true);
             around(&camera, pixel, BESIDE).for_each(|at| nearest[at] = nearest[at].min(depth));
         }
@@ -71,17 +71,9 @@ impl Free {
     }
 
     fn holds(&self, place: Vec3) -> bool {
-        let before = || look(&self.camera, place).is_some_and(|(pixel, depth)| depth < self.depth[pixel]);
+        let before = || self.camera.see(place).is_some_and(|(pixel, depth)| depth < self.depth[pixel]);
         self.centre.distance(place) < self.radius || before()
     }
-}
-
-/// Number of the pixel in which a camera sees a place, and how deep.
-fn look(camera: &Camera, place: Vec3) -> Option<(usize, f32)> {
-    let q = camera.world_to_camera.transform_point3(place);
-    let pixel = camera.to_pixel(q);
-    let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < camera.width as f32 && pixel.y < camera.height as f32;
-    (q.z > 0.0 && inside).then(|| (pixel.y as usize * camera.width as usize + pixel.x as usize, q.z))
 }
 
 /// Numbers of the pixels up to `reach` beside a pixel, itself included.

@@ -1,6 +1,6 @@
 //! Colours and materials by name: what a classifier of things does not tell, a mask's own pixels do.
 //!
-//! Embeddings of the offline encoder end with one number an attribute: for a mask how much of it has that colour, for a text
+//! Embeddings of the offline encoder have one number an attribute: for a mask how much of it has that colour, for a text
 //! whether it names it. Their product adds to the cosine of what the rest of the text means.
 
 use fastlgs_core::LabelMap;
@@ -29,7 +29,7 @@ const ATTRIBUTES: [Attribute; 12] = [
     Attribute { words: &["wooden", "wood"], colors: &[[35.0, 15.0, 22.0], [48.0, 17.0, 28.0], [62.0, 12.0, 30.0], [25.0, 10.0, 14.0]] },
 ];
 
-/// Numbers at the end of an embedding.
+/// Numbers of an embedding.
 pub const COUNT: usize = ATTRIBUTES.len();
 /// Share of a mask that makes a colour neither its own nor foreign to it.
 const NEUTRAL: f32 = 0.25;

@@ -5,6 +5,7 @@ use crate::attributes;
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, normalise};
 use crate::exposure;
+use crate::likeness::{self, Likeness};
 use crate::runtime::{Array, Model};
 use crate::{Result, names, places};
 use fastlgs_core::LabelMap;
@@ -13,7 +14,7 @@ use image::RgbImage;
 use rayon::prelude::*;
 
 /// Changes when the same mask gets another embedding: those of different versions cannot be compared.
-pub const VERSION: u32 = 2;
+pub const VERSION: u32 = 3;
 
 /// Classes that take part in an embedding.
 const TOP: usize = 10;
@@ -44,6 +45,7 @@ pub struct Conse {
     class_embeddings: Vec<Vec<f32>>,
     /// `[1000][DENSE]`: random projection of logits.
     projection: Vec<[f32; DENSE]>,
+    likeness: Likeness,
 }
 
 impl Conse {
@@ -57,7 +59,8 @@ impl Conse {
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
         let projection = class_embeddings.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
-        Ok(Self { classifier, class_embeddings, projection })
+        let likeness = Likeness::new(class_embeddings.len());
+        Ok(Self { classifier, class_embeddings, projection, likeness })
     }
 
     /// Class logits of each crop.
@@ -112,9 +115,9 @@ impl Conse {
         DenseMap { channels: DENSE, values, ..*map }
     }
 
-    /// Class probabilities of each label 1..=max; empty for labels that do not occur. A mask is looked at twice, by itself and with what
+    /// Class logits of each label 1..=max; empty for labels that do not occur. A mask is looked at twice, by itself and with what
     /// surrounds it; the mean of both logits is what both views of it allow for.
-    fn mask_probabilities(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+    fn mask_logits(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let photo = &exposure::lifted(photo);
         let boxes = masks.boxes();
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
@@ -124,11 +127,11 @@ impl Conse {
             let logits = self.logits(&batch.iter().flat_map(cut).collect::<Vec<_>>())?;
             let classes = logits.shape[1];
             let mean = |pair: &[f32]| -> Vec<f32> { (0..classes).map(|k| 0.5 * (pair[k] + pair[classes + k])).collect() };
-            Ok(logits.values.chunks_exact(views.len() * classes).map(|pair| softmax(&mean(pair))).collect())
+            Ok(logits.values.chunks_exact(views.len() * classes).map(mean).collect())
         };
-        let probabilities = present.par_chunks(BATCH).map(of_batch).collect::<Result<Vec<_>>>()?.concat();
+        let logits = present.par_chunks(BATCH).map(of_batch).collect::<Result<Vec<_>>>()?.concat();
         let mut out = vec![Vec::new(); usize::from(masks.max())];
-        for ((label, _), own) in present.iter().zip(probabilities) {
+        for ((label, _), own) in present.iter().zip(logits) {
             out[usize::from(*label) - 1] = own;
         }
         Ok(out)
@@ -141,12 +144,13 @@ impl Encoder for Conse {
     }
 
     fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let dimension = self.class_embeddings[0].len() + attributes::COUNT;
+        let dimension = self.class_embeddings[0].len() + attributes::COUNT + likeness::COUNT;
         let colors = attributes::of_masks(&exposure::lifted(photo), masks);
-        let embed = |(p, colors): (&Vec<f32>, [f32; attributes::COUNT])| {
-            if p.is_empty() { vec![0.0; dimension] } else { [self.embedding(p).as_slice(), &colors].concat() }
+        let embed = |(logits, colors): (&Vec<f32>, [f32; attributes::COUNT])| match logits.as_slice() {
+            [] => vec![0.0; dimension],
+            logits => [self.embedding(&softmax(logits)).as_slice(), &colors, &self.likeness.of(logits)].concat(),
         };
-        Ok(self.mask_probabilities(photo, masks)?.iter().zip(colors).map(embed).collect())
+        Ok(self.mask_logits(photo, masks)?.iter().zip(colors).map(embed).collect())
     }
 }
 

@@ -17,6 +17,7 @@ pub mod histogram;
 pub mod import;
 pub mod inpaint;
 pub mod keypoints;
+pub mod likeness;
 pub mod masks;
 pub mod matching;
 pub mod models;

@@ -56,22 +56,10 @@ impl View {
         self.camera.height as usize
     }
 
-    /// A pixel's number, if it lies inside.
-    fn at(&self, pixel: Vec2) -> Option<usize> {
-        let inside = pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < self.camera.width as f32 && pixel.y < self.camera.height as f32;
-        inside.then(|| pixel.y as usize * self.width() + pixel.x as usize)
-    }
-
     /// The world's point at a depth before the middle of a pixel.
     fn point(&self, pixel: usize, depth: f32) -> Vec3 {
         let middle = Vec2::new((pixel % self.width()) as f32 + 0.5, (pixel / self.width()) as f32 + 0.5);
         self.camera.world_to_camera.inverse().transform_point3(self.camera.ray(middle) * depth)
-    }
-
-    /// Where a point of the world is seen, and at what depth.
-    fn see(&self, point: Vec3) -> Option<(usize, f32)> {
-        let q = self.camera.world_to_camera.transform_point3(point);
-        if q.z <= 0.0 { None } else { Some((self.at(self.camera.to_pixel(q))?, q.z)) }
     }
 }
 
@@ -296,9 +284,9 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
             let point = view.point(pixel, depths[v][pixel]);
             let (mut sum, mut seen_by) = (point, vec![v as u32]);
             for &other in &neighbours[v] {
-                let Some((there, _)) = views[other].see(point) else { continue };
+                let Some((there, _)) = views[other].camera.see(point) else { continue };
                 let seen = views[other].point(there, depths[other][there]);
-                let apart = (pixel as isize - view.see(seen).map_or(-1, |s| s.0 as isize)).unsigned_abs();
+                let apart = (pixel as isize - view.camera.see(seen).map_or(-1, |s| s.0 as isize)).unsigned_abs();
                 // The same pixel, or one that touches it.
                 let touches = [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
                 if depths[other][there] > 0.0 && touches {
@@ -319,7 +307,7 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
 
 /// Marks the pixels around a point that lie about as deep as it: a point a pixel would be denser than a start needs.
 fn cover(view: &View, depths: &[f32], point: Vec3, used: &mut [bool]) {
-    let Some((pixel, depth)) = view.see(point) else { return };
+    let Some((pixel, depth)) = view.camera.see(point) else { return };
     let (x, y) = (pixel % view.width(), pixel / view.width());
     for y in y.saturating_sub(SPACING)..(y + SPACING + 1).min(view.height()) {
         for x in x.saturating_sub(SPACING)..(x + SPACING + 1).min(view.width()) {

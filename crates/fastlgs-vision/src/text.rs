@@ -2,6 +2,7 @@
 
 use crate::attributes;
 use crate::encoder::{TextEncoder, normalise};
+use crate::likeness;
 use crate::runtime::{Array, Model};
 use crate::{Error, Result, places};
 use tokenizers::Tokenizer;
@@ -80,7 +81,7 @@ impl TextEncoder for OfflineText {
             meanings[k].iter_mut().zip(whole).for_each(|(rest, whole)| *rest += whole);
             normalise(&mut meanings[k]);
         }
-        Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named].concat()).collect())
+        Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named, &[0.0; likeness::COUNT]].concat()).collect())
     }
 
     fn advantage(&self, text: &str) -> f32 {
@@ -100,11 +101,13 @@ mod tests {
             Err(e) => return eprintln!("SKIPPED: {e}"),
         };
         let embedded = text.embed(&["orange juice", "juice", "golden retriever", "yellow retriever"]).unwrap();
-        let meaning = |k: usize| &embedded[k][..embedded[k].len() - attributes::COUNT];
+        let ends = embedded[0].len() - likeness::COUNT;
+        let meaning = |k: usize| &embedded[k][..ends - attributes::COUNT];
+        let named = |k: usize| &embedded[k][ends - attributes::COUNT..ends];
         let cosine = |a: usize, b: usize| meaning(a).iter().zip(meaning(b)).map(|(x, y)| x * y).sum::<f32>();
         assert!((0..4).all(|k| (cosine(k, k) - 1.0).abs() < 1e-4));
         assert!(cosine(0, 1) < 0.99 && cosine(2, 3) < 0.99, "{} {}", cosine(0, 1), cosine(2, 3));
-        assert!(embedded[1].iter().rev().take(attributes::COUNT).all(|named| *named == 0.0));
-        assert!(embedded[0].iter().rev().take(attributes::COUNT).any(|named| *named > 0.0));
+        assert!(named(1).iter().all(|named| *named == 0.0) && named(0).iter().any(|named| *named > 0.0));
+        assert!(embedded.iter().all(|e| e[ends..].iter().all(|v| *v == 0.0)), "words look like nothing");
     }
 }

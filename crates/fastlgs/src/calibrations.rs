@@ -87,8 +87,8 @@ impl Calibrations {
     /// The offline encoder's.
     pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
 
-    /// What is assumed of a CLIP that was not measured: pictures about as far from each other as with the offline encoder.
-    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration { measured: false, ..Calibration::OFFLINE_PICTURES } };
+    /// What is assumed of a CLIP that was not measured.
+    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration::CLIP_PICTURES };
 
     /// Those of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {

@@ -10,7 +10,8 @@ use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
-    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, models, places, segmenter,
+    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, likeness, models, places,
+    segmenter,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -292,6 +293,16 @@ pub(crate) fn identity_of(manifest: &Manifest) -> String {
         calibrations::OFFLINE => format!("offline {}", conse::VERSION),
         other => file("clip_image").or_else(|| file("clip_text")).unwrap_or_else(|| other.to_owned()),
     }
+}
+
+/// An embedding of a scene's encoder as other masks and pictures are compared with it.
+pub fn without_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
+    if manifest.encoder == calibrations::OFFLINE { likeness::without_words(embedding) } else { embedding }
+}
+
+/// The same as texts are compared with it.
+pub fn without_likeness(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
+    if manifest.encoder == calibrations::OFFLINE { likeness::without_likeness(embedding) } else { embedding }
 }
 
 /// The model file of a role, as the manifest remembers it.

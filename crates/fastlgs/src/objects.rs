@@ -33,7 +33,11 @@ const EMBEDDED_VIEWS: usize = 3;
 pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperConfig, run: &Run) -> Result<Grid> {
     let masks = masks::evidence(folder, training, run)?;
     let pairs = evidence::load_pairs(folder, &masks)?;
-    let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&masks, &pairs, config)?;
+    let manifest = folder.manifest()?;
+    // By kinds of things: by single things the masks of fox fall into twice as many objects (theta 0.6 to 0.8: oracle 0.45, 0.45, 0.43; by kinds 0.48).
+    let of_kind = |mask: &Mask| Mask { embedding: eyes::without_likeness(&manifest, mask.embedding.clone()), ..mask.clone() };
+    let compared: Vec<Mask> = masks.iter().map(of_kind).collect();
+    let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&compared, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
     begin_maps(folder)?;
     for (view, camera) in training.iter().enumerate() {

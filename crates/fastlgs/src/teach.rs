@@ -80,7 +80,8 @@ pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report
     let Some(object) = usize::from(id).checked_sub(1).and_then(|k| grid.objects.get(k)) else {
         bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len())
     };
-    keep(scene, name, Some(id), format!("object {id} of {root}"), object.embeddings.clone())
+    let shown = object.embeddings.iter().map(|e| eyes::without_words(&scene.manifest, e.clone())).collect();
+    keep(scene, name, Some(id), format!("object {id} of {root}"), shown)
 }
 
 fn keep(scene: &Session, name: &str, object: Option<u16>, from: String, embeddings: Vec<Vec<f32>>) -> Result<Report> {

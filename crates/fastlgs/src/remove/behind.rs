@@ -26,15 +26,7 @@ pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool
             }
         }
     }
-    let is_within = |mean: Vec3| {
-        views.iter().any(|(camera, hidden)| {
-            let seen = camera.world_to_camera.transform_point3(mean);
-            let place = camera.to_pixel(seen);
-            let [w, h] = [camera.width, camera.height];
-            let shown = seen.z > 0.0 && place.x >= 0.0 && place.y >= 0.0 && place.x < w as f32 && place.y < h as f32;
-            shown && hidden[place.y as usize * w as usize + place.x as usize]
-        })
-    };
+    let is_within = |mean: Vec3| views.iter().any(|(camera, hidden)| camera.see(mean).is_some_and(|(pixel, _)| hidden[pixel]));
     let stays = |((count, within), mean): ((u8, bool), &Vec3)| count >= WITNESSES || !(within || is_within(*mean));
     Ok(witnesses.into_iter().zip(within).zip(&session.gaussians.means).map(stays).collect())
 }

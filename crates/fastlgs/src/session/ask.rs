@@ -1,9 +1,9 @@
 //! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
 
-use super::{Pixels, Session, Texts};
-use crate::Result;
+use super::{Pixels, Session, Texts, texts};
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
+use crate::{Result, eyes};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -113,10 +113,13 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
     let (width, height) = photo.dimensions();
     let everything = LabelMap { width, height, labels: vec![1; (width * height) as usize] };
     let encoder = session.image_encoder()?;
-    let embedding = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
-    let embedding =
-        embedding.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    Ok(TextQuery::of_examples(vec![embedding], session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures))
+    let found = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
+    let whole = found.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
+    texts::check_length(&session.grid()?, whole.len(), &session.folder, "pictures")?;
+    Ok(TextQuery::of_examples(
+        vec![eyes::without_words(&session.manifest, whole)],
+        session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures,
+    ))
 }
 
 impl Meaning {

@@ -11,6 +11,19 @@ use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
 
+/// Fails where the objects' embeddings cannot be compared with those of texts or pictures, which have so many numbers.
+pub(super) fn check_length(grid: &Grid, length: usize, folder: &SceneFolder, what: &str) -> Result<()> {
+    let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
+    if let Some(own) = own.filter(|own| *own != length) {
+        let root = folder.root.display();
+        bail!(
+            "{root}: its embeddings have {own} numbers, those of {what} {length}; they are of another encoder or version: \
+             run 'fastlgs train {root}' again, or name the right tower with --clip-text"
+        );
+    }
+    Ok(())
+}
+
 /// A loaded text tower.
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
@@ -32,14 +45,7 @@ impl Texts {
         let canonical = if manifest.encoder == calibrations::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
-        let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
-        if let Some(own) = own.filter(|own| *own != length) {
-            let root = folder.root.display();
-            bail!(
-                "{root}: its embeddings have {own} numbers, those of texts {length}; they are of another encoder or version: \
-                 run 'fastlgs train {root}' again, or name the right tower with --clip-text"
-            );
-        }
+        check_length(&grid, length, folder, "texts")?;
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
         Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
     }
