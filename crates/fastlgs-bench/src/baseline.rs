@@ -117,7 +117,7 @@ impl PerPixel {
         let lifted = lifted(scene, |view, camera| {
             let map = scene.folder.masks(camera)?.painted(Level::Whole);
             let own = masks.iter().filter(|m| m.view == view);
-            Ok((map, own.map(|m| (m.label, eyes::without_likeness(&scene.manifest, m.embedding.clone()))).collect()))
+            Ok((map, own.map(|m| (m.label, eyes::for_words(&scene.manifest, m.embedding.clone()))).collect()))
         })?;
         Ok(Self { layers: vec![lifted], meaning: Meaning::Embedding })
     }
@@ -236,7 +236,7 @@ type Labelled = (LabelMap, Vec<(u16, Vec<f32>)>);
 fn embedded(scene: &Session, encoder: &dyn Encoder, camera: &Camera, map: LabelMap) -> Result<Labelled> {
     let found = encoder.embed_masks(&camera.name, &scene.folder.photo(&camera.name)?, &map)?;
     let own = found.into_iter().enumerate().filter(|(_, e)| e.iter().any(|v| *v != 0.0));
-    Ok((map, own.map(|(k, e)| (k as u16 + 1, eyes::without_likeness(&scene.manifest, e))).collect()))
+    Ok((map, own.map(|(k, e)| (k as u16 + 1, eyes::for_words(&scene.manifest, e))).collect()))
 }
 
 fn rows(vectors: &[&Vec<f32>]) -> Result<Vectors> {

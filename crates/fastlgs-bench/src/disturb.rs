@@ -1,6 +1,7 @@
 //! What goes wrong with photos, masks and embeddings, done on purpose.
 
 use anyhow::{Context, Result};
+use fastlgs::eyes;
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::mask_list::{Mask, RunLengths};
 use fastlgs_core::rng::Rng;
@@ -264,17 +265,17 @@ fn reach(place: usize, w: usize, h: usize, pixels: isize) -> impl Iterator<Item 
     (-pixels..=pixels).flat_map(move |d| [at(x + d, y), at(x, y + d)])
 }
 
-/// Adds noise of this length, as a share of their own, to all embeddings of a scene's objects.
+/// Adds noise of this length to what texts are compared by in all embeddings of a scene's objects.
 pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed embeddings");
     let mut grid = Grid::load(scene)?;
+    let manifest = scene.manifest()?;
     for embedding in grid.objects.iter_mut().flat_map(|o| &mut o.embeddings) {
-        let length = |e: &[f32]| e.iter().map(|v| v * v).sum::<f32>().sqrt();
-        let own = length(embedding);
-        let deviation = noise * own / (embedding.len() as f32).sqrt();
-        embedding.iter_mut().for_each(|v| *v += deviation * rng.normal());
-        let factor = own / length(embedding).max(f32::MIN_POSITIVE);
-        embedding.iter_mut().for_each(|v| *v *= factor);
+        let words = eyes::words(&manifest, embedding);
+        let deviation = noise / (words.len() as f32).sqrt();
+        words.iter_mut().for_each(|v| *v += deviation * rng.normal());
+        let length = words.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        words.iter_mut().for_each(|v| *v /= length);
     }
     Ok(grid.save(scene)?)
 }

@@ -106,6 +106,7 @@ impl School {
         let mut scene = Session::open(root, run.device)?;
         scene.forget_taught();
         let grid = scene.grid()?;
+        eyes::check_version(&scene.manifest, &grid, &scene.folder)?;
         let mut seen = Vec::new();
         for view in views {
             let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
@@ -129,10 +130,7 @@ impl School {
     /// Asks for a name, wherever it labels something here, that was taught by an object of another scene or of this one.
     fn exam(&self, teacher: &Self, lesson: &str, name: &str, object: Option<u16>, config: &QueryConfig) -> Result<Vec<Value>> {
         let mut rows = Vec::new();
-        let embedded = |id: u16| teacher.grid.objects[usize::from(id) - 1].embeddings.iter();
-        let shown: Option<Vec<_>> =
-            object.map(|id| embedded(id).map(|e| eyes::without_words(&teacher.scene.manifest, e.clone())).collect());
-        let shown = shown.filter(|shown| !shown.is_empty());
+        let shown = object.map(|id| teacher.grid.objects[usize::from(id) - 1].embeddings.clone()).filter(|shown| !shown.is_empty());
         for view in &self.seen {
             for label in view.labels.iter().filter(|label| label.name == name) {
                 let iou = match &shown {

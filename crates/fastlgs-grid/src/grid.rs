@@ -20,7 +20,7 @@ pub struct Object {
     pub support: f32,
     /// Code in (0, 1)^3.
     pub code: Vec3,
-    /// Embeddings of its masks; what texts are compared with is L2-normalised in each, and so is what other masks are.
+    /// Embeddings of its masks; of each what texts are compared with is L2-normalised.
     pub embeddings: Vec<Vec<f32>>,
     /// Share of its photo that each of those masks covered.
     pub areas: Vec<f32>,

@@ -19,8 +19,9 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::Mutex;
 
-/// Principal components that are kept.
-const COMPONENTS: usize = 64;
+/// Principal components that are kept. With 64, nearly all are spent on what examples are compared by: of ten objects that are most like words
+/// eight are among the nearest hundredth, with 128 all ten.
+const COMPONENTS: usize = 128;
 /// Embeddings from which they are found, evenly spread.
 const SAMPLES: usize = 8_192;
 /// Objects that are compared in full.
@@ -304,7 +305,9 @@ mod tests {
     use crate::calibration::Calibration;
     use fastlgs_core::rng::Rng;
 
+    /// Numbers that texts are compared by, and those that examples are.
     const DIMENSION: usize = 384;
+    const APPEARANCE: usize = 64;
 
     fn unit(mut v: Vec<f32>) -> Vec<f32> {
         let length = dot(&v, &v).sqrt();
@@ -312,7 +315,12 @@ mod tests {
         v
     }
 
-    /// Embeddings as encoders make them: mixtures of some concepts, and noise.
+    /// A text's embedding, which looks like nothing.
+    fn text(concept: &[f32]) -> Vec<f32> {
+        [concept, &[0.0; APPEARANCE]].concat()
+    }
+
+    /// Embeddings as encoders make them: mixtures of some concepts, and noise; then what tells single things apart.
     fn scenes(count: usize, objects: u16, concepts: &[Vec<f32>]) -> Vec<(Entry, Grid)> {
         let mut rng = Rng::new(7, "library");
         let mut pick = |n: usize| ((rng.uniform() * n as f32) as usize).min(n - 1);
@@ -321,14 +329,12 @@ mod tests {
             .map(|k| {
                 let object = |id: u16| {
                     let own = pick(concepts.len());
+                    let look = unit((0..APPEARANCE).map(|_| noise.uniform() - 0.5).collect());
                     let embeddings: Vec<Vec<f32>> = (0..1 + pick(5))
                         .map(|_| {
                             let other = pick(concepts.len());
-                            unit(
-                                (0..DIMENSION)
-                                    .map(|d| concepts[own][d] + 0.5 * concepts[other][d] + 0.02 * (noise.uniform() - 0.5))
-                                    .collect(),
-                            )
+                            let mixed = |d| concepts[own][d] + 0.5 * concepts[other][d] + 0.02 * (noise.uniform() - 0.5);
+                            [unit((0..DIMENSION).map(mixed).collect()), look.clone()].concat()
                         })
                         .collect();
                     let areas = vec![0.1; embeddings.len()];
@@ -357,7 +363,7 @@ mod tests {
         assert_eq!((library.len(), library.scenes.len()), (2400, 40));
         let (mut same, mut asked) = (0, 0);
         for concept in concepts.iter().take(50) {
-            let query = TextQuery::new(vec![concept.clone()], Calibration::OFFLINE);
+            let query = TextQuery::new(vec![text(concept)], Calibration::OFFLINE);
             let mut exact: Vec<Found> = Vec::new();
             for (k, (_, grid)) in scenes.iter().enumerate() {
                 let own = |object: &Object| (query::margin(object, &query).unwrap(), object.id);
@@ -367,12 +373,12 @@ mod tests {
             exact.sort_by(|a, b| b.margin.total_cmp(&a.margin));
             for (found, own) in library.search(&query, 5).unwrap().iter().zip(&exact) {
                 asked += 1;
-                same += u32::from(found.scene == own.scene && found.object == own.object);
+                // Embeddings are rounded: what is nearly level may change places.
+                same += u32::from((found.margin - own.margin).abs() < 0.002);
                 assert!((found.margin - own.margin).abs() < 0.002 || found.scene != own.scene, "{found:?} {own:?}");
             }
         }
-        // Embeddings are rounded: what is nearly level may change places.
-        assert!(same * 100 >= asked * 90, "{same} of {asked} as by asking each scene");
+        assert!(same * 100 >= asked * 95, "{same} of {asked} as good as by asking each scene");
         let short = TextQuery::new(vec![vec![1.0]], Calibration::OFFLINE);
         assert!(library.search(&short, 5).unwrap_err().to_string().contains("different encoders"));
     }
@@ -406,7 +412,7 @@ mod tests {
         let library = Library::open(&path).unwrap();
         let mut milliseconds: Vec<f64> = (0..20)
             .map(|k| {
-                let query = TextQuery::new(vec![concepts[k].clone()], Calibration::OFFLINE);
+                let query = TextQuery::new(vec![text(&concepts[k])], Calibration::OFFLINE);
                 let started = std::time::Instant::now();
                 assert_eq!(library.search(&query, 10).unwrap().len(), 10);
                 started.elapsed().as_secs_f64() * 1e3

@@ -15,7 +15,7 @@ pub struct Mask {
     pub label: u16,
     /// Share of the photo that it covers.
     pub area: f32,
-    /// Embedding L, of which what masks are compared by is L2-normalised; zeros where there is none.
+    /// Embedding L, L2-normalised as masks are compared by it; zeros where there is none.
     pub embedding: Vec<f32>,
     /// Colour distribution C, summing to 1.
     pub histogram: Vec<f32>,

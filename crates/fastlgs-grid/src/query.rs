@@ -67,7 +67,7 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
         let Some(cosine) = mean_cosine(object, query).filter(|_| !is_refuted(object, query)) else {
             return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
         };
-        if query.shown && object.embeddings.iter().all(|e| query.shows(e)) {
+        if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
             return Evidence { rank: f32::INFINITY, likeness: f32::INFINITY, score: 1.0, error: 0.0 };
         }
         let likeness = calibration.temperature * cosine;

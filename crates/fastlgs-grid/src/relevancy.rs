@@ -11,7 +11,7 @@ const TEMPERATURE: f32 = 10.0;
 /// What is meant, ready to be compared: its embeddings and those of the canonical phrases.
 #[derive(Clone, Debug)]
 pub struct TextQuery {
-    /// Embeddings, L2-normalised: one of a text, or those of examples, of which the nearest counts; zero in all that this is not compared by.
+    /// Embeddings: one of a text, or those of examples, of which the nearest counts.
     pub meant: Vec<Vec<f32>>,
     /// Whether they are of things that were shown, and not of words.
     pub shown: bool,
@@ -27,6 +27,7 @@ pub struct TextQuery {
 
 /// In sixteen sums, which the compiler may keep in vectors; one sum would have to be added up in order.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
+    debug_assert_eq!(a.len(), b.len(), "embeddings of one encoder");
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
     let mut sums = [0.0; 16];
     for (a, b) in a.iter().zip(b) {
@@ -61,12 +62,7 @@ impl TextQuery {
         self.negatives.iter().map(|n| dot(embedding, n)).fold(-1.0, f32::max)
     }
 
-    /// Whether an embedding is one of those that were shown, whose zeros say nothing.
-    pub(crate) fn shows(&self, embedding: &[f32]) -> bool {
-        self.meant.iter().any(|meant| meant.iter().zip(embedding).all(|(shown, own)| *shown == 0.0 || shown == own))
-    }
-
-    /// Cosine of an embedding with what is meant.
+    /// Cosine of an embedding with what is meant; for encoders that compare examples by more than texts the sum of both cosines.
     pub fn cosine(&self, embedding: &[f32]) -> f32 {
         self.meant.iter().map(|meant| dot(embedding, meant)).fold(-1.0, f32::max)
     }
@@ -75,12 +71,6 @@ impl TextQuery {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn what_was_shown_is_known_by_the_numbers_that_it_has() {
-        let shown = TextQuery::of_examples(vec![vec![0.0, 0.6, 0.8]], Calibration::OFFLINE_PICTURES);
-        assert!(shown.shows(&[0.3, 0.6, 0.8]) && !shown.shows(&[0.0, 0.6, 0.799]));
-    }
 
     #[test]
     fn the_strongest_canonical_phrase_counts() {

@@ -29,7 +29,7 @@ const ATTRIBUTES: [Attribute; 12] = [
     Attribute { words: &["wooden", "wood"], colors: &[[35.0, 15.0, 22.0], [48.0, 17.0, 28.0], [62.0, 12.0, 30.0], [25.0, 10.0, 14.0]] },
 ];
 
-/// Numbers of an embedding.
+/// Attributes, each a number of an embedding.
 pub const COUNT: usize = ATTRIBUTES.len();
 /// Share of a mask that makes a colour neither its own nor foreign to it.
 const NEUTRAL: f32 = 0.25;

@@ -1,11 +1,11 @@
-//! The offline joint space: ConSE (Norouzi et al. 2014). An image's embedding is the probability-weighted mean of the
+//! The offline joint space: ConSE (Norouzi et al. 2014). What an image means is the probability-weighted mean of the
 //! text embeddings of its ten most likely ImageNet class names. A zero-shot encoder with the limits of 1,000 concepts.
 
+use crate::appearance::{self, Appearance};
 use crate::attributes;
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, normalise};
 use crate::exposure;
-use crate::likeness::{self, Likeness};
 use crate::runtime::{Array, Model};
 use crate::{Result, names, places};
 use fastlgs_core::LabelMap;
@@ -16,7 +16,10 @@ use rayon::prelude::*;
 /// Changes when the same mask gets another embedding: those of different versions cannot be compared.
 pub const VERSION: u32 = 3;
 
-/// Classes that take part in an embedding.
+/// Numbers of an embedding: what MiniLM makes of words, [`attributes`], and [`appearance`].
+pub const LENGTH: usize = 384 + attributes::COUNT + appearance::COUNT;
+
+/// Classes that take part in what an embedding means.
 const TOP: usize = 10;
 /// Input size of EfficientNet-Lite2.
 const SIZE: usize = 260;
@@ -45,7 +48,7 @@ pub struct Conse {
     class_embeddings: Vec<Vec<f32>>,
     /// `[1000][DENSE]`: random projection of logits.
     projection: Vec<[f32; DENSE]>,
-    likeness: Likeness,
+    appearance: Appearance,
 }
 
 impl Conse {
@@ -59,8 +62,8 @@ impl Conse {
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
         let projection = class_embeddings.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
-        let likeness = Likeness::new(class_embeddings.len());
-        Ok(Self { classifier, class_embeddings, projection, likeness })
+        let appearance = Appearance::new(class_embeddings.len());
+        Ok(Self { classifier, class_embeddings, projection, appearance })
     }
 
     /// Class logits of each crop.
@@ -144,11 +147,10 @@ impl Encoder for Conse {
     }
 
     fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let dimension = self.class_embeddings[0].len() + attributes::COUNT + likeness::COUNT;
         let colors = attributes::of_masks(&exposure::lifted(photo), masks);
         let embed = |(logits, colors): (&Vec<f32>, [f32; attributes::COUNT])| match logits.as_slice() {
-            [] => vec![0.0; dimension],
-            logits => [self.embedding(&softmax(logits)).as_slice(), &colors, &self.likeness.of(logits)].concat(),
+            [] => vec![0.0; LENGTH],
+            logits => [self.embedding(&softmax(logits)).as_slice(), &colors, &self.appearance.of(logits)].concat(),
         };
         Ok(self.mask_logits(photo, masks)?.iter().zip(colors).map(embed).collect())
     }

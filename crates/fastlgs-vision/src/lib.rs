@@ -2,6 +2,7 @@
 //!
 //! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
 
+pub mod appearance;
 pub mod attributes;
 pub mod brightness;
 pub mod bundle;
@@ -17,7 +18,6 @@ pub mod histogram;
 pub mod import;
 pub mod inpaint;
 pub mod keypoints;
-pub mod likeness;
 pub mod masks;
 pub mod matching;
 pub mod models;

@@ -1,8 +1,8 @@
 //! The offline text tower: all-MiniLM-L6-v2.
 
+use crate::appearance;
 use crate::attributes;
 use crate::encoder::{TextEncoder, normalise};
-use crate::likeness;
 use crate::runtime::{Array, Model};
 use crate::{Error, Result, places};
 use tokenizers::Tokenizer;
@@ -81,7 +81,11 @@ impl TextEncoder for OfflineText {
             meanings[k].iter_mut().zip(whole).for_each(|(rest, whole)| *rest += whole);
             normalise(&mut meanings[k]);
         }
-        Ok(meanings.into_iter().zip(named).map(|(meaning, named)| [meaning.as_slice(), &named, &[0.0; likeness::COUNT]].concat()).collect())
+        Ok(meanings
+            .into_iter()
+            .zip(named)
+            .map(|(meaning, named)| [meaning.as_slice(), &named, &[0.0; appearance::COUNT]].concat())
+            .collect())
     }
 
     fn advantage(&self, text: &str) -> f32 {
@@ -101,7 +105,7 @@ mod tests {
             Err(e) => return eprintln!("SKIPPED: {e}"),
         };
         let embedded = text.embed(&["orange juice", "juice", "golden retriever", "yellow retriever"]).unwrap();
-        let ends = embedded[0].len() - likeness::COUNT;
+        let ends = embedded[0].len() - appearance::COUNT;
         let meaning = |k: usize| &embedded[k][..ends - attributes::COUNT];
         let named = |k: usize| &embedded[k][ends - attributes::COUNT..ends];
         let cosine = |a: usize, b: usize| meaning(a).iter().zip(meaning(b)).map(|(x, y)| x * y).sum::<f32>();

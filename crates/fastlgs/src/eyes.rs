@@ -4,13 +4,13 @@ use crate::error::{Context, bail};
 use crate::{Result, calibrations};
 use fastlgs_core::scene_folder::{Manifest, ModelFile};
 use fastlgs_core::{Camera, LabelMap, Level, MaskList, SceneFolder};
-use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
+use fastlgs_grid::{Grid, evidence};
 use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
-    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, clip, conse, likeness, models, places,
+    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, appearance, clip, conse, models, places,
     segmenter,
 };
 use image::RgbImage;
@@ -295,14 +295,36 @@ pub(crate) fn identity_of(manifest: &Manifest) -> String {
     }
 }
 
-/// An embedding of a scene's encoder as other masks and pictures are compared with it.
-pub fn without_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
-    if manifest.encoder == calibrations::OFFLINE { likeness::without_words(embedding) } else { embedding }
+/// An embedding of a scene's encoder for what knows nothing but words: without the numbers that only examples are compared by.
+pub fn for_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
+    if manifest.encoder == calibrations::OFFLINE { appearance::for_words(embedding) } else { embedding }
 }
 
-/// The same as texts are compared with it.
-pub fn without_likeness(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
-    if manifest.encoder == calibrations::OFFLINE { likeness::without_likeness(embedding) } else { embedding }
+/// The numbers of an embedding that texts are compared by.
+pub fn words<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32] {
+    let others = if manifest.encoder == calibrations::OFFLINE { appearance::COUNT } else { 0 };
+    let count = embedding.len().saturating_sub(others);
+    &mut embedding[..count]
+}
+
+/// Whether embeddings of a scene are of this version of its encoder, as far as their length tells.
+pub(crate) fn is_current<'a>(manifest: &Manifest, mut embeddings: impl Iterator<Item = &'a Vec<f32>>) -> bool {
+    manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
+}
+
+/// Fails where the objects of a scene were embedded by an earlier version of the offline encoder, with which nothing of this one can be compared.
+///
+/// # Errors
+/// One sentence with the mend.
+pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
+    if !is_current(manifest, grid.objects.iter().flat_map(|o| &o.embeddings)) {
+        let root = folder.root.display();
+        bail!(
+            "{root}: its objects were embedded by an earlier version; 'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' does it again \
+             and keeps the Gaussians"
+        );
+    }
+    Ok(())
 }
 
 /// The model file of a role, as the manifest remembers it.

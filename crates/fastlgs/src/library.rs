@@ -234,12 +234,14 @@ fn up_to_date(root: &Path, scenes: &[Scene], run: &Run) -> Result<Library> {
         }
     }
     let work = run.work("library", entries.len() as u64);
-    let load = |entry: &Entry| -> Result<(Entry, Grid)> {
+    let load = |(entry, manifest): &Scene| -> Result<(Entry, Grid)> {
         work.advance()?;
-        let grid = Grid::load(&SceneFolder::new(root.join(&entry.path)));
-        Ok((entry.clone(), grid.with_context(|| format!("{}: its table cannot be read; train it again", entry.path))?))
+        let folder = SceneFolder::new(root.join(&entry.path));
+        let grid = Grid::load(&folder).with_context(|| format!("{}: its table cannot be read; train it again", entry.path))?;
+        eyes::check_version(manifest, &grid, &folder)?;
+        Ok((entry.clone(), grid))
     };
-    let tables = entries.into_iter().map(load).collect::<Result<Vec<_>>>()?;
+    let tables = scenes.iter().map(load).collect::<Result<Vec<_>>>()?;
     library::write(&path, &tables).context("the library's index cannot be written")?;
     Ok(Library::open(&path)?)
 }

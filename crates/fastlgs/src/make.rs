@@ -6,6 +6,7 @@ use crate::preprocess::fingerprint;
 use crate::{Result, Run, checkpoints, preprocess, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
+use fastlgs_vision::conse;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -82,7 +83,7 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     // A scene may be moved.
     let how = preprocess::Config { photos: photos.clone(), output: PathBuf::new(), ..preprocess.clone() };
     let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
-    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), seeds, how, files(&photos)?]));
+    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), conse::VERSION, seeds, how, files(&photos)?]));
     let folder = SceneFolder::new(&preprocess.output);
     let mut made = with()?;
     let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));

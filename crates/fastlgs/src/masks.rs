@@ -32,10 +32,14 @@ pub fn whole(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
 /// # Errors
 /// Missing masks or models.
 pub fn evidence(folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<Vec<Mask>> {
-    if evidence::masks_path(folder).is_file() {
-        return Ok(evidence::load_masks(folder)?);
-    }
     let manifest = folder.manifest()?;
+    if evidence::masks_path(folder).is_file() {
+        let masks = evidence::load_masks(folder)?;
+        // An earlier version may have left them.
+        if eyes::is_current(&manifest, masks.iter().map(|mask| &mask.embedding)) {
+            return Ok(masks);
+        }
+    }
     let encoder = eyes::encoder_of(folder, &manifest)?;
     describe(folder, training, encoder.as_ref(), Some(&eyes::identity_of(&manifest)), run)
 }

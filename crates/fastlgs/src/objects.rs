@@ -35,8 +35,8 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
     let pairs = evidence::load_pairs(folder, &masks)?;
     let manifest = folder.manifest()?;
     // By kinds of things: by single things the masks of fox fall into twice as many objects (theta 0.6 to 0.8: oracle 0.45, 0.45, 0.43; by kinds 0.48).
-    let of_kind = |mask: &Mask| Mask { embedding: eyes::without_likeness(&manifest, mask.embedding.clone()), ..mask.clone() };
-    let compared: Vec<Mask> = masks.iter().map(of_kind).collect();
+    let mut compared = masks.clone();
+    compared.iter_mut().for_each(|mask| mask.embedding = eyes::for_words(&manifest, std::mem::take(&mut mask.embedding)));
     let mapping::Mapped { object_of, count, comparisons } = mapping::paper(&compared, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
     begin_maps(folder)?;
@@ -74,6 +74,7 @@ pub fn end_maps(folder: &SceneFolder) {
 pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     let advice = || format!("{}: --mapping keep needs the objects of a trained scene; train it first", folder.root.display());
     let grid = Grid::load(folder).with_context(advice)?;
+    eyes::check_version(&folder.manifest()?, &grid, folder)?;
     if unfinished(folder).is_file() {
         bail!("{}: a training that was broken off left object maps that are not those of grid.json; train it again", folder.root.display());
     }

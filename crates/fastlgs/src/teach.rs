@@ -76,12 +76,12 @@ pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
 /// # Errors
 /// As [`teach`].
 pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report> {
+    eyes::check_version(&scene.manifest, grid, &scene.folder)?;
     let root = scene.folder.root.display().to_string();
     let Some(object) = usize::from(id).checked_sub(1).and_then(|k| grid.objects.get(k)) else {
         bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len())
     };
-    let shown = object.embeddings.iter().map(|e| eyes::without_words(&scene.manifest, e.clone())).collect();
-    keep(scene, name, Some(id), format!("object {id} of {root}"), shown)
+    keep(scene, name, Some(id), format!("object {id} of {root}"), object.embeddings.clone())
 }
 
 fn keep(scene: &Session, name: &str, object: Option<u16>, from: String, embeddings: Vec<Vec<f32>>) -> Result<Report> {

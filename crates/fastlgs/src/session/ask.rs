@@ -115,11 +115,10 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
     let encoder = session.image_encoder()?;
     let found = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let whole = found.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    texts::check_length(&session.grid()?, whole.len(), &session.folder, "pictures")?;
-    Ok(TextQuery::of_examples(
-        vec![eyes::without_words(&session.manifest, whole)],
-        session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures,
-    ))
+    let grid = session.grid()?;
+    eyes::check_version(&session.manifest, &grid, &session.folder)?;
+    texts::check_length(&grid, whole.len(), &session.folder, "pictures")?;
+    Ok(TextQuery::of_examples(vec![whole], session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures))
 }
 
 impl Meaning {

@@ -17,8 +17,8 @@ pub(super) fn check_length(grid: &Grid, length: usize, folder: &SceneFolder, wha
     if let Some(own) = own.filter(|own| *own != length) {
         let root = folder.root.display();
         bail!(
-            "{root}: its embeddings have {own} numbers, those of {what} {length}; they are of another encoder or version: \
-             run 'fastlgs train {root}' again, or name the right tower with --clip-text"
+            "{root}: its embeddings have {own} numbers, those of {what} {length}; they are of another encoder: \
+             name the right tower with --clip-text, or run 'fastlgs train {root}' again"
         );
     }
     Ok(())
@@ -45,6 +45,7 @@ impl Texts {
         let canonical = if manifest.encoder == calibrations::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
+        eyes::check_version(manifest, &grid, folder)?;
         check_length(&grid, length, folder, "texts")?;
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
         Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
@@ -71,7 +72,7 @@ impl Texts {
         if self.is_taught(text) {
             return self.of_examples(text).with_context(|| {
                 format!(
-                    "'{text}' was taught with another encoder than that of this scene: teach it here as well, or forget it: fastlgs names remove '{text}'"
+                    "'{text}' was taught with another encoder than that of this scene, or an earlier version of it: teach it here as well, or forget it: fastlgs names remove '{text}'"
                 )
             });
         }
