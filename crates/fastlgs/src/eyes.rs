@@ -312,16 +312,18 @@ pub(crate) fn is_current<'a>(manifest: &Manifest, mut embeddings: impl Iterator<
     manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
 }
 
-/// Fails where the objects of a scene were embedded by an earlier version of the offline encoder, with which nothing of this one can be compared.
+/// Fails where the objects of a scene of the offline encoder were embedded by another one or an earlier version, with which nothing of this one can be compared.
 ///
 /// # Errors
 /// One sentence with the mend.
 pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
-    if !is_current(manifest, grid.objects.iter().flat_map(|o| &o.embeddings)) {
-        let root = folder.root.display();
+    let odd = grid.objects.iter().flat_map(|o| &o.embeddings).find(|e| !is_current(manifest, std::iter::once(*e)));
+    if let Some(odd) = odd {
+        let (root, own) = (folder.root.display(), odd.len());
         bail!(
-            "{root}: its objects were embedded by an earlier version; 'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' does it again \
-             and keeps the Gaussians"
+            "{root}: its objects' embeddings have {own} numbers, those of its encoder {}: they are of another encoder, or an earlier version of it; \
+             'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians",
+            conse::LENGTH
         );
     }
     Ok(())
