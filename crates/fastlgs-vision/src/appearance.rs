@@ -21,7 +21,7 @@ const MEAN: [f32; COUNT] = [
 
 /// What the cosine of appearances counts against that of meanings. With 1 it is 88 % instead of 90, with nothing but appearance 91, but then the mug of one generated table is
 /// not known by that of another.
-const WEIGHT: f32 = 2.0;
+pub const WEIGHT: f32 = 2.0;
 
 /// Where each class of a classifier lies.
 pub struct Appearance(Vec<[f32; COUNT]>);
