@@ -2,7 +2,8 @@
 //!
 //! ConSE keeps of the classifier's logits what the ten likeliest names mean, so that two things of one kind are the same to it. All logits together tell
 //! single things apart. Both together do both: by one view of an object of three photographed scenes, its other views are told from all objects of
-//! the other scenes in 90 % of all cases instead of 43 % (where 7 % of these are taken for it), and a lamp of one generated scene is still known by that of another.
+//! the other scenes in 90 % of all cases instead of 43 % (where 7 % of these are taken for it), and a lamp of one generated scene is still known by
+//! that of another.
 //! Embeddings of the offline encoder end with what logits look like, in fewer dimensions; for texts that is zero.
 
 use crate::encoder::normalise;
@@ -19,8 +20,8 @@ const MEAN: [f32; COUNT] = [
     -24.8, 22.6, 19.0, 14.1, 2.9, -32.0, -27.3, 34.8, -5.2, -26.5, 21.7, -38.6, 10.3, 12.2, 39.5, 0.1, 13.7, -4.1, 1.2, -0.4, -12.4,
 ];
 
-/// What the cosine of appearances counts against that of meanings. With 1 it is 88 % instead of 90, with nothing but appearance 91, but then the mug of one generated table is
-/// not known by that of another.
+/// What the cosine of appearances counts against that of meanings. With 1 it is 88 % instead of 90. With nothing but appearance it is 91, but the mug of
+/// one generated table is not known by that of another.
 pub const WEIGHT: f32 = 2.0;
 
 /// Where each class of a classifier lies.
@@ -45,10 +46,16 @@ impl Appearance {
     }
 }
 
-/// An embedding of the offline encoder for what knows nothing but words: without the numbers that only examples are compared by.
+/// The numbers of an offline embedding that texts are compared by.
+pub fn words(embedding: &mut [f32]) -> &mut [f32] {
+    let count = embedding.len().saturating_sub(COUNT);
+    &mut embedding[..count]
+}
+
+/// An offline embedding for what knows nothing but words: without the numbers that count only between examples.
 pub fn for_words(mut embedding: Vec<f32>) -> Vec<f32> {
-    let words = embedding.len().saturating_sub(COUNT);
-    embedding[words..].fill(0.0);
+    let count = words(&mut embedding).len();
+    embedding[count..].fill(0.0);
     embedding
 }
 

@@ -9,7 +9,7 @@ pub trait Encoder: Sync {
     /// Name recorded in the scene; a query must use the text tower of the same encoder.
     fn name(&self) -> &'static str;
     /// One embedding for each label 1..=max of the map of a view, in order; zeros for labels that do not occur. What texts are compared with has length 1;
-    /// examples may be compared by further numbers ([`crate::appearance`]).
+    /// between examples further numbers may count ([`crate::appearance`]).
     ///
     /// # Errors
     /// When inference fails, or embeddings that were made elsewhere are missing.

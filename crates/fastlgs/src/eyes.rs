@@ -295,30 +295,28 @@ pub(crate) fn identity_of(manifest: &Manifest) -> String {
     }
 }
 
-/// An embedding of a scene's encoder for what knows nothing but words: without the numbers that only examples are compared by.
+/// An embedding of a scene's encoder for what knows nothing but words: without the numbers that count only between examples.
 pub fn for_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
     if manifest.encoder == calibrations::OFFLINE { appearance::for_words(embedding) } else { embedding }
 }
 
 /// The numbers of an embedding that texts are compared by.
 pub fn words<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32] {
-    let others = if manifest.encoder == calibrations::OFFLINE { appearance::COUNT } else { 0 };
-    let count = embedding.len().saturating_sub(others);
-    &mut embedding[..count]
+    if manifest.encoder == calibrations::OFFLINE { appearance::words(embedding) } else { embedding }
 }
 
-/// Whether embeddings of a scene are of this version of its encoder, as far as their length tells.
-pub(crate) fn is_current<'a>(manifest: &Manifest, mut embeddings: impl Iterator<Item = &'a Vec<f32>>) -> bool {
-    manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
+/// Whether an embedding of a scene is of this version of its encoder, as far as its length tells.
+pub(crate) fn is_current(manifest: &Manifest, embedding: &[f32]) -> bool {
+    manifest.encoder != calibrations::OFFLINE || embedding.len() == conse::LENGTH
 }
 
-/// Fails where the objects of a scene of the offline encoder were embedded by another one or an earlier version, with which nothing of this one can be compared.
+/// Fails where the objects of a scene of the offline encoder were embedded by another one or an earlier version, with which nothing of this one can
+/// be compared.
 ///
 /// # Errors
 /// One sentence with the mend.
 pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
-    let odd = grid.objects.iter().flat_map(|o| &o.embeddings).find(|e| !is_current(manifest, std::iter::once(*e)));
-    if let Some(odd) = odd {
+    if let Some(odd) = grid.objects.iter().flat_map(|o| &o.embeddings).find(|e| !is_current(manifest, e)) {
         let (root, own) = (folder.root.display(), odd.len());
         bail!(
             "{root}: its objects' embeddings have {own} numbers, those of its encoder {}: they are of another encoder, or an earlier version of it; \

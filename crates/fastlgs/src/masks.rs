@@ -36,7 +36,7 @@ pub fn evidence(folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<
     if evidence::masks_path(folder).is_file() {
         let masks = evidence::load_masks(folder)?;
         // An earlier version may have left them.
-        if eyes::is_current(&manifest, masks.iter().map(|mask| &mask.embedding)) {
+        if masks.iter().all(|mask| eyes::is_current(&manifest, &mask.embedding)) {
             return Ok(masks);
         }
     }

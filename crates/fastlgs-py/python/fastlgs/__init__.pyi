@@ -120,7 +120,7 @@ class Scene:
     def objects(self) -> List[Dict[str, Any]]:
         """id, parent (0 for none), support, views, area (largest share of a photo), code."""
     def embeddings(self, id: int) -> NDArray[np.float32]:
-        """(views, numbers): with the offline encoder 384 that texts are compared by, 12 colours and materials, 64 that examples are compared by."""
+        """(views, numbers): with the offline encoder 384 that texts are compared by, 12 colours and materials, 64 more that count between objects, examples and pictures."""
     def render(self, view: Optional[View] = None, what: Literal["color", "depth", "feature", "objects"] = "color") -> NDArray[Any]:
         """color uint8 (h, w, 3), depth float32 (h, w) in units of the scene, feature float32 (h, w, 3), objects uint16 (h, w)."""
     @property

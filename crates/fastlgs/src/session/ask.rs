@@ -1,9 +1,9 @@
 //! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
 
 use super::{Pixels, Session, Texts, texts};
+use crate::Result;
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
-use crate::{Result, eyes};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -115,9 +115,7 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
     let encoder = session.image_encoder()?;
     let found = encoder.embed_masks(name, photo, &everything)?.pop().filter(|e| e.iter().any(|v| *v != 0.0));
     let whole = found.with_context(|| format!("{name}: the scene's embeddings were imported, so that pictures cannot be embedded"))?;
-    let grid = session.grid()?;
-    eyes::check_version(&session.manifest, &grid, &session.folder)?;
-    texts::check_length(&grid, whole.len(), &session.folder, "pictures")?;
+    texts::check(&session.manifest, &session.grid()?, &session.folder, "pictures", whole.len())?;
     Ok(TextQuery::of_examples(vec![whole], session.calibrations.unwrap_or_else(|| Calibrations::of(&session.manifest)).pictures))
 }
 

@@ -12,7 +12,8 @@ use fastlgs_vision::TextEncoder;
 use std::path::Path;
 
 /// Fails where the objects' embeddings cannot be compared with those of texts or pictures, which have so many numbers.
-pub(super) fn check_length(grid: &Grid, length: usize, folder: &SceneFolder, what: &str) -> Result<()> {
+pub(super) fn check(manifest: &Manifest, grid: &Grid, folder: &SceneFolder, what: &str, length: usize) -> Result<()> {
+    eyes::check_version(manifest, grid, folder)?;
     let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
     if let Some(own) = own.filter(|own| *own != length) {
         let root = folder.root.display();
@@ -45,8 +46,7 @@ impl Texts {
         let canonical = if manifest.encoder == calibrations::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
-        eyes::check_version(manifest, &grid, folder)?;
-        check_length(&grid, length, folder, "texts")?;
+        check(manifest, &grid, folder, "texts", length)?;
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
         Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
     }
@@ -72,7 +72,8 @@ impl Texts {
         if self.is_taught(text) {
             return self.of_examples(text).with_context(|| {
                 format!(
-                    "'{text}' was taught with another encoder than that of this scene, or an earlier version of it: teach it here as well, or forget it: fastlgs names remove '{text}'"
+                    "'{text}' was taught with another encoder than that of this scene, or an earlier version of it: teach it here as well, or forget \
+                     it: fastlgs names remove '{text}'"
                 )
             });
         }
