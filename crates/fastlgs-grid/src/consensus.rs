@@ -1,10 +1,11 @@
 //! Global mapping, first step: every mask proposes a thing, and the other views' masks say what it is.
 //!
-//! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing, where it fits at
-//! all, and what most of all these masks' pixels hold is the thing as more views see it; and so on, until nothing changes. Such a set is its own
-//! consensus: whichever of its masks it starts from, a view that cuts the thing apart or glues it to another one has no voice, masks
-//! that are missing are not missed, and a thing, its parts, and what it stands on are all found, each from its own masks. (As MaskClustering,
-//! 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in two; but there a mask belongs to one thing only.)
+//! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing where each holds most
+//! of the other, so that no mask can show two things that share nothing; and what most of all these masks' pixels hold is the thing as more views
+//! see it; and so on, until nothing changes. Such a set is its own consensus: whichever of its masks it starts from, a view that cuts the thing
+//! apart or glues it to another one has no voice, masks that are missing are not missed, and a thing, its parts, and what it stands on are all
+//! found, each from its own masks. (As MaskClustering, 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in
+//! two; but there a mask belongs to one thing only.)
 
 use crate::sightings::{Fit, MIN_PIXELS, MaskId, Scratch, Sightings};
 use rayon::prelude::*;
@@ -18,8 +19,6 @@ pub struct Proposal {
     pub masks: Vec<Fit>,
 }
 
-/// A mask shows a thing where their IoU is at least this: so no mask can show two things that share nothing.
-const SHOWS: f32 = 0.5;
 /// Most rounds; nearly all sets rest after four.
 const ROUNDS: usize = 8;
 /// Masks that propose at the same time, before those that are explained fall out.
@@ -57,7 +56,7 @@ fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &m
     for _ in 0..ROUNDS {
         let set = sightings.held_by(asked.iter().copied(), scratch);
         let mut masks = sightings.best_fits(&set, scratch);
-        masks.retain(|fit| fit.iou >= SHOWS);
+        masks.retain(|fit| fit.mutual);
         let rests = masks.iter().map(|fit| fit.mask).eq(asked.iter().copied());
         asked = masks.iter().map(|fit| fit.mask).collect();
         found = (masks.len() >= min_views).then_some(Proposal { set, masks });

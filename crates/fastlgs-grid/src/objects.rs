@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 pub struct Config {
     /// Fewest views that must show it, each in [`MIN_PIXELS`](crate::sightings::MIN_PIXELS) at least: so glimpses from afar make nothing smaller.
     pub min_views: usize,
-    /// Least support by masks: their IoU, as where masks propose a set.
+    /// Least support by masks: their mean IoU.
     pub min_support: f32,
     /// Of sets whose IoU is more than this only the best supported one is an object.
     pub same: f32,

@@ -96,6 +96,8 @@ pub struct Fit {
     pub mask: MaskId,
     /// IoU of both, where the Gaussians show in the mask's view.
     pub iou: f32,
+    /// Whether each holds most of the other.
+    pub mutual: bool,
 }
 
 /// What a view shows of a set of Gaussians.
@@ -247,9 +249,10 @@ impl<'a> Sightings<'a> {
         for mask in listed(met) {
             let common = std::mem::take(&mut scratch.masks[mask as usize]);
             let view = self.view_of(mask);
-            let iou = common / (shown[view] + self.pixels[mask as usize] - common);
+            let (set, whole) = (shown[view], self.pixels[mask as usize]);
+            let iou = common / (set + whole - common);
             if best[view].is_none_or(|fit| iou > fit.iou) {
-                best[view] = Some(Fit { mask, iou });
+                best[view] = Some(Fit { mask, iou, mutual: 2.0 * common > set.max(whole) });
             }
         }
         let views = (0..).zip(shown).zip(best).map(|((view, pixels), best)| Shown { view, pixels, best });
@@ -305,7 +308,9 @@ mod tests {
         assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
         assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "half of what shows of 4 is not most of it");
         let fits = sightings.best_fits(&[0, 1, 2, 3], &mut scratch);
-        assert_eq!(fits, [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
+        assert_eq!(fits, [Fit { mask: 0, iou: 1.0, mutual: true }, Fit { mask: 2, iou: 0.8, mutual: true }]);
+        let beside = sightings.best_fits(&[2, 3, 4, 5, 6], &mut scratch);
+        assert_eq!(beside.iter().map(|fit| fit.mutual).collect::<Vec<_>>(), [false, true], "2 of 5 and 4, 3 of 5 and 5: an IoU of 3 in 7");
         assert_eq!(sightings.best_fits(&[8], &mut scratch), []);
         assert!([scratch.gaussians, scratch.atoms, scratch.masks].concat().iter().all(|sum| *sum == 0.0));
     }
