@@ -23,18 +23,31 @@ pub struct Frame {
     pub pairs: u32,
 }
 
+/// Whether a channel of [`Frame`] is rendered.
+pub(crate) fn rendered(channels: Channels, channel: usize) -> bool {
+    match channel {
+        0..3 => channels.color(),
+        3..6 => channels.feature(),
+        _ => true,
+    }
+}
+
 impl Frame {
+    /// The frame of a view, all 0.
+    pub(crate) fn new(view: &View) -> Self {
+        Self { width: view.size[0], height: view.size[1], data: vec![0.0; 8 * view.pixels()], pairs: view.pairs }
+    }
+
     /// The frame of a view from rows (of a channel and y) that begin at its left border; only what was rendered is copied.
     pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32] + Sync) -> Self {
-        let [w, h] = view.size.map(|s| s as usize);
-        let mut data = vec![0.0; 8 * w * h];
-        let rendered = |c: usize| (c >= 3 || channels.color()) && (!(3..6).contains(&c) || channels.feature());
-        data.par_chunks_exact_mut(w * h).enumerate().filter(|(channel, _)| rendered(*channel)).for_each(|(channel, plane)| {
+        let (mut frame, w) = (Self::new(view), view.size[0] as usize);
+        let planes = frame.data.par_chunks_exact_mut(view.pixels()).enumerate();
+        planes.filter(|(channel, _)| rendered(channels, *channel)).for_each(|(channel, plane)| {
             for (y, out) in plane.chunks_exact_mut(w).enumerate() {
                 out.copy_from_slice(&row(channel, y as u32)[..w]);
             }
         });
-        Self { width: view.size[0], height: view.size[1], data, pairs: view.pairs }
+        frame
     }
 
     /// Channels `from..to` as one planar slice.

@@ -39,12 +39,24 @@ const ROWS: Tile = {
 /// What the forward pass makes of a tile.
 #[derive(Clone)]
 pub struct Blended {
-    /// r, g, b, f0, f1, f2 without the background.
+    /// r, g, b, f0, f1, f2.
     pub sums: [Tile; 6],
     /// Transmittance left.
     pub transmittance: Tile,
     /// Pairs walked.
     pub walked: u32,
+}
+
+impl Blended {
+    /// The beginning of row `y` of a channel of [`Frame`](crate::engine::Frame).
+    pub fn row(&self, channel: usize, y: usize, out: &mut [f32]) {
+        let own = y * EDGE..y * EDGE + out.len();
+        match channel {
+            0..6 => out.copy_from_slice(&self.sums[channel][own]),
+            6 => out.copy_from_slice(&self.transmittance[own]),
+            _ => out.fill(self.walked as f32),
+        }
+    }
 }
 
 /// A tile's place and its list.
@@ -88,6 +100,10 @@ struct Placed<'a, V> {
     dx: V,
     /// From the mean to the tile's upper edge.
     down: f32,
+    /// Logarithm of alpha where dy is 0.
+    level: V,
+    /// How fast it changes with dy there.
+    slope: V,
     /// First pixels of the vectors in which it can reach the least alpha.
     pixels: std::iter::StepBy<std::ops::Range<usize>>,
 }
@@ -95,13 +111,13 @@ struct Placed<'a, V> {
 impl<'a, V: Vector> Placed<'a, V> {
     #[inline(always)]
     fn new(job: &Job<'a>, gaussian: usize) -> Self {
-        let (splat, reach) = (&job.lists.splats[gaussian], job.lists.reach[gaussian]);
-        let down = job.y - splat[0][1];
-        let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
-        let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
-        let per_vector = V::LANES / EDGE;
-        let pixels = (rows.start / per_vector * V::LANES..rows.end.div_ceil(per_vector) * V::LANES).step_by(V::LANES);
-        Self { splat, dx: V::load(&COLUMNS).add(V::splat(job.x - splat[0][0])), down, pixels }
+        let splat = &job.lists.splats[gaussian];
+        let [[x, y, qx, qy], [_, log_opacity, ..], _] = *splat;
+        let (dx, down) = (V::load(&COLUMNS).add(V::splat(job.x - x)), job.y - y);
+        let vectors = reached::<V>(down, job.lists.reach[gaussian]);
+        let pixels = (vectors.start * V::LANES..vectors.end * V::LANES).step_by(V::LANES);
+        let level = V::splat(qx).mul(dx).madd(dx, V::splat(log_opacity));
+        Self { splat, dx, down, level, slope: V::splat(qy).mul(dx), pixels }
     }
 
     /// Offsets along y of the vector that begins at pixel `p`.
@@ -113,11 +129,10 @@ impl<'a, V: Vector> Placed<'a, V> {
     /// Alphas of that vector.
     #[inline(always)]
     fn alphas(&self, dy: V) -> V {
-        let [[_, _, qx, qy], [qz, log_opacity, ..], _] = *self.splat;
-        let c0 = V::splat(qz).mul(dy).madd(dy, V::splat(log_opacity));
-        let exponent = self.dx.madd(V::splat(qx).madd(self.dx, V::splat(qy).mul(dy)), c0);
+        let [_, [qz, ..], _] = *self.splat;
+        let exponent = V::splat(qz).madd(dy, self.slope).madd(dy, self.level);
         // Far out on a long needle, rounding would lift it above any opacity.
-        exponent.exp2().min(V::splat(ALPHA_MAX)).at_least_or_zero(V::splat(ALPHA_MIN))
+        V::splat(ALPHA_MAX).min(exponent.exp2()).at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Colour and feature.
@@ -127,6 +142,15 @@ impl<'a, V: Vector> Placed<'a, V> {
         // `map` is not inlined here.
         [V::splat(r), V::splat(g), V::splat(b), V::splat(f0), V::splat(f1), V::splat(f2)]
     }
+}
+
+/// The vectors of a tile that a Gaussian reaches whose mean lies `down` above the tile's upper edge.
+#[inline(always)]
+fn reached<V: Vector>(down: f32, reach: f32) -> std::ops::Range<usize> {
+    let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
+    let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
+    let per_vector = V::LANES / EDGE;
+    rows.start / per_vector..rows.end.div_ceil(per_vector)
 }
 
 /// Whether no pixel of the tile needs more.

@@ -10,10 +10,10 @@ mod simd;
 use crate::channels::Channels;
 use crate::cpu::{self, perturb_one};
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
+use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered};
 use crate::view::{Perturb, Step, TILE, View};
 use crate::{Error, Result};
-use blend::{Blended, Given, Job, Tile};
+use blend::{Blended, EDGE, Given, Job, Tile};
 use fastlgs_core::Shares;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{KEPT, pack};
@@ -101,6 +101,32 @@ fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
     best.map(|(id, weight)| pack(id, weight))
 }
 
+/// What a tile shows, background included; channels that are not asked for are 0.
+fn shown<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, tile: usize) -> Blended {
+    let job = Job::new(view, tile, lists);
+    let shown = blend::shown(view, &job);
+    let mut out = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
+    blend::forward::<COLOR, FEATURE>(&job, &mut out);
+    let background = view.background_color[..3].iter().chain(&view.background_feature[..3]);
+    for (c, (sums, background)) in out.sums.iter_mut().zip(background).enumerate() {
+        if if c < 3 { COLOR } else { FEATURE } {
+            for (p, sum) in sums.iter_mut().enumerate() {
+                *sum = shown[p] * (*sum + out.transmittance[p] * background);
+            }
+        }
+    }
+    out
+}
+
+/// [`shown`] with these channels.
+fn shown_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
+    match channels {
+        Channels::Color => shown::<true, false>,
+        Channels::Feature => shown::<false, true>,
+        Channels::Both | Channels::Coupled => shown::<true, true>,
+    }
+}
+
 impl CpuEngine {
     /// An engine without Gaussians.
     pub fn new() -> Self {
@@ -116,7 +142,8 @@ impl CpuEngine {
         out
     }
 
-    fn forward(&mut self, view: &View, channels: Channels, frozen: Option<usize>) -> Result<()> {
+    /// Projects and lists the Gaussians of a view.
+    fn list(&mut self, view: &View, frozen: Option<usize>) -> Result<()> {
         if view.gaussians as usize != self.n || self.n == 0 {
             return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {}", view.gaussians, self.n)));
         }
@@ -129,40 +156,24 @@ impl CpuEngine {
                 None => Some(Lists::new(view, &s.params)),
             };
         });
-        self.timed("blend", |s| match channels {
-            Channels::Color => s.blend::<true, false>(view),
-            Channels::Feature => s.blend::<false, true>(view),
-            Channels::Both | Channels::Coupled => s.blend::<true, true>(view),
-        });
         Ok(())
     }
 
-    fn blend<const COLOR: bool, const FEATURE: bool>(&mut self, view: &View) {
+    /// What the losses compare, and how far each tile's list was walked.
+    fn blend(&mut self, view: &View, channels: Channels) {
         self.frame.prepare(view);
         self.walked.resize(view.tile_count() as usize, 0);
-        let lists = self.lists.as_ref().expect("made before blending");
+        let (lists, shown) = (self.lists.as_ref().expect("made before blending"), shown_by(channels));
         let (width, tiles_x) = (self.frame.width, view.tiles[0] as usize);
-        let background: [f32; 6] = std::array::from_fn(|c| if c < 3 { view.background_color[c] } else { view.background_feature[c - 3] });
-        let bands = self.frame.data.par_chunks_exact_mut(TILE as usize * 8 * width).zip(self.walked.par_chunks_exact_mut(tiles_x));
+        let bands = self.frame.data.par_chunks_exact_mut(EDGE * 8 * width).zip(self.walked.par_chunks_exact_mut(tiles_x));
         bands.enumerate().for_each(|(row, (band, walked))| {
             for column in 0..tiles_x {
-                let tile = row * tiles_x + column;
-                let job = Job::new(view, tile, lists);
-                let shown = blend::shown(view, &job);
-                let mut out = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
-                blend::forward::<COLOR, FEATURE>(&job, &mut out);
-                walked[column] = out.walked;
-                const EDGE: usize = TILE as usize;
-                for y in 0..EDGE {
-                    let own = y * EDGE..(y + 1) * EDGE;
-                    let at = |c: usize| (y * 8 + c) * width + column * EDGE;
-                    for c in (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 }) {
-                        for (i, p) in own.clone().enumerate() {
-                            band[at(c) + i] = shown[p] * (out.sums[c][p] + out.transmittance[p] * background[c]);
-                        }
+                let tile = shown(view, lists, row * tiles_x + column);
+                walked[column] = tile.walked;
+                for (y, line) in band.chunks_exact_mut(8 * width).enumerate() {
+                    for (c, plane) in line.chunks_exact_mut(width).enumerate().filter(|(c, _)| rendered(channels, *c)) {
+                        tile.row(c, y, &mut plane[column * EDGE..][..EDGE]);
                     }
-                    band[at(6)..][..EDGE].copy_from_slice(&out.transmittance[own]);
-                    band[at(7)..][..EDGE].fill(out.walked as f32);
                 }
             }
         });
@@ -284,9 +295,25 @@ impl Engine for CpuEngine {
     }
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
-        self.forward(&view, channels, None)?;
-        let pairs = self.lists.as_ref().map_or(0, Lists::pairs) as u32;
-        Ok(Frame::gathered(&View { pairs, ..view }, channels, |channel, y| self.frame.row(channel, y as usize)))
+        self.list(&view, None)?;
+        let (lists, shown) = (self.lists.as_ref().expect("made a line above"), shown_by(channels));
+        let (mut frame, width) = (Frame::new(&View { pairs: lists.pairs() as u32, ..view }), view.size[0] as usize);
+        // Of each plane what lies in a row of tiles.
+        let mut planes: Vec<_> = frame.data.chunks_exact_mut(view.pixels()).map(|plane| plane.chunks_mut(EDGE * width)).collect();
+        let band = |_| -> Vec<&mut [f32]> { planes.iter_mut().filter_map(Iterator::next).collect() };
+        let bands: Vec<Vec<&mut [f32]>> = (0..view.tiles[1]).map(band).collect();
+        bands.into_par_iter().enumerate().for_each(|(row, mut band)| {
+            for column in 0..view.tiles[0] as usize {
+                let tile = shown(&view, lists, row * view.tiles[0] as usize + column);
+                let columns = column * EDGE..width.min((column + 1) * EDGE);
+                for (c, plane) in band.iter_mut().enumerate().filter(|(c, _)| rendered(channels, *c)) {
+                    for (y, line) in plane.chunks_exact_mut(width).enumerate() {
+                        tile.row(c, y, &mut line[columns.clone()]);
+                    }
+                }
+            }
+        });
+        Ok(frame)
     }
 
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
@@ -294,7 +321,6 @@ impl Engine for CpuEngine {
         let lists = Lists::new(&view, &self.params);
         let [width, height] = view.size;
         let mut pixels = vec![[0; KEPT]; view.pixels()];
-        const EDGE: usize = TILE as usize;
         pixels.par_chunks_mut(EDGE * width as usize).enumerate().for_each_init(Vec::new, |sums, (row, band)| {
             for tile in row * view.tiles[0] as usize..(row + 1) * view.tiles[0] as usize {
                 let job = Job::new(&view, tile, &lists);
@@ -323,7 +349,8 @@ impl Engine for CpuEngine {
         let frozen = (channels == Channels::Feature).then_some(id);
         // Lists that are kept hold all Gaussians.
         let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
-        self.forward(&view, channels, frozen)?;
+        self.list(&view, frozen)?;
+        self.timed("blend", |s| s.blend(&view, channels));
         self.timed("loss", |s| {
             s.gradient.prepare(&view);
             s.losses = Losses::default();

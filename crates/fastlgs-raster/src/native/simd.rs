@@ -43,25 +43,36 @@ pub trait Vector: Copy {
     fn min(self, b: Self) -> Self;
     /// self, and 0 where it is below `least`.
     fn at_least_or_zero(self, least: Self) -> Self;
-    /// self * 2^k, where `k`'s lowest bits hold a whole number.
-    fn times_power_of_two(self, k: Self) -> Self;
     /// The sum of each vector's floats.
     fn sums(all: &[Self; SUMS]) -> [f32; SUMS];
 
-    /// 2^x for x up to 126, within 2e-7 of it; x below -126 are taken for -126.
+    /// The nearest whole numbers, as [`Self::times_power_of_two`] takes them, and what is left of self.
+    fn split(self) -> (Self, Self);
+    /// self * 2^k.
+    fn times_power_of_two(self, k: Self) -> Self;
+
+    /// 2^x for x up to 126, within 2e-7 of it, and of 2^-126 where that is more.
     #[inline(always)]
     fn exp2(self) -> Self {
-        // Adding 1.5 * 2^23 rounds to the nearest integer, which then stands in the lowest bits.
-        let round = Self::splat(12_582_912.0);
-        let x = self.max(Self::splat(-126.0));
-        let shifted = x.add(round);
-        let f = x.sub(shifted.sub(round));
-        let mut p = Self::splat(1.540_353e-4);
-        for c in [1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 2.402_265e-1, 6.931_472e-1, 1.0] {
+        let (k, f) = self.split();
+        // The polynomial of degree 5 with 1 at 0 whose largest relative error from -1/2 to 1/2 is least.
+        let mut p = Self::splat(1.326_472_7e-3);
+        for c in [9.671_513e-3, 5.550_733_6e-2, 2.402_224_2e-1, 6.931_47e-1, 1.0] {
             p = p.madd(f, Self::splat(c));
         }
-        p.times_power_of_two(shifted)
+        p.times_power_of_two(k)
     }
+}
+
+/// Added, it rounds to the nearest whole number, which then stands in the lowest bits.
+const ROUND: f32 = 12_582_912.0;
+
+/// [`Vector::split`] where no instruction does it.
+#[inline(always)]
+fn split<V: Vector>(x: V) -> (V, V) {
+    let x = x.max(V::splat(-126.0));
+    let shifted = x.add(V::splat(ROUND));
+    (shifted, x.sub(shifted.sub(V::splat(ROUND))))
 }
 
 /// Floats that the compiler may keep in whatever registers there are.
@@ -134,6 +145,11 @@ impl<const N: usize> Vector for Portable<N> {
     }
 
     #[inline(always)]
+    fn split(self) -> (Self, Self) {
+        split(self)
+    }
+
+    #[inline(always)]
     fn times_power_of_two(self, k: Self) -> Self {
         self.with(k, |a, k| f32::from_bits(a.to_bits().wrapping_add(k.to_bits() << 23)))
     }
@@ -201,6 +217,11 @@ mod x86 {
         }
 
         #[inline(always)]
+        fn split(self) -> (Self, Self) {
+            super::split(self)
+        }
+
+        #[inline(always)]
         fn splat(value: f32) -> Self {
             // SAFETY: see the module.
             Self(unsafe { _mm256_set1_ps(value) })
@@ -253,10 +274,14 @@ mod x86 {
             fn max(b) = _mm512_max_ps;
             fn min(b) = _mm512_min_ps;
             fn at_least_or_zero(least) = |a, least| _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, least), a);
-            fn times_power_of_two(k) = |a, k| {
-                let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(k));
-                _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(a), exponent))
-            };
+            fn times_power_of_two(k) = _mm512_scalef_ps;
+        }
+
+        #[inline(always)]
+        fn split(self) -> (Self, Self) {
+            // SAFETY: see the module.
+            let whole = Self(unsafe { _mm512_roundscale_ps::<_MM_FROUND_TO_NEAREST_INT>(self.0) });
+            (whole, self.sub(whole))
         }
 
         #[inline(always)]
