@@ -89,17 +89,24 @@ fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32]
     }
 }
 
-/// A sum that processors can take in many lanes.
+/// Values of a row that are worked on together.
+const LANES: usize = 16;
+
+/// The values of a row from place `first` on; beyond its end there are zeros.
 #[inline(always)]
-fn sum_of(count: usize, value: impl Fn(usize) -> f32) -> f32 {
-    const LANES: usize = 16;
-    let mut sums = [0.0; LANES];
-    for first in (0..count - count % LANES).step_by(LANES) {
-        for k in 0..LANES {
-            sums[k] += value(first + k);
-        }
+fn lanes(row: &[f32], first: usize) -> [f32; LANES] {
+    let rest = &row[first..];
+    rest.first_chunk().copied().unwrap_or_else(|| std::array::from_fn(|k| rest.get(k).copied().unwrap_or(0.0)))
+}
+
+/// Writes values to a row from place `first` on, as far as it goes.
+#[inline(always)]
+fn put(row: &mut [f32], first: usize, values: &[f32; LANES]) {
+    let rest = &mut row[first..];
+    match rest.first_chunk_mut() {
+        Some(all) => *all = *values,
+        None => rest.copy_from_slice(&values[..rest.len()]),
     }
-    sums.iter().sum::<f32>() + (count - count % LANES..count).map(value).sum::<f32>()
 }
 
 impl Scratch {
@@ -203,19 +210,26 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
     let (by_mean, rest) = out.split_at_mut(w);
     let (by_square, by_product) = rest.split_at_mut(w);
     let by_product = &mut by_product[..w];
-    for i in 0..w {
-        let a = 2.0 * mx[i] * my[i] + 0.0001;
-        let b = 2.0 * (xy[i] - mx[i] * my[i]) + 0.0009;
-        let c = mx[i] * mx[i] + my[i] * my[i] + 0.0001;
-        let d = (xx[i] - mx[i] * mx[i]) + (yy[i] - my[i] * my[i]) + 0.0009;
-        let inverse = 1.0 / (c * d);
-        let ssim = a * b * inverse;
-        by_mean[i] = 2.0 * my[i] * (b - a) * inverse - 2.0 * mx[i] * ssim * (d - c) * inverse;
-        by_square[i] = -ssim * (c * inverse);
-        by_product[i] = 2.0 * a * inverse;
+    let mut sums = [0.0; LANES];
+    for first in (0..w).step_by(LANES) {
+        let [mx, my, xx, yy, xy] = [mx, my, xx, yy, xy].map(|row| lanes(row, first));
+        let mut by = [[0.0; LANES]; 3];
+        for i in 0..LANES {
+            let a = 2.0 * mx[i] * my[i] + 0.0001;
+            let b = 2.0 * (xy[i] - mx[i] * my[i]) + 0.0009;
+            let c = mx[i] * mx[i] + my[i] * my[i] + 0.0001;
+            let d = (xx[i] - mx[i] * mx[i]) + (yy[i] - my[i] * my[i]) + 0.0009;
+            let inverse = 1.0 / (c * d);
+            let ssim = a * b * inverse;
+            by[0][i] = 2.0 * my[i] * (b - a) * inverse - 2.0 * mx[i] * ssim * (d - c) * inverse;
+            by[1][i] = -ssim * (c * inverse);
+            by[2][i] = 2.0 * a * inverse;
+            // Beyond the row both pictures are black.
+            sums[i] += if first + i < w { ssim } else { 0.0 };
+        }
+        [&mut *by_mean, by_square, by_product].into_iter().zip(&by).for_each(|(row, values)| put(row, first, values));
     }
-    // SSIM = a b / (c d), and what was stored last of it is -a b / (c d) / d.
-    *sum = f64::from(sum_of(w, |i| -by_square[i] * ((xx[i] - mx[i] * mx[i]) + (yy[i] - my[i] * my[i]) + 0.0009)));
+    *sum = sums.iter().map(|s| f64::from(*s)).sum();
 }
 
 vectorised! {
@@ -230,16 +244,24 @@ fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], 
     let [x, y, weight] = [0, 1, 2].map(|m| &compared[m * w..(m + 1) * w]);
     let [rendered, transmittance] = light.map(|row| &row[..w]);
     let [by_mean, by_square, by_product] = [0, 1, 2].map(|m| &by[m * w..(m + 1) * w]);
-    for i in 0..w {
-        let sign = if x[i] > y[i] { 1.0 } else { 0.0 } - if x[i] < y[i] { 1.0 } else { 0.0 };
-        let d_ssim = by_mean[i] + 2.0 * x[i] * by_square[i] + y[i] * by_product[i];
-        out[i] = weight[i] * plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim);
+    let mut totals = [[0.0; LANES]; 4];
+    for first in (0..w).step_by(LANES) {
+        // Beyond the row weights are 0.
+        let [x, y, weight] = [x, y, weight].map(|row| lanes(row, first));
+        let [rendered, transmittance] = [rendered, transmittance].map(|row| lanes(row, first));
+        let [by_mean, by_square, by_product] = [by_mean, by_square, by_product].map(|row| lanes(row, first));
+        let mut values = [0.0; LANES];
+        for i in 0..LANES {
+            let sign = if x[i] > y[i] { 1.0 } else { 0.0 } - if x[i] < y[i] { 1.0 } else { 0.0 };
+            let d_ssim = by_mean[i] + 2.0 * x[i] * by_square[i] + y[i] * by_product[i];
+            let value = weight[i] * plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim);
+            totals[0][i] += weight[i] * (x[i] - y[i]).abs();
+            totals[1][i] += value * rendered[i];
+            totals[2][i] += value;
+            totals[3][i] += plane.gain * value * transmittance[i];
+            values[i] = plane.gain * value;
+        }
+        put(out, first, &values);
     }
-    *sums = [
-        f64::from(sum_of(w, |i| weight[i] * (x[i] - y[i]).abs())),
-        f64::from(sum_of(w, |i| out[i] * rendered[i])),
-        f64::from(sum_of(w, |i| out[i])),
-        f64::from(plane.gain * sum_of(w, |i| out[i] * transmittance[i])),
-    ];
-    out.iter_mut().for_each(|value| *value *= plane.gain);
+    *sums = totals.map(|lanes| lanes.iter().map(|sum| f64::from(*sum)).sum());
 }
