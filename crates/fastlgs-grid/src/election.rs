@@ -12,7 +12,7 @@ use std::collections::{BTreeMap, BTreeSet};
 pub fn elected(proposals: Vec<Proposal>, least: usize) -> Vec<Proposal> {
     let mut ballots: BTreeMap<MaskId, Vec<(f32, usize)>> = BTreeMap::new();
     for (place, proposal) in proposals.iter().enumerate() {
-        proposal.masks.iter().for_each(|&Fit { mask, iou, .. }| ballots.entry(mask).or_default().push((iou, place)));
+        proposal.masks.iter().for_each(|&Fit { mask, iou }| ballots.entry(mask).or_default().push((iou, place)));
     }
     // The favourite last.
     ballots.values_mut().for_each(|ballot| ballot.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))));
@@ -47,7 +47,7 @@ mod tests {
     fn votes_go_to_the_next_best() {
         let proposal = |name: u32, fits: &[(MaskId, f32)]| Proposal {
             set: vec![name],
-            masks: fits.iter().map(|&(mask, iou)| Fit { mask, iou, mutual: true }).collect(),
+            masks: fits.iter().map(|&(mask, iou)| Fit { mask, iou }).collect(),
         };
         let all = vec![
             proposal(0, &[(0, 0.9), (1, 0.7), (2, 0.7)]),

@@ -96,8 +96,6 @@ pub struct Fit {
     pub mask: MaskId,
     /// IoU of both, where the Gaussians show in the mask's view.
     pub iou: f32,
-    /// Whether each holds most of the other.
-    pub mutual: bool,
 }
 
 /// What a view shows of a set of Gaussians.
@@ -109,6 +107,8 @@ pub struct Shown {
     pub pixels: f32,
     /// The mask that fits them best, if one holds any of them at all.
     pub best: Option<Fit>,
+    /// The one that fits best of those that hold most of them, and of which they hold most.
+    pub mutual: Option<Fit>,
 }
 
 /// Sums that one search after the other uses; all zero between them.
@@ -154,7 +154,7 @@ impl<'a> Sightings<'a> {
         Self { votes, begin, tables, held, first_atom, pixels }
     }
 
-    /// Room for [`Self::held_by`] and [`Self::best_fits`].
+    /// Room for [`Self::held_by`] and [`Self::showing`].
     pub fn scratch(&self) -> Scratch {
         let atoms = self.first_atom.last().map_or(0, |count| *count as usize);
         Scratch { gaussians: vec![0.0; self.gaussians()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
@@ -224,9 +224,9 @@ impl<'a> Sightings<'a> {
         met
     }
 
-    /// Of each view that shows these Gaussians the mask that fits them best, if one holds any of them at all.
-    pub fn best_fits(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
-        self.shown(set, scratch).into_iter().filter_map(|shown| shown.best).collect()
+    /// The masks that show these Gaussians: of each view the one that fits best where each holds most of the other, if there is one.
+    pub fn showing(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
+        self.shown(set, scratch).into_iter().filter_map(|shown| shown.mutual).collect()
     }
 
     /// What the views show of these Gaussians, rising by view.
@@ -245,17 +245,22 @@ impl<'a> Sightings<'a> {
                 add(&mut scratch.masks, self.held[view].first + MaskId::from(*mask), weight, &mut met);
             }
         }
-        let mut best: Vec<Option<Fit>> = vec![None; self.tables.len()];
+        let mut fits: Vec<[Option<Fit>; 2]> = vec![[None; 2]; self.tables.len()];
         for mask in listed(met) {
             let common = std::mem::take(&mut scratch.masks[mask as usize]);
             let view = self.view_of(mask);
-            let (set, whole) = (shown[view], self.pixels[mask as usize]);
-            let iou = common / (set + whole - common);
-            if best[view].is_none_or(|fit| iou > fit.iou) {
-                best[view] = Some(Fit { mask, iou, mutual: 2.0 * common > set.max(whole) });
+            let (own, whole) = (shown[view], self.pixels[mask as usize]);
+            let iou = common / (own + whole - common);
+            let better = |fit: &Option<Fit>| fit.is_none_or(|fit| iou > fit.iou);
+            let [best, mutual] = &mut fits[view];
+            if better(best) {
+                *best = Some(Fit { mask, iou });
+            }
+            if better(mutual) && 2.0 * common > own.max(whole) {
+                *mutual = Some(Fit { mask, iou });
             }
         }
-        let views = (0..).zip(shown).zip(best).map(|((view, pixels), best)| Shown { view, pixels, best });
+        let views = (0..).zip(shown).zip(fits).map(|((view, pixels), [best, mutual])| Shown { view, pixels, best, mutual });
         views.filter(|shown| shown.pixels >= MIN_PIXELS).collect()
     }
 }
@@ -307,11 +312,13 @@ mod tests {
         let mut scratch = sightings.scratch();
         assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
         assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "half of what shows of 4 is not most of it");
-        let fits = sightings.best_fits(&[0, 1, 2, 3], &mut scratch);
-        assert_eq!(fits, [Fit { mask: 0, iou: 1.0, mutual: true }, Fit { mask: 2, iou: 0.8, mutual: true }]);
-        let beside = sightings.best_fits(&[2, 3, 4, 5, 6], &mut scratch);
-        assert_eq!(beside.iter().map(|fit| fit.mutual).collect::<Vec<_>>(), [false, true], "2 of 5 and 4, 3 of 5 and 5: an IoU of 3 in 7");
-        assert_eq!(sightings.best_fits(&[8], &mut scratch), []);
+        assert_eq!(sightings.showing(&[0, 1, 2, 3], &mut scratch), [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
+        // Of 0..4 the set holds half, of 0..2 nothing; of 0..5 it holds three of five.
+        assert_eq!(sightings.showing(&[2, 3, 4, 5, 6], &mut scratch), [Fit { mask: 2, iou: 3.0 / 7.0 }]);
+        // The masks of 0..4 and 0..5 hold all of it, and it holds a little of them.
+        assert_eq!(sightings.showing(&[2], &mut scratch), []);
+        assert_eq!(sightings.shown(&[2], &mut scratch).iter().map(|shown| shown.best.is_some()).collect::<Vec<_>>(), [true, true]);
+        assert_eq!(sightings.showing(&[8], &mut scratch), []);
         assert!([scratch.gaussians, scratch.atoms, scratch.masks].concat().iter().all(|sum| *sum == 0.0));
     }
 }

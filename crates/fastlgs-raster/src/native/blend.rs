@@ -2,7 +2,7 @@
 
 use super::lists::{Band, Lists};
 use super::simd::{SUMS, Vector, dispatched};
-use crate::cpu::{ALPHA_MAX, ALPHA_MIN, BATCH, Splat};
+use crate::cpu::{ALPHA_MIN, BATCH, Splat};
 use crate::view::View;
 
 /// Pixels along a tile's edge.
@@ -39,7 +39,7 @@ const ROWS: Tile = {
 /// What the forward pass makes of a tile.
 #[derive(Clone)]
 pub struct Blended {
-    /// r, g, b, f0, f1, f2.
+    /// r, g, b, f0, f1, f2; [`forward`] leaves the background out.
     pub sums: [Tile; 6],
     /// Transmittance left.
     pub transmittance: Tile,
@@ -48,8 +48,8 @@ pub struct Blended {
 }
 
 impl Blended {
-    /// The beginning of row `y` of a channel of [`Frame`](crate::engine::Frame).
-    pub fn row(&self, channel: usize, y: usize, out: &mut [f32]) {
+    /// Writes the beginning of row `y` of a channel of [`Frame`](crate::engine::Frame).
+    pub fn write_row(&self, channel: usize, y: usize, out: &mut [f32]) {
         let own = y * EDGE..y * EDGE + out.len();
         match channel {
             0..6 => out.copy_from_slice(&self.sums[channel][own]),
@@ -93,6 +93,9 @@ pub fn shown(view: &View, job: &Job) -> Tile {
     std::array::from_fn(|p| if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h { 1.0 } else { 0.0 })
 }
 
+/// Logarithm of the largest alpha, to base 2.
+const MOST: f32 = -0.014_499_57;
+
 /// A splat as it lies to a tile.
 struct Placed<'a, V> {
     splat: &'a Splat,
@@ -100,7 +103,7 @@ struct Placed<'a, V> {
     dx: V,
     /// From the mean to the tile's upper edge.
     down: f32,
-    /// Logarithm of alpha where dy is 0.
+    /// Logarithm of alpha to base 2 where dy is 0.
     level: V,
     /// How fast it changes with dy there.
     slope: V,
@@ -114,8 +117,11 @@ impl<'a, V: Vector> Placed<'a, V> {
         let splat = &job.lists.splats[gaussian];
         let [[x, y, qx, qy], [_, log_opacity, ..], _] = *splat;
         let (dx, down) = (V::load(&COLUMNS).add(V::splat(job.x - x)), job.y - y);
-        let vectors = reached::<V>(down, job.lists.reach[gaussian]);
-        let pixels = (vectors.start * V::LANES..vectors.end * V::LANES).step_by(V::LANES);
+        let reach = job.lists.reach[gaussian];
+        let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
+        let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
+        let per_vector = V::LANES / EDGE;
+        let pixels = (rows.start / per_vector * V::LANES..rows.end.div_ceil(per_vector) * V::LANES).step_by(V::LANES);
         let level = V::splat(qx).mul(dx).madd(dx, V::splat(log_opacity));
         Self { splat, dx, down, level, slope: V::splat(qy).mul(dx), pixels }
     }
@@ -131,8 +137,8 @@ impl<'a, V: Vector> Placed<'a, V> {
     fn alphas(&self, dy: V) -> V {
         let [_, [qz, ..], _] = *self.splat;
         let exponent = V::splat(qz).madd(dy, self.slope).madd(dy, self.level);
-        // Far out on a long needle, rounding would lift it above any opacity.
-        V::splat(ALPHA_MAX).min(exponent.exp2()).at_least_or_zero(V::splat(ALPHA_MIN))
+        // Far out on a long needle, rounding would lift it above any opacity. What is not a number stays none here, and becomes 0 below.
+        V::splat(MOST).min(exponent).exp2().at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Colour and feature.
@@ -142,15 +148,6 @@ impl<'a, V: Vector> Placed<'a, V> {
         // `map` is not inlined here.
         [V::splat(r), V::splat(g), V::splat(b), V::splat(f0), V::splat(f1), V::splat(f2)]
     }
-}
-
-/// The vectors of a tile that a Gaussian reaches whose mean lies `down` above the tile's upper edge.
-#[inline(always)]
-fn reached<V: Vector>(down: f32, reach: f32) -> std::ops::Range<usize> {
-    let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
-    let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
-    let per_vector = V::LANES / EDGE;
-    rows.start / per_vector..rows.end.div_ceil(per_vector)
 }
 
 /// Whether no pixel of the tile needs more.

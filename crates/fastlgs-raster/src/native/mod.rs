@@ -102,28 +102,27 @@ fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
 }
 
 /// What a tile shows, background included; channels that are not asked for are 0.
-fn shown<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, tile: usize) -> Blended {
+fn blended<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, tile: usize) -> Blended {
     let job = Job::new(view, tile, lists);
     let shown = blend::shown(view, &job);
     let mut out = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
     blend::forward::<COLOR, FEATURE>(&job, &mut out);
     let background = view.background_color[..3].iter().chain(&view.background_feature[..3]);
-    for (c, (sums, background)) in out.sums.iter_mut().zip(background).enumerate() {
-        if if c < 3 { COLOR } else { FEATURE } {
-            for (p, sum) in sums.iter_mut().enumerate() {
-                *sum = shown[p] * (*sum + out.transmittance[p] * background);
-            }
+    let asked = [COLOR, COLOR, COLOR, FEATURE, FEATURE, FEATURE];
+    for ((sums, background), _) in out.sums.iter_mut().zip(background).zip(asked).filter(|(_, asked)| *asked) {
+        for (p, sum) in sums.iter_mut().enumerate() {
+            *sum = shown[p] * (*sum + out.transmittance[p] * background);
         }
     }
     out
 }
 
-/// [`shown`] with these channels.
-fn shown_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
+/// [`blended`] with these channels.
+fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
     match channels {
-        Channels::Color => shown::<true, false>,
-        Channels::Feature => shown::<false, true>,
-        Channels::Both | Channels::Coupled => shown::<true, true>,
+        Channels::Color => blended::<true, false>,
+        Channels::Feature => blended::<false, true>,
+        Channels::Both | Channels::Coupled => blended::<true, true>,
     }
 }
 
@@ -163,16 +162,16 @@ impl CpuEngine {
     fn blend(&mut self, view: &View, channels: Channels) {
         self.frame.prepare(view);
         self.walked.resize(view.tile_count() as usize, 0);
-        let (lists, shown) = (self.lists.as_ref().expect("made before blending"), shown_by(channels));
+        let (lists, blended) = (self.lists.as_ref().expect("made before blending"), blended_by(channels));
         let (width, tiles_x) = (self.frame.width, view.tiles[0] as usize);
         let bands = self.frame.data.par_chunks_exact_mut(EDGE * 8 * width).zip(self.walked.par_chunks_exact_mut(tiles_x));
         bands.enumerate().for_each(|(row, (band, walked))| {
             for column in 0..tiles_x {
-                let tile = shown(view, lists, row * tiles_x + column);
+                let tile = blended(view, lists, row * tiles_x + column);
                 walked[column] = tile.walked;
                 for (y, line) in band.chunks_exact_mut(8 * width).enumerate() {
                     for (c, plane) in line.chunks_exact_mut(width).enumerate().filter(|(c, _)| rendered(channels, *c)) {
-                        tile.row(c, y, &mut plane[column * EDGE..][..EDGE]);
+                        tile.write_row(c, y, &mut plane[column * EDGE..][..EDGE]);
                     }
                 }
             }
@@ -296,7 +295,7 @@ impl Engine for CpuEngine {
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
         self.list(&view, None)?;
-        let (lists, shown) = (self.lists.as_ref().expect("made a line above"), shown_by(channels));
+        let (lists, blended) = (self.lists.as_ref().expect("made a line above"), blended_by(channels));
         let (mut frame, width) = (Frame::new(&View { pairs: lists.pairs() as u32, ..view }), view.size[0] as usize);
         // Of each plane what lies in a row of tiles.
         let mut planes: Vec<_> = frame.data.chunks_exact_mut(view.pixels()).map(|plane| plane.chunks_mut(EDGE * width)).collect();
@@ -304,11 +303,11 @@ impl Engine for CpuEngine {
         let bands: Vec<Vec<&mut [f32]>> = (0..view.tiles[1]).map(band).collect();
         bands.into_par_iter().enumerate().for_each(|(row, mut band)| {
             for column in 0..view.tiles[0] as usize {
-                let tile = shown(&view, lists, row * view.tiles[0] as usize + column);
+                let tile = blended(&view, lists, row * view.tiles[0] as usize + column);
                 let columns = column * EDGE..width.min((column + 1) * EDGE);
                 for (c, plane) in band.iter_mut().enumerate().filter(|(c, _)| rendered(channels, *c)) {
                     for (y, line) in plane.chunks_exact_mut(width).enumerate() {
-                        tile.row(c, y, &mut line[columns.clone()]);
+                        tile.write_row(c, y, &mut line[columns.clone()]);
                     }
                 }
             }

@@ -51,7 +51,7 @@ pub trait Vector: Copy {
     /// self * 2^k.
     fn times_power_of_two(self, k: Self) -> Self;
 
-    /// 2^x for x up to 126, within 2e-7 of it, and of 2^-126 where that is more.
+    /// 2^x for x up to 126, within 2e-7 of it; for x below -126 something from 0 to 2^-126.
     #[inline(always)]
     fn exp2(self) -> Self {
         let (k, f) = self.split();
@@ -384,7 +384,13 @@ mod tests {
                 assert!((sum - expected).abs() < 1e-3, "sum {k}: {sum} instead of {expected}");
             }
         }
-        assert!(read(V::splat(-1e9).exp2())[0] < 1e-37);
+        for low in [-1e9, -1000.5, -160.0, -127.3] {
+            assert!((0.0..1.2e-38).contains(&read(V::splat(low).exp2())[0]), "2^{low}");
+        }
+        // As alphas are made: what is not a number reaches nothing.
+        let alpha = |x: f32| read(V::splat(-0.5).min(V::splat(x)).exp2().at_least_or_zero(V::splat(0.01)))[0];
+        assert_eq!([f32::NAN, f32::NEG_INFINITY, -200.0].map(alpha), [0.0; 3]);
+        assert_eq!([f32::INFINITY, 1e9].map(alpha), [alpha(-0.5); 2]);
         *checked += V::LANES as u32;
     }
 
@@ -396,5 +402,14 @@ mod tests {
         widest(&mut checked);
         println!("checked: portable ones of 8 and 16, and vectors of {}", checked - 24);
         assert!(checked >= 32);
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+            #[target_feature(enable = "avx2,fma")]
+            fn avx2(checked: &mut u32) {
+                check_body::<Avx2>(checked);
+            }
+            // SAFETY: the features were found a line above.
+            unsafe { avx2(&mut checked) };
+        }
     }
 }
