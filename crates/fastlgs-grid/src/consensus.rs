@@ -1,11 +1,11 @@
 //! Global mapping, first step: every mask proposes a thing, and the other views' masks say what it is.
 //!
-//! A mask holds the Gaussians that lie in it. Of the masks of another view that hold most of these, and of which these hold most, the one that fits
-//! best is taken to show the same thing; no mask can show two things that share nothing. What most of all these masks' pixels hold is the thing as more views
-//! see it; and so on, until nothing changes. Such a set is its own consensus: whichever of its masks it starts from, a view that cuts the thing
-//! apart or glues it to another one has no voice, masks that are missing are not missed, and a thing, its parts, and what it stands on are all
-//! found, each from its own masks. (As MaskClustering, 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in
-//! two; but there a mask belongs to one thing only.)
+//! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing if each holds most
+//! of the other, so that no mask can show two things that share nothing. What most of all these masks' pixels hold is the thing as more views see
+//! it; and so on, until nothing changes. Such a set is its own consensus: whichever of its masks it starts from, a view that cuts the thing apart
+//! or glues it to another one has no voice, masks that are missing are not missed, and a thing, its parts, and what it stands on are all found,
+//! each from its own masks. (As MaskClustering, 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in two;
+//! but there a mask belongs to one thing only.)
 
 use crate::sightings::{Fit, MIN_PIXELS, MaskId, Scratch, Sightings};
 use rayon::prelude::*;

@@ -107,8 +107,8 @@ pub struct Shown {
     pub pixels: f32,
     /// The mask that fits them best, if one holds any of them at all.
     pub best: Option<Fit>,
-    /// The one that fits best of those that hold most of them, and of which they hold most.
-    pub mutual: Option<Fit>,
+    /// Whether that one holds most of them, and they most of it.
+    pub mutual: bool,
 }
 
 /// Sums that one search after the other uses; all zero between them.
@@ -224,9 +224,9 @@ impl<'a> Sightings<'a> {
         met
     }
 
-    /// The masks that show these Gaussians: of each view the one that fits best where each holds most of the other, if there is one.
+    /// The masks that show these Gaussians: of each view the one that fits them best, if each holds most of the other.
     pub fn showing(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
-        self.shown(set, scratch).into_iter().filter_map(|shown| shown.mutual).collect()
+        self.shown(set, scratch).into_iter().filter(|shown| shown.mutual).filter_map(|shown| shown.best).collect()
     }
 
     /// What the views show of these Gaussians, rising by view.
@@ -245,22 +245,17 @@ impl<'a> Sightings<'a> {
                 add(&mut scratch.masks, self.held[view].first + MaskId::from(*mask), weight, &mut met);
             }
         }
-        let mut fits: Vec<[Option<Fit>; 2]> = vec![[None; 2]; self.tables.len()];
+        let mut best: Vec<(Option<Fit>, bool)> = vec![(None, false); self.tables.len()];
         for mask in listed(met) {
             let common = std::mem::take(&mut scratch.masks[mask as usize]);
             let view = self.view_of(mask);
             let (own, whole) = (shown[view], self.pixels[mask as usize]);
             let iou = common / (own + whole - common);
-            let better = |fit: &Option<Fit>| fit.is_none_or(|fit| iou > fit.iou);
-            let [best, mutual] = &mut fits[view];
-            if better(best) {
-                *best = Some(Fit { mask, iou });
-            }
-            if better(mutual) && 2.0 * common > own.max(whole) {
-                *mutual = Some(Fit { mask, iou });
+            if best[view].0.is_none_or(|fit| iou > fit.iou) {
+                best[view] = (Some(Fit { mask, iou }), 2.0 * common > own.max(whole));
             }
         }
-        let views = (0..).zip(shown).zip(fits).map(|((view, pixels), [best, mutual])| Shown { view, pixels, best, mutual });
+        let views = (0..).zip(shown).zip(best).map(|((view, pixels), (best, mutual))| Shown { view, pixels, best, mutual });
         views.filter(|shown| shown.pixels >= MIN_PIXELS).collect()
     }
 }
@@ -313,7 +308,7 @@ mod tests {
         assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
         assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "half of what shows of 4 is not most of it");
         assert_eq!(sightings.showing(&[0, 1, 2, 3], &mut scratch), [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
-        // Of 0..4 the set holds half, of 0..2 nothing; of 0..5 it holds three of five.
+        // Of the mask of 0..4 the set holds half, which is not most; of 0..5 three fifths, and that mask three fifths of the set.
         assert_eq!(sightings.showing(&[2, 3, 4, 5, 6], &mut scratch), [Fit { mask: 2, iou: 3.0 / 7.0 }]);
         // The masks of 0..4 and 0..5 hold all of it, and it holds a little of them.
         assert_eq!(sightings.showing(&[2], &mut scratch), []);
