@@ -53,6 +53,8 @@ pub trait Vector: Copy {
 
     /// 2^x for x up to 126, within 2e-7 of it; for x below -126 something from 0 to 2^-126.
     #[inline(always)]
+    // One coefficient is nearly ln 2.
+    #[allow(clippy::approx_constant)]
     fn exp2(self) -> Self {
         let (k, f) = self.split();
         // The polynomial of degree 5 with 1 at 0 whose largest relative error from -1/2 to 1/2 is least.
