@@ -11,7 +11,7 @@ fn options(channels: Channels) -> StepOptions {
     StepOptions { channels, lambda: 0.2, feature_weight: 0.7, exposure }
 }
 
-/// Frame and gradients of one step with learning rates of zero.
+/// Frame (channels that were asked for, and transmittance) and gradients of one step with learning rates of zero.
 fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, size: (u32, u32)) -> (Vec<f32>, Vec<f32>, crate::Losses) {
     engine.set_state(state).unwrap();
     engine.set_target(0, target(size.0, size.1)).unwrap();
@@ -19,8 +19,11 @@ fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, 
     let all = 0..channels_of(state.sh_degree);
     engine.step(view, 0, &options(channels), &Step::new(1, all, &[0.0; BASE_CHANNELS + 1])).unwrap();
     let n = (size.0 * size.1) as usize;
-    let shown = if channels.color() { 0..3 * n } else { 3 * n..6 * n };
-    (frame.data[shown].to_vec(), engine.gradients().unwrap(), engine.losses().unwrap())
+    let asked = |c: usize| if c < 3 { channels.color() } else { c >= 6 || channels.feature() };
+    let planes = frame.data.chunks_exact(n).take(7).enumerate();
+    assert!(planes.clone().filter(|(c, _)| !asked(*c)).all(|(_, plane)| plane.iter().all(|v| *v == 0.0)), "what was not asked for is 0");
+    let shown = planes.filter(|(c, _)| asked(*c)).flat_map(|(_, plane)| plane.to_vec()).collect();
+    (shown, engine.gradients().unwrap(), engine.losses().unwrap())
 }
 
 #[test]
@@ -53,6 +56,7 @@ fn gpu_and_cpu_agree() {
                 near(a.2.color_ssim, b.2.color_ssim);
                 near(a.2.feature_l1, b.2.feature_l1);
                 (0..3).for_each(|c| near(a.2.by_gain[c], b.2.by_gain[c]));
+                (0..3).for_each(|c| near(a.2.by_offset[c], b.2.by_offset[c]));
                 (0..6).for_each(|c| near(a.2.by_background[c], b.2.by_background[c]));
             }
         }
