@@ -72,6 +72,8 @@ pub type Splat = [[f32; 4]; 3];
 
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
+/// Its logarithm to base 2, for those who bound the exponent.
+pub(crate) const LOG2_ALPHA_MAX: f32 = -0.014_499_57;
 pub(crate) const DILATION: f32 = 0.3;
 pub(crate) const NEAR: f32 = 0.5;
 

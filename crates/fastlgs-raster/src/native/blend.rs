@@ -2,7 +2,7 @@
 
 use super::lists::{Band, Lists};
 use super::simd::{SUMS, Vector, dispatched};
-use crate::cpu::{ALPHA_MIN, BATCH, Splat};
+use crate::cpu::{ALPHA_MIN, BATCH, LOG2_ALPHA_MAX, Splat};
 use crate::view::View;
 
 /// Pixels along a tile's edge.
@@ -93,9 +93,6 @@ pub fn shown(view: &View, job: &Job) -> Tile {
     std::array::from_fn(|p| if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h { 1.0 } else { 0.0 })
 }
 
-/// Logarithm of the largest alpha, to base 2.
-const MOST: f32 = -0.014_499_57;
-
 /// A splat as it lies to a tile.
 struct Placed<'a, V> {
     splat: &'a Splat,
@@ -138,7 +135,7 @@ impl<'a, V: Vector> Placed<'a, V> {
         let [_, [qz, ..], _] = *self.splat;
         let exponent = V::splat(qz).madd(dy, self.slope).madd(dy, self.level);
         // Far out on a long needle, rounding would lift it above any opacity. What is not a number stays none here, and becomes 0 below.
-        V::splat(MOST).min(exponent).exp2().at_least_or_zero(V::splat(ALPHA_MIN))
+        V::splat(LOG2_ALPHA_MAX).min(exponent).exp2().at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Colour and feature.
@@ -398,6 +395,11 @@ mod tests {
             out.extend(changes);
         }
         out
+    }
+
+    #[test]
+    fn the_bound_of_the_exponent_is_that_of_alpha() {
+        assert!((LOG2_ALPHA_MAX.exp2() - crate::cpu::ALPHA_MAX).abs() < 2e-7);
     }
 
     #[test]
