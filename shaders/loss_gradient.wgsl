@@ -1,6 +1,6 @@
 // Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for the loss and the exposure.
 //
-// rows     [planes][5][padded rows][quads]  three maps from ssim_backward_rows
+// rows     [planes][4][padded rows][quads]  three maps from ssim_backward_rows
 // gradient [6][padded rows][quads]          dL/d frame
 // sums     [4][6][tile rows][quads]         sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
 #import columns

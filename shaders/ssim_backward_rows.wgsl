@@ -28,7 +28,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             load(base, i32(quad) + $K - 2),
 #end
         ));
-        let place = ((5u * number + map) * plane.rows + row) * plane.quads + quad;
+        let place = ((4u * number + map) * plane.rows + row) * plane.quads + quad;
         rows[place] = out[0];
         rows[place + 1u] = out[1];
     }

@@ -1,7 +1,7 @@
-// Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments of x.
+// Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments that x is in.
 //
-// rows     [planes][5][padded rows][quads]  from ssim_rows
-// partials [planes][3][padded rows][quads]  d SSIM / d (mean x, mean x^2, mean x y)
+// rows     [planes][4][padded rows][quads]  from ssim_rows
+// partials [planes][3][padded rows][quads]  d SSIM / d (mean x, mean x^2 + y^2, mean x y)
 // sums     [6][tile rows][quads]            sum of SSIM over eight rows, for the loss
 #import columns
 #import flat
@@ -11,12 +11,13 @@
 @group(0) @binding(2) var<storage, read_write> partials: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> sums: array<vec4<f32>>;
 
-// SSIM of four pixels from their five local moments; stores its derivatives.
-fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, xx: vec4<f32>, yy: vec4<f32>, xy: vec4<f32>) -> vec4<f32> {
+// SSIM of four pixels from their four local moments; stores its derivatives.
+fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, squares: vec4<f32>, xy: vec4<f32>) -> vec4<f32> {
     let a = 2.0 * mx * my + 0.0001;
     let b = 2.0 * (xy - mx * my) + 0.0009;
-    let c = mx * mx + my * my + 0.0001;
-    let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
+    let of_means = mx * mx + my * my;
+    let c = of_means + 0.0001;
+    let d = squares - of_means + 0.0009;
     let weight = shown(quad, row);
     let inverse = 1.0 / (c * d);
     let value = a * b * inverse;
@@ -41,12 +42,11 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let first = 8u * (id / plane.quads);
     let mx = blurred(0u, quad, i32(first));
     let my = blurred(1u, quad, i32(first));
-    let xx = blurred(2u, quad, i32(first));
-    let yy = blurred(3u, quad, i32(first));
-    let xy = blurred(4u, quad, i32(first));
+    let squares = blurred(2u, quad, i32(first));
+    let xy = blurred(3u, quad, i32(first));
     var total = vec4<f32>(0.0);
 #each K 8
-    total += ssim(quad, first + $Ku, mx[$K], my[$K], xx[$K], yy[$K], xy[$K]);
+    total += ssim(quad, first + $Ku, mx[$K], my[$K], squares[$K], xy[$K]);
 #end
     sums[plane.channel * runs * plane.quads + id] = total;
 }

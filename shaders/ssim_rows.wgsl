@@ -1,8 +1,8 @@
-// Blurs x, y, x^2, y^2 and x y along rows: the first half of SSIM's window.
+// Blurs x, y, x^2 + y^2 and x y along rows: the first half of SSIM's window.
 //
 // frame  [..][padded rows][quads]  rendered x
 // targets [2][padded rows][quads]   8-bit y of colour and feature; where a pixel does not count, y := x
-// rows   [planes][5][padded rows][quads]
+// rows   [planes][4][padded rows][quads]
 #import rows
 #import flat
 
@@ -26,8 +26,12 @@ fn load(quad: i32, row: u32) -> Pair {
     return Pair(select(vec4<f32>(0.0), x, in_picture), select(vec4<f32>(0.0), select(x, y.value, y.counts), in_picture));
 }
 
+fn squares(pair: Pair) -> vec4<f32> {
+    return fma(pair.x, pair.x, pair.y * pair.y);
+}
+
 fn store(map: u32, quad: u32, row: u32, values: array<vec4<f32>, 2>) {
-    let place = ((5u * number + map) * plane.rows + row) * plane.quads + quad;
+    let place = ((4u * number + map) * plane.rows + row) * plane.quads + quad;
     rows[place] = values[0];
     rows[place + 1u] = values[1];
 }
@@ -47,7 +51,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #end
     store(0u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x, p1.x, p2.x, p3.x, p4.x, p5.x)));
     store(1u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.y, p1.y, p2.y, p3.y, p4.y, p5.y)));
-    store(2u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x * p0.x, p1.x * p1.x, p2.x * p2.x, p3.x * p3.x, p4.x * p4.x, p5.x * p5.x)));
-    store(3u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.y * p0.y, p1.y * p1.y, p2.y * p2.y, p3.y * p3.y, p4.y * p4.y, p5.y * p5.y)));
-    store(4u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x * p0.y, p1.x * p1.y, p2.x * p2.y, p3.x * p3.y, p4.x * p4.y, p5.x * p5.y)));
+    store(2u, quad, row, blurred_row(array<vec4<f32>, 6>(squares(p0), squares(p1), squares(p2), squares(p3), squares(p4), squares(p5))));
+    store(3u, quad, row, blurred_row(array<vec4<f32>, 6>(p0.x * p0.y, p1.x * p1.y, p2.x * p2.y, p3.x * p3.y, p4.x * p4.y, p5.x * p5.y)));
 }

@@ -76,11 +76,11 @@ fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
     bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
 }
 
-/// Hands each plane to a twin with its own maps: five of `rows`, and three of `partials` where there are any.
+/// Hands each plane to a twin with its own maps: four of `rows`, and three of `partials` where there are any.
 fn each_plane(planes: &Planes, rows: &mut [u32], partials: &mut [u32], mut twin: impl FnMut(&Plane, &mut [u32], &mut [u32])) {
     for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
         let size = (4 * plane.quads * plane.rows) as usize;
         let own = |maps: usize| number * maps * size..(number + 1) * maps * size;
-        twin(plane, &mut rows[own(5)], partials.get_mut(own(3)).unwrap_or_default());
+        twin(plane, &mut rows[own(4)], partials.get_mut(own(3)).unwrap_or_default());
     }
 }

@@ -18,11 +18,12 @@ pub fn ssim_columns(plane: &Plane, rows: &[f32], partials: &mut [f32], sums: &mu
     sums[base..base + runs * w].fill(0.0);
     for j in 0..h {
         for i in 0..w {
-            let [mx, my, xx, yy, xy] = [0, 1, 2, 3, 4].map(|m| blur_column(plane, rows, m, i, j));
+            let [mx, my, squares, xy] = [0, 1, 2, 3].map(|m| blur_column(plane, rows, m, i, j));
             let a = 2.0 * mx * my + 0.0001;
             let b = 2.0 * (xy - mx * my) + 0.0009;
-            let c = mx * mx + my * my + 0.0001;
-            let d = (xx - mx * mx) + (yy - my * my) + 0.0009;
+            let of_means = mx * mx + my * my;
+            let c = of_means + 0.0001;
+            let d = squares - of_means + 0.0009;
             let ssim = a * b / (c * d);
             let weight = shown_plane(plane, i, j);
             sums[base + (j / RUN) * w + i] += weight * ssim;

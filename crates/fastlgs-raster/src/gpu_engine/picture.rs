@@ -47,7 +47,7 @@ impl Loss {
     pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View, planes: usize) -> Result<Self> {
         let pixels = view.padded_pixels() as u64;
         // Real GPUs have room for all; a software adapter's cache has not.
-        let rows = 20 * pixels;
+        let rows = 16 * pixels;
         let at_once = if gpu.shape == Shape::Wide { 1 } else { (LARGEST.min(gpu.max_binding) / rows).clamp(1, 6) };
         // As many each time.
         let at_once = (planes as u64).div_ceil((planes as u64).div_ceil(at_once));

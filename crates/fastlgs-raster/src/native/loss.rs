@@ -50,7 +50,7 @@ fn taps<'a>(window: &Window, rows: &'a [f32], line: usize, j: usize) -> (Window,
 }
 
 vectorised! {
-    /// Weighted sums of x, y, x^2, y^2 and x y over rows that hold x and then y, into five lines of `out` from place SSIM_RADIUS on.
+    /// Weighted sums of x, y, x^2 + y^2 and x y over rows that hold x and then y, into four lines of `out` from place SSIM_RADIUS on.
     fn moments(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) = moments_body
 }
 
@@ -58,15 +58,15 @@ vectorised! {
 fn moments_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) {
     let (x, y) = (rows.map(|row| &row[..w]), rows.map(|row| &row[w..2 * w]));
     let mut lines = out.chunks_exact_mut(w + 2 * SSIM_RADIUS).map(|line| &mut line[SSIM_RADIUS..SSIM_RADIUS + w]);
-    let [mx, my, xx, yy, xy] = std::array::from_fn(|_| lines.next().expect("five lines"));
+    let [mx, my, squares, xy] = std::array::from_fn(|_| lines.next().expect("four lines"));
     for i in 0..w {
-        let mut sums = [0.0; 5];
+        let mut sums = [0.0; 4];
         for k in 0..window.len() {
             let (x, y) = (x[k][i], y[k][i]);
             let (wx, wy) = (window[k] * x, window[k] * y);
-            sums = [sums[0] + wx, sums[1] + wy, madd::<FMA>(wx, x, sums[2]), madd::<FMA>(wy, y, sums[3]), madd::<FMA>(wx, y, sums[4])];
+            sums = [sums[0] + wx, sums[1] + wy, madd::<FMA>(wx, x, madd::<FMA>(wy, y, sums[2])), madd::<FMA>(wx, y, sums[3])];
         }
-        [mx[i], my[i], xx[i], yy[i], xy[i]] = sums;
+        [mx[i], my[i], squares[i], xy[i]] = sums;
     }
 }
 
@@ -175,7 +175,7 @@ struct Moments {
 
 impl Moments {
     fn new(w: usize) -> Self {
-        Self { padded: vec![0.0; 5 * (w + 2 * SSIM_RADIUS)], moments: vec![0.0; 5 * w], partials: vec![0.0; 3 * w] }
+        Self { padded: vec![0.0; 4 * (w + 2 * SSIM_RADIUS)], moments: vec![0.0; 4 * w], partials: vec![0.0; 3 * w] }
     }
 
     /// The sum of SSIM over a row of windows; its derivatives by the moments, blurred along the row, into `out` `[3][w]`.
@@ -199,26 +199,27 @@ impl Moments {
 }
 
 vectorised! {
-    /// SSIM of a row from its five local moments `[5][w]`, summed; `out` `[3][w]` gets its derivatives.
+    /// SSIM of a row from its four local moments `[4][w]`, summed; `out` `[3][w]` gets its derivatives.
     fn derivatives(moments: &[f32], out: &mut [f32], sum: &mut f64) = derivatives_body
 }
 
 #[inline(always)]
 fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut f64) {
-    let w = moments.len() / 5;
-    let [mx, my, xx, yy, xy] = [0, 1, 2, 3, 4].map(|m| &moments[m * w..(m + 1) * w]);
+    let w = moments.len() / 4;
+    let [mx, my, squares, xy] = [0, 1, 2, 3].map(|m| &moments[m * w..(m + 1) * w]);
     let (by_mean, rest) = out.split_at_mut(w);
     let (by_square, by_product) = rest.split_at_mut(w);
     let by_product = &mut by_product[..w];
     let mut sums = [0.0; LANES];
     for first in (0..w).step_by(LANES) {
-        let [mx, my, xx, yy, xy] = [mx, my, xx, yy, xy].map(|row| lanes(row, first));
+        let [mx, my, squares, xy] = [mx, my, squares, xy].map(|row| lanes(row, first));
         let mut by = [[0.0; LANES]; 3];
         for i in 0..LANES {
             let a = 2.0 * mx[i] * my[i] + 0.0001;
             let b = 2.0 * (xy[i] - mx[i] * my[i]) + 0.0009;
-            let c = mx[i] * mx[i] + my[i] * my[i] + 0.0001;
-            let d = (xx[i] - mx[i] * mx[i]) + (yy[i] - my[i] * my[i]) + 0.0009;
+            let of_means = mx[i] * mx[i] + my[i] * my[i];
+            let c = of_means + 0.0001;
+            let d = squares[i] - of_means + 0.0009;
             let inverse = 1.0 / (c * d);
             let ssim = a * b * inverse;
             by[0][i] = 2.0 * my[i] * (b - a) * inverse - 2.0 * mx[i] * ssim * (d - c) * inverse;

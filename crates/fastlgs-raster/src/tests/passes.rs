@@ -361,7 +361,7 @@ fn loss() {
             }
             twin
         };
-        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(10 * n)], row_groups, &[(2, 1e-4)]);
+        let blurred = run(shaders::SsimRows::SHADER, &[&frame, &targets, &zeros(8 * n)], row_groups, &[(2, 1e-4)]);
         let ssim = run(shaders::SsimColumns::SHADER, &[&blurred[2], &zeros(6 * n), &sums], column_groups, &[(1, 1e-2), (2, 1e-3)]);
         let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
         run(shaders::LossGradient::SHADER, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
