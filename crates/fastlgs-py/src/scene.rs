@@ -224,24 +224,25 @@ impl Scene {
     fn render<'py>(&self, py: Python<'py>, view: Option<&Bound<'py, PyAny>>, what: &str) -> PyResult<Bound<'py, PyAny>> {
         let which = Which::of(view)?;
         let size = |camera: &fastlgs_core::Camera| [camera.height as usize, camera.width as usize];
-        let planes = |first: usize| {
+        let planes = |color: bool| {
             self.with(py, |opened| {
                 let camera = opened.camera(&which)?;
-                let frame = opened.session.render(&camera)?;
+                let session = &mut opened.session;
+                let frame = if color { session.render(&camera) } else { session.render_feature(&camera) }?;
                 let pixels = size(&camera).iter().product::<usize>();
-                let planes = frame.channels(first, first + 3);
+                let planes = if color { frame.channels(0, 3) } else { frame.channels(3, 6) };
                 let values: Vec<f32> = (0..pixels).flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]]).collect();
                 Ok((size(&camera), values))
             })
         };
         match what {
             "color" => {
-                let ([h, w], values) = planes(0)?;
+                let ([h, w], values) = planes(true)?;
                 let bytes: Vec<u8> = values.into_iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
                 table(py, bytes, &[h, w, 3])
             }
             "feature" => {
-                let ([h, w], values) = planes(3)?;
+                let ([h, w], values) = planes(false)?;
                 table(py, values, &[h, w, 3])
             }
             "depth" => {

@@ -60,7 +60,7 @@ pub struct Report {
     pub size: String,
     /// Gaussians.
     pub gaussians: usize,
-    /// Milliseconds of colour and feature of each view.
+    /// Milliseconds of each view's colour, where it was asked for.
     pub render_ms: Vec<f64>,
     /// The device's name.
     pub adapter: String,
@@ -78,19 +78,20 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
     let work = run.work("render", cameras.len() as u64);
     let (mut files, mut milliseconds) = (Vec::new(), Vec::new());
     for camera in &cameras {
-        let started = Instant::now();
-        let frame = scene.render(camera)?;
-        milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
-        let (w, h) = (frame.width as usize, frame.height as usize);
+        let (w, h) = (camera.width as usize, camera.height as usize);
         let mut path = |what: &str, ending: &str| {
             let path = config.output.join(format!("{}.{what}.{ending}", camera.name));
             files.push(path.clone());
             path
         };
         if config.what.contains(&What::Color) {
+            let started = Instant::now();
+            let frame = scene.render(camera)?;
+            milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
             image_io::save_png(&path("color", "png"), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
         }
         if config.what.contains(&What::Feature) {
+            let frame = scene.render_feature(camera)?;
             let channels = [("feature.0", frame.channels(3, 4)), ("feature.1", frame.channels(4, 5)), ("feature.2", frame.channels(5, 6))];
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
@@ -100,7 +101,7 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
         }
         if config.what.contains(&What::Objects) {
             let ids = scene.field(camera, None)?.owners(&scene.grid()?);
-            let picture = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
+            let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
             image_io::save_png(&path("objects", "png"), picture)?;
         }
         work.advance()?;

@@ -105,9 +105,14 @@ impl Session {
         Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
     }
 
-    /// Renders colour, feature and transmittance.
+    /// Renders colour and transmittance.
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
-        Ok(self.engine.render(self.view(camera), Channels::Both)?)
+        Ok(self.engine.render(self.view(camera), Channels::Color)?)
+    }
+
+    /// Renders feature and transmittance.
+    pub fn render_feature(&mut self, camera: &Camera) -> Result<Frame> {
+        Ok(self.engine.render(self.view(camera), Channels::Feature)?)
     }
 
     /// The frame of a camera, rendered in the way the scene was trained.
@@ -128,7 +133,7 @@ impl Session {
         if lifted && tau_ac.is_none() {
             return Ok(Field::Shares(self.engine.render_ids(self.view(camera), &self.gaussians.object_ids)?));
         }
-        let frame = self.engine.render(self.view(camera), Channels::Feature)?;
+        let frame = self.render_feature(camera)?;
         let (width, height) = (frame.width, frame.height);
         // Codes that were trained make up for what passes through; those that were lifted do not.
         let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
