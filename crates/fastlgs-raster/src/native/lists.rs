@@ -63,6 +63,14 @@ impl Lists {
         size_of_val(self.splats.as_slice()) + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
     }
 
+    /// The places of a Gaussian; none beyond the last one.
+    pub fn places_of(&self, gaussian: usize) -> &[u32] {
+        match self.first.get(gaussian..gaussian + 2) {
+            Some([first, end]) => &self.places[*first as usize..*end as usize],
+            _ => &[],
+        }
+    }
+
     /// Pairs of a tile and a Gaussian.
     pub fn pairs(&self) -> usize {
         self.bands.iter().map(|band| band.pairs.len()).sum()

@@ -126,6 +126,9 @@ fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
     }
 }
 
+/// So many Gaussians before it is their turn their sums are fetched: places lie anywhere.
+const AHEAD: usize = 8;
+
 impl CpuEngine {
     /// An engine without Gaussians.
     pub fn new() -> Self {
@@ -223,10 +226,12 @@ impl CpuEngine {
         blocks.zip(stats).enumerate().for_each(|(block, ((((params, moment1), moment2), gradients), (lengths, counts)))| {
             for (k, (params, gradients)) in params.chunks_exact(width).zip(gradients.chunks_exact_mut(width)).enumerate() {
                 let i = block * adam::BLOCK + k;
-                let places = &lists.places[lists.first[i] as usize..lists.first[i + 1] as usize];
+                let places = lists.places_of(i);
+                lists.places_of(i + AHEAD).iter().for_each(|place| simd::prefetch(&slots[*place as usize]));
                 let mut slot = [0.0; SUMS];
                 for place in places {
-                    slot.iter_mut().zip(&slots[*place as usize]).for_each(|(sum, value)| *sum += value);
+                    let values = &slots[*place as usize];
+                    (0..SUMS).for_each(|k| slot[k] += values[k]);
                 }
                 let put = |c: usize, value: f32| gradients[c] = value;
                 let drawn = cpu::backward_one(view, channels, |c| params[c], !places.is_empty(), &lists.splats[i], &slot, put);

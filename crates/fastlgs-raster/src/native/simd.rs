@@ -11,6 +11,19 @@ pub fn madd<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
+/// Has sums brought to the cache.
+#[inline(always)]
+pub fn prefetch(sums: &[f32; SUMS]) {
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        for end in [&sums[0], &sums[SUMS - 1]] {
+            // SAFETY: a hint, of an address that is there.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(end).cast()) };
+        }
+    }
+}
+
 /// Sums that a pair leaves behind.
 pub const SUMS: usize = 12;
 
