@@ -1,6 +1,7 @@
 //! Projection, depth order and tile lists.
 
-use super::simd::vectorised;
+use super::AHEAD;
+use super::simd::{prefetch, vectorised};
 use crate::cpu::{self, Footprint, NOT_DRAWN, Projected, Splat, span};
 use crate::view::View;
 use rayon::prelude::*;
@@ -47,7 +48,7 @@ impl Lists {
         let projected = project(view, params);
         let bands = bands(view, &projected);
         let (first, places) = places(&bands, projected.len());
-        let reach = projected.iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect();
+        let reach = projected.par_iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect();
         Self { splats: splats(&projected), reach, bands, places, first }
     }
 
@@ -136,15 +137,35 @@ fn project_block_body<const FMA: bool>(view: &View, first: u32, width: usize, pa
 }
 
 fn splats(projected: &[Projected]) -> Vec<Splat> {
-    projected.iter().map(|p| p.splat).collect()
+    projected.par_iter().map(|p| p.splat).collect()
 }
 
 /// Drawn Gaussians by ascending depth; those of the same depth by their number.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
-    let mut keys: Vec<u64> =
-        projected.iter().enumerate().filter(|(_, p)| p.depth != NOT_DRAWN).map(|(i, p)| u64::from(p.depth) << 32 | i as u64).collect();
-    keys.par_sort_unstable();
-    keys.into_iter().map(|k| k as u32).collect()
+    let depths: Vec<u32> = projected.iter().map(|p| p.depth).collect();
+    let drawn = (0..).zip(&depths).filter(|(_, depth)| **depth != NOT_DRAWN).map(|(g, _)| g).collect();
+    // The lower digit first: sorting by the higher one keeps the order of those that have it in common.
+    [0, DIGIT].into_iter().fold(drawn, |order, shift| by_digit(&order, |g| (depths[g as usize] >> shift) as usize % (1 << DIGIT)))
+}
+
+/// Bits of a digit of depths, which have two.
+const DIGIT: u32 = 12;
+const _: () = assert!(NOT_DRAWN < 1 << (2 * DIGIT));
+
+/// Counting sort.
+fn by_digit(order: &[u32], digit: impl Fn(u32) -> usize) -> Vec<u32> {
+    let mut next = vec![0; (1 << DIGIT) + 1];
+    order.iter().for_each(|g| next[digit(*g) + 1] += 1);
+    for digit in 0..1 << DIGIT {
+        next[digit + 1] += next[digit];
+    }
+    let mut sorted = vec![0; order.len()];
+    for g in order {
+        let place: &mut usize = &mut next[digit(*g)];
+        sorted[*place] = *g;
+        *place += 1;
+    }
+    sorted
 }
 
 /// The rows of tiles, each with its Gaussians in order of depth.
@@ -160,6 +181,9 @@ fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
     (0..view.tiles[1] as usize).into_par_iter().map(band).collect()
 }
 
+/// Rows of tiles that are looked at together.
+const ROWS: usize = 8;
+
 vectorised! {
     /// Adds to each row of tiles what touches it, in the order of `gaussians`.
     fn touches(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) = touches_body
@@ -167,12 +191,20 @@ vectorised! {
 
 #[inline(always)]
 fn touches_body<const FMA: bool>(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) {
-    for &gaussian in gaussians {
+    for (k, &gaussian) in gaussians.iter().enumerate() {
+        if let Some(later) = gaussians.get(k + AHEAD) {
+            prefetch(&projected[*later as usize].footprint);
+        }
         let footprint: &Footprint = &projected[gaussian as usize].footprint;
-        for row in footprint[1][2] as u32..(footprint[1][3] as u32).min(view.tiles[1]) {
-            let columns = span(footprint, row, view.tiles[0]);
-            if !columns.is_empty() {
-                rows[row as usize].push(Touch { gaussian, columns });
+        let end = (footprint[1][3] as u32).min(view.tiles[1]);
+        for first in (footprint[1][2] as u32..end).step_by(ROWS) {
+            let (mut starts, mut ends) = ([0; ROWS], [0; ROWS]);
+            for k in 0..ROWS {
+                let columns = span(footprint, first + k as u32, view.tiles[0]);
+                (starts[k], ends[k]) = (columns.start, columns.end);
+            }
+            for (row, (start, end)) in (first..end).zip(starts.into_iter().zip(ends)).filter(|(_, (start, end))| start < end) {
+                rows[row as usize].push(Touch { gaussian, columns: start..end });
             }
         }
     }

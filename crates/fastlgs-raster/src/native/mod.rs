@@ -126,7 +126,7 @@ fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
     }
 }
 
-/// So many Gaussians before it is their turn their sums are fetched: places lie anywhere.
+/// So many Gaussians before it is their turn, what is known of them and lies anywhere is fetched.
 const AHEAD: usize = 8;
 
 impl CpuEngine {

@@ -11,17 +11,20 @@ pub fn madd<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// Has sums brought to the cache.
+/// Has a value of up to two cache lines brought to the cache.
 #[inline(always)]
-pub fn prefetch(sums: &[f32; SUMS]) {
+pub fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
     {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        for end in [&sums[0], &sums[SUMS - 1]] {
+        let first = std::ptr::from_ref(value).cast::<i8>();
+        for end in [first, first.wrapping_add(size_of::<T>() - 1)] {
             // SAFETY: a hint, of an address that is there.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(end).cast()) };
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(end) };
         }
     }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = value;
 }
 
 /// Sums that a pair leaves behind.
