@@ -29,7 +29,7 @@ pub struct Lesson {
     /// An object by its number.
     #[cfg_attr(feature = "clap", arg(long, value_name = "ID", group = "shown"))]
     pub object: Option<u16>,
-    /// A picture of the thing.
+    /// A picture of the thing, cut out of its surroundings.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", group = "shown"))]
     pub image: Option<PathBuf>,
 }

@@ -35,7 +35,7 @@ pub struct Args {
     /// texts from standard input and answers each line at once with a line of JSON; on a terminal it is a dialogue.
     #[arg(required_unless_present_any = ["image", "point", "scenes_below"])]
     text: Vec<String>,
-    /// A picture of what to look for.
+    /// A picture of what to look for, cut out of its surroundings.
     #[arg(long, value_name = "FILE")]
     image: Vec<PathBuf>,
     /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that they tell of together.
