@@ -215,7 +215,10 @@ fn renders_every_kind_of_picture_and_any_camera() {
     let what = ["--what", "color,depth,feature,objects", "-o", text(&out)];
     let mut args = vec!["render", text(&f.scene), "--view", "008.png"];
     args.extend(what);
-    json(&args);
+    let report = json(&args);
+    assert!(report["render_ms"][0].as_f64().is_some_and(|ms| ms > 0.0), "{report}");
+    let (_, _, features) = fastlgs_core::exr_image::read(&out.join("008.png.feature.exr")).expect("features");
+    assert!(features.len() == 3 && features.iter().all(|f| f.1.iter().any(|value| *value > 0.05)), "codes are seen");
     let (w, h, depth) = fastlgs_core::exr_image::read(&out.join("008.png.depth.exr")).expect("depth");
     let (_, _, truth) = fastlgs_core::exr_image::read(&f.photos.join("depth/008.png.exr")).expect("exact depth");
     assert_eq!((w, h), (320, 240));

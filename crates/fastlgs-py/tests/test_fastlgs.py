@@ -51,7 +51,9 @@ def test_questions_are_answered(scene):
     assert pointed.found and pointed.mask[y, x]
     several = scene.query(point=[[int(x), int(y)], (int(x), int(y))], view=view)
     assert [o["id"] for o in several.objects] == [o["id"] for o in pointed.objects]
-    # A picture of the thing itself, cut out of the render.
+    feature = scene.render(view, "feature")
+    assert feature.shape == (height, width, 3) and feature.max() > 0.05
+    # A picture of where the thing is.
     shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
     assert shown.text == "image"
 

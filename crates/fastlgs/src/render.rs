@@ -7,7 +7,7 @@ use fastlgs_core::{exr_image, image_io, turbo};
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -60,10 +60,18 @@ pub struct Report {
     pub size: String,
     /// Gaussians.
     pub gaussians: usize,
-    /// Milliseconds of each view's colour, where it was asked for.
+    /// Milliseconds in which what was asked for was rendered, of each view.
     pub render_ms: Vec<f64>,
     /// The device's name.
     pub adapter: String,
+}
+
+/// Adds the time that something takes.
+fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
+    let started = Instant::now();
+    let out = work();
+    *total += started.elapsed();
+    out
 }
 
 /// Writes pictures of a trained scene.
@@ -79,31 +87,31 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
     let (mut files, mut milliseconds) = (Vec::new(), Vec::new());
     for camera in &cameras {
         let (w, h) = (camera.width as usize, camera.height as usize);
+        let mut rendered = Duration::ZERO;
         let mut path = |what: &str, ending: &str| {
             let path = config.output.join(format!("{}.{what}.{ending}", camera.name));
             files.push(path.clone());
             path
         };
         if config.what.contains(&What::Color) {
-            let started = Instant::now();
-            let frame = scene.render(camera)?;
-            milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
+            let frame = timed(&mut rendered, || scene.render(camera))?;
             image_io::save_png(&path("color", "png"), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
         }
         if config.what.contains(&What::Feature) {
-            let frame = scene.render_feature(camera)?;
+            let frame = timed(&mut rendered, || scene.render_feature(camera))?;
             let channels = [("feature.0", frame.channels(3, 4)), ("feature.1", frame.channels(4, 5)), ("feature.2", frame.channels(5, 6))];
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
         if config.what.contains(&What::Depth) {
-            let depth = scene.render_depth(camera)?;
+            let depth = timed(&mut rendered, || scene.render_depth(camera))?;
             exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
         }
         if config.what.contains(&What::Objects) {
-            let ids = scene.field(camera, None)?.owners(&scene.grid()?);
+            let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&scene.grid()?);
             let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
             image_io::save_png(&path("objects", "png"), picture)?;
         }
+        milliseconds.push(rendered.as_secs_f64() * 1e3);
         work.advance()?;
     }
     let (scene_root, gaussians, adapter) = (config.scene.clone(), scene.gaussians.len(), scene.engine.name());

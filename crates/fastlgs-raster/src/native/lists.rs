@@ -142,7 +142,7 @@ fn splats(projected: &[Projected]) -> Vec<Splat> {
 
 /// Drawn Gaussians by ascending depth; those of the same depth by their number.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
-    let depths: Vec<u32> = projected.iter().map(|p| p.depth).collect();
+    let depths: Vec<u32> = projected.par_iter().map(|p| p.depth).collect();
     let drawn = (0..).zip(&depths).filter(|(_, depth)| **depth != NOT_DRAWN).map(|(g, _)| g).collect();
     // The lower digit first: sorting by the higher one keeps the order of those that have it in common.
     [0, DIGIT].into_iter().fold(drawn, |order, shift| by_digit(&order, |g| (depths[g as usize] >> shift) as usize % (1 << DIGIT)))
@@ -224,4 +224,52 @@ fn places(bands: &[Band], count: usize) -> (Vec<u32>, Vec<u32>) {
         next[g] += 1;
     }
     (first, places)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::rng::Rng;
+
+    /// Gaussians that are nothing but a depth and a footprint.
+    fn of(depth: u32, footprint: Footprint) -> Projected {
+        Projected { splat: [[0.0; 4]; 3], depth, footprint }
+    }
+
+    #[test]
+    fn depths_are_sorted_and_ties_keep_their_order() {
+        let mut rng = Rng::new(3, "depths");
+        let mut depths = vec![0, NOT_DRAWN, 0xfff, 0x1000, NOT_DRAWN - 1, 0xfff, 0, 0x1001];
+        depths.extend((0..500).map(|_| (rng.uniform() * 300.0) as u32 * 0x777));
+        let projected: Vec<Projected> = depths.iter().map(|depth| of(*depth, [[0.0; 4]; 2])).collect();
+        let mut wanted: Vec<u32> = (0..depths.len() as u32).filter(|g| depths[*g as usize] != NOT_DRAWN).collect();
+        wanted.sort_by_key(|g| depths[*g as usize]);
+        assert_eq!(in_depth_order(&projected), wanted);
+        assert!(in_depth_order(&[]).is_empty());
+    }
+
+    #[test]
+    fn rows_of_tiles_hold_what_touches_them() {
+        // Nineteen rows of tiles, and ellipses from a fraction of one to more than all.
+        let view = View::new(&crate::tests::camera(90, 150), 4, 0);
+        let round = |x: f32, y: f32, r: f32| {
+            let rows = |y: f32| (y / 8.0).floor().clamp(0.0, 19.0);
+            [[x, y, 0.0, 1.0], [r * r, 0.0, rows(y - r), rows(y + r) + 1.0]]
+        };
+        let footprints = [round(40.0, 70.0, 65.0), round(3.0, 3.0, 1.5), round(88.0, 148.0, 30.0), round(45.0, 75.0, 300.0)];
+        let projected: Vec<Projected> = footprints.iter().zip([4, 3, 2, 1]).map(|(footprint, depth)| of(depth, *footprint)).collect();
+        let bands = bands(&view, &projected);
+        assert_eq!(bands.len(), 19);
+        for (row, band) in (0..).zip(&bands) {
+            let [first, end] = [2, 3].map(|k| footprints.map(|f| f[1][k] as u32));
+            let within = |g: &u32| (first[*g as usize]..end[*g as usize]).contains(&row);
+            for column in 0..view.tiles[0] {
+                let there = |g: &u32| within(g) && span(&footprints[*g as usize], row, view.tiles[0]).contains(&column);
+                let wanted: Vec<u32> = [3, 2, 1, 0].into_iter().filter(there).collect();
+                let found: Vec<u32> = band.tile(column as usize).iter().map(|place| band.gaussians[*place as usize]).collect();
+                assert_eq!(found, wanted, "row {row}, column {column}");
+            }
+        }
+        assert!(bands[18].tile(11).len() == 2 && bands[0].tile(0).len() == 2);
+    }
 }

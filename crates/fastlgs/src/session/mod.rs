@@ -105,12 +105,12 @@ impl Session {
         Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
     }
 
-    /// Renders colour and transmittance.
+    /// Renders colour and transmittance; features are 0.
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
         Ok(self.engine.render(self.view(camera), Channels::Color)?)
     }
 
-    /// Renders feature and transmittance.
+    /// Renders feature and transmittance; colour is 0.
     pub fn render_feature(&mut self, camera: &Camera) -> Result<Frame> {
         Ok(self.engine.render(self.view(camera), Channels::Feature)?)
     }
