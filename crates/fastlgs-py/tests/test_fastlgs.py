@@ -51,8 +51,6 @@ def test_questions_are_answered(scene):
     assert pointed.found and pointed.mask[y, x]
     several = scene.query(point=[[int(x), int(y)], (int(x), int(y))], view=view)
     assert [o["id"] for o in several.objects] == [o["id"] for o in pointed.objects]
-    feature = scene.render(view, "feature")
-    assert feature.shape == (height, width, 3) and feature.max() > 0.05
     # A picture of where the thing is.
     shown = scene.query(image=scene.render(view), view=view, false_alarms=1.0)
     assert shown.text == "image"
@@ -83,6 +81,8 @@ def test_cameras_of_either_convention_agree(scene):
     assert a.dtype == np.uint8 and np.abs(a.astype(int) - b).mean() < 0.5
     photo_like = scene.render(known.resized(80, 60), "depth")
     assert photo_like.shape == (60, 80) and (photo_like > 0).all()
+    feature = scene.render(view, "feature")
+    assert feature.shape == (known.size[1], known.size[0], 3) and feature.max() > 0.05
 
 
 def test_selections_are_exported(scene, tmp_path):

@@ -1,7 +1,6 @@
 //! Projection, depth order and tile lists.
 
-use super::AHEAD;
-use super::simd::{prefetch, vectorised};
+use super::simd::{AHEAD, prefetch, vectorised};
 use crate::cpu::{self, Footprint, NOT_DRAWN, Projected, Splat, span};
 use crate::view::View;
 use rayon::prelude::*;

@@ -19,7 +19,7 @@ use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{KEPT, pack};
 pub(crate) use lists::Lists;
 use rayon::prelude::*;
-use simd::SUMS;
+use simd::{AHEAD, SUMS};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
@@ -125,9 +125,6 @@ fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
         Channels::Both | Channels::Coupled => blended::<true, true>,
     }
 }
-
-/// So many Gaussians before it is their turn, what is known of them and lies anywhere is fetched.
-const AHEAD: usize = 8;
 
 impl CpuEngine {
     /// An engine without Gaussians.

@@ -11,6 +11,9 @@ pub fn madd<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
+/// So many Gaussians before it is their turn, what is known of them and lies anywhere is [`prefetch`]ed.
+pub const AHEAD: usize = 8;
+
 /// Has a value of up to two cache lines brought to the cache.
 #[inline(always)]
 pub fn prefetch<T>(value: &T) {
