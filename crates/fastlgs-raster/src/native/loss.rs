@@ -92,11 +92,19 @@ fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32]
 /// Values of a row that are worked on together.
 const LANES: usize = 16;
 
-/// The values of a row from place `first` on; beyond its end there are zeros.
+/// The values of some rows from place `first` on; beyond their ends there are zeros. (`map` over an array is a function of its own, which would not be
+/// compiled for the vectors of the one that calls it.)
 #[inline(always)]
-fn lanes(row: &[f32], first: usize) -> [f32; LANES] {
-    let rest = &row[first..];
-    rest.first_chunk().copied().unwrap_or_else(|| std::array::from_fn(|k| rest.get(k).copied().unwrap_or(0.0)))
+fn lanes<const ROWS: usize>(rows: [&[f32]; ROWS], first: usize) -> [[f32; LANES]; ROWS] {
+    let mut values = [[0.0; LANES]; ROWS];
+    for (values, row) in values.iter_mut().zip(rows) {
+        let rest = &row[first..];
+        match rest.first_chunk() {
+            Some(all) => *values = *all,
+            None => values[..rest.len()].copy_from_slice(rest),
+        }
+    }
+    values
 }
 
 /// Writes values to a row from place `first` on, as far as it goes.
@@ -212,7 +220,7 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
     let by_product = &mut by_product[..w];
     let mut sums = [0.0; LANES];
     for first in (0..w).step_by(LANES) {
-        let [mx, my, squares, xy] = [mx, my, squares, xy].map(|row| lanes(row, first));
+        let [mx, my, squares, xy] = lanes([mx, my, squares, xy], first);
         let mut by = [[0.0; LANES]; 3];
         for i in 0..LANES {
             let a = 2.0 * mx[i] * my[i] + 0.0001;
@@ -248,9 +256,8 @@ fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], 
     let mut totals = [[0.0; LANES]; 4];
     for first in (0..w).step_by(LANES) {
         // Beyond the row weights are 0.
-        let [x, y, weight] = [x, y, weight].map(|row| lanes(row, first));
-        let [rendered, transmittance] = [rendered, transmittance].map(|row| lanes(row, first));
-        let [by_mean, by_square, by_product] = [by_mean, by_square, by_product].map(|row| lanes(row, first));
+        let [x, y, weight, rendered, transmittance] = lanes([x, y, weight, rendered, transmittance], first);
+        let [by_mean, by_square, by_product] = lanes([by_mean, by_square, by_product], first);
         let mut values = [0.0; LANES];
         for i in 0..LANES {
             let sign = if x[i] > y[i] { 1.0 } else { 0.0 } - if x[i] < y[i] { 1.0 } else { 0.0 };
