@@ -1,6 +1,6 @@
 //! L1 + D-SSIM and its gradient, row by row.
 
-use super::Picture;
+use super::picture::Picture;
 use super::simd::{madd, vectorised};
 use crate::engine::Losses;
 use crate::view::Plane;

@@ -5,19 +5,21 @@ pub(crate) mod blend;
 mod ceiling;
 mod lists;
 mod loss;
+mod picture;
 mod simd;
 
 use crate::channels::Channels;
 use crate::cpu::{self, perturb_one};
 use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered};
-use crate::view::{Perturb, Step, TILE, View};
+use crate::view::{Perturb, Step, View};
 use crate::{Error, Result};
 use blend::{Blended, EDGE, Given, Job, Tile};
 use fastlgs_core::Shares;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{KEPT, pack};
 pub(crate) use lists::Lists;
+use picture::Picture;
 use rayon::prelude::*;
 use simd::{AHEAD, SUMS};
 use std::collections::{BTreeMap, HashMap};
@@ -25,37 +27,6 @@ use std::time::Instant;
 
 /// Bytes of lists that are kept where Gaussians do not move; further views make theirs anew.
 const CACHE_LIMIT: usize = 1 << 30;
-
-/// Planes padded to whole tiles, `[row][C][padded width]`, so that a row of tiles is one piece of memory.
-#[derive(Default)]
-pub struct Picture<const C: usize> {
-    width: usize,
-    data: Vec<f32>,
-}
-
-impl<const C: usize> Picture<C> {
-    fn prepare(&mut self, view: &View) {
-        self.width = (view.tiles[0] * TILE) as usize;
-        self.data.resize(C * view.padded_pixels(), 0.0);
-    }
-
-    fn row(&self, channel: usize, y: usize) -> &[f32] {
-        &self.data[(y * C + channel) * self.width..][..self.width]
-    }
-
-    fn rows_mut(&mut self) -> rayon::slice::ChunksExactMut<'_, f32> {
-        self.data.par_chunks_exact_mut(C * self.width)
-    }
-
-    /// The pixels of a tile.
-    fn tile(&self, channel: usize, job: &Job) -> Tile {
-        let mut tile = blend::EMPTY;
-        for (y, row) in tile.chunks_exact_mut(TILE as usize).enumerate() {
-            row.copy_from_slice(&self.row(channel, job.y as usize + y)[job.x as usize..][..TILE as usize]);
-        }
-        tile
-    }
-}
 
 /// [`Engine`] on the processor.
 #[derive(Default)]

@@ -6,7 +6,7 @@ use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{FreeSpace, Target, TargetImage, Targets, init, pack};
+use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -45,7 +45,7 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
 
 /// What the views of `cameras` look through, where density control asks for it.
 pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], first: &Gaussians) -> Result<FreeSpace> {
-    if config.strategy != Strategy::Classic || config.iterations() == 0 {
+    if cameras.len() >= FEW_VIEWS || config.strategy != Strategy::Classic || config.iterations() == 0 {
         return Ok(FreeSpace::default());
     }
     Ok(FreeSpace::of(cameras, &first.means, &folder.points()?))
