@@ -71,6 +71,22 @@ impl Gaussians {
         self.object_ids.push(0);
     }
 
+    /// Appends another scene.
+    ///
+    /// # Panics
+    /// If its SH degree is another.
+    pub fn append(&mut self, mut other: Self) {
+        assert_eq!(self.sh_degree, other.sh_degree, "scenes of one SH degree");
+        self.means.append(&mut other.means);
+        self.log_scales.append(&mut other.log_scales);
+        self.rotations.append(&mut other.rotations);
+        self.opacity_logits.append(&mut other.opacity_logits);
+        self.sh_dc.append(&mut other.sh_dc);
+        self.sh_rest.append(&mut other.sh_rest);
+        self.features.append(&mut other.features);
+        self.object_ids.append(&mut other.object_ids);
+    }
+
     /// The SH coefficients of Gaussian `i` above degree 0.
     pub fn rest(&self, i: usize) -> &[Vec3] {
         let k = rest_len(self.sh_degree);
@@ -191,5 +207,8 @@ mod tests {
         assert_eq!(round.with_sh_degree(1).with_sh_degree(0), g);
         assert!((sigmoid(g.opacity_logits[0]) - 0.25).abs() < 1e-6);
         assert_eq!(g.select(&[1]).object_ids, vec![7]);
+        let mut halves = g.clone().with_sh_degree(2).select(&[0]);
+        halves.append(g.clone().with_sh_degree(2).select(&[1]));
+        assert_eq!(halves.with_sh_degree(0), g);
     }
 }

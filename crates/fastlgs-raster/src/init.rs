@@ -1,11 +1,11 @@
-//! First Gaussians: from points, or at worst at random in what the cameras see together.
+//! First Gaussians: from points, or at worst at random in what the cameras see together, and a backdrop.
 
 use crate::Result;
 use crate::target::{Target, Targets};
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
-use glam::Vec3;
+use glam::{Mat3, Vec2, Vec3};
 use kiddo::{KdTree, SquaredEuclidean};
 use std::collections::BTreeSet;
 
@@ -57,7 +57,7 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
                 }
             }
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
-            let ray = camera.ray(glam::Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
+            let ray = camera.ray(Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
             let [r, g, b, _] = image.color[pixel[1] * width + pixel[0]].to_le_bytes();
             out.push(SfmPoint { position: inverse.transform_point3(ray * depth), color: [r, g, b], seen_by: Vec::new() });
         }
@@ -65,12 +65,66 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
     Ok(out)
 }
 
+/// Cells of a backdrop along the longer side of a photo.
+const CELLS: u32 = 30;
+/// Share of the points that may lie beyond a backdrop.
+const BEYOND: f32 = 0.02;
+/// Opacity of a backdrop: what is solid leaves training nothing to explain.
+const SOLID: f32 = 0.9;
+
+/// A backdrop for few photos: at most `most` solid Gaussians on a sphere around the cameras' common focus that holds all but a few of `points`, coloured as
+/// photos are wherever these show no point nearby.
+///
+/// What few photos show can stand anywhere along their rays, and training makes a haze in mid-air of what it finds nothing for, which hides the scene from
+/// other places. Behind everything it hides nothing.
+///
+/// # Errors
+/// When a picture cannot be read.
+pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gaussians> {
+    let focus = common_focus(&views.cameras);
+    let mut distances: Vec<f32> = points.iter().map(|point| point.position.distance(focus)).collect();
+    distances.sort_by(f32::total_cmp);
+    let farthest_camera = views.cameras.iter().map(|camera| camera.centre().distance(focus)).fold(0.0, f32::max);
+    let radius =
+        distances.get(((1.0 - BEYOND) * distances.len() as f32) as usize).map_or(farthest_camera, |most| most.max(farthest_camera));
+    let mut scene = Gaussians::default();
+    for id in 0..views.len() {
+        let Target { camera, image, .. } = views.get(id)?;
+        let cells = camera.shrunk_to(CELLS);
+        let [width, height] = [cells.width, cells.height].map(|side| side as usize);
+        let mut known = vec![false; width * height];
+        // What earlier photos added counts, too.
+        let shown = points.iter().map(|point| point.position).chain(scene.means.iter().copied());
+        for (cell, _) in shown.filter_map(|place| cells.see(place)) {
+            let beside = |at: usize, side: usize| at.saturating_sub(1)..(at + 2).min(side);
+            beside(cell / width, height).for_each(|y| beside(cell % width, width).for_each(|x| known[y * width + x] = true));
+        }
+        let turn = Mat3::from_mat4(camera.world_to_camera).transpose();
+        let from = camera.centre() - focus;
+        for cell in (0..width * height).filter(|cell| !known[*cell]) {
+            let middle = Vec2::new((cell % width) as f32 + 0.5, (cell / width) as f32 + 0.5);
+            let ray = turn * cells.ray(middle).normalize();
+            // Where the ray leaves the sphere.
+            let towards = from.dot(ray);
+            let way = (towards * towards + radius * radius - from.length_squared()).max(0.0).sqrt() - towards;
+            let [x, y] = [middle.x * camera.width as f32 / cells.width as f32, middle.y * camera.height as f32 / cells.height as f32];
+            let [r, g, b, counts] = image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
+            // Of one camera alone the focus may be its own place.
+            if counts == 255 && way > 0.0 {
+                scene.push_sphere(camera.centre() + way * ray, way / cells.fx, SOLID, [r, g, b].map(|c| f32::from(c) / 255.0));
+            }
+        }
+    }
+    let kept: Vec<usize> = (0..scene.len().min(most)).map(|k| k * scene.len() / most.min(scene.len())).collect();
+    Ok(scene.select(&kept))
+}
+
 /// The point nearest to all viewing axes (least squares).
 pub fn common_focus(cameras: &[Camera]) -> Vec3 {
-    let (mut a, mut b) = (glam::Mat3::ZERO, Vec3::ZERO);
+    let (mut a, mut b) = (Mat3::ZERO, Vec3::ZERO);
     for camera in cameras {
         let d = camera.forward();
-        let across = glam::Mat3::IDENTITY - glam::Mat3::from_cols(d * d.x, d * d.y, d * d.z);
+        let across = Mat3::IDENTITY - Mat3::from_cols(d * d.x, d * d.y, d * d.z);
         a += across;
         b += across * camera.centre();
     }
@@ -82,6 +136,7 @@ pub fn common_focus(cameras: &[Camera]) -> Vec3 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::TargetImage;
 
     #[test]
     fn points_in_one_place_are_one() {
@@ -100,5 +155,45 @@ mod tests {
         let eyes = [Vec3::new(4.0, 0.0, 0.0), Vec3::new(0.0, 1.0, -5.0), Vec3::new(-3.0, 0.5, 3.0)];
         let cameras = eyes.map(|e| Camera::look_at("c", e, target, Vec3::Y, 64, 48, 0.8));
         assert!((common_focus(&cameras) - target).length() < 1e-3);
+    }
+
+    /// Four photos of what lies around the origin: grey, but for their blackened right third.
+    fn photos() -> Targets {
+        let eyes = [Vec3::X, Vec3::Z, -Vec3::X, -Vec3::Z].map(|eye| 4.0 * eye);
+        let target = |(k, eye): (usize, &Vec3)| {
+            let camera = Camera::look_at(&k.to_string(), *eye, Vec3::ZERO, Vec3::Y, 60, 40, 0.8);
+            let color = (0..60 * 40).map(|pixel| crate::pack([50 + k as u8, 100, 200], pixel % 60 < 40)).collect();
+            Target { camera, image: TargetImage { size: [60, 40], color, feature: Vec::new() }, gain: [1.0; 3] }
+        };
+        eyes.iter().enumerate().map(target).collect::<Vec<_>>().into()
+    }
+
+    #[test]
+    fn a_backdrop_stands_behind_all_where_photos_show_no_points() {
+        let views = photos();
+        // A ball of radius 1, and one point that is far away and wrong.
+        let mut points: Vec<SfmPoint> = (0..200)
+            .map(|k| {
+                let (up, around) = (k as f32 / 100.0 - 1.0, 2.4 * k as f32);
+                let across = (1.0 - up * up).max(0.0).sqrt();
+                SfmPoint { position: Vec3::new(across * around.cos(), up, across * around.sin()), color: [0; 3], seen_by: Vec::new() }
+            })
+            .collect();
+        points.push(SfmPoint { position: Vec3::splat(900.0), color: [0; 3], seen_by: Vec::new() });
+        let scene = backdrop(&views, &points, usize::MAX).unwrap();
+        assert!(scene.len() > 500, "{} Gaussians", scene.len());
+        for (mean, color) in scene.means.iter().zip(&scene.sh_dc) {
+            assert!((mean.length() - 4.0).abs() < 1e-3, "on the sphere that holds cameras and points: {mean}");
+            let grey = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
+            assert!((50.0..54.0).contains(&grey[0]) && grey[1..] == [100.0, 200.0], "{grey:?}");
+        }
+        let first = &views.cameras[0].shrunk_to(CELLS);
+        let shown: Vec<usize> = scene.means.iter().filter_map(|mean| first.see(*mean)).map(|(cell, _)| cell).collect();
+        assert!(shown.iter().all(|cell| cell % first.width as usize != 15 || cell / first.width as usize != 10), "the ball is known");
+        let own = 20 * 20 - shown.iter().filter(|cell| *cell % 30 < 20).count();
+        assert!(own < 200, "all else that counts is covered: {own} cells are not");
+        assert!(backdrop(&views, &points, 40).unwrap().len() == 40);
+        assert!(backdrop(&views, &[], usize::MAX).unwrap().len() > scene.len(), "no points are needed");
+        assert_eq!(backdrop(&views, &points, 0).unwrap().len(), 0);
     }
 }

@@ -12,10 +12,10 @@ use std::sync::Arc;
 
 /// Share of the distance to its neighbours that a Gaussian has at first with MCMC.
 const MCMC_SCALE: f32 = 0.1;
-/// Points from which training starts; where fewer are known, random ones make up for the rest.
+/// What training starts from; where less is known, random points make up for the rest.
 const ENOUGH: usize = 5000;
 
-/// The given PLY, else the scene's points, with random ones where these are too few.
+/// The given PLY, else the scene's points: with a backdrop where photos are few, and random ones where all these are too few.
 pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
     if let Some(path) = &config.init_ply {
         let first = ply::read(path)?;
@@ -26,20 +26,23 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
-    let missing = ENOUGH.saturating_sub(points.len());
+    // More than half the budget would leave no room to grow where it matters.
+    let most = (config.budget(views.pixels()).most() / 2).max(1);
+    let behind = if views.len() < FEW_VIEWS { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
+    let missing = ENOUGH.saturating_sub(points.len() + behind.len());
     if missing > 0 {
         run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
         points.extend(init::random_points(views, missing, &mut rng)?);
     }
-    // More points than half the budget would leave no room to grow where it matters.
     rng.shuffle(&mut points);
-    points.truncate((config.budget(views.pixels()).most() / 2).max(1));
+    points.truncate(most - behind.len());
     let mut first = init::from_points(&points);
     if config.strategy == Strategy::Mcmc {
         // As its authors start: what is small and solid is moved, rather than grown.
         first.opacity_logits.fill(0.0);
         first.log_scales.iter_mut().for_each(|s| *s += MCMC_SCALE.ln());
     }
+    first.append(behind);
     Ok(first)
 }
 
