@@ -65,6 +65,16 @@ fn transparent_and_masked_pixels_do_not_count() {
     assert_eq!(report["background"], serde_json::json!([0.0, 1.0, 0.0]));
     assert_eq!(report["curve"][0]["iteration"], 40);
     fails(&["train", text(&scene), "--iterations", "1", "--background", "learn"], &["001.png", "transparent"]);
+
+    // Few photos have a backdrop, but not things that were cut out.
+    let solid = || {
+        json(&["train", text(&scene), "--iterations", "1", "--device", "cpu"]);
+        let opacities = fastlgs_core::ply::read(&scene.join("scene.ply")).expect("a scene").opacity_logits;
+        opacities.iter().filter(|logit| **logit > 1.5).count()
+    };
+    assert_eq!(solid(), 0);
+    std::fs::remove_file(scene.join("alpha/001.png.png")).expect("an alpha channel");
+    assert!(solid() > 20);
 }
 
 /// The lens bends the photos, and neither the poses nor anything else says so.

@@ -28,7 +28,9 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     let mut points = folder.points()?;
     // More than half the budget would leave no room to grow where it matters.
     let most = (config.budget(views.pixels()).most() / 2).max(1);
-    let behind = if views.len() < FEW_VIEWS { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
+    // There is nothing behind what was cut out.
+    let cut_out = views.cameras.iter().any(|camera| folder.alpha_path(&camera.name).is_file());
+    let behind = if views.len() < FEW_VIEWS && !cut_out { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
     let missing = ENOUGH.saturating_sub(points.len() + behind.len());
     if missing > 0 {
         run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
