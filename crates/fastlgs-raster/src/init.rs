@@ -69,11 +69,13 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
 const CELLS: u32 = 30;
 /// Share of the points that may lie beyond a backdrop.
 const BEYOND: f32 = 0.02;
+/// How many times as far from the focus as the farthest camera it is at least: no camera that looks outwards has it before its lens.
+const ROOM: f32 = 2.0;
 /// Opacity of a backdrop: what is solid leaves training nothing to explain.
 const SOLID: f32 = 0.9;
 
-/// A backdrop for few photos: at most `most` solid Gaussians on a sphere around the cameras' common focus that holds all but a few of `points`, coloured as
-/// photos are wherever these show no point nearby.
+/// A backdrop for few photos: at most `most` solid Gaussians on a sphere around the cameras' common focus that holds all cameras and all but a few of
+/// `points`, coloured as photos are wherever these show no point nearby.
 ///
 /// What few photos show can stand anywhere along their rays, and training makes a haze in mid-air of what it finds nothing for, which hides the scene from
 /// other places. Behind everything it hides nothing.
@@ -84,9 +86,8 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
     let focus = common_focus(&views.cameras);
     let mut distances: Vec<f32> = points.iter().map(|point| point.position.distance(focus)).collect();
     distances.sort_by(f32::total_cmp);
-    let farthest_camera = views.cameras.iter().map(|camera| camera.centre().distance(focus)).fold(0.0, f32::max);
-    let radius =
-        distances.get(((1.0 - BEYOND) * distances.len() as f32) as usize).map_or(farthest_camera, |most| most.max(farthest_camera));
+    let room = ROOM * views.cameras.iter().map(|camera| camera.centre().distance(focus)).fold(0.0, f32::max);
+    let radius = distances.get(((1.0 - BEYOND) * distances.len() as f32) as usize).map_or(room, |farthest| farthest.max(room));
     let mut scene = Gaussians::default();
     for id in 0..views.len() {
         let Target { camera, image, .. } = views.get(id)?;
@@ -183,7 +184,7 @@ mod tests {
         let scene = backdrop(&views, &points, usize::MAX).unwrap();
         assert!(scene.len() > 500, "{} Gaussians", scene.len());
         for (mean, color) in scene.means.iter().zip(&scene.sh_dc) {
-            assert!((mean.length() - 4.0).abs() < 1e-3, "on the sphere that holds cameras and points: {mean}");
+            assert!((mean.length() - 8.0).abs() < 1e-3, "on the sphere that holds cameras, with room, and points: {mean}");
             let grey = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
             assert!((50.0..54.0).contains(&grey[0]) && grey[1..] == [100.0, 200.0], "{grey:?}");
         }
