@@ -77,7 +77,7 @@ impl Free {
 }
 
 /// Numbers of the pixels up to `reach` beside a pixel, itself included.
-fn around(camera: &Camera, pixel: usize, reach: usize) -> impl Iterator<Item = usize> {
+pub(crate) fn around(camera: &Camera, pixel: usize, reach: usize) -> impl Iterator<Item = usize> {
     let [width, height] = [camera.width, camera.height].map(|side| side as usize);
     let beside = |at: usize, side: usize| at.saturating_sub(reach)..(at + reach + 1).min(side);
     let (columns, rows) = (beside(pixel % width, width), beside(pixel / width, height));

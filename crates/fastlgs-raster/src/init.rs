@@ -1,6 +1,7 @@
 //! First Gaussians: from points, or at worst at random in what the cameras see together, and a backdrop.
 
 use crate::Result;
+use crate::floaters::around;
 use crate::target::{Target, Targets};
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
@@ -97,8 +98,7 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
         // What earlier photos added counts, too.
         let shown = points.iter().map(|point| point.position).chain(scene.means.iter().copied());
         for (cell, _) in shown.filter_map(|place| cells.see(place)) {
-            let beside = |at: usize, side: usize| at.saturating_sub(1)..(at + 2).min(side);
-            beside(cell / width, height).for_each(|y| beside(cell % width, width).for_each(|x| known[y * width + x] = true));
+            around(&cells, cell, 1).for_each(|at| known[at] = true);
         }
         let turn = Mat3::from_mat4(camera.world_to_camera).transpose();
         let from = camera.centre() - focus;
@@ -110,7 +110,7 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
             let way = (towards * towards + radius * radius - from.length_squared()).max(0.0).sqrt() - towards;
             let [x, y] = [middle.x * camera.width as f32 / cells.width as f32, middle.y * camera.height as f32 / cells.height as f32];
             let [r, g, b, counts] = image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
-            // Of one camera alone the focus may be its own place.
+            // Where all cameras stand in one place and no points are known there is no sphere.
             if counts == 255 && way > 0.0 {
                 scene.push_sphere(camera.centre() + way * ray, way / cells.fx, SOLID, [r, g, b].map(|c| f32::from(c) / 255.0));
             }
@@ -158,7 +158,7 @@ mod tests {
         assert!((common_focus(&cameras) - target).length() < 1e-3);
     }
 
-    /// Four photos of what lies around the origin: grey, but for their blackened right third.
+    /// Four photos of what lies around the origin, of nearly one colour, but for their blackened right third.
     fn photos() -> Targets {
         let eyes = [Vec3::X, Vec3::Z, -Vec3::X, -Vec3::Z].map(|eye| 4.0 * eye);
         let target = |(k, eye): (usize, &Vec3)| {
@@ -185,8 +185,8 @@ mod tests {
         assert!(scene.len() > 500, "{} Gaussians", scene.len());
         for (mean, color) in scene.means.iter().zip(&scene.sh_dc) {
             assert!((mean.length() - 8.0).abs() < 1e-3, "on the sphere that holds cameras, with room, and points: {mean}");
-            let grey = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
-            assert!((50.0..54.0).contains(&grey[0]) && grey[1..] == [100.0, 200.0], "{grey:?}");
+            let shown = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
+            assert!((50.0..54.0).contains(&shown[0]) && shown[1..] == [100.0, 200.0], "{shown:?}");
         }
         let first = &views.cameras[0].shrunk_to(CELLS);
         let shown: Vec<usize> = scene.means.iter().filter_map(|mean| first.see(*mean)).map(|(cell, _)| cell).collect();
