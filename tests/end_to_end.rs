@@ -11,7 +11,8 @@ mod run;
 mod toy_models;
 
 use fastlgs_core::label_map::LabelMap;
-use fastlgs_core::ply;
+use fastlgs_core::{SceneFolder, ply};
+use fastlgs_grid::Grid;
 use run::{coffee_iou, copy_folder, fails, fastlgs, fixture, json, text};
 use serde_json::Value;
 use std::path::Path;
@@ -176,7 +177,7 @@ fn onnx_exports_of_sam_and_clip() {
     // Embeddings of another encoder are not compared.
     let manifest = std::fs::read_to_string(scene.join("scene.json")).expect("the manifest");
     std::fs::write(scene.join("scene.json"), manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\"")).expect("a file");
-    fails(&["query", text(&scene), "red"], &["3 numbers", "another encoder"]);
+    fails(&["query", text(&scene), "red"], &["another encoder", "--iterations 0"]);
     std::fs::write(scene.join("scene.json"), manifest).expect("a file");
     // A scene remembers its models; other files in their place are noticed.
     std::fs::write(&words, b"short").expect("a file");
@@ -286,6 +287,15 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     std::fs::write(copy.join("scene.ply"), &ply).expect("a file");
     std::fs::write(copy.join("grid.safetensors"), &cut[..cut.len() / 2]).expect("a file");
     fails(&["query", text(&copy), "cat"], &["grid.safetensors"]);
+    // Objects that an earlier version of the encoder embedded, and the mend that is named.
+    std::fs::write(copy.join("grid.safetensors"), &cut).expect("a file");
+    let folder = SceneFolder::new(&copy);
+    let grid = Grid::load(&folder).expect("the grid");
+    assert!(grid.encoder.starts_with("offline "), "{}", grid.encoder);
+    Grid { encoder: "offline 1".to_owned(), ..grid }.save(&folder).expect("a file");
+    fails(&["query", text(&copy), "cat"], &["another encoder", "--iterations 0"]);
+    json(&["train", text(&copy), "--init-ply", text(&copy.join("scene.ply")), "--iterations", "0"]);
+    json(&["query", text(&copy), "cat"]);
     fails(&["info", "--device", "nonsense", text(&at("nowhere"))], &["nowhere"]);
     fails(&["render", text(&f.scene), "--device", "nonsense", "-o", text(&at("r"))], &["nonsense"]);
     assert_eq!(fastlgs(&["query"]).status.code(), Some(2), "wrong usage");

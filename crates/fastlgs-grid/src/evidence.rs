@@ -2,9 +2,10 @@
 //! (`embeddings.safetensors`).
 
 use crate::Result;
+use crate::grid::ENCODER;
 use crate::mapping::{Correspondences, Mask};
-use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Error, SceneFolder};
+use fastlgs_core::scene_folder::{load_tensors, note_of_tensors, parse_tensors, save_noted_tensors, save_tensors};
+use fastlgs_core::{Error, SceneFolder, fs};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -49,11 +50,11 @@ pub fn load_pairs(folder: &SceneFolder, masks: &[Mask]) -> Result<Correspondence
     Ok(rows.1.chunks_exact(5).filter_map(pair).collect())
 }
 
-/// Writes what describes each mask: view, label, area, embedding, histogram.
+/// Writes what describes each mask: view, label, area, embedding, histogram; and what made the embeddings, as its user calls it.
 ///
 /// # Errors
 /// The system's refusal.
-pub fn save_masks(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
+pub fn save_masks(folder: &SceneFolder, masks: &[Mask], encoder: &str) -> Result<()> {
     let n = masks.len();
     let width = |f: fn(&Mask) -> &Vec<f32>| masks.first().map_or(0, |m| f(m).len());
     let places: Vec<f32> = masks.iter().flat_map(|m| [m.view as f32, f32::from(m.label), m.area]).collect();
@@ -64,16 +65,17 @@ pub fn save_masks(folder: &SceneFolder, masks: &[Mask]) -> Result<()> {
         ("embeddings", vec![n, width(|m| &m.embedding)], &embeddings),
         ("histograms", vec![n, width(|m| &m.histogram)], &histograms),
     ];
-    Ok(save_tensors(&masks_path(folder), &tensors)?)
+    Ok(save_noted_tensors(&masks_path(folder), &tensors, Some((ENCODER, encoder)))?)
 }
 
-/// Reads what [`save_masks`] wrote.
+/// Reads what [`save_masks`] wrote: the masks, and what made their embeddings; empty where nobody knows.
 ///
 /// # Errors
 /// Missing or damaged file.
-pub fn load_masks(folder: &SceneFolder) -> Result<Vec<Mask>> {
+pub fn load_masks(folder: &SceneFolder) -> Result<(Vec<Mask>, String)> {
     let path = masks_path(folder);
-    let tensors = load_tensors(&path)?;
+    let file = fs::read(&path)?;
+    let (tensors, encoder) = (parse_tensors(&path, &file)?, note_of_tensors(&path, &file, ENCODER)?);
     let get = |name: &str| {
         let found = tensors.get(name).filter(|t| t.0.len() == 2);
         found.ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing; run 'fastlgs preprocess' again")))
@@ -94,7 +96,7 @@ pub fn load_masks(folder: &SceneFolder) -> Result<Vec<Mask>> {
             histogram: row(histograms, i),
         }
     });
-    Ok(masks.collect())
+    Ok((masks.collect(), encoder))
 }
 
 #[cfg(test)]
@@ -106,9 +108,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let mask = |view, label| Mask { view, label, area: 0.25, embedding: vec![0.5, 0.25], histogram: vec![1.0, 0.0, 0.0] };
-        save_masks(&folder, &[mask(0, 1), mask(3, 2)]).unwrap();
-        let masks = load_masks(&folder).unwrap();
-        assert_eq!((masks.len(), masks[1].view, masks[1].label), (2, 3, 2));
+        save_masks(&folder, &[mask(0, 1), mask(3, 2)], "offline 3").unwrap();
+        let (masks, encoder) = load_masks(&folder).unwrap();
+        assert_eq!((masks.len(), masks[1].view, masks[1].label, encoder.as_str()), (2, 3, 2, "offline 3"));
         assert_eq!(masks[0].histogram, [1.0, 0.0, 0.0]);
         // The second names a mask that is too small to be described.
         save_pairs(&folder, &Pairs::from([([(3, 2), (0, 1)], 7), ([(3, 9), (0, 1)], 2)])).unwrap();

@@ -3,7 +3,7 @@
 use crate::Result;
 use crate::mapping::Mask;
 use crate::overlaps::Overlaps;
-use fastlgs_core::scene_folder::{parse_tensors, save_tensors};
+use fastlgs_core::scene_folder::{note_of_tensors, parse_tensors, save_noted_tensors};
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -37,6 +37,8 @@ pub struct Grid {
     pub overlaps: Overlaps,
     /// By id that Gaussians can have: the pixels that those of this id show in all views together, in pictures; empty where nobody knows.
     pub shown: Vec<f32>,
+    /// What made the embeddings, as its user calls it; empty where nobody knows.
+    pub encoder: String,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -52,6 +54,9 @@ struct Row {
     first: usize,
     count: usize,
 }
+
+/// What files of embeddings call the note that says what made them.
+pub(crate) const ENCODER: &str = "encoder";
 
 /// Share of an object that lies in another one of which it is a part.
 pub const PART: f32 = 0.7;
@@ -185,7 +190,7 @@ impl Grid {
         let surface = self.surface();
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &surface, 1.0);
         let shown = overlaps.sums(objects.len(), &ids, &surface);
-        (Self { objects, overlaps, shown }, ids)
+        (Self { objects, overlaps, shown, encoder: self.encoder.clone() }, ids)
     }
 
     /// Code of an object, or of the smallest one that a Gaussian of this id lies in; zero where there is none.
@@ -227,7 +232,7 @@ impl Grid {
             ("overlaps", vec![overlaps.len()], &overlaps),
             ("shown", vec![self.shown.len()], &self.shown),
         ];
-        save_tensors(&folder.root.join("grid.safetensors"), &tensors)?;
+        save_noted_tensors(&folder.root.join("grid.safetensors"), &tensors, Some((ENCODER, &self.encoder)))?;
         Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
     }
 
@@ -248,6 +253,7 @@ impl Grid {
         let rows: Vec<Row> =
             serde_json::from_slice(rows).map_err(|e| Error::format(root.join("grid.json"), format!("not the expected JSON: {e}")))?;
         let path = root.join("grid.safetensors");
+        let encoder = note_of_tensors(&path, tensors, ENCODER)?;
         let tensors = parse_tensors(&path, tensors)?;
         let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing")));
         let (embeddings, areas) = (get("embeddings")?, get("areas")?);
@@ -279,7 +285,7 @@ impl Grid {
         let are_lists = overlaps.iter().all(known) && overlaps.split_inclusive(|id| *id == 0.0).all(falls);
         let lists = overlaps.split(|id| *id == 0.0).filter(|list| !list.is_empty());
         let lists = lists.map(|list| list.iter().map(|id| *id as u16).collect()).collect();
-        let grid = Self { objects, overlaps: Overlaps(lists), shown: values("shown").to_vec() };
+        let grid = Self { objects, overlaps: Overlaps(lists), shown: values("shown").to_vec(), encoder };
         let are_counts = grid.shown.iter().all(|shown| *shown >= 0.0);
         if !are_lists || !are_counts || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
             return Err(Error::format(&path, "its overlaps do not fit the objects in grid.json; train the scene again").into());

@@ -305,23 +305,27 @@ pub fn words<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32]
     if manifest.encoder == calibrations::OFFLINE { appearance::words(embedding) } else { embedding }
 }
 
-/// Whether an embedding of a scene is of this version of its encoder, as far as its length tells.
-pub(crate) fn is_current(manifest: &Manifest, embedding: &[f32]) -> bool {
-    manifest.encoder != calibrations::OFFLINE || embedding.len() == conse::LENGTH
+/// Whether `embeddings` that `encoder` made, if anybody knows, can be compared with those of a scene's encoder.
+pub(crate) fn is_current<'a>(manifest: &Manifest, encoder: &str, mut embeddings: impl Iterator<Item = &'a Vec<f32>>) -> bool {
+    // Earlier versions did not say; of the offline encoder's the length tells.
+    if encoder.is_empty() {
+        manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
+    } else {
+        encoder == identity_of(manifest)
+    }
 }
 
-/// Fails where the objects of a scene of the offline encoder were embedded by another one or an earlier version, with which nothing of this one can
-/// be compared.
+/// Fails where the objects of a scene were embedded by another encoder than its own or an earlier version of it, with which nothing of this one can be
+/// compared.
 ///
 /// # Errors
 /// One sentence with the mend.
 pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
-    if let Some(odd) = grid.objects.iter().flat_map(|o| &o.embeddings).find(|e| !is_current(manifest, e)) {
-        let (root, own) = (folder.root.display(), odd.len());
+    if !is_current(manifest, &grid.encoder, grid.objects.iter().flat_map(|o| &o.embeddings)) {
+        let root = folder.root.display();
         bail!(
-            "{root}: its objects' embeddings have {own} numbers, those of its encoder {}: they are of another encoder, or an earlier version of it; \
-             'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians",
-            conse::LENGTH
+            "{root}: its objects were embedded by another encoder than the scene's, or by an earlier version of it; \
+             'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians"
         );
     }
     Ok(())
@@ -370,7 +374,7 @@ struct Recorded {
 impl Recorded {
     fn load(folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
         let views = manifest.training(&folder.cameras()?);
-        Ok(Self { folder: folder.clone(), views, masks: evidence::load_masks(folder)? })
+        Ok(Self { folder: folder.clone(), views, masks: evidence::load_masks(folder)?.0 })
     }
 }
 

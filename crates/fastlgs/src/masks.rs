@@ -34,9 +34,9 @@ pub fn whole(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
 pub fn evidence(folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<Vec<Mask>> {
     let manifest = folder.manifest()?;
     if evidence::masks_path(folder).is_file() {
-        let masks = evidence::load_masks(folder)?;
+        let (masks, encoder) = evidence::load_masks(folder)?;
         // An earlier version may have left them.
-        if masks.iter().all(|mask| eyes::is_current(&manifest, &mask.embedding)) {
+        if eyes::is_current(&manifest, &encoder, masks.iter().map(|mask| &mask.embedding)) {
             return Ok(masks);
         }
     }
@@ -70,6 +70,6 @@ pub(crate) fn describe(
         Ok(found.into_iter().map(|mask| Mask { view, ..mask }).collect())
     };
     let found: Vec<Mask> = training.par_iter().enumerate().map(of_view).collect::<Result<Vec<_>>>()?.concat();
-    evidence::save_masks(folder, &found)?;
+    evidence::save_masks(folder, &found, identity.unwrap_or_default())?;
     Ok(found)
 }

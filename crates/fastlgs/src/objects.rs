@@ -51,7 +51,8 @@ pub fn by_algorithm_1(folder: &SceneFolder, training: &[Camera], config: &PaperC
         let map = LabelMap { labels: labels.labels.iter().map(|l| table[usize::from(*l)]).collect(), ..labels };
         map.save(&folder.objects_path(&camera.name))?;
     }
-    Ok(Grid::build(&masks, &object_of, codes::lattice(usize::from(count), run.seed)))
+    let encoder = eyes::identity_of(&manifest);
+    Ok(Grid { encoder, ..Grid::build(&masks, &object_of, codes::lattice(usize::from(count), run.seed)) })
 }
 
 /// What is there while object maps do not belong to the scene's table of objects.
@@ -178,7 +179,7 @@ pub fn by_consensus(
     for (object, (parent, support)) in grid.objects.iter_mut().zip(chosen.parents.iter().zip(&chosen.support)) {
         (object.parent, object.support, object.views) = (*parent, support.iou, support.areas.len());
     }
-    (grid.overlaps, grid.shown) = (chosen.overlaps, chosen.shown);
+    (grid.overlaps, grid.shown, grid.encoder) = (chosen.overlaps, chosen.shown, eyes::identity_of(&folder.manifest()?));
     grid.set_codes(scene);
     Ok((grid, summary))
 }
