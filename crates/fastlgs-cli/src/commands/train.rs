@@ -41,7 +41,7 @@ pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcom
         return report::tell(common, &train::train(&args.config, &common.run(console))?, words::train);
     };
     let config = &args.config;
-    let live = Live::new(config.iterations(), config.antialias, config.background.color);
+    let live = Live::new(config.iterations(), config.antialias, config.background.unwrap_or_default().color);
     let server = Server::start(&SceneFolder::open(&config.scene)?, bind, Some(Arc::new(live)))?;
     // Standard output is the report's.
     eprintln!("watch it at {}", server.url);

@@ -128,13 +128,16 @@ pub struct Background {
 }
 
 impl Background {
+    /// Learned, from grey on.
+    pub(super) const LEARNED: Self = Self { color: [0.5; 3], learn: true };
+
     /// Parses `0,0.5,1` or `learn`.
     ///
     /// # Errors
     /// Anything else.
     pub fn parse(text: &str) -> Result<Self, String> {
         if text == "learn" {
-            return Ok(Self { color: [0.5; 3], learn: true });
+            return Ok(Self::LEARNED);
         }
         let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
         let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1"))?;
@@ -208,9 +211,10 @@ pub struct Config {
     /// Anti-aliasing by the 2-D Mip filter.
     #[cfg_attr(feature = "clap", arg(long))]
     pub antialias: bool,
-    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`.
-    #[cfg_attr(feature = "clap", arg(long, default_value = "0,0,0", value_parser = Background::parse))]
-    pub background: Background,
+    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`; by default that of the scene's last training with --init-ply,
+    /// else black, but learned where fewer than 25 photos are trained on and none is transparent.
+    #[cfg_attr(feature = "clap", arg(long, value_parser = Background::parse))]
+    pub background: Option<Background>,
     /// Learn an affine exposure for each training photo.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t, num_args = 0..=1, default_missing_value = "on", require_equals = true))]
     pub exposure: Exposures,
@@ -271,7 +275,7 @@ impl Default for Config {
             strategy: Strategy::default(),
             sh_degree: None,
             antialias: false,
-            background: Background::default(),
+            background: None,
             exposure: Exposures::default(),
             align: Align::default(),
             freeze: false,

@@ -61,8 +61,10 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     };
     let codes = known.as_ref().filter(|_| by_descent);
     let light = preprocess::Brightness::of(&manifest);
-    let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &config.background, |name| light.gain(name));
-    let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &config.background, |_| [1.0; 3]);
+    let background = start::background(config, &folder, &manifest, &training);
+    let config = &Config { background: Some(background), ..config.clone() };
+    let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &background, |name| light.gain(name));
+    let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
     held_out.check()?;
     let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, began, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
@@ -194,6 +196,7 @@ fn device(iterations: u32, run: &Run) -> Result<Choice> {
 /// What the trainer is told: options, else what the preset says.
 fn settings(config: &Config, first: &Gaussians, views: &Targets, brightness_spread: f32, seed: u64) -> TrainConfig {
     let by_descent = config.feature_mode == FeatureMode::Train;
+    let background = config.background.unwrap_or_default();
     TrainConfig {
         iterations: config.iterations(),
         seed,
@@ -212,8 +215,8 @@ fn settings(config: &Config, first: &Gaussians, views: &Targets, brightness_spre
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
         antialias: config.antialias,
-        background: config.background.color,
-        learn_background: config.background.learn,
+        background: background.color,
+        learn_background: background.learn,
         exposure: match config.exposure {
             Exposures::Auto => brightness_spread >= VARYING,
             Exposures::On => true,

@@ -1,9 +1,10 @@
 //! What training starts from: first Gaussians, and the pictures that they shall show.
 
-use super::config::{Background, Config, Strategy};
+use super::config::{Background, Config, Report, Strategy};
 use crate::error::bail;
 use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
+use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
@@ -28,9 +29,7 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     let mut points = folder.points()?;
     // More than half the budget would leave no room to grow where it matters.
     let most = (config.budget(views.pixels()).most() / 2).max(1);
-    // There is nothing behind what was cut out.
-    let cut_out = views.cameras.iter().any(|camera| folder.alpha_path(&camera.name).is_file());
-    let behind = if views.len() < FEW_VIEWS && !cut_out { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
+    let behind = if has_unseen(folder, &views.cameras) { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
     let missing = ENOUGH.saturating_sub(points.len() + behind.len());
     if missing > 0 {
         run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
@@ -46,6 +45,22 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     }
     first.append(behind);
     Ok(first)
+}
+
+/// Whether something lies behind what photos show that they may not have seen: they are few, and nothing was cut out.
+fn has_unseen(folder: &SceneFolder, training: &[Camera]) -> bool {
+    training.len() < FEW_VIEWS && !training.iter().any(|camera| folder.alpha_path(&camera.name).is_file())
+}
+
+/// What lies behind everything: what was asked for, else what the Gaussians that training starts from were trained with. What few photos do not show is black
+/// then, unless it is learned.
+pub fn background(config: &Config, folder: &SceneFolder, manifest: &Manifest, training: &[Camera]) -> Background {
+    let of_first = || match &config.init_ply {
+        Some(_) => Background { color: Report::of(manifest).unwrap_or_default().background, learn: false },
+        None if has_unseen(folder, training) => Background::LEARNED,
+        None => Background::default(),
+    };
+    config.background.unwrap_or_else(of_first)
 }
 
 /// What the views of `cameras` look through, where density control asks for it.
