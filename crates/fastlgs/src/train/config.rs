@@ -128,16 +128,13 @@ pub struct Background {
 }
 
 impl Background {
-    /// Learned, from grey on.
-    pub(super) const LEARNED: Self = Self { color: [0.5; 3], learn: true };
-
     /// Parses `0,0.5,1` or `learn`.
     ///
     /// # Errors
     /// Anything else.
     pub fn parse(text: &str) -> Result<Self, String> {
         if text == "learn" {
-            return Ok(Self::LEARNED);
+            return Ok(Self { color: [0.5; 3], learn: true });
         }
         let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
         let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1"))?;
@@ -208,11 +205,11 @@ pub struct Config {
     /// trained on.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
     pub sh_degree: Option<u32>,
-    /// Anti-aliasing by the 2-D Mip filter.
+    /// Anti-aliasing by the 2-D Mip filter; also where --init-ply names the scene's own Gaussians, which were trained with it.
     #[cfg_attr(feature = "clap", arg(long))]
     pub antialias: bool,
-    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`; by default that of the scene's last training with --init-ply,
-    /// else black, but learned where fewer than 25 photos are trained on and none is transparent.
+    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`; by default black, but that which they were trained with
+    /// where --init-ply names the scene's own Gaussians.
     #[cfg_attr(feature = "clap", arg(long, value_parser = Background::parse))]
     pub background: Option<Background>,
     /// Learn an affine exposure for each training photo.

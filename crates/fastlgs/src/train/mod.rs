@@ -61,8 +61,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     };
     let codes = known.as_ref().filter(|_| by_descent);
     let light = preprocess::Brightness::of(&manifest);
-    let background = start::background(config, &folder, &manifest, &training);
-    let config = &Config { background: Some(background), ..config.clone() };
+    let config = &start::as_before(config, &folder, &manifest);
+    let background = config.background.unwrap_or_default();
     let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &background, |name| light.gain(name));
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
     held_out.check()?;

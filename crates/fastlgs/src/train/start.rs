@@ -8,7 +8,7 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Share of the distance to its neighbours that a Gaussian has at first with MCMC.
@@ -29,7 +29,9 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     let mut points = folder.points()?;
     // More than half the budget would leave no room to grow where it matters.
     let most = (config.budget(views.pixels()).most() / 2).max(1);
-    let behind = if has_unseen(folder, &views.cameras) { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
+    // There is nothing behind what was cut out.
+    let cut_out = views.cameras.iter().any(|camera| folder.alpha_path(&camera.name).is_file());
+    let behind = if views.len() < FEW_VIEWS && !cut_out { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
     let missing = ENOUGH.saturating_sub(points.len() + behind.len());
     if missing > 0 {
         run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
@@ -47,20 +49,13 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     Ok(first)
 }
 
-/// Whether something lies behind what photos show that they may not have seen: they are few, and nothing was cut out.
-fn has_unseen(folder: &SceneFolder, training: &[Camera]) -> bool {
-    training.len() < FEW_VIEWS && !training.iter().any(|camera| folder.alpha_path(&camera.name).is_file())
-}
-
-/// What lies behind everything: what was asked for, else what the Gaussians that training starts from were trained with. What few photos do not show is black
-/// then, unless it is learned.
-pub fn background(config: &Config, folder: &SceneFolder, manifest: &Manifest, training: &[Camera]) -> Background {
-    let of_first = || match &config.init_ply {
-        Some(_) => Background { color: Report::of(manifest).unwrap_or_default().background, learn: false },
-        None if has_unseen(folder, training) => Background::LEARNED,
-        None => Background::default(),
-    };
-    config.background.unwrap_or_else(of_first)
+/// The options, with what the scene's own Gaussians were trained with where training starts from these and nothing else was asked for.
+pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> Config {
+    let place = |path: &Path| path.canonicalize().ok();
+    let is_own = |first: &&PathBuf| place(first).is_some_and(|first| Some(first) == place(&folder.ply_path()));
+    let earlier = config.init_ply.as_ref().filter(is_own).and_then(|_| Report::of(manifest)).unwrap_or_default();
+    let background = config.background.unwrap_or(Background { color: earlier.background, learn: false });
+    Config { background: Some(background), antialias: config.antialias || earlier.antialias, ..config.clone() }
 }
 
 /// What the views of `cameras` look through, where density control asks for it.
