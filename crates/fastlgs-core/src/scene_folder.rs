@@ -5,7 +5,7 @@ use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, compact, fs, i
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 
 /// What makes a folder a scene.
@@ -330,20 +330,26 @@ pub type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 /// # Errors
 /// The system's refusal, or a shape that does not fit its values.
 pub fn save_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])]) -> Result<()> {
-    save_noted_tensors(path, tensors, None)
+    write_tensors(path, tensors, None)
 }
 
-/// As [`save_tensors`], with a note of some name in the file's head.
+/// What the metadata of a file of embeddings calls what made them.
+const ENCODER: &str = "encoder";
+
+/// As [`save_tensors`], of embeddings; what made them stands in the file's metadata.
 ///
 /// # Errors
 /// As [`save_tensors`].
-pub fn save_noted_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], note: Option<(&str, &str)>) -> Result<()> {
-    let head = note.map(|(name, text)| [(name.to_owned(), text.to_owned())].into());
+pub fn save_embeddings(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], encoder: &str) -> Result<()> {
+    write_tensors(path, tensors, Some([(ENCODER.to_owned(), encoder.to_owned())].into()))
+}
+
+fn write_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], metadata: Option<HashMap<String, String>>) -> Result<()> {
     let views =
         tensors.iter().map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?)));
     let views: Result<Vec<_>, safetensors::SafeTensorError> = views.collect();
     let data =
-        views.and_then(|v| safetensors::serialize(v, head)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
+        views.and_then(|v| safetensors::serialize(v, metadata)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
@@ -373,13 +379,13 @@ pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
         .collect()
 }
 
-/// The note of that name in the head of a safetensors file that is in memory; empty where it has none.
+/// What made the embeddings in a file that is in memory, as [`save_embeddings`] was told; empty where it does not say.
 ///
 /// # Errors
 /// As [`load_tensors`].
-pub fn note_of_tensors(path: &Path, data: &[u8], name: &str) -> Result<String> {
+pub fn embedded_by(path: &Path, data: &[u8]) -> Result<String> {
     let (_, head) = SafeTensors::read_metadata(data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
-    Ok(head.metadata().as_ref().and_then(|notes| notes.get(name)).cloned().unwrap_or_default())
+    Ok(head.metadata().as_ref().and_then(|metadata| metadata.get(ENCODER)).cloned().unwrap_or_default())
 }
 
 #[cfg(test)]
@@ -393,10 +399,10 @@ mod tests {
         save_tensors(&path, &[("a", vec![2, 2], &[1.0, 2.0, 3.0, 4.0])]).unwrap();
         assert_eq!(load_tensors(&path).unwrap()["a"], (vec![2, 2], vec![1.0, 2.0, 3.0, 4.0]));
         let data = std::fs::read(&path).unwrap();
-        assert_eq!(note_of_tensors(&path, &data, "encoder").unwrap(), "");
-        save_noted_tensors(&path, &[("a", vec![1], &[1.0])], Some(("encoder", "offline 3"))).unwrap();
+        assert_eq!(embedded_by(&path, &data).unwrap(), "");
+        save_embeddings(&path, &[("a", vec![1], &[1.0])], "offline 3").unwrap();
         let noted = std::fs::read(&path).unwrap();
-        assert_eq!(note_of_tensors(&path, &noted, "encoder").unwrap(), "offline 3");
+        assert_eq!(embedded_by(&path, &noted).unwrap(), "offline 3");
         assert_eq!(load_tensors(&path).unwrap().len(), 1, "a note is no tensor");
         std::fs::write(&path, &data[..data.len() - 3]).unwrap();
         assert!(load_tensors(&path).unwrap_err().to_string().contains("t.safetensors"));

@@ -2,9 +2,8 @@
 //! (`embeddings.safetensors`).
 
 use crate::Result;
-use crate::grid::ENCODER;
 use crate::mapping::{Correspondences, Mask};
-use fastlgs_core::scene_folder::{load_tensors, note_of_tensors, parse_tensors, save_noted_tensors, save_tensors};
+use fastlgs_core::scene_folder::{embedded_by, load_tensors, parse_tensors, save_embeddings, save_tensors};
 use fastlgs_core::{Error, SceneFolder, fs};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -65,7 +64,7 @@ pub fn save_masks(folder: &SceneFolder, masks: &[Mask], encoder: &str) -> Result
         ("embeddings", vec![n, width(|m| &m.embedding)], &embeddings),
         ("histograms", vec![n, width(|m| &m.histogram)], &histograms),
     ];
-    Ok(save_noted_tensors(&masks_path(folder), &tensors, Some((ENCODER, encoder)))?)
+    Ok(save_embeddings(&masks_path(folder), &tensors, encoder)?)
 }
 
 /// Reads what [`save_masks`] wrote: the masks, and what made their embeddings; empty where nobody knows.
@@ -75,7 +74,7 @@ pub fn save_masks(folder: &SceneFolder, masks: &[Mask], encoder: &str) -> Result
 pub fn load_masks(folder: &SceneFolder) -> Result<(Vec<Mask>, String)> {
     let path = masks_path(folder);
     let file = fs::read(&path)?;
-    let (tensors, encoder) = (parse_tensors(&path, &file)?, note_of_tensors(&path, &file, ENCODER)?);
+    let (tensors, encoder) = (parse_tensors(&path, &file)?, embedded_by(&path, &file)?);
     let get = |name: &str| {
         let found = tensors.get(name).filter(|t| t.0.len() == 2);
         found.ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing; run 'fastlgs preprocess' again")))

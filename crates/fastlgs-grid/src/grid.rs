@@ -3,7 +3,7 @@
 use crate::Result;
 use crate::mapping::Mask;
 use crate::overlaps::Overlaps;
-use fastlgs_core::scene_folder::{note_of_tensors, parse_tensors, save_noted_tensors};
+use fastlgs_core::scene_folder::{embedded_by, parse_tensors, save_embeddings};
 use fastlgs_core::{Error, Gaussians, SceneFolder, fs};
 use glam::Vec3;
 use serde::{Deserialize, Serialize};
@@ -54,9 +54,6 @@ struct Row {
     first: usize,
     count: usize,
 }
-
-/// What files of embeddings call the note that says what made them.
-pub(crate) const ENCODER: &str = "encoder";
 
 /// Share of an object that lies in another one of which it is a part.
 pub const PART: f32 = 0.7;
@@ -232,7 +229,7 @@ impl Grid {
             ("overlaps", vec![overlaps.len()], &overlaps),
             ("shown", vec![self.shown.len()], &self.shown),
         ];
-        save_noted_tensors(&folder.root.join("grid.safetensors"), &tensors, Some((ENCODER, &self.encoder)))?;
+        save_embeddings(&folder.root.join("grid.safetensors"), &tensors, &self.encoder)?;
         Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
     }
 
@@ -253,7 +250,7 @@ impl Grid {
         let rows: Vec<Row> =
             serde_json::from_slice(rows).map_err(|e| Error::format(root.join("grid.json"), format!("not the expected JSON: {e}")))?;
         let path = root.join("grid.safetensors");
-        let encoder = note_of_tensors(&path, tensors, ENCODER)?;
+        let encoder = embedded_by(&path, tensors)?;
         let tensors = parse_tensors(&path, tensors)?;
         let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing")));
         let (embeddings, areas) = (get("embeddings")?, get("areas")?);
