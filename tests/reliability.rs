@@ -6,8 +6,9 @@ mod run;
 use fastlgs_core::rng::Rng;
 use run::{complaint, copy_folder, json, text};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -113,13 +114,15 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     let scene = f.dir.path().join("begun");
     copy_folder(&f.trained, &scene);
     let photos = f.dir.path().join("photos");
-    let all = |root: &Path| {
-        let file = |path: PathBuf| (path.clone(), std::fs::read(path).expect("a file"));
-        let within = ["photos", "cameras", "masks"].into_iter().flat_map(|folder| {
-            std::fs::read_dir(root.join(folder)).expect("a folder").flatten().map(|e| e.path()).filter(|p| p.is_file()).collect::<Vec<_>>()
-        });
-        within.chain([root.join("scene.json"), root.join("scene.ply")]).map(file).collect::<std::collections::BTreeMap<_, _>>()
+    // Without the manifest, in which seconds stand, so that what two runs made can be compared.
+    let made = |root: &Path| {
+        let folders = ["photos", "cameras", "masks"].map(|folder| root.join(folder));
+        let entries = folders.iter().flat_map(std::fs::read_dir).flat_map(Iterator::flatten).map(|entry| entry.path());
+        let file = |path: PathBuf| (path.strip_prefix(root).expect("within").to_owned(), std::fs::read(&path).expect("a file"));
+        entries.filter(|path| path.is_file()).chain([root.join("scene.ply")]).map(file).collect::<BTreeMap<_, _>>()
     };
+    let manifest = |root: &Path| std::fs::read(root.join("scene.json")).ok();
+    let all = |root: &Path| (made(root), manifest(root));
     let before = all(&scene);
     let labels = f.dir.path().join("labels-of-others");
     std::fs::create_dir_all(&labels).expect("a folder");
@@ -128,22 +131,53 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     let smaller = ["preprocess", text(&photos), "-o", text(&scene), "--max-side", "96", "--segmenter", "import", "--device", "cpu"];
     run::fails(&[&smaller[..], &["--holdout-labels", text(&labels)]].concat(), &["999", "none of the photos"]);
     assert!(all(&scene) == before, "labels of other photos");
+    let anew = f.dir.path().join("begun-anew");
+    copy_folder(&f.trained, &anew);
+    json(&["preprocess", text(&photos), "-o", text(&anew), "--max-side", "96", "--segmenter", "import", "--device", "cpu"]);
+    let after = made(&anew);
+    assert!(after != before.0);
+    let begin = || Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(smaller).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let end = |mut run: Child| {
+        let was_running = run.try_wait().expect("a child").is_none();
+        let _ = run.kill();
+        run.wait().expect("an end");
+        was_running
+    };
     let mut kills = 0;
-    for wait in [20, 60, 120, 200, 400, 800, 1600] {
-        let run = Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(smaller).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
-        let mut run = run.expect("the binary starts");
+    for wait in [20, 60, 120, 200, 400] {
+        let run = begin().expect("the binary starts");
         std::thread::sleep(Duration::from_millis(wait));
-        if run.try_wait().expect("a child").is_some() {
+        // One that moves what it made to its place, or clears up after that, is the next loop's matter.
+        if !end(run) || manifest(&scene) != before.1 {
             break;
         }
-        run.kill().expect("a child");
-        run.wait().expect("an end");
         assert!(all(&scene) == before, "killed after {wait} ms");
         kills += 1;
     }
-    println!("preprocess: {kills} kills, the earlier scene is whole");
+    // Killed while it moves what it made to its place, or soon after: a scene without a manifest is put back by the next run.
+    let mut moving = 0;
+    for _ in 0..3 {
+        std::fs::remove_dir_all(&scene).expect("a scene");
+        copy_folder(&f.trained, &scene);
+        let mut run = begin().expect("the binary starts");
+        while manifest(&scene) == before.1 && run.try_wait().expect("a child").is_none() {}
+        end(run);
+        if manifest(&scene).is_none() {
+            moving += 1;
+            let run = begin().expect("the binary starts");
+            let started = Instant::now();
+            while manifest(&scene).is_none() {
+                assert!(started.elapsed() < Duration::from_secs(60), "the earlier scene is not put back");
+            }
+            let had_time = !end(run) || made(&scene) == after;
+            assert!(had_time || all(&scene) == before, "put back");
+        } else {
+            assert!(made(&scene) == after, "killed after its manifest was in its place");
+        }
+    }
+    println!("preprocess: {kills} kills before and {moving} of 3 amid its last moves, no scene is a mixture");
     json(&smaller);
-    assert!(kills > 0 && all(&scene) != before && !scene.join("preprocess.partial").exists());
+    assert!(kills > 0 && made(&scene) == after && !scene.join("preprocess.partial").exists());
 }
 
 #[test]
