@@ -9,6 +9,7 @@ mod run;
 use run::{json, text};
 use serde_json::Value;
 use std::path::Path;
+use std::time::Instant;
 
 fn number(row: &Value, name: &str) -> f64 {
     row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"))
@@ -28,6 +29,8 @@ fn quick_suite() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let out = dir.path();
+    let mut began = Instant::now();
+    let mut lap = |what: &str| println!("{what}: {:.0} s", std::mem::replace(&mut began, Instant::now()).elapsed().as_secs_f64());
     let bench = |what: &str, scene: &[&str], dose: &[&str]| {
         let quick = ["bench", what, "--quick", "--device", "cpu", "-o", text(out)];
         json(&[&quick[..], scene, if run::all() { &[] } else { dose }].concat())
@@ -38,6 +41,7 @@ fn quick_suite() {
     json(&["preprocess", text(&photos), "-o", text(&table), "--segmenter", "import", "--device", "cpu"]);
     json(&["train", text(&table), "--iterations", "1000", "--device", "cpu"]);
     let table = text(&table);
+    lap("a trained scene");
 
     let chart = bench("chart", &[table], &["--ways", "embeddings,global,no grid,paper 300 steps"]);
     let rows = chart["rows"].as_array().expect("rows");
@@ -52,6 +56,7 @@ fn quick_suite() {
     assert!(oracle("global") > 0.75 && oracle("global") > oracle("embeddings") && oracle("global") > oracle("no grid"), "{chart}");
     assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| number(r, "seconds") > 0.0));
     written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
+    lap("chart");
 
     let few = ["--ways", "matching: embeddings,matching: + colour,all: as the paper"];
     let paper = ["bench", "paper", table, "--iterations", "500", "--device", "cpu", "-o", text(out)];
@@ -62,6 +67,7 @@ fn quick_suite() {
     println!("paper: embeddings {embeddings:.3}, with key points and colour {matching:.3}, trained with the scene {all:.3}");
     assert!(matching > embeddings && matching > 0.8 && all > 0.45 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
     written(out, &["paper.md", "paper.csv", "paper.json"]);
+    lap("paper");
 
     let size = bench("size", &[], &["--iterations", "400"]);
     let verdict = &size["auto"][0];
@@ -72,6 +78,7 @@ fn quick_suite() {
     let bytes = |model: &str| number(rows.iter().find(|r| r["model"] == model).expect("a model"), "scene_bytes");
     assert!(bytes("auto, compact") < bytes("auto") && bytes("degree 0") < bytes("full"));
     written(out, &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
+    lap("size");
 
     let stability = bench("stability", &[table], &["--cases", "photos shuffled,masks split,masks dropped"]);
     let rows = stability["rows"].as_array().expect("rows");
@@ -95,6 +102,7 @@ fn quick_suite() {
     let twins = rows.iter().find(|r| r["scene"] == "twins").expect("twins");
     assert!(number(twins, "apart") >= 0.95, "{twins}");
     written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
+    lap("stability");
 
     let report = json(&["bench", "report", text(out), "-o", text(&out.join("report.html"))]);
     assert_eq!(report["results"].as_array().map(Vec::len), Some(4));

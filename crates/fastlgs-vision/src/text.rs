@@ -5,18 +5,37 @@ use crate::attributes;
 use crate::encoder::{TextEncoder, normalise};
 use crate::runtime::{Array, Model};
 use crate::{Error, Result, places};
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, PoisonError};
 use tokenizers::Tokenizer;
 
 /// Longest text in tokens.
 const MAX_TOKENS: usize = 128;
+/// Texts that are remembered: six megabytes.
+const REMEMBERED: usize = 4096;
 
 /// all-MiniLM-L6-v2 (mean pooling, 384 dimensions).
 pub struct MiniLm {
     model: Model,
     tokenizer: Tokenizer,
+    /// What texts mean that were asked for alone. In company they may differ in the last digit, and no answer should hang on what was asked before.
+    known: Mutex<HashMap<String, Vec<f32>>>,
 }
 
 impl MiniLm {
+    /// That of this process, loaded by whoever asks first: scenes that are opened one after the other share it with what it remembers.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn shared() -> Result<Arc<Self>> {
+        static SHARED: Mutex<Option<Arc<MiniLm>>> = Mutex::new(None);
+        let mut shared = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(known) = shared.as_ref() {
+            return Ok(known.clone());
+        }
+        Ok(shared.insert(Arc::new(Self::load()?)).clone())
+    }
+
     /// Loads it from the cache folder.
     ///
     /// # Errors
@@ -29,12 +48,18 @@ impl MiniLm {
         tokenizer.with_padding(None);
         let truncation = tokenizers::TruncationParams { max_length: MAX_TOKENS, ..Default::default() };
         tokenizer.with_truncation(Some(truncation)).map_err(|e| Error::Invalid(format!("{}: {e}", path.display())))?;
-        Ok(Self { model, tokenizer })
+        Ok(Self { model, tokenizer, known: Mutex::default() })
     }
 }
 
 impl TextEncoder for MiniLm {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
+        let known = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        if let [text] = texts
+            && let Some(embedding) = known().get(*text)
+        {
+            return Ok(vec![embedding.clone()]);
+        }
         let mut out = Vec::with_capacity(texts.len());
         for batch in texts.chunks(64) {
             let encoded = self
@@ -53,20 +78,27 @@ impl TextEncoder for MiniLm {
             let embeddings = self.model.run(inputs, &["embedding"])?.remove(0);
             out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(<[f32]>::to_vec));
         }
+        if let ([text], [embedding]) = (texts, out.as_slice()) {
+            let mut known = known();
+            if known.len() == REMEMBERED {
+                known.clear();
+            }
+            known.insert((*text).to_owned(), embedding.clone());
+        }
         Ok(out)
     }
 }
 
 /// Texts of the offline encoder: what they mean by MiniLM, and the colours and materials that they name.
-pub struct OfflineText(MiniLm);
+pub struct OfflineText(Arc<MiniLm>);
 
 impl OfflineText {
-    /// Loads MiniLM from the cache folder.
+    /// With MiniLM from the cache folder, which is loaded once a process.
     ///
     /// # Errors
     /// When it is not installed.
     pub fn load() -> Result<Self> {
-        Ok(Self(MiniLm::load()?))
+        Ok(Self(MiniLm::shared()?))
     }
 }
 
@@ -113,5 +145,11 @@ mod tests {
         assert!(cosine(0, 1) < 0.99 && cosine(2, 3) < 0.99, "{} {}", cosine(0, 1), cosine(2, 3));
         assert!(named(1).iter().all(|named| *named == 0.0) && named(0).iter().any(|named| *named > 0.0));
         assert!(embedded.iter().all(|e| e[ends..].iter().all(|v| *v == 0.0)), "words look like nothing");
+        // What is remembered is what a fresh one says.
+        let fresh = MiniLm::load().unwrap();
+        for texts in [["juice"], ["a bowl of ripe oranges"], ["juice"]] {
+            assert_eq!(text.0.embed(&texts).unwrap(), fresh.embed(&texts).unwrap());
+        }
+        assert_eq!((fresh.known.lock().unwrap().len(), fresh.embed(&["juice", "tea"]).unwrap().len()), (2, 2));
     }
 }
