@@ -131,7 +131,8 @@ impl Browser {
 
     pub fn screenshot(&self, path: &Path) {
         let mut response = self.agent.get(&format!("{}/screenshot", self.session)).call().expect("a screenshot");
-        let value: Value = response.body_mut().with_config().limit(64 << 20).read_json().expect("JSON");
+        let body = response.body_mut().with_config().limit(64 << 20).read_to_vec().expect("an answer");
+        let value: Value = serde_json::from_slice(&body).expect("JSON");
         let data = base64::engine::general_purpose::STANDARD.decode(value["value"].as_str().expect("base64")).expect("base64");
         std::fs::write(path, data).expect("the screenshot");
     }
