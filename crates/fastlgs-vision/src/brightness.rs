@@ -2,6 +2,7 @@
 
 use crate::tracks::PairMatches;
 use nalgebra::{DMatrix, DVector};
+use std::collections::BTreeSet;
 
 /// Fewest matches that tell how bright one photo is against another.
 const FEW: usize = 8;
@@ -9,8 +10,10 @@ const FEW: usize = 8;
 const DARK: f32 = 8.0;
 /// Nor do values that may have been cut off at white.
 const CLIPPED: f32 = 250.0;
-/// Matches' worth of belief that a photo is as bright as the mean: what holds photos that nothing matches.
+/// Matches' worth of belief that a photo is as bright as it looks: what holds photos, and groups of them, that no match ties to the others.
 const HOLD: f32 = 1e-2;
+/// Matches' worth of belief that what brightens a channel of a photo brightens them all: where one is cut off at white, the others tell.
+const TOGETHER: f32 = 1.0;
 
 fn median(values: &mut [f32]) -> Option<f32> {
     values.sort_by(f32::total_cmp);
@@ -44,25 +47,54 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     };
     let channels: [Vec<Difference>; 3] = std::array::from_fn(of_channel);
     let spread = |differences: &Vec<Difference>| median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0);
-    let stops = channels.each_ref().map(|differences| consistent(colors.len(), differences));
+    let looks = looks(colors);
+    // Photos of one exposure look brighter and darker by what they show; by how much looks tell, those say that matches tell of.
+    let known = consistent(&channels, &DVector::zeros(looks.len()));
+    let told = channels.iter().enumerate().flat_map(|(c, all)| all.iter().flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c)));
+    let told: BTreeSet<usize> = told.collect();
+    let [common, own] = told.iter().fold([0.0, 0.0], |[common, own], &k| [common + known[k] * looks[k], own + looks[k] * looks[k]]);
+    let stops = consistent(&channels, &(looks * (common / own.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)));
     Brightness {
         spread_stops: channels.iter().map(spread).fold(0.0, f32::max),
-        gains: (0..colors.len()).map(|photo| [0, 1, 2].map(|c| stops[c][photo].exp2())).collect(),
+        gains: (0..colors.len()).map(|photo| [0, 1, 2].map(|c| stops[3 * photo + c].exp2())).collect(),
     }
 }
 
-/// Stops of each photo, with a mean of 0, that fit all differences best (least squares).
-fn consistent(photos: usize, differences: &[Difference]) -> Vec<f32> {
-    let mut normal = DMatrix::<f32>::identity(photos, photos) * HOLD;
-    let mut right = DVector::<f32>::zeros(photos);
-    for &(a, b, stops, weight) in differences {
+/// How many stops brighter than the mean of all photos the key points of each one look, channel by channel; `[photo][3]`.
+fn looks(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
+    let of =
+        |photo: &Vec<[u8; 3]>, c: usize| median(&mut photo.iter().map(|color| f32::from(color[c]).max(1.0).log2()).collect::<Vec<_>>());
+    let mut looks = DVector::zeros(3 * colors.len());
+    for c in 0..3 {
+        let of_photos: Vec<Option<f32>> = colors.iter().map(|photo| of(photo, c)).collect();
+        let mean = of_photos.iter().flatten().sum::<f32>() / of_photos.iter().flatten().count().max(1) as f32;
+        of_photos.iter().enumerate().for_each(|(photo, look)| looks[3 * photo + c] = look.map_or(0.0, |look| look - mean));
+    }
+    looks
+}
+
+/// Stops of each photo's channels, `[photo][3]`, with a mean of 0 in each, that fit all differences best (least squares); `looks` is what holds
+/// where no difference does.
+fn consistent(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
+    let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * HOLD;
+    let mut right = looks * HOLD;
+    let mut differs = |a: usize, b: usize, stops: f32, weight: f32| {
         (normal[(a, a)], normal[(b, b)]) = (normal[(a, a)] + weight, normal[(b, b)] + weight);
         (normal[(a, b)], normal[(b, a)]) = (normal[(a, b)] - weight, normal[(b, a)] - weight);
         (right[a], right[b]) = (right[a] + weight * stops, right[b] - weight * stops);
+    };
+    for (c, differences) in channels.iter().enumerate() {
+        differences.iter().for_each(|&(a, b, stops, weight)| differs(3 * a + c, 3 * b + c, stops, weight));
     }
-    let stops = normal.cholesky().map_or_else(|| DVector::zeros(photos), |factors| factors.solve(&right));
-    let mean = stops.mean();
-    stops.iter().map(|s| s - mean).collect()
+    for red in (0..looks.len()).step_by(3) {
+        [(0, 1), (1, 2), (2, 0)].into_iter().for_each(|(a, b)| differs(red + a, red + b, 0.0, TOGETHER));
+    }
+    let mut stops = normal.cholesky().map_or_else(|| DVector::zeros(looks.len()), |factors| factors.solve(&right));
+    for c in 0..3 {
+        let mean = stops.iter().skip(c).step_by(3).sum::<f32>() / (looks.len() / 3).max(1) as f32;
+        stops.iter_mut().skip(c).step_by(3).for_each(|stops| *stops -= mean);
+    }
+    stops
 }
 
 #[cfg(test)]
@@ -79,5 +111,31 @@ mod tests {
         assert_eq!(compare(&[photo(1.0), photo(0.5)], &[]), Brightness { spread_stops: 0.0, gains: vec![[1.0; 3]; 2] });
         let gains = between(1.0, 0.5).gains;
         assert!((gains[0][1] - 2.0f32.sqrt()).abs() < 0.02 && (gains[1][1] - 0.5f32.sqrt()).abs() < 0.02, "{gains:?}");
+    }
+
+    /// Gains of photos of the same twenty points, of which each but the last is matched with the next but one.
+    fn gains_of(light: &[[f32; 3]]) -> Vec<[f32; 3]> {
+        let point = |k: u8, gain: &[f32; 3]| [0, 1, 2].map(|c| ([60 + k, 50 + 2 * k, 70].map(f32::from)[c] * gain[c]) as u8);
+        let colors: Vec<Vec<[u8; 3]>> = light.iter().map(|gain| (0..20).map(|k| point(k, gain)).collect()).collect();
+        let pair = |a: usize| PairMatches { a, b: a + 1, pairs: (0..20).map(|k| (k, k)).collect() };
+        compare(&colors, &(0..light.len() - 2).map(pair).collect::<Vec<_>>()).gains
+    }
+
+    #[test]
+    fn a_channel_that_is_cut_off_follows_the_others() {
+        // Red is at white in the second photo, but for nothing that green and blue say.
+        let gains = gains_of(&[[1.0; 3], [9.0, 2.0, 2.0], [1.0; 3], [1.0; 3]]);
+        let stops = [0, 1, 2].map(|c| (gains[1][c] / gains[0][c]).log2());
+        assert!(stops.iter().all(|s| (s - 1.0).abs() < 0.1), "{stops:?}");
+    }
+
+    #[test]
+    fn a_photo_that_nothing_matches_is_as_bright_as_it_looks_where_light_varies() {
+        let stops = |light: [f32; 5]| {
+            let gains = gains_of(&light.map(|gain| [gain; 3]));
+            (gains[4][1] / gains[0][1]).log2()
+        };
+        let (varying, steady) = (stops([1.0, 2.0, 0.5, 1.5, 0.4]), stops([1.0, 1.0, 1.0, 1.0, 0.4]));
+        assert!((varying - 0.4f32.log2()).abs() < 0.3 && steady.abs() < 0.02, "{varying} {steady}");
     }
 }
