@@ -48,7 +48,7 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let channels: [Vec<Difference>; 3] = std::array::from_fn(of_channel);
     let spread = |differences: &Vec<Difference>| median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0);
     let looks = looks(colors);
-    // Photos of one exposure look brighter and darker by what they show; by how much looks tell, those say that matches tell of.
+    // Photos of one exposure look brighter and darker, too, by what they show: how far looks tell of light is measured where matches tell of it.
     let known = consistent(&channels, &DVector::zeros(looks.len()));
     let told = channels.iter().enumerate().flat_map(|(c, all)| all.iter().flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c)));
     let told: BTreeSet<usize> = told.collect();
@@ -113,7 +113,7 @@ mod tests {
         assert!((gains[0][1] - 2.0f32.sqrt()).abs() < 0.02 && (gains[1][1] - 0.5f32.sqrt()).abs() < 0.02, "{gains:?}");
     }
 
-    /// Gains of photos of the same twenty points, of which each but the last is matched with the next but one.
+    /// Gains of photos of the same twenty points; each is matched with the next, but the last with none.
     fn gains_of(light: &[[f32; 3]]) -> Vec<[f32; 3]> {
         let point = |k: u8, gain: &[f32; 3]| [0, 1, 2].map(|c| ([60 + k, 50 + 2 * k, 70].map(f32::from)[c] * gain[c]) as u8);
         let colors: Vec<Vec<[u8; 3]>> = light.iter().map(|gain| (0..20).map(|k| point(k, gain)).collect()).collect();
@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn a_channel_that_is_cut_off_follows_the_others() {
-        // Red is at white in the second photo, but for nothing that green and blue say.
+        // Red is at white in the second photo, so that green and blue alone tell how bright it is.
         let gains = gains_of(&[[1.0; 3], [9.0, 2.0, 2.0], [1.0; 3], [1.0; 3]]);
         let stops = [0, 1, 2].map(|c| (gains[1][c] / gains[0][c]).log2());
         assert!(stops.iter().all(|s| (s - 1.0).abs() < 0.1), "{stops:?}");
