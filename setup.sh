@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs what FastLGS needs on Debian or Ubuntu and builds it. Safe to run again: it skips what is there.
-# With --tests also what only the tests need: ffmpeg, npm, Chromium with its driver, Snakemake, and a standard library for wasm32.
+# With --tests also what only the tests need: ffmpeg, npm, Chromium with its driver, Snakemake, a standard library for wasm32, and Python's module.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -51,7 +51,11 @@ if ! command -v cargo >/dev/null; then
 fi
 
 say "building (the first build takes some minutes)"
-cargo build --release --locked --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
+# Tests build Python's module as well, in one go: alone it would have other features of most crates, and compile them once more.
+what=""
+if [ "${1:-}" = --tests ]; then what=--workspace; export PYO3_BUILD_EXTENSION_MODULE=1; fi
+# shellcheck disable=SC2086
+cargo build --release --locked $what --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv --quiet || fail "the build failed; its messages are above"
 say "installing the offline encoders"
 ./target/release/fastlgs models install-offline --quiet || fail "the offline encoders could not be installed; the message is above"
 if [ "${1:-}" = --tests ] && [ ! -x target/snakemake/bin/snakemake ]; then

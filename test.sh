@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Installs what is missing and runs the tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
-# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages, the originals of SAM and CLIP. Before a release; about an hour on two cores.
+# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages, pip, the originals of SAM and CLIP. Before a release; about an hour on two cores.
 set -euo pipefail
 cd "$(dirname "$0")"
 ./setup.sh --tests
@@ -11,14 +11,16 @@ if [ "${1:-}" = --all ]; then
     export FASTLGS_TEST_ALL=1 FASTLGS_FUZZ_SECONDS=${FASTLGS_FUZZ_SECONDS:-5}
 fi
 # The same as setup.sh, so that nothing is built twice.
-with="--no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv"
+with="--workspace --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv"
+export PYO3_BUILD_EXTENSION_MODULE=1
 lap() { printf 'test: %s took %d s\n' "$1" $((SECONDS - began)); began=$SECONDS; }
 began=$SECONDS
 cargo fmt --all --check
 # shellcheck disable=SC2086
-cargo clippy --release --locked --workspace --all-targets $with,fastlgs-py/load-ort,fastlgs-py/opencv --quiet -- -D warnings
+cargo clippy --release --locked --all-targets $with --quiet -- -D warnings
 # Also what a build without OpenCV has: key points in pure Rust.
-cargo clippy --release --locked -p fastlgs-cli --quiet -- -D warnings
+# shellcheck disable=SC2086
+cargo clippy --release --locked ${with/opencv/rust-sift} --quiet -- -D warnings
 lap "formatting and clippy"
 # shellcheck disable=SC2086
 RUSTDOCFLAGS="-D warnings" cargo doc --release --locked --no-deps $with --quiet
