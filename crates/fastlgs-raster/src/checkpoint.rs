@@ -34,6 +34,9 @@ pub(crate) struct Course {
     pub poses: Vec<Mat4>,
     /// What the watched views gained by alignment, in dB, once that was looked at.
     pub alignment_gain: Option<f64>,
+    /// Whether masks shape the Gaussians by now.
+    #[serde(default)]
+    pub coupled: bool,
 }
 
 fn tensors_path(path: &Path, iteration: u32) -> PathBuf {

@@ -78,6 +78,9 @@ pub struct TrainConfig {
     pub exposure: bool,
     /// Move the cameras of the training views.
     pub alignment: Alignment,
+    /// Steps after which the caller has masks shape the Gaussians ([`Trainer::couple`](crate::Trainer::couple)).
+    #[serde(default)]
+    pub couples_at: Option<u32>,
 }
 
 impl Default for TrainConfig {
@@ -99,6 +102,7 @@ impl Default for TrainConfig {
             learn_background: false,
             exposure: false,
             alignment: Alignment::Off,
+            couples_at: None,
         }
     }
 }

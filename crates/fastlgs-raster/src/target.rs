@@ -132,6 +132,12 @@ impl Targets {
         Self::new(self.cameras, self.gains, unclipped)
     }
 
+    /// The views with these features.
+    pub(crate) fn with_features(self, features: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) -> Self {
+        let read = self.read;
+        Self::new(self.cameras, self.gains, move |id| Ok(TargetImage { feature: features(id)?, ..read(id)? }))
+    }
+
     /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours. And a fingerprint of all pictures.
     ///
     /// # Errors

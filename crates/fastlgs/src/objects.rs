@@ -172,7 +172,8 @@ pub fn by_consensus(
 ) -> Result<(Grid, Summary)> {
     let Mapped { chosen, summary } = map(scene, folder, training, config, run)?;
     let lists = chosen.lists();
-    write_maps(scene, folder, training, &lists, config.antialias, run)?;
+    begin_maps(folder)?;
+    render_maps(scene, training, &lists, config.antialias, run, |camera, map| Ok(map.save(&folder.objects_path(&camera.name))?))?;
     let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
     let (found, of_found) = embed(folder, training, &chosen.layers(), &lists, &best_views(&areas), run)?;
     let mut grid = Grid::build(&found, &of_found, codes::lattice(chosen.support.len(), run.seed));
@@ -184,15 +185,21 @@ pub fn by_consensus(
     Ok((grid, summary))
 }
 
-/// Writes the object maps of all views: at each pixel the id that stands for the objects there.
-fn write_maps(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], lists: &[Vec<u16>], antialias: bool, run: &Run) -> Result<()> {
+/// Gives the object map of each view to `take`: at each pixel the id that stands for the objects there.
+pub fn render_maps(
+    scene: &Gaussians,
+    training: &[Camera],
+    lists: &[Vec<u16>],
+    antialias: bool,
+    run: &Run,
+    mut take: impl FnMut(&Camera, LabelMap) -> Result<()>,
+) -> Result<()> {
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
     let work = run.work("objects", training.len() as u64);
-    begin_maps(folder)?;
     for camera in training {
         let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
-        field::ids(&shares, lists).save(&folder.objects_path(&camera.name))?;
+        take(camera, field::ids(&shares, lists))?;
         work.advance()?;
     }
     Ok(())
@@ -282,7 +289,7 @@ pub struct Summary {
 }
 
 /// Where the masks of a view end.
-fn atoms(folder: &SceneFolder, camera: &Camera) -> Result<Atoms> {
+pub fn atoms(folder: &SceneFolder, camera: &Camera) -> Result<Atoms> {
     Ok(folder.masks(camera)?.atoms().without_gaps())
 }
 

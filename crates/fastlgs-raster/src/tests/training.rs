@@ -66,6 +66,42 @@ fn resumes_to_the_same_bytes() {
 }
 
 #[test]
+fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let checkpoint = dir.path().join("train");
+    let config = TrainConfig { iterations: 600, budget: Budget::Auto(400), feature_weight: 0.5, ..TrainConfig::default() };
+    let start = || trainer(Box::new(CpuEngine::new()), config.clone());
+    let towards = |trainer: &mut Trainer| trainer.towards(|_| Ok(target(64, 48).feature));
+    let mut errors = Vec::new();
+    let mut whole = start();
+    let shaped = whole.run(Some(&checkpoint), |progress, trainer| {
+        if progress.iteration == 100 {
+            trainer.couple(|scene, cameras| {
+                assert_eq!(cameras.len(), 24);
+                scene.features.fill(Vec3::splat(0.5));
+                Ok::<_, crate::Error>(())
+            })?;
+            towards(trainer);
+        }
+        errors.push(progress.losses.feature_l1);
+        Ok::<_, crate::Error>(())
+    });
+    shaped.unwrap();
+    let after = |steps: usize| errors[steps / 20 - 1];
+    assert!(after(100) == 0.0 && after(120) > 0.0, "from step 100 on: {errors:?}");
+    assert!(after(600) < 0.9 * after(120), "{errors:?}");
+    let mut resumed = start();
+    assert!(!resumed.is_coupled() && resumed.resume(&checkpoint).unwrap() && resumed.is_coupled());
+    towards(&mut resumed);
+    resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
+    assert!(whole.gaussians().unwrap() == resumed.gaussians().unwrap());
+    let (by_color, _) = run(config.clone());
+    assert!(whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means, "geometry follows masks");
+    let refused = start().couple(|_, _| Err(crate::Error::Invalid("no objects".to_owned())));
+    assert!(refused.is_err());
+}
+
+#[test]
 fn what_views_look_through_stays_empty() {
     let config = TrainConfig { iterations: 100, refine_until: 0.8, budget: Budget::Fixed(400), ..TrainConfig::default() };
     let cameras: Vec<Camera> = views(24).into_iter().map(|view| view.camera).collect();

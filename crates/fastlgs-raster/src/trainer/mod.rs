@@ -1,6 +1,7 @@
 //! Training of scene and semantic field together (paper, "Training Features for Gaussians").
 
 mod alignment;
+mod coupling;
 mod shown;
 mod watched;
 
@@ -16,8 +17,9 @@ use crate::shape::Shape;
 use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
+use coupling::FEATURE;
 use fastlgs_core::camera::scene_extent;
-use fastlgs_core::gaussians::{BASE_CHANNELS, channels};
+use fastlgs_core::gaussians::{self, BASE_CHANNELS};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
@@ -121,6 +123,7 @@ impl Trainer {
             shown: fingerprint([pictures as u32, (pictures >> 32) as u32].into_iter().chain(first)),
             poses: targets.cameras.iter().map(|c| c.world_to_camera).collect(),
             alignment_gain: None,
+            coupled: false,
             config,
         };
         let extent = scene_extent(&targets.cameras);
@@ -160,16 +163,12 @@ impl Trainer {
         let camera = &self.targets.cameras[id];
         let camera = if config.coarse(iteration) { camera.halved() } else { camera.clone() };
         let degree = config.degree(iteration);
-        let options = StepOptions {
-            channels: config.channels,
-            lambda: config.lambda,
-            feature_weight: config.feature_weight,
-            exposure: self.exposure(id),
-        };
+        let channels = self.channels();
+        let options = StepOptions { channels, lambda: config.lambda, feature_weight: config.feature_weight, exposure: self.exposure(id) };
         let rates = config.rates(iteration, self.extent);
-        let trained = match config.channels {
-            Channels::Feature => 14..BASE_CHANNELS,
-            Channels::Color | Channels::Both | Channels::Coupled => 0..channels(degree),
+        let trained = match channels {
+            Channels::Feature => FEATURE.start..BASE_CHANNELS,
+            Channels::Color | Channels::Both | Channels::Coupled => 0..gaussians::channels(degree),
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);

@@ -31,7 +31,7 @@ impl Trainer {
     pub(super) fn show(&mut self, id: usize) -> Result<()> {
         let coarse = self.course.config.coarse(self.course.iteration);
         if self.shown.coarse != coarse {
-            std::mem::take(&mut self.shown.views).into_keys().for_each(|id| self.engine.forget_target(id));
+            self.hide();
             self.shown.coarse = coarse;
         }
         if !self.shown.views.contains_key(&id) {
@@ -44,6 +44,11 @@ impl Trainer {
             self.shown.reading += started.elapsed().as_secs_f64();
         }
         Ok(())
+    }
+
+    /// Takes all pictures from the device, as they are no longer what shall be seen.
+    pub(super) fn hide(&mut self) {
+        std::mem::take(&mut self.shown.views).into_keys().for_each(|id| self.engine.forget_target(id));
     }
 
     /// After its step, what came when there was no room left goes again. Views come once each before any comes again: no other choice of those that

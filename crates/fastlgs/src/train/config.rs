@@ -1,6 +1,6 @@
 //! What `train` is asked for, and what it reports.
 
-use crate::eyes::EncoderKind;
+use crate::eyes::{EncoderKind, SegmenterKind};
 use crate::objects;
 use crate::progress::TrainStep;
 use fastlgs_core::scene_folder::Manifest;
@@ -91,6 +91,20 @@ pub enum Mapping {
     Paper,
     /// Those that the scene has; with --init-ply of the trained scene, either feature mode refines what the other made.
     Keep,
+}
+
+/// Whether masks tell Gaussians where things end.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
+pub enum Borders {
+    /// Where masks know more than the photos' edges: those of SAM and imported ones, not those of the offline segmenter.
+    #[default]
+    Auto,
+    /// Yes.
+    On,
+    /// No.
+    Off,
 }
 
 /// How Gaussians get their codes.
@@ -218,6 +232,9 @@ pub struct Config {
     /// Move the cameras of the training photos to where the scene says that they were; `auto` where photos that are kept aside gain by it.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub align: Align,
+    /// Whether Gaussians learn from the masks where things end, with --mapping global and --feature-mode lift.
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
+    pub borders: Borders,
     /// Keep geometry and colour as --init-ply gives them; train features only.
     #[cfg_attr(feature = "clap", arg(long, requires = "init_ply"))]
     pub freeze: bool,
@@ -252,7 +269,8 @@ pub struct Config {
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
     pub curve: Option<u32>,
-    /// Weight of the feature loss against colour's, with --feature-mode train: both move the Gaussians, unless --freeze keeps them.
+    /// Weight of the feature loss against colour's, with --feature-mode train and where masks shape the Gaussians (--borders): both move these, unless
+    /// --freeze keeps them.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = FEATURE_WEIGHT))]
     pub feature_weight: f32,
     /// Continue from the last checkpoint.
@@ -275,6 +293,7 @@ impl Default for Config {
             background: None,
             exposure: Exposures::default(),
             align: Align::default(),
+            borders: Borders::default(),
             freeze: false,
             init_ply: None,
             mapping: Mapping::default(),
@@ -326,6 +345,16 @@ impl Config {
         PaperConfig { tau: self.tau, theta, alpha, key_points: self.cues.contains(&Cue::Keypoints) }
     }
 
+    /// Whether masks of this segmenter shape the Gaussians from some step on.
+    pub(super) fn masks_shape(&self, segmenter: &str) -> bool {
+        let asked = match self.borders {
+            Borders::Auto => segmenter != SegmenterKind::Offline.name(),
+            Borders::On => true,
+            Borders::Off => false,
+        };
+        asked && self.mapping == Mapping::Global && self.feature_mode == FeatureMode::Lift && !self.freeze
+    }
+
     /// Constants of global mapping.
     pub(super) fn global(&self) -> objects::Config {
         objects::Config { antialias: self.antialias, objects: chosen::Config { min_support: self.support, ..chosen::Config::default() } }
@@ -368,6 +397,8 @@ pub struct Report {
     pub alignment_gain: Option<f64>,
     /// Whether the cameras of the training photos were moved.
     pub aligned: bool,
+    /// Whether masks told Gaussians where things end.
+    pub borders: bool,
     /// Whether the 2-D Mip filter was on.
     pub antialias: bool,
     /// Colour behind everything.

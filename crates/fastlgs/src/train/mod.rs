@@ -1,5 +1,6 @@
 //! Colour and semantic field together (paper, training features for Gaussians), and the objects on them.
 
+mod borders;
 mod config;
 mod pace;
 mod start;
@@ -10,7 +11,8 @@ use crate::progress::{Message, TrainStep};
 use crate::{Result, Run, checkpoints, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
-pub use config::{Align, Background, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
+pub use config::{Align, Background, Borders, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
+use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
@@ -78,7 +80,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
         );
     }
-    let settings = settings(config, &first, &targets, light.spread_stops, run.seed);
+    let settings = settings(config, &first, &targets, &manifest, run.seed);
     let device = device(settings.iterations, run)?;
     let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
     let work = run.work("train", u64::from(settings.iterations));
@@ -88,10 +90,18 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     if config.resume && !trainer.resume(&checkpoint)? {
         run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
     }
+    if trainer.is_coupled() {
+        borders::go_on(&mut trainer, &folder)?;
+    }
     run.progress.tell(Message::TrainingBegins(&first));
-    let mut curve = Vec::new();
+    let (mut curve, mut mapping_seconds) = (Vec::new(), 0.0);
     let result = trainer.run(Some(&checkpoint), |p, trainer| {
         work.check()?;
+        if settings.couples_at == Some(p.iteration) {
+            let started = Instant::now();
+            borders::begin(trainer, &folder, &config.global(), run)?;
+            mapping_seconds += started.elapsed().as_secs_f64();
+        }
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
         let (iteration, seconds, psnr, gaussians) = (p.iteration, p.seconds, p.psnr, p.gaussians);
         let mut step = TrainStep { iteration, seconds, loss, psnr, psnr_held_out: None, gaussians };
@@ -137,7 +147,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             grid
         }
     };
-    let mapping_seconds = started.elapsed().as_secs_f64();
+    mapping_seconds += started.elapsed().as_secs_f64();
     let aside = Aside::new(&folder, "train")?;
     grid.save(&aside.folder)?;
     aside.folder.save_trained_cameras(aligned.then_some(&cameras))?;
@@ -160,6 +170,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         exposure: settings.exposure,
         alignment_gain: result.alignment_gain,
         aligned,
+        borders: settings.couples_at.is_some(),
         antialias: settings.antialias,
         background: [r, g, b],
         size: format!("{}x{}", cameras[0].width, cameras[0].height),
@@ -194,7 +205,7 @@ fn device(iterations: u32, run: &Run) -> Result<Choice> {
 }
 
 /// What the trainer is told: options, else what the preset says.
-fn settings(config: &Config, first: &Gaussians, views: &Targets, brightness_spread: f32, seed: u64) -> TrainConfig {
+fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> TrainConfig {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
     TrainConfig {
@@ -214,11 +225,12 @@ fn settings(config: &Config, first: &Gaussians, views: &Targets, brightness_spre
         sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { config.degree(views.len()) }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
+        couples_at: config.masks_shape(&manifest.segmenter).then(|| borders::begin_at(config.iterations())),
         antialias: config.antialias,
         background: background.color,
         learn_background: background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => brightness_spread >= VARYING,
+            Exposures::Auto => preprocess::Brightness::of(manifest).spread_stops >= VARYING,
             Exposures::On => true,
             Exposures::Off => false,
         },

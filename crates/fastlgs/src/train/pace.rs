@@ -1,8 +1,7 @@
 //! How many iterations fit into the minutes that somebody has.
 
 use super::config::{Config, Mapping, Preset};
-use super::{device, settings, start};
-use crate::preprocess::Brightness;
+use super::{borders, device, settings, start};
 use crate::{Result, Run, checkpoints, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};
@@ -67,13 +66,18 @@ fn rounded(iterations: f64) -> u32 {
 fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &Targets, run: &Run) -> Result<[f64; 2]> {
     let short = Config { iterations: Some(TRIAL), ..config.clone() };
     let first = start::gaussians(&short, folder, targets, run)?;
-    let light = Brightness::of(manifest);
-    let settings = settings(&short, &first, targets, light.spread_stops, run.seed);
+    let settings = settings(&short, &first, targets, manifest, run.seed);
     let engine = fastlgs_raster::open_engine_as(&device(MOST, run)?.device, config.shape)?;
     let work = run.work("trial", u64::from(TRIAL));
+    let couples_at = settings.couples_at;
     let mut trainer = Trainer::new(engine, &first, targets.clone(), settings)?;
     trainer.keep_free(start::free_space(&short, folder, &targets.cameras, &first)?);
-    let result = trainer.run(None, |_, _| work.check())?;
+    let result = trainer.run(None, |progress, trainer| {
+        if couples_at == Some(progress.iteration) {
+            borders::pretend(trainer)?;
+        }
+        work.check()
+    })?;
     // The first step is not in these seconds.
     Ok([(result.seconds - result.removal_seconds) / f64::from(TRIAL - 1), result.removal_seconds])
 }

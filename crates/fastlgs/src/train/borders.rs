@@ -1,0 +1,165 @@
+//! Where masks end, Gaussians shall end. Photos that are blurred, or things of one colour, do not tell where one thing ends and the next begins, but their
+//! masks do. Early in a training, once shapes stand, the objects are found as the Gaussians are by then, and from there on every view is trained towards
+//! its masks as well: each in the colour of its object, which is far from those of its neighbours. What the objects are is found again at the end.
+
+use crate::error::Context;
+use crate::progress::{Message, Sink};
+use crate::{Result, Run, objects};
+use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs, image_io};
+use fastlgs_raster::{Trainer, pack};
+use glam::Vec3;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// Share of the iterations after which masks shape the Gaussians: while these still grow, so that borders get what they need.
+const FROM: f32 = 0.15;
+
+/// The iteration after which masks shape the Gaussians; `Trainer::run` tells of every twentieth.
+pub fn begin_at(iterations: u32) -> u32 {
+    ((iterations as f32 * FROM) as u32).next_multiple_of(20)
+}
+
+/// Where it is kept what views are trained towards: a run that was broken off goes on with it.
+fn place(folder: &SceneFolder, name: &str) -> PathBuf {
+    folder.root.join("checkpoints/borders").join(name)
+}
+
+/// Finds the objects, and has the views trained towards their masks from now on.
+pub fn begin(trainer: &mut Trainer, folder: &SceneFolder, config: &objects::Config, run: &Run) -> Result<()> {
+    let run = Run { progress: &Amid(run.progress), ..*run };
+    trainer.couple(|scene, cameras| find(scene, folder, cameras, config, &run))?;
+    go_on(trainer, folder)
+}
+
+/// Who watches the training is told of it alone; the objects' own stages, and their warnings, come at its end.
+struct Amid<'a>(&'a dyn Sink);
+
+impl Sink for Amid<'_> {
+    fn tell(&self, _: Message<'_>) {}
+
+    fn cancelled(&self) -> bool {
+        self.0.cancelled()
+    }
+}
+
+/// Has the steps cost what they cost with masks, for a trial.
+pub fn pretend(trainer: &mut Trainer) -> Result<()> {
+    trainer.couple(|_, _| Ok::<_, crate::Error>(()))?;
+    let pixels: Vec<usize> = trainer.cameras().iter().map(|camera| (camera.width * camera.height) as usize).collect();
+    trainer.towards(move |id| Ok(vec![pack([0; 3], true); pixels[id]]));
+    Ok(())
+}
+
+/// Has the views trained towards the masks that [`begin`] found.
+pub fn go_on(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()> {
+    let codes: Vec<[u8; 3]> = fs::read_json(&place(folder, "codes.json"))?;
+    let (folder, names) = (folder.clone(), trainer.cameras().into_iter().map(|camera| camera.name).collect::<Vec<_>>());
+    let read = move |id: usize| of_view(&folder, &names[id], &codes);
+    trainer.towards(move |id| read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error))));
+    Ok(())
+}
+
+/// What a view is trained towards; what no mask of an object covers does not count.
+fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u32>> {
+    let map = LabelMap::load(&place(folder, &format!("{name}.png")))?;
+    let ignored = Some(folder.ignore_path(name)).filter(|path| path.is_file()).map(|path| image_io::load_gray(&path)).transpose()?;
+    let counts = |k: usize| ignored.as_ref().is_none_or(|mask| mask.as_raw()[k] >= 128);
+    let code = |id: u16| codes.get(usize::from(id)).copied().unwrap_or_default();
+    Ok(map.labels.iter().enumerate().map(|(k, id)| pack(code(*id), *id > 0 && counts(k))).collect())
+}
+
+/// Finds the objects, writes where the views' masks of them are, and gives every Gaussian its object's code.
+fn find(scene: &mut Gaussians, folder: &SceneFolder, cameras: &[Camera], config: &objects::Config, run: &Run) -> Result<()> {
+    let lists = objects::map(scene, folder, cameras, config, run)?.chosen.lists();
+    let mut beside = Beside::default();
+    objects::render_maps(scene, cameras, &lists, config.antialias, run, |camera, shown| {
+        let map = as_masks_have_it(&shown, &objects::atoms(folder, camera)?.map);
+        beside.add(&map);
+        Ok(map.save(&place(folder, &format!("{}.png", camera.name)))?)
+    })?;
+    let codes = beside.codes(lists.len());
+    fs::write_json(&place(folder, "codes.json"), &codes).context("what masks shape cannot be kept")?;
+    scene.features = scene.object_ids.iter().map(|id| Vec3::from(codes[usize::from(*id)].map(f32::from)) / 255.0).collect();
+    Ok(())
+}
+
+/// Each atom of a view's masks as the object that most of it shows; 0 where none does.
+fn as_masks_have_it(shown: &LabelMap, atoms: &LabelMap) -> LabelMap {
+    let mut counts: Vec<BTreeMap<u16, u32>> = vec![BTreeMap::new(); usize::from(atoms.max()) + 1];
+    for (atom, id) in atoms.labels.iter().zip(&shown.labels) {
+        *counts[usize::from(*atom)].entry(*id).or_default() += 1;
+    }
+    let most = |counts: &BTreeMap<u16, u32>| {
+        let all: u32 = counts.values().sum();
+        counts.iter().find(|(_, count)| 2 * **count > all).map_or(0, |(id, _)| *id)
+    };
+    let mut of_atom: Vec<u16> = counts.iter().map(most).collect();
+    // What no mask covers.
+    of_atom[0] = 0;
+    LabelMap { labels: atoms.labels.iter().map(|atom| of_atom[usize::from(*atom)]).collect(), ..*atoms }
+}
+
+/// How many pixels of each object lie beside pixels of each other one, in all views.
+#[derive(Default)]
+struct Beside(BTreeMap<(u16, u16), u32>);
+
+impl Beside {
+    fn add(&mut self, map: &LabelMap) {
+        let width = map.width as usize;
+        for (k, id) in map.labels.iter().enumerate() {
+            let right = (k + 1) % width > 0;
+            for other in [right.then(|| map.labels[k + 1]), map.labels.get(k + width).copied()].into_iter().flatten() {
+                if *id != other && *id > 0 && other > 0 {
+                    *self.0.entry((*id, other)).or_default() += 1;
+                    *self.0.entry((other, *id)).or_default() += 1;
+                }
+            }
+        }
+    }
+
+    /// A code for each of so many objects, 0 included: of the corners of the cube of features the one that is farthest from those of its neighbours, as
+    /// countries on a map have colours. Hundreds of codes would lie close together, and where objects alike meet, nothing would tell them apart.
+    fn codes(&self, count: usize) -> Vec<[u8; 3]> {
+        let mut corners: Vec<u32> = Vec::with_capacity(count);
+        for id in 0..count as u16 {
+            let near = self.0.range((id, 0)..=(id, u16::MAX)).filter(|((_, other), _)| *other < id);
+            let mut alike = [0u64; 8];
+            for ((_, other), pixels) in near {
+                for (corner, sum) in (0u32..).zip(&mut alike) {
+                    *sum += u64::from(*pixels) * u64::from((!(corner ^ corners[usize::from(*other)]) & 7).count_ones());
+                }
+            }
+            // Those that are free of neighbours are spread as well.
+            corners.push((0..8).map(|k| (k + u32::from(id)) % 8).min_by_key(|corner| alike[*corner as usize]).unwrap_or_default());
+        }
+        corners.into_iter().map(|corner| std::array::from_fn(|axis| if corner >> axis & 1 == 1 { 255 } else { 0 })).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn masks_end_where_they_end_whatever_is_shown() {
+        let map = |labels: &[u16]| LabelMap { labels: labels.to_vec(), ..LabelMap::new(4, 2) };
+        // Atom 1 is mostly object 5, atom 2 half 5 and half 6, atom 3 mostly nothing.
+        let atoms = map(&[1, 1, 1, 2, 2, 3, 3, 0]);
+        let shown = map(&[5, 5, 6, 5, 6, 0, 0, 6]);
+        assert_eq!(as_masks_have_it(&shown, &atoms).labels, [5, 5, 5, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn neighbours_have_codes_that_are_far_apart() {
+        let labels = (0..16 * 16).map(|k| 1 + (k % 16 / 4 + k / 64 * 4) as u16).collect();
+        let map = LabelMap { labels, ..LabelMap::new(16, 16) };
+        let mut beside = Beside::default();
+        beside.add(&map);
+        assert_eq!(beside.0[&(1, 2)], 4);
+        let codes = beside.codes(17);
+        for (id, other) in beside.0.keys() {
+            let differ = codes[usize::from(*id)].iter().zip(&codes[usize::from(*other)]).filter(|(a, b)| a != b).count();
+            assert!(differ >= 2, "{id} and {other}: {codes:?}");
+        }
+    }
+}
