@@ -3,6 +3,7 @@
 mod borders;
 mod config;
 mod pace;
+mod report;
 mod start;
 
 use crate::aside::Aside;
@@ -11,12 +12,13 @@ use crate::progress::{Message, TrainStep};
 use crate::{Result, Run, checkpoints, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
-pub use config::{Align, Background, Borders, Config, Cue, CurvePoint, Exposures, FeatureMode, Mapping, Preset, Report, Strategy};
+pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset, Strategy};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
+pub use report::{CurvePoint, Report};
 pub(crate) use start::target;
 use std::time::Instant;
 

@@ -1,6 +1,7 @@
 //! What training starts from: first Gaussians, and the pictures that they shall show.
 
-use super::config::{Background, Config, Report, Strategy};
+use super::config::{Background, Config, Strategy};
+use super::report::Report;
 use crate::error::bail;
 use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
