@@ -4,6 +4,7 @@ mod borders;
 mod config;
 mod pace;
 mod report;
+mod settings;
 mod start;
 
 use crate::aside::Aside;
@@ -13,26 +14,20 @@ use crate::{Result, Run, checkpoints, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset, Strategy};
-use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
-use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig, Trainer};
+use fastlgs_raster::Trainer;
 pub use report::{CurvePoint, Report};
+use settings::{device, settings};
 pub(crate) use start::target;
 use std::time::Instant;
 
 /// Note of the manifest: with what `make` made the scene.
 pub(crate) const MADE: &str = "made";
 
-/// Difference of two photos in stops from which exposures are learned.
-const VARYING: f32 = 0.15;
-
 /// All that training leaves, beside the manifest and the objects' maps.
 const LEFT: [&str; 4] = ["grid.json", "grid.safetensors", "scene.ply", "cameras/trained.json"];
-
-/// Iterations from which it pays to find out first which kernels the device is fastest with.
-const WORTH_TUNING: u32 = 500;
 
 /// Trains the scene folder `config.scene`: Gaussians, their objects, and the table of these.
 ///
@@ -192,57 +187,6 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     // Checkpoints serve a broken run only.
     checkpoints::forget(&folder);
     Ok(report)
-}
-
-/// The device for so many iterations.
-fn device(iterations: u32, run: &Run) -> Result<Choice> {
-    if iterations >= WORTH_TUNING {
-        match fastlgs_raster::tuning::tune(run.device, false) {
-            // Where nothing was asked for, a device that fails is none.
-            Err(error) if run.device == "auto" => return Ok(Choice { device: "cpu".to_owned(), why: error.to_string() }),
-            measured => drop(measured?),
-        }
-    }
-    Ok(fastlgs_raster::choice(run.device))
-}
-
-/// What the trainer is told: options, else what the preset says.
-fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> TrainConfig {
-    let by_descent = config.feature_mode == FeatureMode::Train;
-    let background = config.background.unwrap_or_default();
-    TrainConfig {
-        iterations: config.iterations(),
-        seed,
-        budget: config.budget(views.pixels()),
-        strategy: match config.strategy {
-            Strategy::Classic => fastlgs_raster::Strategy::Classic,
-            Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
-        },
-        channels: match (config.freeze, by_descent) {
-            (true, _) => Channels::Feature,
-            (false, false) => Channels::Color,
-            // As the paper's authors train.
-            (false, true) => Channels::Coupled,
-        },
-        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { config.degree(views.len()) }),
-        first_degree: first.sh_degree,
-        feature_weight: config.feature_weight,
-        couples_at: config.masks_shape(&manifest.segmenter).then(|| borders::begin_at(config.iterations())),
-        antialias: config.antialias,
-        background: background.color,
-        learn_background: background.learn,
-        exposure: match config.exposure {
-            Exposures::Auto => preprocess::Brightness::of(manifest).spread_stops >= VARYING,
-            Exposures::On => true,
-            Exposures::Off => false,
-        },
-        alignment: match config.align {
-            Align::Auto => Alignment::Auto,
-            Align::On => Alignment::On,
-            Align::Off => Alignment::Off,
-        },
-        ..TrainConfig::default()
-    }
 }
 
 /// Gives every Gaussian the object whose code is nearest to its trained feature; none where the origin is nearer, towards which what no mask

@@ -1,7 +1,8 @@
 //! How many iterations fit into the minutes that somebody has.
 
 use super::config::{Config, Mapping, Preset};
-use super::{borders, device, settings, start};
+use super::settings::{device, settings};
+use super::{borders, start};
 use crate::{Result, Run, checkpoints, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, SceneFolder};

@@ -1,0 +1,66 @@
+//! What the trainer is told, and on which device it runs.
+
+use super::borders;
+use super::config::{Align, Config, Exposures, FeatureMode, Strategy};
+use crate::preprocess::Brightness;
+use crate::{Result, Run};
+use fastlgs_core::Gaussians;
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig};
+
+/// Difference of two photos in stops from which exposures are learned.
+const VARYING: f32 = 0.15;
+
+/// Iterations from which it pays to find out first which kernels the device is fastest with.
+const WORTH_TUNING: u32 = 500;
+
+/// The device for so many iterations.
+pub fn device(iterations: u32, run: &Run) -> Result<Choice> {
+    if iterations >= WORTH_TUNING {
+        match fastlgs_raster::tuning::tune(run.device, false) {
+            // Where nothing was asked for, a device that fails is none.
+            Err(error) if run.device == "auto" => return Ok(Choice { device: "cpu".to_owned(), why: error.to_string() }),
+            measured => drop(measured?),
+        }
+    }
+    Ok(fastlgs_raster::choice(run.device))
+}
+
+/// What the trainer is told: options, else what the preset says.
+pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> TrainConfig {
+    let by_descent = config.feature_mode == FeatureMode::Train;
+    let background = config.background.unwrap_or_default();
+    TrainConfig {
+        iterations: config.iterations(),
+        seed,
+        budget: config.budget(views.pixels()),
+        strategy: match config.strategy {
+            Strategy::Classic => fastlgs_raster::Strategy::Classic,
+            Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
+        },
+        channels: match (config.freeze, by_descent) {
+            (true, _) => Channels::Feature,
+            (false, false) => Channels::Color,
+            // As the paper's authors train.
+            (false, true) => Channels::Coupled,
+        },
+        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { config.degree(views.len()) }),
+        first_degree: first.sh_degree,
+        feature_weight: config.feature_weight,
+        couples_at: config.masks_shape(&manifest.segmenter).then(|| borders::begin_at(config.iterations())),
+        antialias: config.antialias,
+        background: background.color,
+        learn_background: background.learn,
+        exposure: match config.exposure {
+            Exposures::Auto => Brightness::of(manifest).spread_stops >= VARYING,
+            Exposures::On => true,
+            Exposures::Off => false,
+        },
+        alignment: match config.align {
+            Align::Auto => Alignment::Auto,
+            Align::On => Alignment::On,
+            Align::Off => Alignment::Off,
+        },
+        ..TrainConfig::default()
+    }
+}
