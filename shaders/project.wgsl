@@ -77,7 +77,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let cyy = cov.z;
     let dets = determinants(ax, ay);
     let det = dets.y;
-    let opacity = kept_gain(view) * compensation(dets, view) / (1.0 + exp(-param(OPACITY, i)));
+    let logit = param(OPACITY, i);
+    let own = select(1.0 / (1.0 + exp(-logit)), SOLID, view.solid == 1u && logit <= CLEAR);
+    let opacity = kept_gain(view) * compensation(dets, view) * own;
     if !(opacity >= ALPHA_MIN) {
         return;
     }

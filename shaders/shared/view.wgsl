@@ -31,9 +31,10 @@ struct View {
     draw: u32,
     // Pairs of a run, within which fold_slots adds up a Gaussian's slots; 1 where it does not run.
     fold: u32,
+    // 1: Gaussians that are clear are drawn as solid ones, to see what objects are where.
+    solid: u32,
     unused0: u32,
     unused1: u32,
-    unused2: u32,
 }
 
 // Tile edge in pixels. Pictures on the device are padded to whole tiles; what is outside the picture is zero.
@@ -41,6 +42,10 @@ const TILE: u32 = 8u;
 // A Gaussian is not drawn where it would add less than one grey level.
 const ALPHA_MIN: f32 = 0.00392156862745098;
 const ALPHA_MAX: f32 = 0.99;
+// A Gaussian is clear from this logit of opacity down: it shows nothing, but stands for a thing that photos see through.
+const CLEAR: f32 = -16.0;
+// Its opacity where it is drawn as a solid one.
+const SOLID: f32 = 0.9;
 // Variance (px^2) added to each projected Gaussian so that none falls between pixels (3DGS).
 const DILATION: f32 = 0.3;
 // A Gaussian is drawn from a depth on of so many times its own size, the length of its three scales: nearer, it would fill the picture, and its

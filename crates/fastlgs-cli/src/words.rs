@@ -64,9 +64,10 @@ pub fn train(r: &fastlgs::train::Report) -> String {
         let left_out = s.few_views + s.unsupported + s.same;
         format!(", of {} masks; {left_out} candidates had too little behind them", thousands(s.masks))
     });
+    let clear = if r.clear > 0 { format!(", {} of them clear, for what photos see through", thousands(r.clear)) } else { String::new() };
     table(&[
         ("scene", r.scene.display().to_string()),
-        ("Gaussians", format!("{}, colour of degree {}", thousands(r.gaussians), r.sh_degree)),
+        ("Gaussians", format!("{}, colour of degree {}{clear}", thousands(r.gaussians), r.sh_degree)),
         ("colour", colour),
         ("objects", format!("{} and parts{}", thousands(r.objects), dropped.unwrap_or_default())),
         (

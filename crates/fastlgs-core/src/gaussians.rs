@@ -5,6 +5,10 @@ use glam::{Quat, Vec3};
 /// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
 pub const SH_C0: f32 = 0.282_094_79;
 
+/// A Gaussian is clear from this logit of opacity down: it shows nothing, but stands for a thing that photos see through. What training fades out stays
+/// well above, since pictures feel nothing of it from -5.5 on.
+pub const CLEAR: f32 = -16.0;
+
 /// 3-D Gaussians with colour, semantic feature and object id. All vectors have the same length.
 ///
 /// Values are stored as they are optimised and as the PLY of 3DGS holds them: scales as logarithms, opacity as a

@@ -11,6 +11,7 @@ pub mod election;
 pub mod evidence;
 pub mod field;
 pub mod grid;
+pub mod hull;
 pub mod library;
 pub mod mapping;
 pub mod objects;

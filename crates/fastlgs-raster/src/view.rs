@@ -58,8 +58,10 @@ pub struct View {
     pub draw: u32,
     /// Pairs of a run, within which `fold_slots` adds up a Gaussian's slots; 1 where it does not run.
     pub fold: u32,
+    /// 1: Gaussians that are clear ([`fastlgs_core::gaussians::CLEAR`]) are drawn as solid ones, to see what objects are where.
+    pub solid: u32,
     /// Padding to 16 bytes.
-    pub unused: [u32; 3],
+    pub unused: [u32; 2],
 }
 
 impl View {
@@ -87,7 +89,8 @@ impl View {
             dropped: 0,
             draw: 0,
             fold: 1,
-            unused: [0; 3],
+            solid: 0,
+            unused: [0; 2],
         }
     }
 

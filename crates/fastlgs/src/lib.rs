@@ -18,6 +18,7 @@ mod cache;
 pub mod calibrate;
 pub mod calibrations;
 mod checkpoints;
+mod clear;
 mod compared;
 mod error;
 pub mod eval;

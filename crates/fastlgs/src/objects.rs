@@ -1,7 +1,7 @@
 //! From masks to objects, for `train`: Algorithm 1 before training, the views' consensus after it, or those of an earlier run.
 
 use crate::error::{Context, bail};
-use crate::{Result, Run, eyes, masks};
+use crate::{Result, Run, clear, eyes, masks};
 use fastlgs_core::mask_list::{Atoms, Table};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
@@ -97,7 +97,7 @@ pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
 
 /// The frame of a camera without what depends on the viewing direction.
 fn frame(scene: &Gaussians, camera: &Camera, antialias: bool) -> View {
-    View { antialias: u32::from(antialias), ..View::new(camera, scene.len(), 0) }
+    View { antialias: u32::from(antialias), solid: 1, ..View::new(camera, scene.len(), 0) }
 }
 
 /// Gives every Gaussian the objects of the views' object maps that most of its blending weight falls on, and the smallest one's code.
@@ -170,7 +170,9 @@ pub fn by_consensus(
     config: &Config,
     run: &Run,
 ) -> Result<(Grid, Summary)> {
-    let Mapped { chosen, summary } = map(scene, folder, training, config, run)?;
+    clear::forget(scene);
+    let mapped = map(scene, folder, training, config, run)?;
+    let Mapped { chosen, summary } = clear::add(scene, folder, training, mapped, config, run)?;
     let lists = chosen.lists();
     begin_maps(folder)?;
     render_maps(scene, training, &lists, config.antialias, run, |camera, map| Ok(map.save(&folder.objects_path(&camera.name))?))?;

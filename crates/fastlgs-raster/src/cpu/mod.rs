@@ -72,6 +72,7 @@ pub type Splat = [[f32; 4]; 3];
 
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
+pub(crate) const SOLID: f32 = 0.9;
 /// Its logarithm to base 2, for those who bound the exponent.
 pub(crate) const LOG2_ALPHA_MAX: f32 = -0.014_499_57;
 pub(crate) const DILATION: f32 = 0.3;

@@ -1,9 +1,9 @@
 use super::footprint::{Footprint, span};
 use super::harmonics::basis;
-use super::{ALPHA_MAX, ALPHA_MIN, NEAR, Splat, covariance, pcg3d};
+use super::{ALPHA_MAX, ALPHA_MIN, NEAR, SOLID, Splat, covariance, pcg3d};
 use crate::View;
 use crate::view::{TILE, stride};
-use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
+use fastlgs_core::gaussians::{BASE_CHANNELS, CLEAR, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, UVec3, Vec2, Vec3};
 
 /// One Gaussian in the image.
@@ -52,7 +52,9 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
     let (cxx, cxy, cyy) = (cov.x, cov.y, cov.z);
     let dets = covariance::determinants(ax, ay);
     let det = dets[1];
-    let opacity = view.kept_gain() * covariance::compensation(dets, view) * sigmoid(param(10));
+    let logit = param(10);
+    let own = if view.solid == 1 && logit <= CLEAR { SOLID } else { sigmoid(logit) };
+    let opacity = view.kept_gain() * covariance::compensation(dets, view) * own;
     if opacity.is_nan() || opacity < ALPHA_MIN {
         return None;
     }

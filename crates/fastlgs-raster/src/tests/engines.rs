@@ -174,6 +174,39 @@ fn gpu_and_cpu_agree_on_objects() {
 }
 
 #[test]
+fn what_is_clear_shows_nothing_but_hides_where_it_counts_as_solid() {
+    let mut scene = cloud(2000, 5, 0, true);
+    let plain = scene.clone();
+    // A pane before the left half of the picture, in four rows of spheres.
+    let camera = camera(96, 64);
+    let to_world = camera.world_to_camera.inverse();
+    for k in 0..24 {
+        let pixel = glam::Vec2::new(4.0 + 8.0 * (k % 6) as f32, 8.0 + 16.0 * (k / 6) as f32);
+        scene.push_sphere(to_world.transform_point3(camera.ray(pixel)), 0.08, 0.5, [1.0, 0.0, 0.0]);
+        *scene.opacity_logits.last_mut().unwrap() = 1.2 * fastlgs_core::gaussians::CLEAR;
+    }
+    let ids: Vec<u16> = (0..scene.len()).map(|g| if g < plain.len() { 1 } else { 2 }).collect();
+    let sets = [vec![], vec![1], vec![2]];
+    let engines = gpu()
+        .map(|gpu| Box::new(GpuEngine::new(gpu)) as Box<dyn Engine>)
+        .into_iter()
+        .chain([Box::new(CpuEngine::new()) as Box<dyn Engine>]);
+    for mut engine in engines {
+        engine.set_state(&State::of(&plain)).unwrap();
+        let before = engine.render(View::new(&camera, plain.len(), 0), Channels::Color).unwrap();
+        engine.set_state(&State::of(&scene)).unwrap();
+        let view = View::new(&camera, scene.len(), 0);
+        assert_eq!(engine.render(view, Channels::Color).unwrap().data, before.data, "{}", engine.name());
+        let mut left = |solid: u32| -> usize {
+            let shares = engine.render_ids(View { solid, ..view }, &ids).unwrap();
+            shares.held(&sets).enumerate().filter(|(p, held)| p % 96 < 48 && held.first() == Some(&2)).count()
+        };
+        assert_eq!(left(0), 0);
+        assert!(left(1) > 48 * 64 * 3 / 4, "{}", left(1));
+    }
+}
+
+#[test]
 fn a_step_leaves_out_its_share() {
     let scene = cloud(20_000, 3, 0, true);
     let view = View::new(&camera(96, 64), scene.len(), 0);

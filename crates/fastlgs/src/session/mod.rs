@@ -131,7 +131,8 @@ impl Session {
     pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
         if lifted && tau_ac.is_none() {
-            return Ok(Field::Shares(self.engine.render_ids(self.view(camera), &self.gaussians.object_ids)?));
+            let view = View { solid: u32::from(self.trained.clear > 0), ..self.view(camera) };
+            return Ok(Field::Shares(self.engine.render_ids(view, &self.gaussians.object_ids)?));
         }
         let frame = self.render_feature(camera)?;
         let (width, height) = (frame.width, frame.height);

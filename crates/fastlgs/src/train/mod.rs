@@ -10,7 +10,7 @@ mod start;
 use crate::aside::Aside;
 use crate::error::{Context, bail};
 use crate::progress::{Message, TrainStep};
-use crate::{Result, Run, checkpoints, objects, preprocess};
+use crate::{Result, Run, checkpoints, clear, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset, Strategy};
@@ -161,7 +161,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         iterations: result.iterations,
         seconds: result.seconds,
         iterations_per_second: result.iterations_per_second,
-        gaussians: result.gaussians,
+        gaussians: scene.len(),
+        clear: clear::count(&scene),
         removals: result.removals,
         sh_degree: scene.sh_degree,
         exposure: settings.exposure,

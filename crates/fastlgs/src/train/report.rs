@@ -36,6 +36,8 @@ pub struct Report {
     pub iterations_per_second: f64,
     /// Gaussians at the end.
     pub gaussians: usize,
+    /// Those of them that are clear: they stand for what photos see through.
+    pub clear: usize,
     /// What the automatic budget removed.
     pub removals: Vec<Removal>,
     /// SH degree of the written scene.

@@ -1,0 +1,228 @@
+//! Things that photos see through. No Gaussian stands for a pane, since all light tells of what is behind it. But masks tell where it is, from many
+//! sides, and what lies in such masks wherever one looks from is their visual hull (Laurentini 1994).
+
+use fastlgs_core::mask_list::Atoms;
+use fastlgs_core::{Camera, LabelMap};
+use glam::{Vec2, Vec3};
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// What a view tells of things that no Gaussians stand for.
+pub struct Outline {
+    /// The view.
+    pub camera: Camera,
+    /// By pixel: whether only masks that no object explains lie there.
+    pub inside: Vec<bool>,
+    /// By pixel: depth of what is seen there; infinite where nothing is.
+    pub depth: Vec<f32>,
+}
+
+/// Places all over a thing.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Hull {
+    /// About evenly spaced, midway between its near and its far side.
+    pub places: Vec<Vec3>,
+    /// Their spacing.
+    pub spacing: f32,
+}
+
+/// Every how-manieth pixel of rows and columns looks for a hull.
+const STRIDE: u32 = 6;
+/// Places that are tried along a ray, evenly in 1/depth.
+const STEPS: u32 = 1024;
+/// Share of the views that may contradict: masks are missing, or a little narrow.
+const MISSED: f32 = 0.1;
+/// Least factor between the depth of a thing that is seen through and of what is seen.
+const BEHIND: f32 = 1.05;
+/// Each how-manieth of the nearest depths of a view may be wrong, and what share of the next one is the least depth of a thing.
+const NEAR: (usize, f32) = (20, 0.5);
+/// Spacings between places of one thing.
+const APART: i32 = 2;
+/// Fewest places of a thing.
+const FEWEST: usize = 16;
+
+/// By pixel: whether masks lie there, but none that an object fits with an IoU of `min_support`. `shown` are the numbers of objects that are seen, which
+/// `lists` tells.
+pub fn unexplained(atoms: &Atoms, shown: &LabelMap, lists: &[Vec<u16>], min_support: f32) -> Vec<bool> {
+    let mut pixels: BTreeMap<(u16, u16), f32> = BTreeMap::new();
+    for (atom, id) in atoms.map.labels.iter().zip(&shown.labels) {
+        *pixels.entry((*atom, *id)).or_default() += 1.0;
+    }
+    let (mut of_mask, mut of_object) = (vec![0.0f32; atoms.table.areas.len()], BTreeMap::<u16, f32>::new());
+    let mut common: BTreeMap<(u16, u16), f32> = BTreeMap::new();
+    for ((atom, id), pixels) in pixels {
+        let (masks, objects) = (atoms.table.masks(atom), &lists[usize::from(id)]);
+        masks.iter().for_each(|mask| of_mask[usize::from(*mask)] += pixels);
+        objects.iter().for_each(|object| *of_object.entry(*object).or_default() += pixels);
+        let pairs = masks.iter().flat_map(|mask| objects.iter().map(move |object| (*mask, *object)));
+        pairs.for_each(|pair| *common.entry(pair).or_default() += pixels);
+    }
+    let mut explained = vec![false; of_mask.len()];
+    for ((mask, object), common) in common {
+        let either = of_mask[usize::from(mask)] + of_object[&object] - common;
+        explained[usize::from(mask)] |= common >= min_support * either;
+    }
+    let none = |masks: &[u16]| !masks.is_empty() && masks.iter().all(|mask| !explained[usize::from(*mask)]);
+    let of_atom: Vec<bool> = (0..atoms.table.count()).map(|atom| none(atoms.table.masks(atom as u16))).collect();
+    atoms.map.labels.iter().map(|atom| of_atom[usize::from(*atom)]).collect()
+}
+
+/// The hulls of what the views outline, one for each thing that stands apart; `min_views` must see every place.
+pub fn hulls(views: &[Outline], min_views: usize) -> Vec<Hull> {
+    let of_view = |(view, outline): (usize, &Outline)| {
+        let [width, height] = [outline.camera.width, outline.camera.height];
+        let lines = |side: u32| (STRIDE / 2..side).step_by(STRIDE as usize);
+        let near = near(outline);
+        let pixels = lines(height).flat_map(move |y| lines(width).map(move |x| (x, y)));
+        let inside = pixels.filter(|(x, y)| outline.inside[(y * width + x) as usize]);
+        inside.filter_map(|pixel| on_ray(views, view, pixel, near, min_views)).collect::<Vec<_>>()
+    };
+    apart(&views.par_iter().enumerate().map(of_view).collect::<Vec<_>>().concat())
+}
+
+/// Depth from which on there may be things.
+fn near(view: &Outline) -> f32 {
+    let mut depths: Vec<f32> = view.depth.iter().copied().filter(|depth| depth.is_finite()).collect();
+    depths.sort_by(f32::total_cmp);
+    depths.get(depths.len() / NEAR.0).map_or(f32::INFINITY, |depth| NEAR.1 * depth)
+}
+
+/// The middle of the hull on a pixel's ray, if what is seen there lies behind the hull, and the spacing of rays there.
+fn on_ray(views: &[Outline], view: usize, (x, y): (u32, u32), near: f32, min_views: usize) -> Option<(Vec3, f32)> {
+    let Outline { camera, depth, .. } = &views[view];
+    let far = depth[(y * camera.width + x) as usize];
+    if far <= near {
+        return None;
+    }
+    let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
+    let to_world = camera.world_to_camera.inverse();
+    let place = |depth: f32| to_world.transform_point3(ray * depth);
+    let depth = |step: u32| {
+        let share = step as f32 / (STEPS - 1) as f32;
+        1.0 / ((1.0 - share) / near + share / far)
+    };
+    let holds = |step: &u32| agreed(views, view, place(depth(*step)), min_views);
+    let first = (0..STEPS).find(holds)?;
+    let last = (first..STEPS).take_while(holds).last()?;
+    let middle = 0.5 * (depth(first) + depth(last));
+    (BEHIND * depth(last) < far).then(|| (place(middle), STRIDE as f32 * middle / camera.fx))
+}
+
+/// Whether a place, which view number `own` outlines, lies in the outlines of nearly all other views to which nothing hides it, if these are most.
+fn agreed(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> bool {
+    let [mut within, mut open, mut missed] = [0usize; 3];
+    // Photos follow each other: those from elsewhere say no soonest.
+    for k in 0..views.len() {
+        let number = (own + views.len() / 3 + k) % views.len();
+        let view = &views[number];
+        let Some((pixel, depth)) = view.camera.see(place).filter(|_| number != own) else { continue };
+        within += 1;
+        if depth > BEHIND * view.depth[pixel] {
+            continue;
+        }
+        open += 1;
+        if !view.inside[pixel] {
+            missed += 1;
+            if missed as f32 > MISSED * views.len() as f32 {
+                return false;
+            }
+        }
+    }
+    open + 1 >= min_views && 2 * open >= within && missed as f32 <= MISSED * open as f32
+}
+
+/// Thins places out to their usual spacing, and puts those together that are near each other.
+fn apart(found: &[(Vec3, f32)]) -> Vec<Hull> {
+    let mut spacings: Vec<f32> = found.iter().map(|(_, spacing)| *spacing).collect();
+    spacings.sort_by(f32::total_cmp);
+    let Some(spacing) = spacings.get(spacings.len() / 2).copied() else { return Vec::new() };
+    let mut cells: BTreeMap<[i32; 3], Vec3> = BTreeMap::new();
+    for (place, _) in found {
+        cells.entry((place / spacing).floor().as_ivec3().to_array()).or_insert(*place);
+    }
+    let mut left: BTreeSet<[i32; 3]> = cells.keys().copied().collect();
+    let mut hulls = Vec::new();
+    while let Some(first) = left.pop_first() {
+        let (mut edge, mut places) = (vec![first], Vec::new());
+        while let Some(cell) = edge.pop() {
+            places.push(cells[&cell]);
+            let [x, y, z] = cell.map(|at| at - APART..=at + APART);
+            for beside in x.flat_map(|x| {
+                y.clone().flat_map({
+                    let z = z.clone();
+                    move |y| z.clone().map(move |z| [x, y, z])
+                })
+            }) {
+                if left.remove(&beside) {
+                    edge.push(beside);
+                }
+            }
+        }
+        if places.len() >= FEWEST {
+            hulls.push(Hull { places, spacing });
+        }
+    }
+    hulls
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fastlgs_core::mask_list::{Mask, RunLengths};
+    use fastlgs_core::{Level, MaskList};
+
+    /// Twelve cameras around a pane of 1 x 1 x 0.05 at the origin, with a wall behind it all around; it is solid, or seen through, and so many views have
+    /// no mask of it.
+    fn views(solid: bool, missing: usize) -> Vec<Outline> {
+        let outline = |k: usize| {
+            let around = 3.0 * Vec2::from_angle(std::f32::consts::TAU * k as f32 / 12.0);
+            let camera = Camera::look_at("a", Vec3::new(around.x, 0.4, around.y), Vec3::ZERO, Vec3::Y, 160, 120, 0.8);
+            let to_world = camera.world_to_camera.inverse();
+            let (mut inside, mut depth) = (Vec::new(), Vec::new());
+            for pixel in 0..160 * 120 {
+                let ray = camera.ray(Vec2::new((pixel % 160) as f32 + 0.5, (pixel / 160) as f32 + 0.5));
+                let [a, b] = [-HALF, HALF].map(|corner| (corner - camera.centre()) / to_world.transform_vector3(ray));
+                let (first, last) = (a.min(b).max_element(), a.max(b).min_element());
+                inside.push(k >= missing && first < last);
+                depth.push(if solid && first < last { first } else { 6.0 });
+            }
+            Outline { camera, inside, depth }
+        };
+        (0..12).map(outline).collect()
+    }
+
+    const HALF: Vec3 = Vec3::new(0.5, 0.5, 0.025);
+
+    #[test]
+    fn a_pane_is_found_where_masks_have_it() {
+        let found = hulls(&views(false, 0), 3);
+        let [hull] = found.as_slice() else { panic!("{} hulls", found.len()) };
+        let off = hull.places.iter().map(|place| (place.abs() - HALF).max_element()).fold(f32::MIN, f32::max);
+        assert!(off < 0.05, "{off}");
+        // It is covered at the spacing of the rays, and once: not on both sides.
+        let cells = hull.spacing.powi(-2);
+        assert!((0.6 * cells..2.5 * cells).contains(&(hull.places.len() as f32)), "{} of {cells}", hull.places.len());
+    }
+
+    #[test]
+    fn one_view_of_twelve_may_lack_the_mask_and_three_may_not() {
+        assert_eq!(hulls(&views(false, 1), 3).len(), 1);
+        assert!(hulls(&views(false, 3), 3).is_empty());
+    }
+
+    #[test]
+    fn what_is_seen_itself_is_not_seen_through() {
+        assert!(hulls(&views(true, 0), 3).is_empty());
+    }
+
+    #[test]
+    fn a_mask_that_an_object_fits_is_explained_and_so_is_all_in_it() {
+        // Masks of 0..6, 0..2, 8..12 on a row of 14; shown are object 1 at 0..5, object 2 at 9..10.
+        let mask = |from, to| Mask::new(Level::Whole, RunLengths::of(14, 1, |x, _| (from..to).contains(&x)));
+        let atoms = MaskList { masks: vec![mask(0, 6), mask(0, 2), mask(8, 12)], ..MaskList::new(14, 1) }.atoms();
+        let labels = (0..14).map(|x| if x < 5 { 1 } else { 2 * u16::from(x == 9) }).collect();
+        let shown = LabelMap { width: 14, height: 1, labels };
+        let found = unexplained(&atoms, &shown, &[vec![], vec![1], vec![2]], 0.5);
+        assert_eq!(found, (0..14).map(|x| (8..12).contains(&x)).collect::<Vec<_>>());
+    }
+}
