@@ -11,10 +11,10 @@ use std::collections::{BTreeMap, BTreeSet};
 pub struct Outline {
     /// The view.
     pub camera: Camera,
+    /// By pixel: depth of what is seen there; infinite where nothing is, through which nothing can be seen.
+    pub depth: Vec<f32>,
     /// By pixel: whether only masks that no object explains lie there.
     pub inside: Vec<bool>,
-    /// By pixel: depth of what is seen there; infinite where nothing is.
-    pub depth: Vec<f32>,
 }
 
 /// Places all over a thing.
@@ -91,7 +91,7 @@ fn near(view: &Outline) -> f32 {
 fn on_ray(views: &[Outline], view: usize, (x, y): (u32, u32), near: f32, min_views: usize) -> Option<(Vec3, f32)> {
     let Outline { camera, depth, .. } = &views[view];
     let far = depth[(y * camera.width + x) as usize];
-    if far <= near {
+    if far <= near || far.is_infinite() {
         return None;
     }
     let ray = camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
@@ -108,7 +108,7 @@ fn on_ray(views: &[Outline], view: usize, (x, y): (u32, u32), near: f32, min_vie
     (BEHIND * depth(last) < far).then(|| (place(middle), STRIDE as f32 * middle / camera.fx))
 }
 
-/// Whether a place, which view number `own` outlines, lies in the outlines of nearly all other views to which nothing hides it, if these are most.
+/// Whether a place, on a ray of view number `own`, lies in the outlines of nearly all other views to which nothing hides it, if these are most.
 fn agreed(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> bool {
     let [mut within, mut open, mut missed] = [0usize; 3];
     // Photos follow each other: those from elsewhere say no soonest.
@@ -121,11 +121,9 @@ fn agreed(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> bool 
             continue;
         }
         open += 1;
-        if !view.inside[pixel] {
-            missed += 1;
-            if missed as f32 > MISSED * views.len() as f32 {
-                return false;
-            }
+        missed += usize::from(!view.inside[pixel] || view.depth[pixel].is_infinite());
+        if missed as f32 > MISSED * views.len() as f32 {
+            return false;
         }
     }
     open + 1 >= min_views && 2 * open >= within && missed as f32 <= MISSED * open as f32
@@ -146,23 +144,19 @@ fn apart(found: &[(Vec3, f32)]) -> Vec<Hull> {
         let (mut edge, mut places) = (vec![first], Vec::new());
         while let Some(cell) = edge.pop() {
             places.push(cells[&cell]);
-            let [x, y, z] = cell.map(|at| at - APART..=at + APART);
-            for beside in x.flat_map(|x| {
-                y.clone().flat_map({
-                    let z = z.clone();
-                    move |y| z.clone().map(move |z| [x, y, z])
-                })
-            }) {
-                if left.remove(&beside) {
-                    edge.push(beside);
-                }
-            }
+            edge.extend(around(cell).filter(|beside| left.remove(beside)));
         }
         if places.len() >= FEWEST {
             hulls.push(Hull { places, spacing });
         }
     }
     hulls
+}
+
+/// Cells up to [`APART`] beside a cell, itself included.
+fn around([x, y, z]: [i32; 3]) -> impl Iterator<Item = [i32; 3]> {
+    let side = 2 * APART + 1;
+    (0..side.pow(3)).map(move |k| [x + k % side - APART, y + k / side % side - APART, z + k / side / side - APART])
 }
 
 #[cfg(test)]
@@ -211,8 +205,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_seen_itself_is_not_seen_through() {
+    fn what_is_seen_itself_is_not_seen_through_nor_is_the_sky_a_thing() {
         assert!(hulls(&views(true, 0), 3).is_empty());
+        let sky = |mut view: Outline| {
+            let pixels = view.inside.iter_mut().zip(&mut view.depth);
+            pixels.for_each(|(inside, depth)| (*inside, *depth) = if *inside { (false, 3.0) } else { (true, f32::INFINITY) });
+            view
+        };
+        assert!(hulls(&views(false, 0).into_iter().map(sky).collect::<Vec<_>>(), 3).is_empty());
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use crate::objects::{self, Config, Mapped};
 use crate::{Result, Run};
 use fastlgs_core::gaussians::{CLEAR, sigmoid};
-use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::hull::{self, Hull, Outline};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, View};
@@ -12,6 +12,8 @@ use std::ops::Range;
 
 /// Longer side of the pictures in which things are looked for.
 const SIDE: u32 = 480;
+/// Most views that are asked, spread over all.
+const ASKED: usize = 200;
 /// A clear Gaussian's logit of opacity.
 const LOGIT: f32 = 1.25 * CLEAR;
 /// Share of what passes through a pixel from which on nothing is seen there.
@@ -22,6 +24,24 @@ pub fn count(scene: &Gaussians) -> usize {
     scene.opacity_logits.iter().filter(|logit| **logit <= CLEAR).count()
 }
 
+/// Takes the clear ones out of a scene.
+pub fn take(scene: &mut Gaussians) -> Gaussians {
+    let (clear, shown): (Vec<usize>, Vec<usize>) = (0..scene.len()).partition(|i| scene.opacity_logits[*i] <= CLEAR);
+    let taken = scene.select(&clear);
+    if !clear.is_empty() {
+        *scene = scene.select(&shown);
+    }
+    taken
+}
+
+/// Leaves out clear ones that stand for nothing.
+pub fn keep_owned(scene: &mut Gaussians) {
+    let kept: Vec<usize> = (0..scene.len()).filter(|i| scene.opacity_logits[*i] > CLEAR || scene.object_ids[*i] > 0).collect();
+    if kept.len() < scene.len() {
+        *scene = scene.select(&kept);
+    }
+}
+
 /// Leaves out what shows nothing: earlier clear ones, and what faded.
 pub fn forget(scene: &mut Gaussians) {
     let shows: Vec<usize> = (0..scene.len()).filter(|i| 255.0 * sigmoid(scene.opacity_logits[*i]) >= 1.0).collect();
@@ -30,38 +50,58 @@ pub fn forget(scene: &mut Gaussians) {
     }
 }
 
-/// Puts clear Gaussians where masks that none of the objects found so far explain agree; returns the objects as they are found with these, and what they
-/// are where there are none.
-pub fn add(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], mapped: Mapped, config: &Config, run: &Run) -> Result<Mapped> {
-    let hulls = hulls(scene, folder, training, &mapped, config, run)?;
+/// Puts clear Gaussians where `unexplained` masks of the views agree; the objects as they are found with these, and nothing where there are none.
+pub fn add(
+    scene: &mut Gaussians,
+    folder: &SceneFolder,
+    training: &[Camera],
+    unexplained: Vec<Vec<bool>>,
+    config: &Config,
+    run: &Run,
+) -> Result<Option<Mapped>> {
+    let hulls = hulls(scene, training, unexplained, config, run)?;
     if hulls.is_empty() {
-        return Ok(mapped);
+        return Ok(None);
     }
-    let shown = scene.len();
-    let places: Vec<Range<usize>> = hulls.iter().map(|hull| put(scene, hull)).collect();
-    let mut mapped = objects::map(scene, folder, training, config, run)?;
-    let lists = mapped.chosen.lists();
-    let lists: Vec<&[u16]> = scene.object_ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
-    let own = places.into_iter().flat_map(|places| own(&lists, places));
-    let kept: Vec<usize> = (0..shown).chain(own).collect();
-    tracing::debug!(hulls = hulls.len(), put = scene.len() - shown, kept = kept.len() - shown, "clear Gaussians");
-    if kept.len() < scene.len() {
-        *scene = scene.select(&kept);
-        mapped = objects::map(scene, folder, training, config, run)?;
+    let (shown, before) = (scene.len(), scene.object_ids.clone());
+    let mut places: Vec<Range<usize>> = hulls.iter().map(|hull| put(scene, hull)).collect();
+    loop {
+        let mapped = objects::map(scene, folder, training, config, run)?;
+        let lists = mapped.chosen.lists();
+        let lists: Vec<&[u16]> = scene.object_ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
+        let kept: Vec<Vec<usize>> = places.iter().map(|places| own(&lists, places.clone())).collect();
+        let all: Vec<usize> = (0..shown).chain(kept.iter().flatten().copied()).collect();
+        tracing::debug!(hulls = places.len(), put = scene.len() - shown, kept = all.len() - shown, "clear Gaussians");
+        if all.len() == scene.len() {
+            return Ok(Some(mapped));
+        }
+        *scene = scene.select(&all);
+        if all.len() == shown {
+            scene.object_ids = before;
+            return Ok(None);
+        }
+        // Without those, what is behind them may belong to something else.
+        let following = |end: &mut usize, kept: &Vec<usize>| {
+            *end += kept.len();
+            Some(*end - kept.len()..*end)
+        };
+        places = kept.iter().scan(shown, following).collect();
     }
-    Ok(mapped)
+}
+
+/// The pixels of a view, in a picture of at most [`SIDE`] pixels, where only masks lie that none of the objects fits which `shown` shows.
+pub fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &[Vec<u16>], config: &Config) -> Result<Vec<bool>> {
+    let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, config.objects.min_support);
+    let small = camera.shrunk_to(SIDE);
+    let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
+    let columns = |x| at(x, camera.width, small.width);
+    let rows = (0..small.height).map(|y| camera.width as usize * at(y, camera.height, small.height));
+    Ok(rows.flat_map(|row| (0..small.width).map(move |x| row + columns(x))).map(|pixel| pixels[pixel]).collect())
 }
 
 /// The hulls of what masks tell of and objects do not.
-fn hulls(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], mapped: &Mapped, config: &Config, run: &Run) -> Result<Vec<Hull>> {
-    let (lists, mut inside) = (mapped.chosen.lists(), Vec::new());
-    objects::render_maps(scene, training, &lists, config.antialias, run, |camera, shown| {
-        let atoms = objects::atoms(folder, camera)?;
-        inside.push(shrunk(camera, &hull::unexplained(&atoms, &shown, &lists, config.objects.min_support)));
-        Ok(())
-    })?;
-    let telling = inside.iter().filter(|view| view.contains(&true)).count();
-    if telling < config.objects.min_views {
+fn hulls(scene: &Gaussians, training: &[Camera], unexplained: Vec<Vec<bool>>, config: &Config, run: &Run) -> Result<Vec<Hull>> {
+    if unexplained.iter().filter(|view| view.contains(&true)).count() < config.objects.min_views {
         return Ok(Vec::new());
     }
     let mut engine = fastlgs_raster::open_engine(run.device)?;
@@ -71,17 +111,9 @@ fn hulls(scene: &Gaussians, folder: &SceneFolder, training: &[Camera], mapped: &
         let depth = depth(engine.as_mut(), scene, &camera, config.antialias)?;
         Ok(Outline { camera, inside, depth })
     };
-    let views = training.iter().zip(inside).map(outline).collect::<Result<Vec<_>>>()?;
+    let every = training.len().div_ceil(ASKED);
+    let views = training.iter().zip(unexplained).step_by(every).map(outline).collect::<Result<Vec<_>>>()?;
     Ok(hull::hulls(&views, config.objects.min_views))
-}
-
-/// The pixels of a view as a smaller picture of it has them.
-fn shrunk(camera: &Camera, pixels: &[bool]) -> Vec<bool> {
-    let small = camera.shrunk_to(SIDE);
-    let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
-    let columns = |x| at(x, camera.width, small.width);
-    let rows = (0..small.height).map(|y| camera.width as usize * at(y, camera.height, small.height));
-    rows.flat_map(|row| (0..small.width).map(move |x| pixels[row + columns(x)])).collect()
 }
 
 /// Depth of what is seen at each pixel.
@@ -106,10 +138,11 @@ fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
 fn own(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
     let mut held: BTreeMap<u16, usize> = BTreeMap::new();
     places.clone().flat_map(|place| lists[place]).for_each(|object| *held.entry(*object).or_default() += 1);
+    // More than half of the places can lie in many objects around each other: the smallest of them is meant.
     let all = |object: u16| lists.iter().filter(|list| list.contains(&object)).count();
-    let mutual = |(object, common): &(u16, usize)| 2 * common > places.len().max(all(*object));
-    let object = held.into_iter().filter(mutual).max_by_key(|(_, common)| *common);
-    object.map_or_else(Vec::new, |(object, _)| places.filter(|place| lists[*place].contains(&object)).collect())
+    let most = held.into_iter().filter(|(_, common)| 2 * common > places.len()).map(|(object, common)| (all(object), common, object));
+    let object = most.min().filter(|(all, common, _)| 2 * common > *all).map(|found| found.2);
+    object.map_or_else(Vec::new, |object| places.filter(|place| lists[*place].contains(&object)).collect())
 }
 
 #[cfg(test)]
@@ -157,12 +190,21 @@ mod tests {
         let run = Run { seed: 0, device: "cpu", progress: &Silent };
         let mapped = objects::map(&mut scene, &folder, &cameras, &config, &run).unwrap();
         assert!(mapped.chosen.support.is_empty(), "the wall is seen in each mask, and none of it in most");
-        let mapped = add(&mut scene, &folder, &cameras, mapped, &config, &run).unwrap();
+        let left = |camera: &Camera| unexplained(&folder, camera, &LabelMap::new(160, 120), &mapped.chosen.lists(), &config).unwrap();
+        let left = cameras.iter().map(left).collect();
+        let mapped = add(&mut scene, &folder, &cameras, left, &config, &run).unwrap().expect("a pane");
         let supports: Vec<f32> = mapped.chosen.support.iter().map(|support| support.iou).collect();
         assert!(supports.len() == 1 && supports[0] > 0.7, "{supports:?}");
         assert_eq!(scene.means[..wall.len()], wall.means);
         assert!(scene.len() > wall.len() && count(&scene) == scene.len() - wall.len());
         assert!(scene.object_ids[wall.len()..].iter().all(|id| *id > 0), "what belongs to nothing is left out");
+        let mut rest = scene.clone();
+        let taken = take(&mut rest);
+        assert_eq!((rest.means, taken.means.as_slice()), (wall.means.clone(), &scene.means[wall.len()..]));
+        *scene.object_ids.last_mut().unwrap() = 0;
+        let all = scene.len();
+        keep_owned(&mut scene);
+        assert_eq!(scene.len(), all - 1);
         forget(&mut scene);
         assert_eq!(scene.means, wall.means);
     }

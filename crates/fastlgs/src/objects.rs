@@ -171,11 +171,20 @@ pub fn by_consensus(
     run: &Run,
 ) -> Result<(Grid, Summary)> {
     clear::forget(scene);
-    let mapped = map(scene, folder, training, config, run)?;
-    let Mapped { chosen, summary } = clear::add(scene, folder, training, mapped, config, run)?;
-    let lists = chosen.lists();
+    let mut mapped = map(scene, folder, training, config, run)?;
     begin_maps(folder)?;
-    render_maps(scene, training, &lists, config.antialias, run, |camera, map| Ok(map.save(&folder.objects_path(&camera.name))?))?;
+    let (lists, mut unexplained) = (mapped.chosen.lists(), Vec::with_capacity(training.len()));
+    render_maps(scene, training, &lists, config.antialias, run, |camera, map| {
+        unexplained.push(clear::unexplained(folder, camera, &map, &lists, config)?);
+        Ok(map.save(&folder.objects_path(&camera.name))?)
+    })?;
+    if let Some(with_clear) = clear::add(scene, folder, training, unexplained, config, run)? {
+        mapped = with_clear;
+        let lists = mapped.chosen.lists();
+        render_maps(scene, training, &lists, config.antialias, run, |camera, map| Ok(map.save(&folder.objects_path(&camera.name))?))?;
+    }
+    let Mapped { chosen, summary } = mapped;
+    let lists = chosen.lists();
     let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
     let (found, of_found) = embed(folder, training, &chosen.layers(), &lists, &best_views(&areas), run)?;
     let mut grid = Grid::build(&found, &of_found, codes::lattice(chosen.support.len(), run.seed));

@@ -1,7 +1,7 @@
 //! The scene folder that is left when a thing was removed.
 
 use crate::error::Context;
-use crate::{Result, Session, train};
+use crate::{Result, Session, clear, train};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
@@ -76,6 +76,7 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
     removed.as_array_mut().into_iter().for_each(|list| list.push(what.into()));
     if let Some(train) = manifest.notes.get_mut("train") {
         (train["gaussians"], train["objects"]) = (session.gaussians.len().into(), grid.objects.len().into());
+        train["clear"] = clear::count(&session.gaussians).into();
     }
     Ok(folder.save_manifest(&manifest)?)
 }

@@ -12,8 +12,10 @@ use crate::error::{Context, bail};
 use crate::session::ask::Ask;
 use crate::session::selection;
 use crate::{Result, Run, Session};
+use fastlgs_core::gaussians::CLEAR;
 use fastlgs_core::{Camera, metrics};
 use fastlgs_grid::Grid;
+use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{Hit, QueryConfig};
 use fastlgs_raster::Channels;
 use fastlgs_vision::inpaint::{self, Inpainter};
@@ -107,17 +109,22 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     }
     let grid = session.grid()?;
     let targets = targets(config, &mut session, &grid)?;
-    let mut hidden = Vec::new();
-    for camera in session.cameras.clone() {
-        let mask = session.field(&camera, None)?.mask(&grid, &targets);
-        let widened = metrics::dilate(&mask, camera.width, camera.height, WIDENED);
-        hidden.push((camera, widened));
-    }
     let views = session.manifest.training(&session.cameras);
     let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
-    let shown: Vec<(Camera, Vec<bool>)> = hidden.iter().filter(|(camera, _)| trained_on(camera)).cloned().collect();
+    let (mut hidden, mut shown) = (Vec::new(), Vec::new());
+    for camera in session.cameras.clone() {
+        let widened = |field: Field| metrics::dilate(&field.mask(&grid, &targets), camera.width, camera.height, WIDENED);
+        let thing = widened(session.field(&camera, None)?);
+        if trained_on(&camera) {
+            // What is seen through the thing is not hidden by it.
+            shown.push((camera.clone(), if session.trained.clear > 0 { widened(session.field_of_shown(&camera)?) } else { thing.clone() }));
+        }
+        hidden.push((camera, thing));
+    }
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let mut stays = behind::seen(&session, &shown)?;
+    // No photo shows what is clear.
+    stays.iter_mut().zip(&session.gaussians.opacity_logits).for_each(|(stays, logit)| *stays |= *logit <= CLEAR);
     selection::gaussians(&session.gaussians, &grid, &objects).into_iter().for_each(|i| stays[i] = false);
     let left: Vec<usize> = (0..stays.len()).filter(|i| stays[*i]).collect();
     if left.is_empty() {
@@ -211,7 +218,7 @@ fn fill(
         Membrane::span(&mut inverse, &gap, width);
         let mut colors = solid_colors(session, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
-        let ids = membrane::continued(&session.field(camera, None)?.ids(grid).labels, &gap, width);
+        let ids = membrane::continued(&session.field_of_shown(camera)?.ids(grid).labels, &gap, width);
         let to_world = camera.world_to_camera.inverse();
         let mut scene = session.gaussians.clone();
         for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {

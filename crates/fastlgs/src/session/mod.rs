@@ -129,12 +129,21 @@ impl Session {
 
     /// What a view tells about objects, in the way the scene was trained, unless `tau_ac` asks for the paper's.
     pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
+        let solid = u32::from(self.trained.clear > 0);
+        self.field_of(View { solid, ..self.view(camera) }, tau_ac)
+    }
+
+    /// The same of what shows alone, as if nothing were seen through.
+    pub fn field_of_shown(&mut self, camera: &Camera) -> Result<Field> {
+        self.field_of(self.view(camera), None)
+    }
+
+    fn field_of(&mut self, view: View, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
         if lifted && tau_ac.is_none() {
-            let view = View { solid: u32::from(self.trained.clear > 0), ..self.view(camera) };
             return Ok(Field::Shares(self.engine.render_ids(view, &self.gaussians.object_ids)?));
         }
-        let frame = self.render_feature(camera)?;
+        let frame = self.engine.render(View { solid: 0, ..view }, Channels::Feature)?;
         let (width, height) = (frame.width, frame.height);
         // Codes that were trained make up for what passes through; those that were lifted do not.
         let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };

@@ -67,6 +67,9 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     held_out.check()?;
     let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, began, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
+    // There is nothing to train in what photos see through.
+    clear::take(&mut first);
+    let kept_clear = if config.mapping == Mapping::Keep { clear::take(&mut folder.gaussians()?) } else { Gaussians::default() };
     let free = start::free_space(config, &folder, &training, &first)?;
     if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
         // What most views say: where they disagree, descent from elsewhere ends between their codes.
@@ -135,7 +138,9 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             found
         }
         Some(found) => {
+            scene.append(kept_clear.with_sh_degree(degree));
             objects::lift(&mut scene, &folder, &training, &found, config.antialias)?;
+            clear::keep_owned(&mut scene);
             found
         }
         None => {
