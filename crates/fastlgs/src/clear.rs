@@ -42,8 +42,22 @@ pub fn keep_owned(scene: &mut Gaussians) {
     }
 }
 
+/// [`objects::map`] with the things that photos see through; writes the object maps.
+pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
+    forget(scene);
+    let mapped = objects::map(scene, folder, training, config, run)?;
+    let (lists, mut left) = (mapped.chosen.lists(), Vec::with_capacity(training.len()));
+    objects::write_maps(scene, folder, training, &mapped, config.antialias, run, |camera, shown| {
+        left.push(unexplained(folder, camera, shown, &lists, config)?);
+        Ok(())
+    })?;
+    let Some(with_clear) = add(scene, folder, training, left, config, run)? else { return Ok(mapped) };
+    objects::write_maps(scene, folder, training, &with_clear, config.antialias, run, |_, _| Ok(()))?;
+    Ok(with_clear)
+}
+
 /// Leaves out what shows nothing: earlier clear ones, and what faded.
-pub fn forget(scene: &mut Gaussians) {
+fn forget(scene: &mut Gaussians) {
     let shows: Vec<usize> = (0..scene.len()).filter(|i| 255.0 * sigmoid(scene.opacity_logits[*i]) >= 1.0).collect();
     if shows.len() < scene.len() {
         *scene = scene.select(&shows);
@@ -51,7 +65,7 @@ pub fn forget(scene: &mut Gaussians) {
 }
 
 /// Puts clear Gaussians where `unexplained` masks of the views agree; the objects as they are found with these, and nothing where there are none.
-pub fn add(
+fn add(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
@@ -90,7 +104,7 @@ pub fn add(
 }
 
 /// The pixels of a view, in a picture of at most [`SIDE`] pixels, where only masks lie that none of the objects fits which `shown` shows.
-pub fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &[Vec<u16>], config: &Config) -> Result<Vec<bool>> {
+fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &[Vec<u16>], config: &Config) -> Result<Vec<bool>> {
     let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, config.objects.min_support);
     let small = camera.shrunk_to(SIDE);
     let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;

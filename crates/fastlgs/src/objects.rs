@@ -1,7 +1,7 @@
 //! From masks to objects, for `train`: Algorithm 1 before training, the views' consensus after it, or those of an earlier run.
 
 use crate::error::{Context, bail};
-use crate::{Result, Run, clear, eyes, masks};
+use crate::{Result, Run, eyes, masks};
 use fastlgs_core::mask_list::{Atoms, Table};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
@@ -162,28 +162,14 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     Ok(Mapped { chosen, summary })
 }
 
-/// Global mapping: the objects of [`map`], each embedded as the views show it.
+/// Global mapping: the objects of [`map`], each embedded as the object maps show it that [`write_maps`] left.
 pub fn by_consensus(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
-    config: &Config,
+    Mapped { chosen, summary }: Mapped,
     run: &Run,
 ) -> Result<(Grid, Summary)> {
-    clear::forget(scene);
-    let mut mapped = map(scene, folder, training, config, run)?;
-    begin_maps(folder)?;
-    let (lists, mut unexplained) = (mapped.chosen.lists(), Vec::with_capacity(training.len()));
-    render_maps(scene, training, &lists, config.antialias, run, |camera, map| {
-        unexplained.push(clear::unexplained(folder, camera, &map, &lists, config)?);
-        Ok(map.save(&folder.objects_path(&camera.name))?)
-    })?;
-    if let Some(with_clear) = clear::add(scene, folder, training, unexplained, config, run)? {
-        mapped = with_clear;
-        let lists = mapped.chosen.lists();
-        render_maps(scene, training, &lists, config.antialias, run, |camera, map| Ok(map.save(&folder.objects_path(&camera.name))?))?;
-    }
-    let Mapped { chosen, summary } = mapped;
     let lists = chosen.lists();
     let areas: Vec<&[(u32, u32)]> = chosen.support.iter().map(|s| s.areas.as_slice()).collect();
     let (found, of_found) = embed(folder, training, &chosen.layers(), &lists, &best_views(&areas), run)?;
@@ -194,6 +180,23 @@ pub fn by_consensus(
     (grid.overlaps, grid.shown, grid.encoder) = (chosen.overlaps, chosen.shown, eyes::identity_of(&folder.manifest()?));
     grid.set_codes(scene);
     Ok((grid, summary))
+}
+
+/// Writes the object map of each view, and tells of it.
+pub fn write_maps(
+    scene: &Gaussians,
+    folder: &SceneFolder,
+    training: &[Camera],
+    mapped: &Mapped,
+    antialias: bool,
+    run: &Run,
+    mut tell: impl FnMut(&Camera, &LabelMap) -> Result<()>,
+) -> Result<()> {
+    begin_maps(folder)?;
+    render_maps(scene, training, &mapped.chosen.lists(), antialias, run, |camera, map| {
+        map.save(&folder.objects_path(&camera.name))?;
+        tell(camera, &map)
+    })
 }
 
 /// Gives the object map of each view to `take`: at each pixel the id that stands for the objects there.

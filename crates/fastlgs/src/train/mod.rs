@@ -144,7 +144,8 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             found
         }
         None => {
-            let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, &config.global(), run)?;
+            let mapped = clear::map(&mut scene, &folder, &training, &config.global(), run)?;
+            let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, mapped, run)?;
             summary = Some(found);
             grid
         }
