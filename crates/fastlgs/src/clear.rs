@@ -19,27 +19,35 @@ const LOGIT: f32 = 1.25 * CLEAR;
 /// Share of what passes through a pixel from which on nothing is seen there.
 const NOTHING: f32 = 0.5;
 
+/// Whether a Gaussian is clear.
+pub fn is_clear(scene: &Gaussians, gaussian: usize) -> bool {
+    scene.opacity_logits[gaussian] <= CLEAR
+}
+
 /// How many clear Gaussians a scene has.
 pub fn count(scene: &Gaussians) -> usize {
-    scene.opacity_logits.iter().filter(|logit| **logit <= CLEAR).count()
+    (0..scene.len()).filter(|i| is_clear(scene, *i)).count()
+}
+
+/// Leaves out what does not stay.
+fn retain(scene: &mut Gaussians, stays: impl Fn(&Gaussians, usize) -> bool) {
+    let kept: Vec<usize> = (0..scene.len()).filter(|i| stays(scene, *i)).collect();
+    if kept.len() < scene.len() {
+        *scene = scene.select(&kept);
+    }
 }
 
 /// Takes the clear ones out of a scene.
 pub fn take(scene: &mut Gaussians) -> Gaussians {
-    let (clear, shown): (Vec<usize>, Vec<usize>) = (0..scene.len()).partition(|i| scene.opacity_logits[*i] <= CLEAR);
+    let clear: Vec<usize> = (0..scene.len()).filter(|i| is_clear(scene, *i)).collect();
     let taken = scene.select(&clear);
-    if !clear.is_empty() {
-        *scene = scene.select(&shown);
-    }
+    retain(scene, |scene, i| !is_clear(scene, i));
     taken
 }
 
 /// Leaves out clear ones that stand for nothing.
 pub fn keep_owned(scene: &mut Gaussians) {
-    let kept: Vec<usize> = (0..scene.len()).filter(|i| scene.opacity_logits[*i] > CLEAR || scene.object_ids[*i] > 0).collect();
-    if kept.len() < scene.len() {
-        *scene = scene.select(&kept);
-    }
+    retain(scene, |scene, i| !is_clear(scene, i) || scene.object_ids[i] > 0);
 }
 
 /// [`objects::map`] with the things that photos see through; writes the object maps.
@@ -58,10 +66,7 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
 
 /// Leaves out what shows nothing: earlier clear ones, and what faded.
 fn forget(scene: &mut Gaussians) {
-    let shows: Vec<usize> = (0..scene.len()).filter(|i| 255.0 * sigmoid(scene.opacity_logits[*i]) >= 1.0).collect();
-    if shows.len() < scene.len() {
-        *scene = scene.select(&shows);
-    }
+    retain(scene, |scene, i| 255.0 * sigmoid(scene.opacity_logits[i]) >= 1.0);
 }
 
 /// Puts clear Gaussians where `unexplained` masks of the views agree; the objects as they are found with these, and nothing where there are none.

@@ -11,8 +11,7 @@ mod membrane;
 use crate::error::{Context, bail};
 use crate::session::ask::Ask;
 use crate::session::selection;
-use crate::{Result, Run, Session};
-use fastlgs_core::gaussians::CLEAR;
+use crate::{Result, Run, Session, clear};
 use fastlgs_core::{Camera, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -124,7 +123,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let mut stays = behind::seen(&session, &shown)?;
     // No photo shows what is clear.
-    stays.iter_mut().zip(&session.gaussians.opacity_logits).for_each(|(stays, logit)| *stays |= *logit <= CLEAR);
+    stays.iter_mut().enumerate().for_each(|(i, stays)| *stays |= clear::is_clear(&session.gaussians, i));
     selection::gaussians(&session.gaussians, &grid, &objects).into_iter().for_each(|i| stays[i] = false);
     let left: Vec<usize> = (0..stays.len()).filter(|i| stays[*i]).collect();
     if left.is_empty() {
