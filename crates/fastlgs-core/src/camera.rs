@@ -129,10 +129,30 @@ impl Camera {
     }
 }
 
-/// Half the diagonal of the box around the camera centres: the scale of learning rates ("scene extent" of 3DGS).
+/// A camera that is so many times farther from the middle of all than their median is taken to have a wrong pose.
+const FAR_OUTSIDE: f32 = 10.0;
+
+/// Which cameras lie far outside of the others, whose poses are wrong most often. The median camera decides, so that they do not.
+pub fn far_outside(cameras: &[Camera]) -> Vec<bool> {
+    let centres: Vec<Vec3> = cameras.iter().map(Camera::centre).collect();
+    let median = |mut values: Vec<f32>| {
+        values.sort_by(f32::total_cmp);
+        values.get(values.len() / 2).copied().unwrap_or(0.0)
+    };
+    let middle = Vec3::from_array([0, 1, 2].map(|k| median(centres.iter().map(|c| c[k]).collect())));
+    let distances: Vec<f32> = centres.iter().map(|c| c.distance(middle)).collect();
+    let usual = median(distances.clone());
+    // Where most stand in one place there is no scale to compare with.
+    distances.iter().map(|distance| usual > 0.0 && *distance > FAR_OUTSIDE * usual).collect()
+}
+
+/// 1.1 times the largest distance of a camera from the mean of all: the scale of learning rates ("scene extent" of 3DGS). Cameras far outside of the
+/// others do not count.
 pub fn scene_extent(cameras: &[Camera]) -> f32 {
-    let mean = cameras.iter().map(Camera::centre).sum::<Vec3>() / cameras.len().max(1) as f32;
-    let radius = cameras.iter().map(|c| c.centre().distance(mean)).fold(0.0, f32::max);
+    let outside = far_outside(cameras);
+    let centres: Vec<Vec3> = cameras.iter().zip(outside).filter(|(_, outside)| !outside).map(|(c, _)| c.centre()).collect();
+    let mean = centres.iter().sum::<Vec3>() / centres.len().max(1) as f32;
+    let radius = centres.iter().map(|c| c.distance(mean)).fold(0.0, f32::max);
     (radius * 1.1).max(1e-3)
 }
 
@@ -166,6 +186,20 @@ mod tests {
         for (x, y, depth) in [(-0.1, 5.0, 2.0), (5.0, -0.1, 2.0), (64.1, 5.0, 2.0), (5.0, 48.1, 2.0), (5.0, 5.0, -2.0)] {
             assert_eq!(camera.see(at(x, y, depth)), None);
         }
+    }
+
+    #[test]
+    fn a_camera_far_outside_does_not_set_the_scale() {
+        let at = |eye: Vec3| Camera::look_at("a", eye, Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let ring = (0..12).map(|k| at(Vec3::new((k as f32).cos(), 0.2, (k as f32).sin()) * 3.0));
+        let mut cameras: Vec<Camera> = ring.collect();
+        let extent = scene_extent(&cameras);
+        cameras.push(at(Vec3::splat(1e4)));
+        assert_eq!((scene_extent(&cameras), far_outside(&cameras).iter().filter(|o| **o).count()), (extent, 1));
+        // A few steps aside are no error.
+        cameras.pop();
+        cameras.push(at(Vec3::splat(6.0)));
+        assert!(scene_extent(&cameras) > extent && !far_outside(&cameras).contains(&true));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //! its PLY, label maps, evaluation labels, metrics, and the scene folder that ties the stages together.
 //!
 //! Conventions, everywhere in the project:
-//! * world units are those of the input poses; cameras look along +z with x right and y down (OpenCV);
+//! * world units are those of the input poses (see [`world_frame`] for extreme ones); cameras look along +z with x right and y down (OpenCV);
 //! * pixel (0, 0) covers [0, 1) x [0, 1): its centre is at (0.5, 0.5);
 //! * images are row-major; planar float images are `[channel][row][column]`.
 
@@ -20,6 +20,7 @@ pub mod glb;
 pub mod image_io;
 pub mod label_map;
 pub mod labels;
+pub mod mask_image;
 pub mod mask_list;
 pub mod metrics;
 pub mod npy;
@@ -33,6 +34,7 @@ pub mod spz;
 pub mod synth;
 pub mod turbo;
 pub mod undistort;
+pub mod world_frame;
 
 pub use camera::Camera;
 pub use error::{Error, Result};
@@ -41,3 +43,4 @@ pub use label_map::LabelMap;
 pub use mask_list::{Level, MaskList};
 pub use scene_folder::SceneFolder;
 pub use shares::Shares;
+pub use world_frame::WorldFrame;

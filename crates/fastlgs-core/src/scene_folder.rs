@@ -1,11 +1,11 @@
 //! The scene folder: one place for everything a stage leaves for the next.
 
 use crate::dataset::SfmPoint;
-use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, compact, fs, image_io, ply};
+use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, WorldFrame, compact, fs, image_io, ply};
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 
 /// What makes a folder a scene.
@@ -51,6 +51,12 @@ pub struct Manifest {
     /// Views that are not trained on because their poses contradict those of the others.
     #[serde(default)]
     pub excluded: Vec<String>,
+    /// Where the scene lies in the world of the poses' files, and its unit.
+    #[serde(default, skip_serializing_if = "WorldFrame::is_identity")]
+    pub frame: WorldFrame,
+    /// The files of the scene, relative to its folder, with '/' between the parts. Stages move and remove only these.
+    #[serde(default)]
+    pub files: BTreeSet<String>,
     /// Seconds a stage took, by name.
     #[serde(default)]
     pub seconds: BTreeMap<String, f64>,
@@ -260,7 +266,12 @@ impl SceneFolder {
 
     /// Label map of a view after mapping: values are object ids.
     pub fn objects_path(&self, view: &str) -> PathBuf {
-        self.root.join("masks/objects").join(format!("{view}.png"))
+        self.root.join(Self::objects_name(view))
+    }
+
+    /// The same, relative to the scene's folder, as the manifest lists it.
+    pub fn objects_name(view: &str) -> String {
+        format!("masks/objects/{view}.png")
     }
 
     /// Reads the object ids of a view.
@@ -311,7 +322,10 @@ impl SceneFolder {
 }
 
 /// Index of a view by exact file name, or by name without ending where that is unique.
+/// Folders before the file name are joined to it as the view's name has them.
 pub fn view_of<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> Option<usize> {
+    let joined = name.replace('/', "_");
+    let name = if names.clone().any(|n| n == name) { name } else { joined.as_str() };
     let bare = |n: &&str| Path::new(n).file_stem().is_some_and(|s| s == name);
     let mut hits = names.clone().enumerate().filter(|(_, n)| bare(n)).map(|(i, _)| i);
     names.clone().position(|n| n == name).or_else(|| hits.next().filter(|_| hits.next().is_none()))

@@ -56,14 +56,25 @@ pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -
     let keep = tensors_path(path, course.iteration);
     save_tensors(&keep, &tensors)?;
     fs::write_json(&path.with_extension("json"), course)?;
-    let folder = path.parent().unwrap_or(Path::new("."));
-    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
-        let old = entry.path();
-        if old != keep && old.extension().is_some_and(|e| e == "safetensors") {
-            let _ = std::fs::remove_file(old);
-        }
-    }
+    tensors_of(path).filter(|old| *old != keep).for_each(|old| drop(std::fs::remove_file(old)));
     Ok(())
+}
+
+/// The tensor files of a checkpoint: `NAME.ITERATION.safetensors` beside `path`.
+fn tensors_of(path: &Path) -> impl Iterator<Item = PathBuf> {
+    let entries = std::fs::read_dir(path.parent().unwrap_or(Path::new("."))).into_iter().flatten().flatten();
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    entries.map(|entry| entry.path()).filter(move |file| {
+        let own = file.file_name().unwrap_or_default().to_string_lossy();
+        let iteration = own.strip_prefix(&name).and_then(|rest| rest.strip_prefix('.')?.strip_suffix(".safetensors"));
+        iteration.is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit()))
+    })
+}
+
+/// Removes a checkpoint and nothing else.
+pub fn remove(path: &Path) {
+    let _ = std::fs::remove_file(path.with_extension("json"));
+    tensors_of(path).for_each(|file| drop(std::fs::remove_file(file)));
 }
 
 /// Reads a checkpoint; nothing where there is none.

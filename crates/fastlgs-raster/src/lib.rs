@@ -11,7 +11,7 @@ pub mod align;
 pub mod budget;
 pub mod change;
 mod channels;
-mod checkpoint;
+pub mod checkpoint;
 pub mod cpu;
 pub mod density;
 mod engine;

@@ -27,6 +27,7 @@ mod opencv;
 pub mod photo_quality;
 pub mod places;
 pub mod pose_check;
+pub mod pose_convention;
 mod printed;
 pub mod pull;
 #[cfg(test)]

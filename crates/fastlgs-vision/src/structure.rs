@@ -8,6 +8,7 @@ use crate::printed::lines;
 use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{self, colmap, is_photo};
+use fastlgs_core::image_io::WayUp;
 use fastlgs_core::{Camera, fs, image_io};
 use glam::Mat4;
 use rayon::prelude::*;
@@ -63,43 +64,45 @@ impl Tool {
     }
 }
 
-/// Finds the poses of the photos in `PHOTOS/images` and leaves them in `PHOTOS/sparse/0`. `say` is told each stage, and what
-/// the tool prints, at least once a second; it answers whether to go on.
+/// The photos in a folder, sorted by name.
 ///
 /// # Errors
-/// When the tool fails, no photo could be placed, or `say` ended it; what the tool said last is in the message.
-pub fn reconstruct(tool: &Tool, photos: &Path, seed: u64, say: impl Fn(&str, &str) -> bool + Sync) -> Result<()> {
-    let images = photos.join("images");
-    let entries = images.read_dir().map_err(fastlgs_core::Error::io(&images))?;
+/// When there are fewer than three; the message names what was not read.
+pub fn photos_in(images: &Path) -> Result<Vec<PathBuf>> {
+    let entries = images.read_dir().map_err(fastlgs_core::Error::io(images))?;
     let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
     files.sort();
     if files.len() < 3 {
-        let folders = dataset::folders_within(&images);
+        let folders = dataset::folders_within(images);
         let below =
             (!folders.is_empty()).then(|| format!("photos in folders within it are not read ({}): move them up", folders.join(", ")));
-        let why: String = dataset::passed_over(&images).into_iter().chain(below).map(|reason| format!("; {reason}")).collect();
+        let why: String = dataset::passed_over(images).into_iter().chain(below).map(|reason| format!("; {reason}")).collect();
         return Err(Error::Invalid(format!("{}: {} photos; poses need at least 3{why}", images.display(), files.len())));
     }
-    let work = photos.join("sparse.partial");
-    let _ = std::fs::remove_dir_all(&work);
+    Ok(files)
+}
+
+/// Finds the poses of photos of one folder. Returns the folder of the COLMAP model that explains most photos; it lies in the folder `work`,
+/// which is emptied first. `say` receives each stage and what the tool prints, at least once a second; it answers whether to continue.
+///
+/// # Errors
+/// When the tool fails, no photo could be placed, or `say` ended it; what the tool said last is in the message.
+pub fn reconstruct(tool: &Tool, files: &[PathBuf], work: &Path, seed: u64, say: impl Fn(&str, &str) -> bool + Sync) -> Result<PathBuf> {
+    let images = files.first().and_then(|file| file.parent()).unwrap_or(Path::new("."));
+    let _ = std::fs::remove_dir_all(work);
     let models = work.join("sparse");
     std::fs::create_dir_all(&models).map_err(fastlgs_core::Error::io(&models))?;
     match tool {
-        Tool::Colmap(program) => by_program(program, &images, &work, &models, &files, &say)?,
+        Tool::Colmap(program) => by_program(program, images, work, &models, files, &say)?,
         Tool::Pycolmap(python) => {
-            plan(&files, &work, seed, &say)?;
-            by_script(python, &work, &say)?;
+            plan(files, work, seed, &say)?;
+            by_script(python, work, &say)?;
         }
     }
-    let best = largest_model(&models).ok_or_else(|| {
+    largest_model(&models).ok_or_else(|| {
         let images = images.display();
         Error::Invalid(format!("{images}: COLMAP could place no photo; are they sharp and do neighbours overlap?"))
-    })?;
-    let target = photos.join("sparse/0");
-    std::fs::create_dir_all(photos.join("sparse")).map_err(fastlgs_core::Error::io(&target))?;
-    std::fs::rename(best, &target).map_err(fastlgs_core::Error::io(&target))?;
-    let _ = std::fs::remove_dir_all(&work);
-    Ok(())
+    })
 }
 
 /// By pycolmap, from what was planned in the work folder.
@@ -159,7 +162,7 @@ fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option
 fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) -> bool + Sync)) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
         going(say("features", &path.file_name().unwrap_or_default().to_string_lossy()))?;
-        let photo = image_io::load_photo(path, None)?.pixels;
+        let photo = image_io::load_photo(path, WayUp::Upright)?.pixels;
         let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
         let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
         let small = image_io::resize(&photo, size(photo.width()), size(photo.height()));
@@ -315,11 +318,11 @@ mod tests {
         Tool::Colmap(path)
     }
 
-    fn photos(dir: &Path, count: usize) -> PathBuf {
-        let photos = dir.join("photos");
-        std::fs::create_dir_all(photos.join("images")).unwrap();
-        (0..count).for_each(|k| std::fs::write(photos.join(format!("images/{k}.jpg")), b"").unwrap());
-        photos
+    fn photos(dir: &Path, count: usize) -> Vec<PathBuf> {
+        let images = dir.join("images");
+        std::fs::create_dir_all(&images).unwrap();
+        (0..count).for_each(|k| std::fs::write(images.join(format!("{k}.jpg")), b"").unwrap());
+        photos_in(&images).unwrap()
     }
 
     const MAPPER: &str = "if [ \"$2\" = --help ]; then echo '  --SiftExtraction.use_gpu arg (=1)'; exit 0; fi
@@ -330,19 +333,19 @@ mod tests {
     fi";
 
     #[test]
-    fn the_largest_model_becomes_sparse_0() {
+    fn the_largest_model_is_found() {
         let dir = tempfile::tempdir().unwrap();
         let photos = photos(dir.path(), 4);
         let stages = Mutex::new(Vec::new());
-        reconstruct(&stand_in(dir.path(), MAPPER), &photos, 0, |stage, _| {
+        let work = dir.path().join("work");
+        let model = reconstruct(&stand_in(dir.path(), MAPPER), &photos, &work, 0, |stage, _| {
             stages.lock().unwrap().push(stage.to_owned());
             true
         })
         .unwrap();
         stages.lock().unwrap().dedup();
         assert_eq!(*stages.lock().unwrap(), ["features", "matches", "mapping"]);
-        assert_eq!(std::fs::metadata(photos.join("sparse/0/images.bin")).unwrap().len(), 11);
-        assert!(!photos.join("sparse.partial").exists());
+        assert_eq!(std::fs::metadata(model.join("images.bin")).unwrap().len(), 11);
         let calls = std::fs::read_to_string(dir.path().join("calls")).unwrap();
         assert!(calls.contains("exhaustive_matcher") && calls.contains("single_camera 1"), "{calls}");
         assert!(calls.contains("--SiftExtraction.use_gpu 0"), "{calls}");
@@ -352,12 +355,18 @@ mod tests {
     fn failures_are_told_in_the_tools_words() {
         let dir = tempfile::tempdir().unwrap();
         let broken = stand_in(dir.path(), "echo 'cannot open display' >&2; exit 1");
-        let error = reconstruct(&broken, &photos(dir.path(), 4), 0, |_, _| true).unwrap_err().to_string();
+        let error = reconstruct(&broken, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| true).unwrap_err().to_string();
         assert!(error.contains("cannot open display") && error.contains("features"), "{error}");
         let nothing = stand_in(dir.path(), "exit 0");
-        assert!(reconstruct(&nothing, &photos(dir.path(), 4), 0, |_, _| true).unwrap_err().to_string().contains("place no photo"));
+        assert!(
+            reconstruct(&nothing, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| true)
+                .unwrap_err()
+                .to_string()
+                .contains("place no photo")
+        );
         let few = tempfile::tempdir().unwrap();
-        assert!(reconstruct(&nothing, &photos(few.path(), 2), 0, |_, _| true).unwrap_err().to_string().contains("at least 3"));
+        (0..2).for_each(|k| std::fs::write(few.path().join(format!("{k}.jpg")), b"").unwrap());
+        assert!(photos_in(few.path()).unwrap_err().to_string().contains("at least 3"));
     }
 
     #[test]
@@ -365,7 +374,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let asleep = stand_in(dir.path(), "[ \"$2\" = --help ] || exec sleep 600");
         let began = std::time::Instant::now();
-        let error = reconstruct(&asleep, &photos(dir.path(), 4), 0, |_, _| began.elapsed() < SILENT).unwrap_err();
+        let error = reconstruct(&asleep, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| began.elapsed() < SILENT).unwrap_err();
         assert!(error.to_string().contains("ended"), "{error}");
         assert!(began.elapsed() < 10 * SILENT);
     }

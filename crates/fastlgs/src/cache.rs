@@ -23,6 +23,8 @@ pub fn key(parts: &[&[u8]]) -> Key {
     hash.finalize().into()
 }
 
+/// Length of the name of a result: sixteen bytes of its fingerprint in hexadecimal digits.
+const NAME_LENGTH: usize = 32;
 /// Bytes that may lie idle in any case.
 const IDLE: u64 = 256 << 20;
 
@@ -43,7 +45,7 @@ impl Cache {
     /// What `make` once made from inputs of this fingerprint, by this version of the program; else makes and keeps it.
     pub fn get<T: Serialize + DeserializeOwned>(&self, stage: &'static str, inputs: &Key, make: impl FnOnce() -> Result<T>) -> Result<T> {
         let key = key(&[env!("CARGO_PKG_VERSION").as_bytes(), inputs]);
-        let name: String = key[..16].iter().map(|b| format!("{b:02x}")).collect();
+        let name: String = key[..NAME_LENGTH / 2].iter().map(|b| format!("{b:02x}")).collect();
         let path = self.root.join(stage).join(name);
         // A file that cannot be read is as good as none.
         let known = std::fs::read(&path).ok().and_then(|bytes| postcard::from_bytes(&bytes).ok());
@@ -77,7 +79,12 @@ impl Cache {
         let used = self.used.lock().expect("no panic while holding the lock");
         let stages = std::fs::read_dir(&self.root).into_iter().flatten().flatten();
         let files = stages.flat_map(|stage| std::fs::read_dir(stage.path()).into_iter().flatten().flatten());
-        let known = files.filter_map(|file| Some((file.path(), file.metadata().ok()?)));
+        // Other files in these folders are not ours.
+        let ours = |file: &std::fs::DirEntry| {
+            let name = file.file_name();
+            name.len() == NAME_LENGTH && name.as_encoded_bytes().iter().all(u8::is_ascii_hexdigit)
+        };
+        let known = files.filter(ours).filter_map(|file| Some((file.path(), file.metadata().ok()?)));
         let (in_use, mut idle): (Vec<_>, Vec<_>) = known.partition(|(path, _)| used.contains(path));
         let room = in_use.iter().map(|(_, about)| about.len()).sum::<u64>().max(least);
         // The newest first.

@@ -15,5 +15,7 @@ pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
 
 /// Forgets a run that was broken off.
 pub(crate) fn forget(folder: &SceneFolder) {
-    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints"));
+    fastlgs_raster::checkpoint::remove(&path(folder));
+    // It stays where anything else lies in it.
+    let _ = std::fs::remove_dir(folder.root.join("checkpoints"));
 }

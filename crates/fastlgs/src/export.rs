@@ -1,12 +1,14 @@
 //! A trained scene for other programs, or a small folder with just what a query needs.
 
-use crate::aside::Aside;
 use crate::compared::Compared;
 use crate::error::{Context, bail};
+use crate::output::SceneLock;
 use crate::session::selection;
+use crate::staged::StagedOutput;
 use crate::{Result, Run, Session, train};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
+use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, ply, sog, spz};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -196,22 +198,23 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
     if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
         bail!("{}: this is the scene itself; name another folder", root.display());
     }
-    // But for what a run that was killed left.
-    let is_empty = root.read_dir().is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == "export.partial"));
-    if root.exists() && !is_empty && !SceneFolder::new(root).is_compact() {
-        bail!("{}: not empty, and not what 'export' made of a scene; name a new folder", root.display());
+    let folder = SceneFolder::new(root);
+    let _lock = SceneLock::take(root, "export")?;
+    if folder.manifest().is_ok() && !folder.is_compact() {
+        bail!("{}: this is a scene that was trained, not an export; name a new folder", root.display());
     }
     let grid = scene.grid()?;
     if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
         bail!("the scene's features were trained by descent, which a small folder cannot hold; export FILE.ply instead");
     }
     let precision = precision(scene)?;
-    let folder = SceneFolder::new(root);
-    let aside = Aside::new(&folder, "export")?;
-    compact::write(&aside.folder.compact_path(), &scene.gaussians, &precision)?;
-    grid.save(&aside.folder)?;
-    aside.folder.save_cameras(&scene.cameras)?;
-    aside.take_its_place(&folder, &LEFT, &scene.manifest)?;
+    let staged = StagedOutput::new(&folder, "export")?;
+    compact::write(&staged.folder.compact_path(), &scene.gaussians, &precision)?;
+    grid.save(&staged.folder)?;
+    staged.folder.save_cameras(&scene.cameras)?;
+    // The export has none of the scene's other files.
+    let manifest = Manifest { files: Default::default(), ..scene.manifest.clone() };
+    staged.publish(&folder, &LEFT, [], &manifest)?;
     let mut written = folder.gaussians()?;
     grid.set_codes(&mut written);
     Ok((written, precision))

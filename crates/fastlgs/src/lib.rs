@@ -13,7 +13,6 @@
 //! Files are read and written in a scene folder ([`fastlgs_core::SceneFolder`]); a stage that fails leaves earlier results whole.
 
 mod absent;
-mod aside;
 mod cache;
 pub mod calibrate;
 pub mod calibrations;
@@ -29,11 +28,13 @@ pub mod make;
 pub mod masks;
 pub mod names;
 pub mod objects;
+mod output;
 pub mod preprocess;
 pub mod progress;
 pub mod remove;
 pub mod render;
 pub mod session;
+mod staged;
 pub mod synth;
 pub mod teach;
 pub mod train;

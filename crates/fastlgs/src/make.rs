@@ -2,6 +2,7 @@
 
 use crate::error::Context;
 use crate::eyes::SamPreset;
+use crate::output::{SceneLock, check_apart};
 use crate::preprocess::fingerprint;
 use crate::{Result, Run, checkpoints, preprocess, train};
 use fastlgs_core::SceneFolder;
@@ -83,29 +84,28 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     // A scene may be moved.
     let how = preprocess::Config { photos: photos.clone(), output: PathBuf::new(), ..preprocess.clone() };
     let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
-    let with = || Ok::<_, crate::Error>(json!([env!("CARGO_PKG_VERSION"), conse::VERSION, seeds, how, files(&photos)?]));
+    check_apart(&photos, &preprocess.output)?;
     let folder = SceneFolder::new(&preprocess.output);
-    let mut made = with()?;
+    let made = json!([env!("CARGO_PKG_VERSION"), conse::VERSION, seeds, how, files(&photos)?]);
     let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
     let whole = [folder.ply_path(), folder.root.join("grid.json")].iter().all(|file| file.is_file());
     if let Some(report) = known.as_ref().filter(|_| whole).and_then(train::Report::of) {
         return Ok((State::Kept, report));
     }
+    let lock = SceneLock::take(&preprocess.output, "make")?;
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
     let begun = known.is_some() && checkpoints::is_begun(&folder);
     let started = Instant::now();
     if !begun {
         checkpoints::forget(&folder);
-        crate::preprocess(preprocess, runs[0])?;
+        crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
         let mut manifest: Manifest = folder.manifest()?;
-        // Poses that were found now lie beside the photos.
-        made = with()?;
         manifest.notes.insert(train::MADE.to_owned(), made.clone());
         folder.save_manifest(&manifest)?;
     }
     // Minutes are those of all stages.
     let minutes = train.minutes.map(|minutes| minutes - started.elapsed().as_secs_f64() / 60.0);
-    let report = crate::train(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, runs[1])?;
+    let report = train::train_locked(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, &lock, runs[1])?;
     let mut manifest = folder.manifest()?;
     // Photos that came or changed while it trained are not in it.
     manifest.notes.insert(train::MADE.to_owned(), made);
@@ -125,15 +125,7 @@ fn files(folder: &Path) -> Result<Value> {
         let name = entry.file_name().to_string_lossy().into_owned();
         // Through links, which folders of photos often are.
         let Some(about) = std::fs::metadata(entry.path()).ok().filter(|_| !name.starts_with('.')) else { continue };
-        let value = if about.is_dir() {
-            // A scene may lie among its photos, and change.
-            if entry.path().join("scene.json").exists() {
-                continue;
-            }
-            files(&entry.path())?
-        } else {
-            fingerprint(&entry.path())?
-        };
+        let value = if about.is_dir() { files(&entry.path())? } else { fingerprint(&entry.path())? };
         found.insert(name, value);
     }
     Ok(Value::Object(found))

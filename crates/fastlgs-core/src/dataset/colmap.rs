@@ -1,10 +1,12 @@
 //! COLMAP sparse models: `cameras`, `images` and `points3D`, each `.bin` (little-endian) or `.txt`.
 
-use super::{Dataset, PosedPhoto, SfmPoint, first_few};
+use super::album::Album;
+use super::pose::{PoseConvention, StatedPose};
+use super::{PosedPhoto, Stated, text};
 use crate::fs::{self, Bytes};
 use crate::undistort::{Bend, Distortion};
 use crate::{Camera, Error, Result};
-use glam::{DMat3, DQuat, DVec3, Mat4, Vec3};
+use glam::{DVec3, Mat4};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -22,12 +24,20 @@ struct Lens {
     distortion: Distortion,
 }
 
-/// A registered image: rotation (w, x, y, z), translation, camera id, file name.
+/// A registered image: rotation (four numbers of a quaternion), translation, camera id, file name.
 struct Registered {
+    id: u32,
     rotation: [f64; 4],
     translation: [f64; 3],
     lens: u32,
     name: String,
+}
+
+/// A point with the ids of the images that show it.
+struct Point {
+    position: DVec3,
+    color: [u8; 3],
+    images: Vec<u32>,
 }
 
 /// Names and parameter counts of COLMAP's camera models, by id.
@@ -45,60 +55,77 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-/// Reads the model in `folder`; photos are looked for in `PHOTOS/images`, then in PHOTOS itself.
+/// How many photos the model in a folder places; 0 where it cannot be read.
+pub fn size(folder: &Path) -> usize {
+    registered(folder).map_or(0, |(_, images)| images.len())
+}
+
+/// A file of the model, and whether it is binary.
+fn file(folder: &Path, name: &str) -> (PathBuf, bool) {
+    let binary = folder.join("cameras.bin").is_file();
+    (folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" })), binary)
+}
+
+/// The images of the model, and the file that lists them.
+fn registered(folder: &Path) -> Result<(PathBuf, Vec<Registered>)> {
+    let (path, binary) = file(folder, "images");
+    let images = if binary { images_bin(&path)? } else { images_txt(&path)? };
+    Ok((path, images))
+}
+
+/// Reads the model in `folder`; photos are looked for in PHOTOS.
 ///
 /// # Errors
 /// Missing or truncated files, unknown camera models, numbers that do not parse.
-pub fn load(photos: &Path, folder: &Path) -> Result<Dataset> {
-    let binary = folder.join("cameras.bin").is_file();
-    let file = |name: &str| folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" }));
-    let (cameras, images, points) = (file("cameras"), file("images"), file("points3D"));
+pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
+    let ((cameras, binary), (points, _)) = (file(folder, "cameras"), file(folder, "points3D"));
     let lenses = if binary { cameras_bin(&cameras)? } else { cameras_txt(&cameras)? };
-    let registered = if binary { images_bin(&images)? } else { images_txt(&images)? };
-    let mut dataset = Dataset::default();
-    if points.is_file() {
-        dataset.points = if binary { points_bin(&points)? } else { points_txt(&points)? };
-    }
+    let (images, registered) = registered(folder)?;
+    let mut stated = Stated { conventions: PoseConvention::OF_QUATERNIONS.to_vec(), ..Stated::default() };
+    let names: Vec<String> = registered.iter().map(|image| image.name.clone()).collect();
     let mut missing = Vec::new();
-    let listed = registered.len();
-    for image in registered {
+    let mut photo_of = HashMap::new();
+    for (image, path) in registered.iter().zip(album.find(&names, base)) {
         let lens = lenses.get(&image.lens).ok_or_else(|| {
             Error::format(&images, format!("image '{}' names camera {}, which {} lacks", image.name, image.lens, cameras.display()))
         })?;
-        match find_photo(photos, &image.name) {
-            Some(path) => dataset.photos.push(posed(path, &image, lens)),
-            None => missing.push(image.name),
+        match path {
+            Some(path) => {
+                photo_of.insert(image.id, stated.photos.len() as u32);
+                stated.photos.push(posed(path, image, lens));
+            }
+            None => missing.push(image.name.clone()),
         }
     }
-    if !missing.is_empty() {
-        let names = first_few(&missing);
-        dataset.warnings.push(format!("{} of {listed} images of {} have no photo: {names}", missing.len(), images.display()));
+    if points.is_file() {
+        let read = if binary { points_bin(&points)? } else { points_txt(&points)? };
+        // Some programs leave out the colours: all points are black then, and the photos tell their colours.
+        let colorless = read.iter().all(|point| point.color == [0; 3]);
+        let shown_in = |point: &Point| point.images.iter().filter_map(|id| photo_of.get(id).copied()).collect();
+        stated.shown_in = if colorless { read.iter().map(shown_in).collect() } else { Vec::new() };
+        stated.points = read.into_iter().map(|point| (point.position, point.color)).collect();
     }
-    Ok(dataset)
-}
-
-fn find_photo(photos: &Path, name: &str) -> Option<PathBuf> {
-    [photos.join("images").join(name), photos.join(name)].into_iter().find(|p| p.is_file())
+    stated.warnings.extend(album.missing(&missing, registered.len(), &images));
+    Ok(stated)
 }
 
 fn posed(path: PathBuf, image: &Registered, lens: &Lens) -> PosedPhoto {
-    let [w, x, y, z] = image.rotation;
-    let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
-    let world_to_camera = glam::DMat4::from_mat3_translation(rotation, DVec3::from(image.translation));
     PosedPhoto {
         camera: Camera {
-            name: path.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            name: String::new(),
             width: lens.width,
             height: lens.height,
             fx: lens.focal[0] as f32,
             fy: lens.focal[1] as f32,
             cx: lens.centre[0] as f32,
             cy: lens.centre[1] as f32,
-            world_to_camera: Mat4::from_cols_array(&world_to_camera.to_cols_array().map(|v| v as f32)),
+            world_to_camera: Mat4::IDENTITY,
         },
+        stated: StatedPose::Quaternion(image.rotation, DVec3::from(image.translation)),
         path,
         distortion: lens.distortion,
         ignore: None,
+        upright: false,
     }
 }
 
@@ -143,7 +170,7 @@ fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     for _ in 0..count {
         let (id, model) = (bytes.u32()?, bytes.u32()?);
         let (width, height) = (bytes.u64()?, bytes.u64()?);
-        let &(name, n) = MODELS.get(model as usize).ok_or_else(|| Error::format(path, format!("unknown camera model number {model}")))?;
+        let &(name, n) = MODELS.get(model as usize).ok_or_else(|| Error::format(path, unknown(&format!("number {model}"))))?;
         let parameters = (0..n).map(|_| bytes.f64()).collect::<Result<Vec<_>>>()?;
         lenses.insert(id, lens(path, name, width, height, &parameters)?);
     }
@@ -156,7 +183,7 @@ fn images_bin(path: &Path) -> Result<Vec<Registered>> {
     let count = bytes.count(73)?;
     (0..count)
         .map(|_| {
-            bytes.u32()?;
+            let id = bytes.u32()?;
             let mut pose = [0.0; 7];
             for value in &mut pose {
                 *value = bytes.f64()?;
@@ -166,24 +193,26 @@ fn images_bin(path: &Path) -> Result<Vec<Registered>> {
             let observations = bytes.count(24)?;
             bytes.take(observations * 24)?;
             let [w, x, y, z, tx, ty, tz] = pose;
-            Ok(Registered { rotation: [w, x, y, z], translation: [tx, ty, tz], lens, name })
+            Ok(Registered { id, rotation: [w, x, y, z], translation: [tx, ty, tz], lens, name })
         })
         .collect()
 }
 
-fn points_bin(path: &Path) -> Result<Vec<SfmPoint>> {
+fn points_bin(path: &Path) -> Result<Vec<Point>> {
     let data = fs::read(path)?;
     let mut bytes = Bytes::new(path, &data);
     let count = bytes.count(51)?;
     (0..count)
         .map(|_| {
             bytes.u64()?;
-            let position = Vec3::new(bytes.f64()? as f32, bytes.f64()? as f32, bytes.f64()? as f32);
+            let position = DVec3::new(bytes.f64()?, bytes.f64()?, bytes.f64()?);
             let rgb = bytes.take(3)?;
+            let color = [rgb[0], rgb[1], rgb[2]];
             bytes.f64()?;
-            let track = bytes.count(8)?;
-            bytes.take(track * 8)?;
-            Ok(SfmPoint { position, color: [rgb[0], rgb[1], rgb[2]], seen_by: Vec::new() })
+            let length = bytes.count(8)?;
+            let track = bytes.take(length * 8)?;
+            let images = track.chunks_exact(8).map(|seen| u32::from_le_bytes([seen[0], seen[1], seen[2], seen[3]])).collect();
+            Ok(Point { position, color, images })
         })
         .collect()
 }
@@ -194,8 +223,13 @@ fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     lines.map(|(i, l)| (i + 1, l.split_whitespace().collect()))
 }
 
-fn text(path: &Path) -> Result<String> {
-    String::from_utf8(fs::read(path)?).map_err(|_| Error::format(path, "not UTF-8 text"))
+/// Says what to do about a camera model that is not known here.
+fn unknown(model: &str) -> String {
+    let known: Vec<&str> = MODELS.iter().map(|model| model.0).collect();
+    format!(
+        "the camera model {model} is not supported; undistort the photos with 'colmap image_undistorter' and use its model (supported: {})",
+        known.join(", ")
+    )
 }
 
 fn parse<T: std::str::FromStr>(path: &Path, line: usize, fields: &[&str], i: usize) -> Result<T> {
@@ -210,7 +244,12 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
     for (line, f) in rows(&text(path)?).filter(|(_, f)| !f.is_empty()) {
         let model = f.get(1).copied().unwrap_or_default();
         let n = MODELS.iter().find(|m| m.0 == model).map(|m| m.1);
-        let n = n.ok_or_else(|| Error::format(path, format!("line {line}: unknown camera model '{model}'")))?;
+        let n = n.ok_or_else(|| Error::format(path, format!("line {line}: {}", unknown(&format!("'{model}'")))))?;
+        if f.len() != 4 + n {
+            let given = f.len().saturating_sub(4);
+            let why = format!("line {line}: the camera model {model} has {n} parameters, and this line gives {given}; export it again");
+            return Err(Error::format(path, why));
+        }
         let parameters = (0..n).map(|i| parse(path, line, &f, 4 + i)).collect::<Result<Vec<f64>>>()?;
         let (width, height) = (parse(path, line, &f, 2)?, parse(path, line, &f, 3)?);
         lenses.insert(parse(path, line, &f, 0)?, lens(path, model, width, height, &parameters)?);
@@ -218,38 +257,57 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
     Ok(lenses)
 }
 
+/// Fields before the name of an image.
+const BEFORE_NAME: usize = 9;
+
+/// Images, each followed by a line of its observations. Some programs leave these lines out, or only those that are empty.
 fn images_txt(path: &Path) -> Result<Vec<Registered>> {
     let content = text(path)?;
-    // Every second line lists observations and may be empty: only comments are dropped before pairing.
-    let lines: Vec<_> = rows(&content).collect();
+    let mut lines = content.lines().enumerate().filter(|(_, line)| !line.starts_with('#')).peekable();
     let mut images = Vec::new();
-    for (line, f) in lines.iter().step_by(2).filter(|(_, f)| !f.is_empty()) {
-        let number = |i| parse::<f64>(path, *line, f, i);
+    while let Some((line, row)) = lines.next() {
+        let f: Vec<&str> = row.split_whitespace().collect();
+        if f.is_empty() {
+            continue;
+        }
+        let line = line + 1;
+        let number = |i| parse::<f64>(path, line, &f, i);
         images.push(Registered {
+            id: parse(path, line, &f, 0)?,
             rotation: [number(1)?, number(2)?, number(3)?, number(4)?],
             translation: [number(5)?, number(6)?, number(7)?],
-            lens: parse(path, *line, f, 8)?,
-            name: f
-                .get(9..)
-                .map(|n| n.join(" "))
-                .filter(|n| !n.is_empty())
-                .ok_or_else(|| Error::format(path, format!("line {line}: the image's name is missing")))?,
+            lens: parse(path, line, &f, 8)?,
+            name: name_of(row).ok_or_else(|| Error::format(path, format!("line {line}: the image's name is missing")))?,
         });
+        lines.next_if(|(_, next)| is_observations(next));
     }
     Ok(images)
 }
 
-fn points_txt(path: &Path) -> Result<Vec<SfmPoint>> {
+/// The name at the end of an image's line, blanks within it included.
+fn name_of(row: &str) -> Option<String> {
+    let mut rest = row.trim();
+    for _ in 0..BEFORE_NAME {
+        rest = rest.split_once(char::is_whitespace)?.1.trim_start();
+    }
+    Some(rest.to_owned()).filter(|name| !name.is_empty())
+}
+
+/// Whether a line lists observations (x, y, point), possibly none; one of an image has ten fields or a name.
+fn is_observations(line: &str) -> bool {
+    let fields: Vec<&str> = line.split_whitespace().collect();
+    fields.len() % 3 == 0 && fields.iter().all(|field| field.parse::<f64>().is_ok())
+}
+
+fn points_txt(path: &Path) -> Result<Vec<Point>> {
     rows(&text(path)?)
         .filter(|(_, f)| !f.is_empty())
         .map(|(line, f)| {
-            let number = |i| parse::<f32>(path, line, &f, i);
+            let number = |i| parse::<f64>(path, line, &f, i);
             let byte = |i| parse::<u8>(path, line, &f, i);
-            Ok(SfmPoint {
-                position: Vec3::new(number(1)?, number(2)?, number(3)?),
-                color: [byte(4)?, byte(5)?, byte(6)?],
-                seen_by: Vec::new(),
-            })
+            // After the error come pairs of image and key point.
+            let images = f.get(8..).unwrap_or_default().iter().step_by(2).filter_map(|id| id.parse().ok()).collect();
+            Ok(Point { position: DVec3::new(number(1)?, number(2)?, number(3)?), color: [byte(4)?, byte(5)?, byte(6)?], images })
         })
         .collect()
 }

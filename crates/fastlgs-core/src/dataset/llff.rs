@@ -1,10 +1,12 @@
 //! LLFF's `poses_bounds.npy`: a row of 17 numbers for each photo, in the order of their names: a 3x5 matrix (camera-to-world
 //! rotation with the axes down, right, back; position; height, width, focal length), then the nearest and farthest depth.
 
-use super::{Dataset, PosedPhoto, is_photo};
+use super::album::images_folder;
+use super::pose::{PoseConvention, StatedPose};
+use super::{PosedPhoto, Stated, is_photo};
 use crate::undistort::Distortion;
 use crate::{Camera, Error, Result, npy};
-use glam::{Mat4, Vec3};
+use glam::{DMat4, DVec3, Mat4};
 use std::path::{Path, PathBuf};
 
 /// Name of the file.
@@ -14,13 +16,13 @@ pub const FILE: &str = "poses_bounds.npy";
 ///
 /// # Errors
 /// A damaged file, or another number of photos than rows.
-pub fn load(photos: &Path) -> Result<Dataset> {
+pub fn load(photos: &Path) -> Result<Stated> {
     let path = photos.join(FILE);
     let table = npy::read(&path)?;
     let [rows, 17] = table.shape[..] else {
         return Err(Error::format(&path, format!("shape {:?}; LLFF's poses are (photos, 17)", table.shape)));
     };
-    let folder = photos.join("images");
+    let folder = images_folder(photos).unwrap_or_else(|| photos.join("images"));
     let entries = std::fs::read_dir(&folder).map_err(Error::io(&folder))?;
     let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
     files.sort();
@@ -36,29 +38,32 @@ pub fn load(photos: &Path) -> Result<Dataset> {
         if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
             return Err(Error::format(&path, format!("the pose of '{name}' holds {bad}; mend that row")));
         }
-        let column = |k: usize| Vec3::new(row[k] as f32, row[5 + k] as f32, row[10 + k] as f32);
+        let column = |k: usize| DVec3::new(row[k], row[5 + k], row[10 + k]);
         let (down, right, back, position) = (column(0), column(1), column(2), column(3));
         let [height, width, focal] = [row[4], row[9], row[14]].map(|v| v as f32);
-        let camera_to_world = Mat4::from_cols(right.extend(0.0), down.extend(0.0), (-back).extend(0.0), position.extend(1.0));
+        let camera_to_world = DMat4::from_cols(right.extend(0.0), down.extend(0.0), (-back).extend(0.0), position.extend(1.0));
         let camera = Camera {
-            name,
+            name: String::new(),
             width: width as u32,
             height: height as u32,
             fx: focal,
             fy: focal,
             cx: width / 2.0,
             cy: height / 2.0,
-            world_to_camera: camera_to_world.inverse(),
+            world_to_camera: Mat4::IDENTITY,
         };
-        Ok(PosedPhoto { path: file, camera, distortion: Distortion::default(), ignore: None })
+        let stated = StatedPose::Matrix(camera_to_world);
+        Ok(PosedPhoto { path: file, camera, stated, distortion: Distortion::default(), ignore: None, upright: false })
     };
     let photos = files.into_iter().zip(table.values.chunks_exact(17)).map(posed).collect::<Result<_>>()?;
-    Ok(Dataset { photos, ..Dataset::default() })
+    // The file's own axes leave no choice.
+    Ok(Stated { photos, conventions: vec![PoseConvention::C2wOpencv], ..Stated::default() })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use glam::Vec3;
     use npyz::WriterBuilder;
 
     #[test]

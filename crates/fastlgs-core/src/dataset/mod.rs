@@ -1,12 +1,19 @@
 //! Posed photos from other programs' folders.
 
+pub mod album;
 pub mod colmap;
 pub mod llff;
+pub mod pose;
 pub mod transforms;
 
 use crate::undistort::Distortion;
-use crate::{Camera, Error, Result};
-use glam::Vec3;
+use crate::world_frame::WorldFrame;
+use crate::{Camera, Error, Result, fs};
+use album::Album;
+pub use album::images_folder;
+use glam::{DVec3, Vec3};
+pub use pose::{PoseConvention, StatedPose};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 /// One photo with the camera that took it, still distorted.
@@ -14,12 +21,16 @@ use std::path::{Path, PathBuf};
 pub struct PosedPhoto {
     /// File of the photo.
     pub path: PathBuf,
-    /// Pinhole part of the camera, at the resolution that the poses' file states.
+    /// Pinhole part of the camera, at the resolution that the poses' file states, in the data set's frame.
     pub camera: Camera,
+    /// Its pose as the file states it.
+    pub stated: StatedPose,
     /// Lens distortion to be removed.
     pub distortion: Distortion,
     /// Mask of what does not count: black there.
     pub ignore: Option<PathBuf>,
+    /// Whether the pose counts the pixels of the photo as EXIF turns it, and not as they are stored.
+    pub upright: bool,
 }
 
 /// A reconstructed 3-D point (structure from motion).
@@ -33,6 +44,22 @@ pub struct SfmPoint {
     pub seen_by: Vec<u32>,
 }
 
+/// What the files of a folder state.
+#[derive(Clone, Debug, Default)]
+pub struct Stated {
+    /// Photos with poses; their cameras have neither name nor pose yet.
+    photos: Vec<PosedPhoto>,
+    /// Points in the world and their colours, 0 to 255.
+    points: Vec<(DVec3, [u8; 3])>,
+    /// By point, the photos that show it, where points have no colours.
+    shown_in: Vec<Vec<u32>>,
+    /// Conventions in which the poses may be written, the standard first.
+    conventions: Vec<PoseConvention>,
+    /// Photos that their data set keeps for testing.
+    held_out: Vec<PathBuf>,
+    warnings: Vec<String>,
+}
+
 /// Posed photos, sorted by name, and what else their folder offered.
 #[derive(Clone, Debug, Default)]
 pub struct Dataset {
@@ -40,18 +67,64 @@ pub struct Dataset {
     pub photos: Vec<PosedPhoto>,
     /// Structure-from-motion points; empty where the folder has none.
     pub points: Vec<SfmPoint>,
+    /// By point, the indices of the photos that show it, where points came without colours; else empty.
+    pub shown_in: Vec<Vec<u32>>,
+    /// The frame of the cameras and points.
+    pub frame: WorldFrame,
+    /// Conventions in which the poses may be written, the standard first.
+    pub conventions: Vec<PoseConvention>,
+    /// Names of the views that the data set itself keeps for testing.
+    pub held_out: Vec<String>,
     /// What was wrong but survivable, one sentence each.
     pub warnings: Vec<String>,
+    /// Points in the world.
+    stated_points: Vec<DVec3>,
+}
+
+impl Dataset {
+    /// Reads the poses by a convention; the frame is chosen anew.
+    pub fn read_poses_by(&mut self, convention: PoseConvention) {
+        let poses: Vec<_> = self.photos.iter().map(|photo| photo.stated.by(convention)).collect();
+        self.frame = WorldFrame::around(&poses.iter().map(|pose| pose.centre()).collect::<Vec<_>>());
+        for (photo, pose) in self.photos.iter_mut().zip(&poses) {
+            photo.camera.world_to_camera = self.frame.local_pose(pose);
+        }
+        for (point, world) in self.points.iter_mut().zip(&self.stated_points) {
+            point.position = self.frame.to_local(*world);
+        }
+    }
+}
+
+/// The COLMAP model of PHOTOS that places most photos, and a sentence that names the others.
+fn colmap_model(photos: &Path) -> Option<(PathBuf, Option<String>)> {
+    let roots = ["sparse", "colmap/sparse"].map(|root| photos.join(root));
+    let numbered = roots.iter().flat_map(|root| {
+        let mut folders: Vec<PathBuf> = root.read_dir().into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        folders.sort();
+        folders
+    });
+    let models: Vec<PathBuf> = numbered.chain(roots.iter().cloned()).filter(|folder| colmap::is_model(folder)).collect();
+    if models.len() < 2 {
+        return models.into_iter().next().map(|model| (model, None));
+    }
+    let mut sizes: Vec<(usize, PathBuf)> = models.into_iter().map(|model| (colmap::size(&model), model)).collect();
+    // Of equally large models the first counts.
+    sizes.sort_by_key(|(size, _)| std::cmp::Reverse(*size));
+    let list = |models: &[(usize, PathBuf)]| {
+        let each = models.iter().map(|(size, model)| format!("{} ({size} photos)", model.display()));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    let warning = format!("of {} COLMAP models {} is used; not used: {}", sizes.len(), list(&sizes[..1]), list(&sizes[1..]));
+    Some((sizes.swap_remove(0).1, Some(warning)))
 }
 
 /// Whether PHOTOS has poses of a kind that [`load`] reads.
 pub fn has_poses(photos: &Path) -> bool {
-    let model = ["sparse/0", "sparse"].iter().any(|s| colmap::is_model(&photos.join(s)));
-    model || photos.join("transforms.json").is_file() || photos.join(llff::FILE).is_file()
+    colmap_model(photos).is_some() || !transforms::files(photos).is_empty() || photos.join(llff::FILE).is_file()
 }
 
-/// Loads PHOTOS, with the masks in `ignore/`: `sparse/0` or `sparse` (COLMAP, binary or text) `transforms.json` (nerfstudio, instant-ngp) or
-/// `poses_bounds.npy` (LLFF).
+/// Loads PHOTOS, with the masks in `ignore/`: a COLMAP model (binary or text) in `sparse/` or `colmap/sparse/`, `transforms.json` (nerfstudio,
+/// instant-ngp), `transforms_train.json` (NeRF's synthetic scenes) or `poses_bounds.npy` (LLFF).
 ///
 /// # Errors
 /// When no poses are found, a file is damaged, a pose is not finite, or no posed photo is left.
@@ -59,11 +132,15 @@ pub fn load(photos: &Path) -> Result<Dataset> {
     if !photos.is_dir() {
         return Err(Error::Invalid(format!("{}: no such folder of photos", photos.display())));
     }
-    let sparse = ["sparse/0", "sparse"].iter().map(|s| photos.join(s));
-    let mut dataset = if let Some(folder) = sparse.into_iter().find(|s| colmap::is_model(s)) {
-        colmap::load(photos, &folder)?
-    } else if photos.join("transforms.json").is_file() {
-        transforms::load(photos)?
+    if let Some((folder, warning)) = colmap_model(photos) {
+        let mut dataset = load_model(photos, &folder)?;
+        dataset.warnings.splice(0..0, warning);
+        return Ok(dataset);
+    }
+    let album = Album::of(photos);
+    let files = transforms::files(photos);
+    let stated = if !files.is_empty() {
+        transforms::load(photos, &album, &files)?
     } else if photos.join(llff::FILE).is_file() {
         llff::load(photos)?
     } else {
@@ -72,66 +149,120 @@ pub fn load(photos: &Path) -> Result<Dataset> {
             photos.display()
         )));
     };
-    if dataset.photos.is_empty() {
-        return Err(Error::Invalid(format!("{}: no photo has a pose", photos.display())));
+    assembled(photos, &album, stated)
+}
+
+/// Loads PHOTOS with the poses of a COLMAP model in any folder.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_model(photos: &Path, model: &Path) -> Result<Dataset> {
+    let album = Album::of(photos);
+    let base = images_folder(photos).unwrap_or_else(|| photos.to_owned());
+    assembled(photos, &album, colmap::load(&album, &base, model)?)
+}
+
+/// Names, sorts and checks what files state.
+fn assembled(photos: &Path, album: &Album, mut stated: Stated) -> Result<Dataset> {
+    if stated.photos.is_empty() {
+        let why = stated.warnings.iter().map(|warning| format!("; {warning}")).collect::<String>();
+        return Err(Error::Invalid(format!("{}: no photo has a pose{why}", photos.display())));
     }
-    for photo in &dataset.photos {
-        photo.camera.check().map_err(|reason| Error::format(photos, reason))?;
-    }
-    let count = dataset.points.len();
-    dataset.points.retain(|point| point.position.is_finite());
-    if dataset.points.len() < count {
-        dataset.warnings.push(format!("{} points of {count} are nowhere (NaN or infinite) and are left out", count - dataset.points.len()));
-    }
-    dataset.photos.sort_by(|a, b| a.camera.name.cmp(&b.camera.name));
+    let files: Vec<&Path> = stated.photos.iter().map(|photo| photo.path.as_path()).collect();
+    let names = album.view_names(&files);
+    let held_out = files.iter().zip(&names).filter(|(file, _)| stated.held_out.iter().any(|held| held == *file)).map(|f| f.1.clone());
+    let held_out = held_out.collect();
+    stated.photos.iter_mut().zip(names).for_each(|(photo, name)| photo.camera.name = name);
+    let mut order: Vec<usize> = (0..stated.photos.len()).collect();
+    order.sort_by(|a, b| stated.photos[*a].camera.name.cmp(&stated.photos[*b].camera.name));
+    let mut place = vec![0; order.len()];
+    order.iter().enumerate().for_each(|(new, old)| place[*old] = new as u32);
+    let renumbered = |photos: &Vec<u32>| photos.iter().map(|photo| place[*photo as usize]).collect();
+    let mut dataset = Dataset {
+        shown_in: stated.shown_in.iter().map(renumbered).collect(),
+        photos: order.into_iter().map(|old| stated.photos[old].clone()).collect(),
+        conventions: stated.conventions,
+        held_out,
+        warnings: stated.warnings,
+        ..Dataset::default()
+    };
     if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
-        return Err(Error::format(
-            photos,
-            format!("two poses for the photo '{}'; photos of different folders need names of their own", pair[0].camera.name),
-        ));
+        return Err(Error::format(photos, format!("two poses for the photo '{}'; remove one of them", pair[0].camera.name)));
     }
-    for photo in dataset.photos.iter_mut().filter(|p| p.ignore.is_none()) {
-        photo.ignore = ignore_mask(photos, &photo.camera.name);
+    let finite: Vec<bool> = stated.points.iter().map(|(position, _)| position.is_finite()).collect();
+    let lost = finite.iter().filter(|finite| !**finite).count();
+    if lost > 0 {
+        dataset.warnings.push(format!("{lost} points of {} are nowhere (NaN or infinite) and are left out", finite.len()));
     }
-    warn_of_photos_without_pose(photos, &mut dataset);
-    dataset.warnings.extend(passed_over(&photos.join("images")));
+    let mut keep = finite.iter();
+    dataset.shown_in.retain(|_| *keep.next().unwrap_or(&true));
+    for (position, color) in stated.points.into_iter().filter(|(position, _)| position.is_finite()) {
+        dataset.stated_points.push(position);
+        dataset.points.push(SfmPoint { position: Vec3::ZERO, color, seen_by: Vec::new() });
+    }
+    dataset.read_poses_by(dataset.conventions[0]);
+    for photo in &mut dataset.photos {
+        photo.camera.check().map_err(|reason| Error::format(photos, reason))?;
+        check_principal_point(photo)?;
+        if photo.ignore.is_none() {
+            photo.ignore = ignore_mask(photos, &photo.camera.name, &photo.path);
+        }
+    }
+    warn_of_photos_without_pose(album, &mut dataset);
+    dataset.warnings.extend(images_folder(photos).and_then(|images| passed_over(&images)));
     Ok(dataset)
 }
 
-/// `PHOTOS/ignore/NAME.png`, with or without the photo's own ending.
-fn ignore_mask(photos: &Path, name: &str) -> Option<PathBuf> {
-    let stem = Path::new(name).file_stem()?.to_string_lossy().into_owned();
-    [name, &stem].iter().map(|n| photos.join("ignore").join(format!("{n}.png"))).find(|p| p.is_file())
+/// A principal point outside the photo belongs to a photo of another size.
+fn check_principal_point(photo: &PosedPhoto) -> Result<()> {
+    let Camera { width, height, cx, cy, .. } = photo.camera;
+    let within = |c: f32, side: u32| c > 0.0 && c < side as f32;
+    if within(cx, width) && within(cy, height) {
+        return Ok(());
+    }
+    let why = format!(
+        "the principal point ({cx}, {cy}) of its camera lies outside its {width}x{height} pixels; state the size that the camera was calibrated          for (w and h in transforms.json), and it is scaled to the photo"
+    );
+    Err(Error::format(&photo.path, why))
+}
+
+/// Text of a file, without a byte order mark.
+fn text(path: &Path) -> Result<String> {
+    let text = String::from_utf8(fs::read(path)?).map_err(|_| Error::format(path, "not UTF-8 text"))?;
+    Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
+}
+
+/// `PHOTOS/ignore/NAME.png`, with or without the photo's own ending, by the view's name or the photo's path below its folder.
+fn ignore_mask(photos: &Path, view: &str, file: &Path) -> Option<PathBuf> {
+    let below = images_folder(photos).and_then(|images| Some(file.strip_prefix(images).ok()?.to_owned()));
+    let names = [PathBuf::from(view), below.unwrap_or_default()];
+    let each = names.iter().flat_map(|name| [name.with_added_extension("png"), name.with_extension("png")]);
+    each.map(|name| photos.join("ignore").join(name)).find(|path| path.is_file())
 }
 
 /// Photos that no pose names are left out; the user hears of it once.
-fn warn_of_photos_without_pose(photos: &Path, dataset: &mut Dataset) {
-    let Ok(entries) = std::fs::read_dir(photos.join("images")) else { return };
-    let posed: std::collections::HashSet<_> = dataset.photos.iter().filter_map(|p| p.path.file_name()).collect();
-    let mut extra: Vec<String> = entries
-        .flatten()
-        .map(|e| e.path())
-        .filter(|p| is_photo(p) && p.file_name().is_some_and(|n| !posed.contains(n)))
-        .filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned()))
-        .collect();
-    extra.sort();
+fn warn_of_photos_without_pose(album: &Album, dataset: &mut Dataset) {
+    let posed: HashSet<&Path> = dataset.photos.iter().map(|p| p.path.as_path()).collect();
+    let extra: Vec<String> = album.others(&posed).collect();
     if !extra.is_empty() {
-        dataset.warnings.push(format!("{} photos have no pose and are left out: {}", extra.len(), first_few(&extra)));
+        let warning = format!("{} photos have no pose and are left out: {}", extra.len(), first_few(&extra));
+        dataset.warnings.push(warning);
     }
 }
 
 /// Endings of pictures that this project does not read.
-const UNREAD: [&str; 12] = ["arw", "avif", "bmp", "cr2", "cr3", "dng", "heic", "heif", "nef", "tif", "tiff", "webp"];
+const UNREAD: [&str; 11] = ["arw", "avif", "cr2", "cr3", "dng", "heic", "heif", "jp2", "jxl", "nef", "orf"];
 
 /// What to do about pictures of a folder that are not read; nothing where there are none.
 pub fn passed_over(images: &Path) -> Option<String> {
     let ending = |path: &Path| path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-    let entries = std::fs::read_dir(images).ok()?.flatten().map(|entry| entry.path());
+    let is_hidden = |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+    let entries = std::fs::read_dir(images).ok()?.flatten().map(|entry| entry.path()).filter(|path| !is_hidden(path));
     let mut unread: Vec<PathBuf> = entries.filter(|path| ending(path).is_some_and(|e| UNREAD.contains(&e.as_str()))).collect();
     unread.sort();
     let names: Vec<String> = unread.iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
     let count = names.len();
-    (count > 0).then(|| format!("{count} pictures are neither JPEG nor PNG and are left out, convert them: {}", first_few(&names)))
+    (count > 0).then(|| format!("{count} pictures are in formats that cannot be read; convert them to JPEG or PNG: {}", first_few(&names)))
 }
 
 /// Folders of photos within a folder of photos.
@@ -144,10 +275,14 @@ pub fn folders_within(images: &Path) -> Vec<String> {
     found
 }
 
-/// Whether the file's ending is that of a photo this project reads.
+/// Endings of the photos that are read.
+const READ: [&str; 8] = ["bmp", "jfif", "jpeg", "jpg", "png", "tif", "tiff", "webp"];
+
+/// Whether the file's ending is that of a photo this project reads. Hidden files, such as the ._NAME that macOS leaves, are none.
 pub fn is_photo(path: &Path) -> bool {
+    let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
-    matches!(ending.as_str(), "jpg" | "jpeg" | "png")
+    !hidden && READ.contains(&ending.as_str())
 }
 
 /// The first names of a list, for a message.

@@ -1,9 +1,11 @@
 //! `transforms.json` of instant-ngp and nerfstudio: camera-to-world matrices in OpenGL axes (y up, looking along -z).
 
-use super::{Dataset, PosedPhoto, first_few};
+use super::album::{Album, by_last_parts};
+use super::pose::{PoseConvention, StatedPose};
+use super::{PosedPhoto, Stated, text};
 use crate::undistort::{Bend, Distortion};
-use crate::{Camera, Error, Result, fs};
-use glam::{Mat4, Vec4};
+use crate::{Camera, Error, Result};
+use glam::{DMat4, DVec4, Mat4};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
@@ -33,7 +35,8 @@ struct Frame {
     file_path: String,
     /// Black where the photo does not count.
     mask_path: Option<String>,
-    transform_matrix: [[Option<f64>; 4]; 4],
+    /// Rows of four numbers; the last row may be left out.
+    transform_matrix: Vec<[Option<f64>; 4]>,
     #[serde(flatten)]
     lens: Lens,
 }
@@ -45,33 +48,92 @@ struct Transforms {
     frames: Vec<Frame>,
 }
 
-/// Reads `PHOTOS/transforms.json`. Frames whose photo is missing are counted in a warning and left out.
+/// The poses of photos to train on, where a data set is divided into sets (NeRF's synthetic scenes).
+const TRAIN: &str = "transforms_train.json";
+/// The poses of its held-out photos.
+const TEST: &str = "transforms_test.json";
+
+/// The files of poses in PHOTOS, and whether their photos are held out.
+pub fn files(photos: &Path) -> Vec<(PathBuf, bool)> {
+    let one = photos.join("transforms.json");
+    if one.is_file() {
+        return vec![(one, false)];
+    }
+    let sets = [(photos.join(TRAIN), false), (photos.join(TEST), true)];
+    if sets[0].0.is_file() { sets.into_iter().filter(|(file, _)| file.is_file()).collect() } else { Vec::new() }
+}
+
+/// Reads the poses of PHOTOS. Frames whose photo is missing are counted in a warning and left out.
 ///
 /// # Errors
 /// Damaged JSON, a matrix entry that is no number, or no focal length.
-pub fn load(photos: &Path) -> Result<Dataset> {
-    let path = photos.join("transforms.json");
-    // JSON has no NaN, but Python writes it: such entries become null and are refused by name below.
-    let text = String::from_utf8(fs::read(&path)?).map_err(|_| Error::format(&path, "not UTF-8 text"))?;
-    let text = without_what_is_no_number(&text);
-    let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(&path, format!("not the expected JSON: {e}")))?;
-    if file.frames.is_empty() {
-        return Err(Error::format(&path, "it lists no frames"));
+pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<Stated> {
+    let mut stated = Stated { conventions: PoseConvention::OF_MATRICES.to_vec(), ..Stated::default() };
+    for (path, held_out) in files {
+        load_file(photos, album, path, *held_out, &mut stated)?;
     }
-    let mut dataset = Dataset::default();
+    Ok(stated)
+}
+
+fn load_file(photos: &Path, album: &Album, path: &Path, held_out: bool, stated: &mut Stated) -> Result<()> {
+    // JSON has no NaN, but Python writes it: such entries become null and are refused by name below.
+    let text = without_what_is_no_number(&text(path)?);
+    let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))?;
+    if file.frames.is_empty() {
+        return Err(Error::format(path, "it lists no frames"));
+    }
+    let names: Vec<String> = file.frames.iter().map(|frame| frame.file_path.clone()).collect();
     let mut missing = Vec::new();
-    let listed = file.frames.len();
-    for frame in file.frames {
-        match find_photo(photos, &frame.file_path) {
-            Some(photo) => dataset.photos.push(posed(&path, photo, &frame, &file.lens)?),
-            None => missing.push(frame.file_path),
+    let mut transposed = 0;
+    for (frame, photo) in file.frames.iter().zip(album.find(&names, photos)) {
+        let Some(photo) = photo else {
+            missing.push(frame.file_path.clone());
+            continue;
+        };
+        let matrix = matrix(path, frame)?;
+        transposed += usize::from(matrix.1);
+        if held_out {
+            stated.held_out.push(photo.clone());
+        }
+        stated.photos.push(posed(path, photo, frame, &file.lens, matrix.0)?);
+    }
+    if transposed > 0 {
+        let why = "have their translation in the last row: they were read as transposed matrices";
+        stated.warnings.push(format!("{}: the poses of {transposed} of {} frames {why}", path.display(), names.len()));
+    }
+    stated.warnings.extend(album.missing(&missing, names.len(), path));
+    Ok(())
+}
+
+/// The pose of a frame, and whether its matrix is stored by columns.
+fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
+    let name = &frame.file_path;
+    let mut rows = [DVec4::W; 4];
+    if !(3..=4).contains(&frame.transform_matrix.len()) {
+        let count = frame.transform_matrix.len();
+        return Err(Error::format(file, format!("the pose of '{name}' has {count} rows, not 4; export it again")));
+    }
+    for (row, values) in rows.iter_mut().zip(&frame.transform_matrix) {
+        for (k, value) in values.iter().enumerate() {
+            row[k] = value.ok_or_else(|| {
+                Error::format(file, format!("the pose of '{name}' has a NaN or infinite entry; remove or mend that frame"))
+            })?;
         }
     }
-    if !missing.is_empty() {
-        let names = first_few(&missing);
-        dataset.warnings.push(format!("{} of {listed} frames of {} have no photo: {names}", missing.len(), path.display()));
+    let by_rows = DMat4::from_cols_array_2d(&rows.map(|r| r.to_array()));
+    let is_last = |row: DVec4| (row - DVec4::W).abs().max_element() < 1e-6;
+    if is_last(rows[3]) {
+        return Ok((by_rows.transpose(), false));
     }
-    Ok(dataset)
+    if is_last(by_rows.row(3)) {
+        return Ok((by_rows, true));
+    }
+    let last = rows[3];
+    let why = format!(
+        "the pose of '{name}' has the last row [{}, {}, {}, {}], not [0, 0, 0, 1]; export it again",
+        last.x, last.y, last.z, last.w
+    );
+    Err(Error::format(file, why))
 }
 
 /// Python's NaN and Infinity as null, outside of strings.
@@ -91,14 +153,7 @@ fn without_what_is_no_number(text: &str) -> String {
     mended.collect()
 }
 
-/// Old files leave out the ending.
-fn find_photo(photos: &Path, name: &str) -> Option<PathBuf> {
-    let bare = photos.join(name);
-    let endings = ["png", "jpg", "jpeg", "JPG"].map(|e| PathBuf::from(format!("{}.{e}", bare.display())));
-    std::iter::once(bare).chain(endings).find(|p| p.is_file())
-}
-
-fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<PosedPhoto> {
+fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat4) -> Result<PosedPhoto> {
     let name = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let either = |f: fn(&Lens) -> Option<f64>| f(&frame.lens).or(f(shared));
     let (w, h) = match (either(|l| l.w), either(|l| l.h)) {
@@ -110,14 +165,6 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
     };
     let from_angle = either(|l| l.camera_angle_x).map(|a| w / (2.0 * (a / 2.0).tan()));
     let fx = either(|l| l.fl_x).or(from_angle).ok_or_else(|| Error::format(file, "neither fl_x nor camera_angle_x is given"))?;
-    let mut rows = [Vec4::ZERO; 4];
-    for (row, values) in rows.iter_mut().zip(&frame.transform_matrix) {
-        for (k, value) in values.iter().enumerate() {
-            row[k] = value.ok_or_else(|| {
-                Error::format(file, format!("the pose of '{name}' has a NaN or infinite entry; remove or mend that frame"))
-            })? as f32;
-        }
-    }
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
     let bend = match frame.lens.camera_model.as_deref().or(shared.camera_model.as_deref()) {
         None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => Bend::Fisheye,
@@ -127,24 +174,20 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
             return Err(Error::format(file, format!("the camera_model '{other}' is not supported; undistort the photos first")));
         }
     };
-    let camera_to_world = Mat4::from_cols_array_2d(&rows.map(|r| r.to_array())).transpose();
-    let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
-    let ignore = frame.mask_path.as_ref().map(|mask| file.with_file_name(mask));
-    if let Some(mask) = ignore.as_ref().filter(|m| !m.is_file()) {
-        return Err(Error::format(file, format!("the mask '{}' of '{name}' is missing; add it or remove its mask_path", mask.display())));
-    }
+    let ignore = frame.mask_path.as_ref().map(|mask| find_mask(file, &name, mask)).transpose()?;
     Ok(PosedPhoto {
         path: photo,
         camera: Camera {
-            name,
+            name: String::new(),
             width: w as u32,
             height: h as u32,
             fx: fx as f32,
             fy: either(|l| l.fl_y).unwrap_or(fx) as f32,
             cx: either(|l| l.cx).unwrap_or(w / 2.0) as f32,
             cy: either(|l| l.cy).unwrap_or(h / 2.0) as f32,
-            world_to_camera: (camera_to_world * flip).inverse(),
+            world_to_camera: Mat4::IDENTITY,
         },
+        stated: StatedPose::Matrix(matrix),
         distortion: Distortion {
             bend,
             k1: coefficient(|l| l.k1),
@@ -156,6 +199,15 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens) -> Result<Po
             ..Distortion::default()
         },
         ignore,
+        upright: false,
+    })
+}
+
+/// The mask that a frame names, by its path or the last parts of it.
+fn find_mask(file: &Path, photo: &str, mask: &str) -> Result<PathBuf> {
+    let folder = file.parent().unwrap_or(Path::new("."));
+    by_last_parts(mask, &[folder.to_owned()]).ok_or_else(|| {
+        Error::format(file, format!("the mask '{}' of '{photo}' is missing; add it or remove its mask_path", folder.join(mask).display()))
     })
 }
 
@@ -176,7 +228,7 @@ mod tests {
                 name = format!("images/{name}")
             );
             std::fs::write(dir.path().join("transforms.json"), text).expect("a file");
-            load(dir.path())
+            super::super::load(dir.path())
         };
         let photos = frame("[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]").expect("a pose").photos;
         assert_eq!((photos.len(), photos[0].distortion.bend), (1, Bend::Fisheye));

@@ -2,7 +2,7 @@
 
 use super::{Thing, World, chain};
 use crate::mask_list::{Mask, RunLengths};
-use crate::{Camera, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
+use crate::{Camera, Error, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
 use serde_json::json;
 use std::path::Path;
 
@@ -19,11 +19,34 @@ pub enum Masks {
 /// nobody would outline: it is not labelled there.
 const SLIVER: usize = 100;
 
+/// Names of the things. Written first: a folder with it is one of generated photos.
+const INSTANCES: &str = "instances.json";
+
+/// Photos of the user's must not be mixed with generated ones, nor replaced by them.
+fn check_output(out: &Path) -> Result<()> {
+    #[derive(serde::Deserialize)]
+    struct Instance {
+        #[serde(rename = "instance")]
+        _instance: usize,
+        #[serde(rename = "parent")]
+        _parent: usize,
+    }
+    let is_ours = fs::read_json::<Vec<Instance>>(&out.join(INSTANCES)).is_ok();
+    let is_empty = out.read_dir().map_or(true, |mut entries| entries.next().is_none());
+    if is_ours || is_empty {
+        return Ok(());
+    }
+    Err(Error::Invalid(format!("{}: it is not empty and holds no generated photos; name a folder that does not exist yet", out.display())))
+}
+
 /// Writes PHOTOS: `images/`, `transforms.json`, exact masks, `depth/` (EXR) and `labels/` of every `holdout`-th view.
 ///
 /// # Errors
 /// The system's refusal.
 pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: impl FnMut()) -> Result<()> {
+    check_output(out)?;
+    let instances = world.things.iter().enumerate().map(|(k, t)| json!({ "instance": k + 1, "name": t.name, "parent": t.parent }));
+    fs::write_json(&out.join(INSTANCES), &instances.collect::<Vec<_>>())?;
     let mut frames = Vec::new();
     let (mut labelled, mut most) = (Vec::new(), vec![0; world.things.len()]);
     for (index, camera) in world.cameras.iter().enumerate() {
@@ -55,8 +78,6 @@ pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: 
         write_labels(out, &world.things, camera, instances, &slivers(areas, &most))?;
     }
     let first = &world.cameras[0];
-    let instances = world.things.iter().enumerate().map(|(k, t)| json!({ "instance": k + 1, "name": t.name, "parent": t.parent }));
-    fs::write_json(&out.join("instances.json"), &instances.collect::<Vec<_>>())?;
     // Written last: its presence says that the folder is whole.
     let transforms = json!({
         "fl_x": first.fx, "fl_y": first.fy, "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height, "frames": frames,

@@ -1,6 +1,7 @@
 //! What `preprocess` is asked for, and what it reports.
 
 use crate::eyes::Eyes;
+use fastlgs_core::dataset::PoseConvention;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -37,7 +38,7 @@ pub enum Poses {
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
-    /// Folder with images/ and poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses pycolmap finds them. Or a video.
+    /// Folder of photos, in images/ or as they are, with poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses pycolmap finds them. Or a video.
     pub photos: PathBuf,
     /// Scene folder to write.
     #[cfg_attr(feature = "clap", arg(short, long))]
@@ -57,6 +58,9 @@ pub struct Config {
     /// What is done about the poses.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub poses: Poses,
+    /// How the poses are written. By default the usual convention of their file, unless the photos' key points fit another one plainly.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "CONVENTION", value_parser = convention_parser()))]
+    pub pose_convention: Option<PoseConvention>,
     /// Segmenter and encoder.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
@@ -79,11 +83,21 @@ impl Default for Config {
             holdout_labels: None,
             sfm: Sfm::default(),
             poses: Poses::default(),
+            pose_convention: None,
             eyes: Eyes::default(),
             neighbours: 10,
             memory: 4_000_000_000,
         }
     }
+}
+
+/// The conventions by name.
+#[cfg(feature = "clap")]
+fn convention_parser() -> impl clap::builder::TypedValueParser<Value = PoseConvention> {
+    use clap::builder::{PossibleValuesParser, TypedValueParser};
+    let all = PoseConvention::ALL;
+    PossibleValuesParser::new(all.map(PoseConvention::name))
+        .map(move |name| all.into_iter().find(|convention| convention.name() == name).expect("one of them"))
 }
 
 /// Parses `500M`.

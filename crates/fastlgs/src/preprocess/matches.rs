@@ -22,13 +22,18 @@ pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, 
     }
     let work = run.work("matches", chosen.len() as u64);
     let match_pair = |(a, b): (usize, usize)| {
-        let inputs = [&photos[a].key, &photos[b].key, keypoints::version().as_bytes()];
-        let pairs = cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))?;
+        let pairs = of_pair(photos, a, b, cache)?;
         work.advance()?;
         Ok::<_, Error>(PairMatches { a, b, pairs })
     };
     let chosen: Vec<(usize, usize)> = chosen.into_iter().collect();
     chosen.into_par_iter().map(match_pair).collect()
+}
+
+/// The matches of two photos, made once.
+pub(super) fn of_pair(photos: &[Known], a: usize, b: usize, cache: &Cache) -> Result<Vec<(usize, usize)>> {
+    let inputs = [&photos[a].key, &photos[b].key, keypoints::version().as_bytes()];
+    cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))
 }
 
 /// The matches between photos that are kept, by their new places, as far as they obey the poses.

@@ -7,12 +7,14 @@ mod photos;
 mod poses;
 mod video;
 
-use crate::aside::Aside;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::eyes::EncoderKind;
+use crate::output::{SceneLock, check_apart};
+use crate::staged::StagedOutput;
 use crate::{Result, Run, calibrations, checkpoints};
 pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
+use fastlgs_core::dataset::Dataset;
 use fastlgs_core::scene_folder::{Manifest, view_of};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
 use fastlgs_grid::evidence;
@@ -21,13 +23,13 @@ use fastlgs_vision::video::is_video;
 use fastlgs_vision::{brightness, import, sweep, tracks};
 use photos::Known;
 pub use photos::{Photo, load_photo};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 pub(crate) use video::fingerprint;
 
 /// All that preprocessing leaves, beside the manifest.
-const LEFT: [&str; 8] =
-    ["photos", "alpha", "ignore", "cameras", "masks", "points.safetensors", "pairs.safetensors", "embeddings.safetensors"];
+const LEFT: [&str; 9] =
+    ["photos", "alpha", "ignore", "sparse", "cameras", "masks", "points.safetensors", "pairs.safetensors", "embeddings.safetensors"];
 
 /// Photos to masks, embeddings, key points, poses and points, all in the scene folder `config.output`.
 ///
@@ -35,6 +37,12 @@ const LEFT: [&str; 8] =
 /// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing models, or a cancelled run. What was
 /// made until then is found again by the next run, and an earlier scene is as it was.
 pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
+    check_apart(&config.photos, &config.output)?;
+    preprocess_locked(config, &SceneLock::take(&config.output, "preprocess")?, run)
+}
+
+/// Preprocesses into a scene that the caller has locked.
+pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
     let started = Instant::now();
     let mut seconds = BTreeMap::new();
     let mut clock = Instant::now();
@@ -53,11 +61,17 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     if of_video.is_some() {
         lap("frames");
     }
-    if config.photos.join("images").is_dir() && !dataset::has_poses(&config.photos) {
-        poses::find(&config.photos, config.sfm, run)?;
+    let scene = SceneFolder::new(&config.output);
+    let cache = Cache::new(&scene);
+    let staged = StagedOutput::new(&scene, "preprocess")?;
+    let folder = staged.folder.clone();
+    let mut dataset = if dataset::images_folder(&config.photos).is_some() && !dataset::has_poses(&config.photos) {
+        let found = poses::find(&config.photos, &folder, &cache, config.sfm, run)?;
         lap("poses");
-    }
-    let dataset = dataset::load(&config.photos)?;
+        found
+    } else {
+        dataset::load(&config.photos)?
+    };
     let lenses = import::lenses(&dataset);
     // Opened first: a missing model should not cost the minutes before.
     let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
@@ -66,21 +80,21 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
     dataset.warnings.iter().for_each(|warning| run.warn(warning));
     let given: Vec<Camera> = dataset.photos.iter().map(|photo| photo.camera.clone()).collect();
-    let held_out_views = labelled_views(config, &given)?;
+    let (holdout, held_out_views) = held_out(config, &dataset, &given)?;
     let models = config.eyes.files()?;
-    let scene = SceneFolder::new(&config.output);
-    let cache = Cache::new(&scene);
-    Aside::recover(&scene, "preprocess", &LEFT)?;
-    let aside = Aside::new(&scene, "preprocess")?;
-    let folder = aside.folder.clone();
     let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
     lap("photos");
     let mut warnings = dataset.warnings.clone();
+    photos::check_masks(&known, run, &mut warnings)?;
     photos::warn_of_bad_photos(&known, run, &mut warnings);
+    poses::settle_convention(&mut dataset, &mut known, config.pose_convention, run, &mut warnings)?;
     let mut checked = match config.poses {
         Poses::Keep => Default::default(),
         Poses::Check | Poses::Refine => poses::check(&mut known, &folder, &cache, run, &mut warnings)?,
     };
+    if config.poses != Poses::Keep {
+        poses::leave_out_lost(&known, &cache, &mut checked)?;
+    }
     lap("pose_check");
     let matches = matches::match_photos(&known, &checked.contradictory, config.neighbours, &cache, run)?;
     lap("matches");
@@ -97,7 +111,7 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     let mut manifest = Manifest {
         version: env!("CARGO_PKG_VERSION").to_owned(),
         photos: config.photos.clone(),
-        holdout: if config.holdout_labels.is_some() { 0 } else { config.holdout },
+        holdout,
         held_out_views,
         segmenter: config.eyes.segmenter.name().to_owned(),
         encoder: config.eyes.encoder.name().to_owned(),
@@ -106,9 +120,12 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
         seed: run.seed,
         warnings: warnings.clone(),
         excluded,
+        frame: dataset.frame,
+        files: BTreeSet::new(),
         seconds: BTreeMap::new(),
         notes: BTreeMap::new(),
     };
+    photos::color_points(&mut dataset, &known, &folder)?;
     let usable = |i: usize| !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i);
     let kept: Vec<usize> = (0..known.len()).filter(|&i| usable(i)).collect();
     let training: Vec<Known> = known.into_iter().enumerate().filter(|(i, _)| usable(*i)).map(|p| p.1).collect();
@@ -151,7 +168,9 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     }
     manifest.seconds = seconds.clone();
     light.note(&mut manifest)?;
-    aside.take_its_place(&scene, &LEFT, &manifest)?;
+    // Training writes the maps of objects in place.
+    let maps = poses.iter().map(|camera| SceneFolder::objects_name(&camera.name));
+    staged.publish(&scene, &LEFT, maps, &manifest)?;
     // Steps of a training on other photos.
     checkpoints::forget(&scene);
     cache.tidy();
@@ -176,12 +195,16 @@ pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     })
 }
 
-/// Names of the views that `--holdout-labels` keeps out.
-fn labelled_views(config: &Config, cameras: &[Camera]) -> Result<Vec<String>> {
-    let Some(folder) = &config.holdout_labels else { return Ok(Vec::new()) };
+/// Which views are held out: each so-manieth, or by name those that `--holdout-labels` names or that the data set keeps for testing.
+fn held_out(config: &Config, dataset: &Dataset, cameras: &[Camera]) -> Result<(usize, Vec<String>)> {
+    if config.holdout_labels.is_none() && config.holdout > 0 && !dataset.held_out.is_empty() {
+        return Ok((0, dataset.held_out.clone()));
+    }
+    let Some(folder) = &config.holdout_labels else { return Ok((config.holdout, Vec::new())) };
     let index = |name: &str| {
         let index = view_of(cameras.iter().map(|c| c.name.as_str()), name);
         index.with_context(|| format!("{}: the labelled view '{name}' is none of the photos", folder.display()))
     };
-    labels::load(folder, None)?.iter().map(|view| Ok(cameras[index(&view.name)?].name.clone())).collect()
+    let names: Result<Vec<String>> = labels::load(folder, None)?.iter().map(|view| Ok(cameras[index(&view.name)?].name.clone())).collect();
+    Ok((0, names?))
 }

@@ -5,6 +5,8 @@ use crate::cache::{self, Cache, Key};
 use crate::error::{Context, bail};
 use crate::{Result, Run};
 use fastlgs_core::dataset::{Dataset, PosedPhoto};
+use fastlgs_core::image_io::WayUp;
+use fastlgs_core::mask_image::MaskImage;
 use fastlgs_core::undistort::{Distortion, imaged, undistort, undistort_gray};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
@@ -24,6 +26,26 @@ pub struct Photo {
     alpha: Option<GrayImage>,
     /// Black where nothing counts.
     ignore: Option<GrayImage>,
+    /// How much of the photo the mask that came with it leaves, if one did.
+    drawn: Option<Extent>,
+}
+
+/// How much of a photo something covers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Extent {
+    Nothing,
+    Part,
+    Everything,
+}
+
+impl Extent {
+    fn of(pixels: usize, all: usize) -> Self {
+        match pixels {
+            0 => Self::Nothing,
+            n if n == all => Self::Everything,
+            _ => Self::Part,
+        }
+    }
 }
 
 /// What is kept in memory of a photo; its pixels lie in the scene folder, so that thousands of photos fit.
@@ -32,6 +54,10 @@ pub(super) struct Known {
     /// Fingerprint of the pixels.
     pub key: Key,
     impression: Impression,
+    /// How much of it the mask that came with it leaves.
+    drawn: Option<Extent>,
+    /// How much of it is not transparent.
+    opaque: Extent,
     pub points: Keypoints,
     /// Colour at each key point.
     pub colors: Vec<[u8; 3]>,
@@ -52,6 +78,61 @@ pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec
             warnings.push(warning);
         }
     }
+}
+
+/// Refuses photos of which nothing would be trained, and masks that ignore nothing; where only some are so, the user hears of them.
+///
+/// # Errors
+/// Masks that leave nothing, or everything, of all photos that have one, and photos that are all transparent.
+pub(super) fn check_masks(photos: &[Known], run: &Run, warnings: &mut Vec<String>) -> Result<()> {
+    let masked: Vec<&Known> = photos.iter().filter(|p| p.drawn.is_some()).collect();
+    let leaving = |extent| masked.iter().filter(|p| p.drawn == Some(extent)).map(|p| p.camera.name.as_str()).collect::<Vec<_>>();
+    let (nothing, everything) = (leaving(Extent::Nothing), leaving(Extent::Everything));
+    let transparent: Vec<&str> = photos.iter().filter(|p| p.opaque == Extent::Nothing).map(|p| p.camera.name.as_str()).collect();
+    if !masked.is_empty() && nothing.len() == masked.len() {
+        bail!("the masks of all {} photos that have one leave nothing to train on; black is ignored: are they inverted?", masked.len());
+    }
+    if !masked.is_empty() && everything.len() == masked.len() {
+        bail!("the masks of all {} photos that have one ignore nothing; are they the right files? black is ignored", masked.len());
+    }
+    if transparent.len() == photos.len() {
+        bail!("all {} photos are fully transparent; export them with their colours", photos.len());
+    }
+    for (list, what) in [
+        (nothing, "have masks that leave nothing of them; they are not trained on"),
+        (everything, "have masks that ignore nothing of them"),
+        (transparent, "are fully transparent; they show only the background"),
+    ] {
+        if !list.is_empty() {
+            let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), list.join(", "));
+            run.warn(&warning);
+            warnings.push(warning);
+        }
+    }
+    Ok(())
+}
+
+/// Gives points that came without colours the mean colour of the photos that show them.
+pub(super) fn color_points(dataset: &mut Dataset, photos: &[Known], folder: &SceneFolder) -> Result<()> {
+    if dataset.shown_in.is_empty() {
+        return Ok(());
+    }
+    let mut sums = vec![[0u32; 4]; dataset.points.len()];
+    for (index, known) in photos.iter().enumerate() {
+        let pixels = folder.photo(&known.camera.name)?;
+        let shows = |list: &Vec<u32>| list.is_empty() || list.contains(&(index as u32));
+        for (point, sum) in dataset.points.iter().zip(&mut sums).zip(&dataset.shown_in).filter(|(_, list)| shows(list)).map(|p| p.0) {
+            if let Some((place, _)) = known.camera.see(point.position) {
+                let (x, y) = (place as u32 % pixels.width(), place as u32 / pixels.width());
+                let [r, g, b] = pixels.get_pixel(x, y).0.map(u32::from);
+                *sum = [sum[0] + r, sum[1] + g, sum[2] + b, sum[3] + 1];
+            }
+        }
+    }
+    for (point, [r, g, b, count]) in dataset.points.iter_mut().zip(sums).filter(|(_, sum)| sum[3] > 0) {
+        point.color = [r, g, b].map(|sum| (sum / count) as u8);
+    }
+    Ok(())
 }
 
 /// Bytes that a photo takes while it is read, for each of its file's pixels: decoded, shrunk, undistorted, encoded again.
@@ -85,13 +166,15 @@ fn fingerprint(camera: &Camera, pixels: &RgbImage) -> Key {
 }
 
 /// What stays in memory of a photo.
-fn known(Photo { camera, pixels, .. }: Photo, cache: &Cache) -> Result<Known> {
+fn known(Photo { camera, pixels, alpha, drawn, .. }: Photo, cache: &Cache) -> Result<Known> {
+    let covered = |alpha: GrayImage| Extent::of(alpha.pixels().filter(|p| p[0] > 0).count(), alpha.pixels().len());
+    let opaque = alpha.map_or(Extent::Everything, covered);
     let key = fingerprint(&camera, &pixels);
     let inputs = cache::key(&[&key, keypoints::version().as_bytes()]);
     let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
     let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
     let colors = points.positions.iter().map(color).collect();
-    Ok(Known { impression: Impression::of(&pixels), camera, key, points, colors, bend: 0.0 })
+    Ok(Known { impression: Impression::of(&pixels), drawn, opaque, camera, key, points, colors, bend: 0.0 })
 }
 
 /// Writes a working photo with its masks into the scene folder.
@@ -122,7 +205,7 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
         let (pixels, alpha) = resampled(&folder.photo(&camera.name)?, alpha.as_ref(), color, mask);
         (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
         known.points.positions.iter_mut().for_each(|p| *p = lens.straight_pixel(&camera, *p));
-        save_photo(&Photo { camera, pixels, alpha, ignore }, folder)
+        save_photo(&Photo { camera, pixels, alpha, ignore, drawn: known.drawn }, folder)
     })
 }
 
@@ -139,7 +222,8 @@ fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage
 
 /// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
 pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
-    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, Some((posed.camera.width, posed.camera.height)))?;
+    let way_up = if posed.upright { WayUp::Upright } else { WayUp::AsPosed(posed.camera.width, posed.camera.height) };
+    let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, way_up)?;
     // The file decides the true size; some tools scale photos and leave the poses' file as it was.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
     if !is_alike(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
@@ -158,17 +242,18 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
         if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) }
     };
     let (pixels, alpha) = resampled(&raw, alpha.as_ref(), color, mask);
-    let mut ignore = None;
+    let (mut ignore, mut drawn) = (None, None);
     if let Some(path) = &posed.ignore {
-        let drawn = image_io::load_gray(path)?;
-        if !is_alike(drawn.dimensions(), raw.dimensions()) {
-            let ((w, h), (width, height)) = (drawn.dimensions(), raw.dimensions());
-            bail!("{}: the mask is {w}x{h}, its photo {width}x{height}; was it rotated or cropped?", path.display());
+        let own = MaskImage::load(path)?;
+        if !is_alike((own.width, own.height), raw.dimensions()) {
+            let (width, height) = raw.dimensions();
+            bail!("{}: the mask is {}x{}, its photo {width}x{height}; was it rotated or cropped?", path.display(), own.width, own.height);
         }
-        ignore = Some(mask(&drawn));
+        drawn = Some(Extent::of(own.area(), own.inside.len()));
+        ignore = Some(mask(&own.to_gray()));
     }
     let ignore = in_both(ignore, imaged(&camera, &posed.distortion));
-    Ok(Photo { pixels, alpha, ignore, camera })
+    Ok(Photo { pixels, alpha, ignore, drawn, camera })
 }
 
 /// Whether two sizes have the same proportions, but for rounding.

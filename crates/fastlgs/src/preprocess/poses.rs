@@ -3,29 +3,127 @@
 use super::config::{Adjusted, Poses, Sfm};
 use super::photos::Known;
 use crate::cache::{self, Cache};
+use crate::error::bail;
 use crate::progress::Work;
 use crate::{Error, Result, Run};
-use fastlgs_core::{Camera, SceneFolder, dataset, image_io};
+use fastlgs_core::dataset::{Dataset, PoseConvention, PosedPhoto};
+use fastlgs_core::{Camera, SceneFolder, camera, dataset, fs, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::pose_convention::{self, Verdict};
 use fastlgs_vision::structure::Tool;
 use fastlgs_vision::tracks::PairMatches;
-use fastlgs_vision::{bundle, frame, pose_check, resection, structure};
+use fastlgs_vision::{bundle, frame, pose_check, resection, structure, tracks};
 use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Structure from motion for photos without poses.
-pub(super) fn find(photos: &Path, sfm: Sfm, run: &Run) -> Result<()> {
-    let tool = structure::Tool::find(sfm == Sfm::Colmap)?;
+/// Structure from motion for photos without poses. The model lies in the scene and is found again as long as the photos are the same.
+pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm, run: &Run) -> Result<Dataset> {
+    let images = structure::photos_in(&dataset::images_folder(photos).unwrap_or_else(|| photos.join("images")))?;
+    let mut inputs = vec![format!("{sfm:?} {} {}", run.seed, keypoints::version()).into_bytes()];
+    for image in &images {
+        inputs.extend([image.file_name().unwrap_or_default().as_encoded_bytes().to_vec(), fs::read(image)?]);
+    }
+    let key = cache::key(&inputs.iter().map(Vec::as_slice).collect::<Vec<_>>());
+    let model = folder.root.join("sparse/0");
+    let (upright, files) = cache.get("structure", &key, || {
+        let tool = Tool::find(sfm == Sfm::Colmap)?;
+        // The program counts pixels as they are stored; key points that are found here lie on upright photos.
+        Ok((matches!(tool, Tool::Pycolmap(_)), reconstruct(&tool, photos, &images, folder, run)?))
+    })?;
+    for (name, bytes) in files {
+        fs::write_atomic(&model.join(name), |file| std::io::Write::write_all(file, &bytes))?;
+    }
+    let mut dataset = dataset::load_model(photos, &model)?;
+    dataset.photos.iter_mut().for_each(|photo| photo.upright = upright);
+    // This model is in no other convention.
+    dataset.conventions.truncate(1);
+    Ok(dataset)
+}
+
+/// Reads the poses in the convention that was asked for, or that the photos' key points plainly fit.
+///
+/// # Errors
+/// A convention that the file cannot have, and key points that fit several alike but not the usual one.
+pub(super) fn settle_convention(
+    dataset: &mut Dataset,
+    photos: &mut [Known],
+    asked: Option<PoseConvention>,
+    run: &Run,
+    warnings: &mut Vec<String>,
+) -> Result<()> {
+    let standard = dataset.conventions[0];
+    let names = |list: &[PoseConvention]| list.iter().map(|c| c.name()).collect::<Vec<_>>().join(", ");
+    let chosen = match asked {
+        Some(asked) if !dataset.conventions.contains(&asked) => {
+            let all = names(&dataset.conventions);
+            bail!("--pose-convention {}: the poses' file cannot have it; its conventions are {all}", asked.name());
+        }
+        Some(asked) => asked,
+        None if dataset.conventions.len() < 2 => standard,
+        None => {
+            let keypoints: Vec<Keypoints> = photos.iter().map(|photo| photo.points.clone()).collect();
+            let matches = pose_convention::sample(&keypoints);
+            let conventions = dataset.conventions.clone();
+            let by = |convention: PoseConvention| {
+                dataset.read_poses_by(convention);
+                let pose = |(known, posed): (&Known, &PosedPhoto)| Camera {
+                    world_to_camera: posed.camera.world_to_camera,
+                    ..known.camera.clone()
+                };
+                (convention, photos.iter().zip(&dataset.photos).map(pose).collect::<Vec<_>>())
+            };
+            let candidates: Vec<_> = conventions.into_iter().map(by).collect();
+            match pose_convention::judge(&candidates, &keypoints, &matches) {
+                Verdict::Standard => standard,
+                Verdict::Other(found, [share, usual]) => {
+                    let warning = format!(
+                        "the poses fit the photos as {} ({:.0} % of the key points' matches obey them), not as {} ({:.0} %), and are read so; \
+                         --pose-convention names one",
+                        found.name(),
+                        100.0 * share,
+                        standard.name(),
+                        100.0 * usual
+                    );
+                    run.warn(&warning);
+                    warnings.push(warning);
+                    found
+                }
+                Verdict::Unclear(among) => bail!(
+                    "the poses do not fit the photos as {}, but as {} alike; say by --pose-convention which one they are written in",
+                    standard.name(),
+                    names(&among)
+                ),
+            }
+        }
+    };
+    dataset.read_poses_by(chosen);
+    for (known, posed) in photos.iter_mut().zip(&dataset.photos) {
+        posed.camera.check().map_err(crate::Error::Invalid)?;
+        known.camera.world_to_camera = posed.camera.world_to_camera;
+    }
+    Ok(())
+}
+
+/// Names and contents of the files of the model that explains most photos.
+fn reconstruct(tool: &Tool, photos: &Path, images: &[PathBuf], folder: &SceneFolder, run: &Run) -> Result<Vec<(String, Vec<u8>)>> {
     let work = run.work("poses", 0);
     run.warn(&format!("{}: no poses; structure from motion looks for them, which takes minutes", photos.display()));
-    let folders = dataset::folders_within(&photos.join("images"));
+    let folders = images.first().and_then(|image| image.parent()).map(dataset::folders_within).unwrap_or_default();
     if !folders.is_empty() {
         run.warn(&format!("photos in folders within images/ are not read ({}): move them up", folders.join(", ")));
     }
-    let found = structure::reconstruct(&tool, photos, run.seed, |stage, line| told(&work, stage, line));
+    let partial = folder.root.join(PARTIAL);
+    let found = structure::reconstruct(tool, images, &partial, run.seed, |stage, line| told(&work, stage, line));
     work.check()?;
-    Ok(found?)
+    let model = found?;
+    let mut files = Vec::new();
+    for entry in model.read_dir().map_err(fastlgs_core::Error::io(&model))?.flatten() {
+        files.push((entry.file_name().to_string_lossy().into_owned(), fs::read(&entry.path())?));
+    }
+    files.sort();
+    let _ = std::fs::remove_dir_all(&partial);
+    Ok(files)
 }
 
 /// Passes on what a tool prints; whether to go on.
@@ -132,6 +230,32 @@ fn anew(
     moved.extend(again.moved);
     let moved = moved.difference(&lost).copied().collect();
     Ok(Some((cameras, pose_check::Report { moved, contradictory: lost.into_iter().collect() })))
+}
+
+/// Matches with another photo from which these may support a pose, and the share of them that must obey it.
+const SUPPORT: (usize, f32) = (15, 0.5);
+
+/// Adds photos to the contradictory ones whose poses lie far outside of all others and that no match with another photo supports.
+pub(super) fn leave_out_lost(photos: &[Known], cache: &Cache, checked: &mut pose_check::Report) -> Result<()> {
+    let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
+    let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
+    let outside = camera::far_outside(&cameras);
+    let doubtful: Vec<usize> = (0..photos.len()).filter(|photo| outside[*photo] && !checked.contradictory.contains(photo)).collect();
+    for lost in doubtful {
+        let mut supported = false;
+        for other in (0..photos.len()).filter(|other| !outside[*other]) {
+            let (a, b) = (lost.min(other), lost.max(other));
+            let found = PairMatches { a, b, pairs: super::matches::of_pair(photos, a, b, cache)? };
+            let obeying = found.obeying(&cameras, &points, tracks::TOLERANCE).pairs.len();
+            supported |= found.pairs.len() >= SUPPORT.0 && obeying as f32 > SUPPORT.1 * found.pairs.len() as f32;
+        }
+        if !supported {
+            checked.moved.retain(|photo| *photo != lost);
+            checked.contradictory.push(lost);
+        }
+    }
+    checked.contradictory.sort_unstable();
+    Ok(())
 }
 
 /// Places photos that contradict the others by what their key points show.

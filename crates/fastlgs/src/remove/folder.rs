@@ -1,15 +1,16 @@
 //! The scene folder that is left when a thing was removed.
 
-use crate::error::Context;
+use crate::staged::StagedOutput;
 use crate::{Result, Session, clear, train};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
 use image::{GrayImage, Luma, Rgb, RgbImage};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// What is not taken over: it speaks of the photos as they were.
-const LEFT_BEHIND: [&str; 4] = ["cache", "checkpoints", "objects", "embeddings.safetensors"];
+const LEFT_BEHIND: [&str; 2] = ["masks/objects", "embeddings.safetensors"];
 
 /// Share of a mask's pixels that must be hidden for it to be one of the thing.
 const OF_THE_THING: f64 = 0.5;
@@ -20,22 +21,10 @@ type Hidden = (Camera, Vec<bool>);
 /// Writes the scene that `session` holds now to `output`: photos to train on show it without the thing; in photos that are held out, which still
 /// show the thing, those pixels do not count.
 pub fn write(output: &Path, session: &mut Session, grid: &Grid, views: &[Hidden], what: &str) -> Result<()> {
-    let name = output.file_name().with_context(|| format!("{}: it has no name", output.display()))?;
-    // Beside its place, so that it can be renamed; a folder that is not finished never bears its name.
-    let unfinished = output.with_file_name(format!(".{}.unfinished", name.to_string_lossy()));
-    let _ = std::fs::remove_dir_all(&unfinished);
-    let written = assemble(&unfinished, session, grid, views, what);
-    if written.is_err() {
-        let _ = std::fs::remove_dir_all(&unfinished);
-    }
-    written?;
-    Ok(std::fs::rename(&unfinished, output).map_err(Error::io(output))?)
-}
-
-/// Writes the folder under the name that it has until it is finished.
-fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidden], what: &str) -> Result<()> {
-    copy(&session.folder.root, unfinished).map_err(Error::io(unfinished))?;
-    let folder = SceneFolder::new(unfinished);
+    let scene = SceneFolder::new(output);
+    let staged = StagedOutput::new(&scene, "remove")?;
+    let folder = &staged.folder;
+    copy(&session.manifest.files, &session.folder.root, &folder.root)?;
     let mut manifest = session.manifest.clone();
     let held_out = manifest.held_out(&session.cameras);
     for (camera, hidden) in views {
@@ -49,7 +38,7 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
-        let counts = counting(&folder, &camera.name, hidden.len())?;
+        let counts = counting(folder, &camera.name, hidden.len())?;
         patch(&mut photo, hidden, &counts, session.render(camera)?.channels(0, 3));
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
@@ -63,8 +52,8 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
         }
     }
     // Numbers of masks are others now.
-    evidence::save_pairs(&folder, &Pairs::new())?;
-    grid.save(&folder)?;
+    evidence::save_pairs(folder, &Pairs::new())?;
+    grid.save(folder)?;
     ply::write(&folder.ply_path(), &session.gaussians)?;
     let compact = folder.compact_path();
     if compact.is_file() {
@@ -78,7 +67,8 @@ fn assemble(unfinished: &Path, session: &mut Session, grid: &Grid, views: &[Hidd
         (train["gaussians"], train["objects"]) = (session.gaussians.len().into(), grid.objects.len().into());
         train["clear"] = clear::count(&session.gaussians).into();
     }
-    Ok(folder.save_manifest(&manifest)?)
+    let maps = session.manifest.training(&session.cameras).into_iter().map(|camera| SceneFolder::objects_name(&camera.name));
+    staged.publish(&scene, &[], maps, &manifest)
 }
 
 /// The pixels of a photo that it shows: opaque ones that no mask blackens.
@@ -110,19 +100,14 @@ fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) 
     }
 }
 
-fn copy(from: &Path, to: &Path) -> std::io::Result<()> {
-    std::fs::create_dir_all(to)?;
-    for entry in std::fs::read_dir(from)? {
-        let entry = entry?;
-        let name = entry.file_name();
-        if LEFT_BEHIND.iter().any(|left| name == *left) || entry.path().extension().is_some_and(|ending| ending == "partial") {
-            continue;
-        }
-        // Folders may be linked.
-        match entry.path().is_dir() {
-            true => copy(&entry.path(), &to.join(name))?,
-            false => drop(std::fs::copy(entry.path(), to.join(name))?),
-        }
+/// Copies the files of a scene, as far as they are there and speak of the scene as it will be.
+fn copy(files: &BTreeSet<String>, from: &Path, to: &Path) -> Result<()> {
+    let stays = |file: &&String| !LEFT_BEHIND.iter().any(|left| Path::new(file).starts_with(left)) && from.join(file).is_file();
+    for file in files.iter().filter(stays) {
+        let (old, new) = (from.join(file), to.join(file));
+        let parent = new.parent().unwrap_or(to);
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+        std::fs::copy(&old, &new).map_err(Error::io(&old))?;
     }
     Ok(())
 }

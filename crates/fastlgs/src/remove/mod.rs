@@ -9,10 +9,11 @@ mod folder;
 mod membrane;
 
 use crate::error::{Context, bail};
+use crate::output::{SceneLock, resolved};
 use crate::session::ask::Ask;
 use crate::session::selection;
 use crate::{Result, Run, Session, clear};
-use fastlgs_core::{Camera, metrics};
+use fastlgs_core::{Camera, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{Hit, QueryConfig};
@@ -89,16 +90,14 @@ const EMPTY: f32 = 0.5;
 /// # Errors
 /// A text that names nothing in the scene, an object that it does not have, a folder that exists already, or a device that fails.
 pub fn remove(config: &Config, run: &Run) -> Result<Report> {
-    if config.output.exists() {
-        bail!("{}: there is something already; name a folder that is not there yet", config.output.display());
-    }
-    // The nearest folder above that is there.
-    let above = std::path::absolute(&config.output)?.ancestors().find_map(|folder| folder.canonicalize().ok());
-    if let (Some(above), Ok(scene)) = (above, config.scene.canonicalize())
-        && above.starts_with(&scene)
-    {
+    let (output, scene) = (resolved(&config.output)?, resolved(&config.scene)?);
+    if output.starts_with(&scene) || scene.starts_with(&output) {
         bail!("{}: it lies in the scene itself; name a folder beside {}", config.output.display(), config.scene.display());
     }
+    if SceneFolder::open(&config.output).is_ok() {
+        bail!("{}: there is a scene already; name a folder that is not there yet", config.output.display());
+    }
+    let _lock = SceneLock::take(&config.output, "remove")?;
     let inpainter: Box<dyn Inpainter> =
         if config.inpainter == "membrane" { Box::new(Membrane) } else { inpaint::named(&config.inpainter).context("--inpainter")? };
     let mut session = Session::open(&config.scene, run.device)?;

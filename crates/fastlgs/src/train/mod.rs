@@ -7,9 +7,10 @@ mod report;
 mod settings;
 mod start;
 
-use crate::aside::Aside;
 use crate::error::{Context, bail};
+use crate::output::SceneLock;
 use crate::progress::{Message, TrainStep};
+use crate::staged::StagedOutput;
 use crate::{Result, Run, checkpoints, clear, objects, preprocess};
 #[cfg(feature = "clap")]
 pub(crate) use config::parse_minutes;
@@ -35,6 +36,11 @@ const LEFT: [&str; 4] = ["grid.json", "grid.safetensors", "scene.ply", "cameras/
 /// Options that contradict each other, a scene that was not preprocessed, a device that fails, or a cancelled run, after which the
 /// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
 pub fn train(config: &Config, run: &Run) -> Result<Report> {
+    train_locked(config, &SceneLock::of_scene(&config.scene, "train")?, run)
+}
+
+/// Trains a scene that the caller has locked.
+pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
     if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
         bail!("--preset like-paper finds objects as the paper does: leave out --mapping keep, or name another preset");
     }
@@ -46,7 +52,6 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
             "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
         );
     }
-    Aside::recover(&SceneFolder::new(&config.scene), "train", &LEFT)?;
     let folder = SceneFolder::open(&config.scene)?;
     let mut manifest = folder.manifest()?;
     let given = folder.given_cameras()?;
@@ -151,10 +156,10 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
         }
     };
     mapping_seconds += started.elapsed().as_secs_f64();
-    let aside = Aside::new(&folder, "train")?;
-    grid.save(&aside.folder)?;
-    aside.folder.save_trained_cameras(aligned.then_some(&cameras))?;
-    ply::write(&aside.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
+    let staged = StagedOutput::new(&folder, "train")?;
+    grid.save(&staged.folder)?;
+    staged.folder.save_trained_cameras(aligned.then_some(&cameras))?;
+    ply::write(&staged.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
     let report = Report {
         scene: config.scene.clone(),
@@ -189,7 +194,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
     manifest.notes.remove(pace::NOTE);
-    aside.take_its_place(&folder, &LEFT, &manifest)?;
+    staged.publish(&folder, &LEFT, [], &manifest)?;
     objects::end_maps(&folder);
     // Checkpoints serve a broken run only.
     checkpoints::forget(&folder);

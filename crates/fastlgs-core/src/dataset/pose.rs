@@ -1,0 +1,105 @@
+//! Poses as their files state them, and the conventions in which programs write them.
+
+use crate::world_frame::Pose;
+use glam::{DMat4, DQuat, DVec3, DVec4};
+use serde::{Deserialize, Serialize};
+
+/// Direction and axes of the poses in a file. OpenCV: x right, y down, z forward. OpenGL: x right, y up, z backward.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum PoseConvention {
+    /// Camera to world, OpenGL axes: transforms.json of instant-ngp and nerfstudio.
+    C2wOpengl,
+    /// Camera to world, OpenCV axes.
+    C2wOpencv,
+    /// World to camera, OpenGL axes.
+    W2cOpengl,
+    /// World to camera, OpenCV axes: COLMAP.
+    W2cOpencv,
+    /// As `W2cOpencv`, with quaternions in the order x, y, z, w.
+    W2cOpencvXyzw,
+    /// As `C2wOpencv`, with quaternions in the order x, y, z, w.
+    C2wOpencvXyzw,
+}
+
+impl PoseConvention {
+    /// The conventions in which matrices are found; the first is the standard.
+    pub const OF_MATRICES: [Self; 4] = [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpencv, Self::W2cOpengl];
+    /// Those in which quaternions are found; the first is the standard.
+    pub const OF_QUATERNIONS: [Self; 4] = [Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencv, Self::C2wOpencvXyzw];
+
+    /// All of them.
+    pub const ALL: [Self; 6] =
+        [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpengl, Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencvXyzw];
+
+    /// Its name on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::C2wOpengl => "c2w-opengl",
+            Self::C2wOpencv => "c2w-opencv",
+            Self::W2cOpengl => "w2c-opengl",
+            Self::W2cOpencv => "w2c-opencv",
+            Self::W2cOpencvXyzw => "w2c-opencv-xyzw",
+            Self::C2wOpencvXyzw => "c2w-opencv-xyzw",
+        }
+    }
+}
+
+/// The numbers of a pose as its file states them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum StatedPose {
+    /// A 4x4 matrix.
+    Matrix(DMat4),
+    /// Four numbers of a rotation, and a translation.
+    Quaternion([f64; 4], DVec3),
+}
+
+impl StatedPose {
+    /// What it means by a convention.
+    pub fn by(&self, convention: PoseConvention) -> Pose {
+        use PoseConvention::{C2wOpencv, C2wOpencvXyzw, C2wOpengl, W2cOpencv, W2cOpencvXyzw, W2cOpengl};
+        let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
+        let matrix = match *self {
+            Self::Matrix(matrix) => matrix,
+            Self::Quaternion([a, b, c, d], translation) => {
+                let xyzw = matches!(convention, W2cOpencvXyzw | C2wOpencvXyzw);
+                let rotation = if xyzw { DQuat::from_xyzw(a, b, c, d) } else { DQuat::from_xyzw(b, c, d, a) };
+                DMat4::from_mat3_translation(glam::DMat3::from_quat(rotation.normalize()), translation)
+            }
+        };
+        match convention {
+            C2wOpengl => Pose::CameraToWorld(matrix * flip),
+            C2wOpencv | C2wOpencvXyzw => Pose::CameraToWorld(matrix),
+            W2cOpengl => Pose::WorldToCamera(flip * matrix),
+            W2cOpencv | W2cOpencvXyzw => Pose::WorldToCamera(matrix),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_conventions_state_the_same_pose() {
+        let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
+        let rotation = DQuat::from_rotation_y(0.7) * DQuat::from_rotation_x(-0.4);
+        let c2w = DMat4::from_rotation_translation(rotation, DVec3::new(1.0, 2.0, 3.0));
+        let w2c = c2w.inverse();
+        let matrices = [c2w * flip, c2w, w2c, flip * w2c];
+        let quaternion = |pose: DMat4, xyzw: bool| {
+            let (_, rotation, translation) = pose.to_scale_rotation_translation();
+            let [x, y, z, w] = rotation.to_array();
+            StatedPose::Quaternion(if xyzw { [x, y, z, w] } else { [w, x, y, z] }, translation)
+        };
+        let quaternions = [quaternion(w2c, false), quaternion(w2c, true), quaternion(c2w, false), quaternion(c2w, true)];
+        let stated = PoseConvention::OF_MATRICES.into_iter().zip(matrices.map(StatedPose::Matrix));
+        for (convention, stated) in stated.chain(PoseConvention::OF_QUATERNIONS.into_iter().zip(quaternions)) {
+            let found = match stated.by(convention) {
+                Pose::CameraToWorld(pose) => pose,
+                Pose::WorldToCamera(pose) => pose.inverse(),
+            };
+            assert!(found.abs_diff_eq(c2w, 1e-12), "{}", convention.name());
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! Black-and-white masks as programs save them: 0 and 255, 0 and 1, a palette, 16 bits, or in the alpha channel, with hard or soft edges.
+
+use crate::{LabelMap, Result, image_io};
+use image::{DynamicImage, GrayImage, Luma};
+use std::path::Path;
+
+/// A mask: one truth value a pixel.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MaskImage {
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+    /// Row by row.
+    pub inside: Vec<bool>,
+}
+
+impl MaskImage {
+    /// Reads a mask. The alpha channel carries it where that varies, else the brightness; what is brighter than the level between the two
+    /// clusters of values is inside. A picture of one value is inside everywhere, unless that value is 0.
+    ///
+    /// # Errors
+    /// As [`image_io::load_rgb`].
+    pub fn load(path: &Path) -> Result<Self> {
+        let picture = image_io::load_any(path)?;
+        let mut values = values(&picture);
+        if is_flat(&values) {
+            // A palette of one colour: its places are the values.
+            if let Some(map) = LabelMap::load(path).ok().filter(|map| map.labels.len() == values.len()) {
+                values = map.labels;
+            }
+        }
+        let level = level(&values);
+        Ok(Self { width: picture.width(), height: picture.height(), inside: values.iter().map(|v| f64::from(*v) > level).collect() })
+    }
+
+    /// Pixels inside.
+    pub fn area(&self) -> usize {
+        self.inside.iter().filter(|inside| **inside).count()
+    }
+
+    /// White inside, black outside.
+    pub fn to_gray(&self) -> GrayImage {
+        let value = |inside: bool| Luma([if inside { 255 } else { 0 }]);
+        GrayImage::from_fn(self.width, self.height, |x, y| value(self.inside[(y * self.width + x) as usize]))
+    }
+}
+
+fn is_flat(values: &[u16]) -> bool {
+    values.windows(2).all(|pair| pair[0] == pair[1])
+}
+
+/// Alpha where it varies, else brightness, in 16 bits.
+fn values(picture: &DynamicImage) -> Vec<u16> {
+    if picture.color().has_alpha() {
+        let alpha: Vec<u16> = picture.to_luma_alpha16().pixels().map(|p| p[1]).collect();
+        if !is_flat(&alpha) {
+            return alpha;
+        }
+    }
+    picture.to_luma16().into_raw()
+}
+
+/// The level between the two clusters of the values: halfway between the means of those above and below it (Ridler and Calvard, 1978). It starts in
+/// the middle of their range, so that a small cluster counts as much as a large one.
+fn level(values: &[u16]) -> f64 {
+    let mut counts = vec![0u64; usize::from(u16::MAX) + 1];
+    values.iter().for_each(|value| counts[usize::from(*value)] += 1);
+    let known: Vec<(f64, f64)> = counts.iter().enumerate().filter(|(_, n)| **n > 0).map(|(v, n)| (v as f64, *n as f64)).collect();
+    let (Some(least), Some(most)) = (known.first(), known.last()) else { return 0.5 };
+    if known.len() == 1 {
+        // Anything but 0 lies above it.
+        return 0.5;
+    }
+    let mut level = (least.0 + most.0) / 2.0;
+    // It settles after a few steps; the limit guards against rounding.
+    for _ in 0..100 {
+        let mean = |above: bool| {
+            let (sum, count) = known.iter().filter(|k| (k.0 > level) == above).fold((0.0, 0.0), |(s, n), k| (s + k.0 * k.1, n + k.1));
+            sum / count
+        };
+        let next = (mean(true) + mean(false)) / 2.0;
+        if next == level {
+            break;
+        }
+        level = next;
+    }
+    level
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{ImageBuffer, LumaA, Rgba};
+
+    const SIDE: u32 = 20;
+
+    /// A disc that covers a part of the picture.
+    fn inside(x: u32, y: u32) -> bool {
+        (x as f32 - 8.0).hypot(y as f32 - 9.0) < 5.2
+    }
+
+    fn area() -> usize {
+        (0..SIDE * SIDE).filter(|p| inside(p % SIDE, p / SIDE)).count()
+    }
+
+    /// The area that is read of a picture.
+    fn read(picture: impl Into<DynamicImage>, name: &str) -> usize {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(name);
+        picture.into().save(&path).unwrap();
+        MaskImage::load(&path).unwrap().area()
+    }
+
+    #[test]
+    fn all_ways_to_save_a_mask_have_the_same_pixels() {
+        for (low, high) in [(0, 255), (0, 1), (0, 128), (3, 9), (100, 101)] {
+            let picture = GrayImage::from_fn(SIDE, SIDE, |x, y| Luma([if inside(x, y) { high } else { low }]));
+            assert_eq!(read(picture, "a.png"), area(), "{low} and {high}");
+        }
+        for (low, high) in [(0u16, 1u16), (0, 65535), (0, 255), (300, 301)] {
+            let picture: ImageBuffer<Luma<u16>, _> = ImageBuffer::from_fn(SIDE, SIDE, |x, y| Luma([if inside(x, y) { high } else { low }]));
+            assert_eq!(read(picture, "a.png"), area(), "16 bits, {low} and {high}");
+        }
+        let in_alpha: image::RgbaImage = ImageBuffer::from_fn(SIDE, SIDE, |x, y| Rgba([7, 7, 7, if inside(x, y) { 255 } else { 0 }]));
+        assert_eq!(read(in_alpha, "a.png"), area());
+        let opaque: image::RgbaImage =
+            ImageBuffer::from_fn(SIDE, SIDE, |x, y| Rgba(if inside(x, y) { [200, 0, 0, 255] } else { [0, 0, 0, 255] }));
+        assert_eq!(read(opaque, "a.png"), area());
+        let gray: ImageBuffer<LumaA<u8>, _> = ImageBuffer::from_fn(SIDE, SIDE, |x, y| LumaA([255, if inside(x, y) { 255 } else { 0 }]));
+        assert_eq!(read(gray, "a.png"), area());
+        // Through JPEG, and with soft edges: within a tenth.
+        let binary = GrayImage::from_fn(SIDE, SIDE, |x, y| Luma([if inside(x, y) { 255 } else { 0 }]));
+        let soft = image::imageops::blur(&binary, 0.7);
+        for found in [read(binary, "a.jpg"), read(soft, "a.png")] {
+            assert!(found.abs_diff(area()) * 10 <= area(), "{found} of {}", area());
+        }
+    }
+
+    #[test]
+    fn palettes_are_read_by_colour_and_else_by_place() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        for (palette, name) in
+            [([0, 0, 0, 128, 0, 0], "DAVIS"), ([0, 0, 0, 255, 255, 255], "two colours"), ([9, 9, 9, 9, 9, 9], "one colour")]
+        {
+            let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), SIDE, SIDE);
+            encoder.set_color(png::ColorType::Indexed);
+            encoder.set_depth(png::BitDepth::Eight);
+            encoder.set_palette(palette.to_vec());
+            let places: Vec<u8> = (0..SIDE * SIDE).map(|p| u8::from(inside(p % SIDE, p / SIDE))).collect();
+            encoder.write_header().unwrap().write_image_data(&places).unwrap();
+            assert_eq!(MaskImage::load(&path).unwrap().area(), area(), "{name}");
+        }
+    }
+
+    #[test]
+    fn pictures_of_one_value_are_all_or_nothing() {
+        for (value, expected) in [(0, 0), (1, SIDE * SIDE), (255, SIDE * SIDE)] {
+            assert_eq!(read(GrayImage::from_pixel(SIDE, SIDE, Luma([value])), "a.png"), expected as usize);
+        }
+    }
+}

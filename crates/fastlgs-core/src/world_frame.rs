@@ -1,0 +1,151 @@
+//! The frame of a scene within the world of its poses' files.
+//!
+//! Scenes are stored and trained in 32-bit floats. Poses far from the origin (UTM coordinates) or in very small or large units would lose their
+//! digits there, so a scene has a frame of its own: `world = origin + scale * local`.
+
+use glam::{DMat4, DVec3, Mat4, Vec3};
+use serde::{Deserialize, Serialize};
+
+/// Origin and scale of a scene's own coordinates in the world; the identity for most scenes.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct WorldFrame {
+    /// The scene's origin in the world.
+    pub origin: DVec3,
+    /// World units of a unit of the scene, a power of two.
+    pub scale: f64,
+}
+
+impl Default for WorldFrame {
+    fn default() -> Self {
+        Self { origin: DVec3::ZERO, scale: 1.0 }
+    }
+}
+
+/// A pose in OpenCV axes (x right, y down, z forward), in the direction in which its file states it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pose {
+    /// Maps world to camera.
+    WorldToCamera(DMat4),
+    /// Maps camera to world.
+    CameraToWorld(DMat4),
+}
+
+impl Pose {
+    /// Position of the camera in the world.
+    pub fn centre(&self) -> DVec3 {
+        match self {
+            Self::WorldToCamera(pose) => pose.inverse().w_axis.truncate(),
+            Self::CameraToWorld(pose) => pose.w_axis.truncate(),
+        }
+    }
+}
+
+/// The origin moves when the median camera is farther from it than so many times the cameras' spread: 32-bit floats then keep fewer than five digits
+/// of the spread.
+const FAR: f64 = 100.0;
+/// Spreads, in world units, within which a scene keeps the world's units.
+const USUAL_SPREAD: std::ops::Range<f64> = 0.1..100.0;
+
+impl WorldFrame {
+    /// The frame for cameras at these places: the world's own unless they are far from its origin, or its units very small or large for them.
+    /// A few cameras with wrong poses do not matter: both origin and scale stand on medians.
+    pub fn around(centres: &[DVec3]) -> Self {
+        let middle = DVec3::from_array([0, 1, 2].map(|k| median(centres.iter().map(|c| c[k]).collect())));
+        let spread = median(centres.iter().map(|c| c.distance(middle)).collect());
+        let is_far = middle.length() > FAR * spread && middle.length() > FAR;
+        let scale = if spread > 0.0 && !USUAL_SPREAD.contains(&spread) { spread.log2().floor().exp2() } else { 1.0 };
+        Self { origin: if is_far || (scale != 1.0 && middle.length() > FAR * spread) { middle } else { DVec3::ZERO }, scale }
+    }
+
+    /// Whether local coordinates are those of the world.
+    pub fn is_identity(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// A place of the scene in the world.
+    pub fn to_world(&self, local: Vec3) -> DVec3 {
+        self.origin + self.scale * local.as_dvec3()
+    }
+
+    /// A place of the world in the scene.
+    pub fn to_local(&self, world: DVec3) -> Vec3 {
+        ((world - self.origin) / self.scale).as_vec3()
+    }
+
+    /// World-to-camera matrix of a pose in the scene's coordinates. Matrices are inverted after they were rounded, as their files have most often been
+    /// made.
+    pub fn local_pose(&self, pose: &Pose) -> Mat4 {
+        match pose {
+            Pose::WorldToCamera(pose) => {
+                let mut local = *pose;
+                // The identity must not change a bit.
+                if !self.is_identity() {
+                    local.w_axis = (pose.transform_point3(self.origin) / self.scale).extend(1.0);
+                }
+                local.as_mat4()
+            }
+            Pose::CameraToWorld(pose) => {
+                let mut local = *pose;
+                if !self.is_identity() {
+                    local.w_axis = ((pose.w_axis.truncate() - self.origin) / self.scale).extend(1.0);
+                }
+                local.as_mat4().inverse()
+            }
+        }
+    }
+
+    /// Camera-to-world matrix, in the world's coordinates, of a pose in the scene's.
+    pub fn world_pose(&self, world_to_camera: &Mat4) -> DMat4 {
+        let mut pose = world_to_camera.as_dmat4().inverse();
+        pose.w_axis = (self.origin + self.scale * pose.w_axis.truncate()).extend(1.0);
+        pose
+    }
+}
+
+/// The middle of some values; 0 of none.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DQuat;
+
+    fn ring(origin: DVec3, unit: f64) -> Vec<DVec3> {
+        (0..12).map(|k| origin + unit * DVec3::new((f64::from(k)).cos(), 0.3, (f64::from(k)).sin()) * 2.5).collect()
+    }
+
+    #[test]
+    fn usual_scenes_keep_the_worlds_coordinates() {
+        for (origin, unit) in [(DVec3::ZERO, 1.0), (DVec3::new(20.0, -3.0, 7.0), 1.0), (DVec3::splat(50.0), 0.5)] {
+            assert!(WorldFrame::around(&ring(origin, unit)).is_identity());
+        }
+        assert!(WorldFrame::around(&[DVec3::ZERO; 4]).is_identity(), "a camera that only turns");
+    }
+
+    #[test]
+    fn far_and_tiny_scenes_keep_their_digits() {
+        let utm = DVec3::new(512_345.6, 5_403_210.9, 431.2);
+        for (origin, unit) in [(utm, 1.0), (DVec3::splat(1e5), 1.0), (DVec3::ZERO, 1e-5), (DVec3::ZERO, 1e5), (utm, 1e3)] {
+            let mut centres = ring(origin, unit);
+            // One wrong pose.
+            centres.push(DVec3::splat(1e9));
+            let frame = WorldFrame::around(&centres);
+            let plain = WorldFrame::around(&ring(DVec3::ZERO, 1.0));
+            assert!(plain.is_identity() && !frame.is_identity());
+            for (k, world) in ring(origin, unit).into_iter().enumerate() {
+                let turn = DQuat::from_rotation_y(k as f64) * DQuat::from_rotation_x(0.3);
+                let pose = Pose::CameraToWorld(DMat4::from_rotation_translation(turn, world));
+                let inverse = Pose::WorldToCamera(DMat4::from_rotation_translation(turn, world).inverse());
+                let local = frame.local_pose(&pose);
+                assert!(local.abs_diff_eq(frame.local_pose(&inverse), 1e-5), "{origin} {unit}");
+                assert!(frame.world_pose(&local).w_axis.truncate().distance(world) < 1e-5 * unit.max(1.0), "{origin} {unit}");
+                let spread = frame.to_local(world).length();
+                assert!((0.1..100.0).contains(&spread), "{origin} {unit}: {spread}");
+            }
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! Which folders a stage may write, and the lock that lets one run at a time write a scene.
+
+use crate::Result;
+use crate::error::{Context, bail};
+use crate::staged::StagedOutput;
+use fastlgs_core::scene_folder::{MANIFEST, Manifest};
+use fastlgs_core::{Error, SceneFolder, fs};
+use std::fs::{File, TryLockError};
+use std::io::{Read, Seek, Write};
+use std::path::{Component, Path, PathBuf};
+
+/// The lock file in a scene's folder. It also marks the folder of a first run that was killed as ours.
+const LOCK: &str = "scene.lock";
+/// How a lock file of ours begins.
+const MARK: &str = "FastLGS";
+
+/// While it lives, no other run writes the scene. The system releases it when the process ends.
+pub(crate) struct SceneLock {
+    folder: PathBuf,
+    _file: File,
+}
+
+impl SceneLock {
+    /// Checks that `stage` may write the folder `scene`, creates it where it is missing, and locks it. A scene that a killed run was
+    /// replacing is put back.
+    ///
+    /// # Errors
+    /// A folder with files that are no scene's, a folder that another run writes, or the system's refusal.
+    pub fn take(scene: &Path, stage: &str) -> Result<Self> {
+        let folder = resolved(scene)?;
+        check_writable(&folder).with_context(|| format!("{} cannot be written", scene.display()))?;
+        std::fs::create_dir_all(&folder).map_err(Error::io(scene))?;
+        let path = folder.join(LOCK);
+        let open = File::options().create(true).truncate(false).read(true).write(true).open(&path);
+        let mut file = open.map_err(Error::io(&path))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let _ = file.read_to_string(&mut holder);
+                let holder = holder.trim().strip_prefix(MARK).map_or("another run", |line| line.trim_start_matches([':', ' ']));
+                bail!("{}: {holder} is writing this scene; wait until it ends, or stop it", scene.display());
+            }
+            Err(TryLockError::Error(error)) => return Err(Error::io(&path)(error).into()),
+        }
+        let line = format!("{MARK}: 'fastlgs {stage}' (process {})\n", std::process::id());
+        let note = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(line.as_bytes()));
+        note.map_err(Error::io(&path))?;
+        StagedOutput::recover(&SceneFolder::new(&folder))?;
+        Ok(Self { folder, _file: file })
+    }
+}
+
+impl SceneLock {
+    /// Locks a scene that must be there.
+    ///
+    /// # Errors
+    /// A folder that is no scene, and those of [`SceneLock::take`].
+    pub fn of_scene(scene: &Path, stage: &str) -> Result<Self> {
+        // Where a run was killed while it replaced the scene, the lock remains, and the scene is put back below.
+        if !scene.join(LOCK).is_file() {
+            SceneFolder::open(scene)?;
+        }
+        Self::take(scene, stage)
+    }
+}
+
+impl Drop for SceneLock {
+    fn drop(&mut self) {
+        // A run that failed before it wrote anything leaves no folder behind.
+        let only_lock = self.folder.read_dir().is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == LOCK));
+        if only_lock {
+            let _ = std::fs::remove_file(self.folder.join(LOCK));
+            let _ = std::fs::remove_dir(&self.folder);
+        }
+    }
+}
+
+/// A folder may be written when it does not exist, is empty, is a scene of ours, or holds what a killed first run left.
+fn check_writable(folder: &Path) -> Result<()> {
+    let entries = match folder.read_dir() {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(error) => return Err(Error::io(folder)(error).into()),
+    };
+    let mut names: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    let manifest = folder.join(MANIFEST);
+    if manifest.is_file() {
+        if let Err(error) = fs::read_json::<Manifest>(&manifest) {
+            bail!("its {MANIFEST} is none that FastLGS wrote ({error}); name a folder that does not exist yet");
+        }
+        return Ok(());
+    }
+    let ours = std::fs::read_to_string(folder.join(LOCK)).is_ok_and(|text| text.is_empty() || text.starts_with(MARK));
+    match names.first() {
+        Some(name) if !ours => {
+            bail!(
+                "it is not empty ('{name}') and has no {MANIFEST}, so it is not a scene; name a folder that does not exist yet or is empty"
+            )
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Checks that photos (a folder or a video) and the scene to write lie apart: neither is, holds or lies in the other, links resolved.
+///
+/// # Errors
+/// A sentence that names both places.
+pub(crate) fn check_apart(photos: &Path, scene: &Path) -> Result<()> {
+    let folder = resolved(scene)?;
+    let mut places = vec![resolved(photos)?];
+    for entry in photos.read_dir().into_iter().flatten().flatten() {
+        if entry.file_type().is_ok_and(|kind| kind.is_symlink()) {
+            places.extend(entry.path().canonicalize());
+        }
+    }
+    let Some(place) = places.iter().find(|place| place.starts_with(&folder) || folder.starts_with(place)) else { return Ok(()) };
+    let how = match (*place == folder, place.starts_with(&folder)) {
+        (true, _) => "it is the folder of the photos",
+        (_, true) => "the photos lie in it",
+        _ => "it lies in the folder of the photos",
+    };
+    let (scene, photos, other) = (scene.display(), photos.display(), beside(&places[0]));
+    bail!(
+        "{scene} cannot be the scene of the photos {photos}: {how}; nothing was written, name a folder beside the photos, such as {}",
+        other.display()
+    )
+}
+
+/// A name for a scene beside a folder of photos.
+fn beside(photos: &Path) -> PathBuf {
+    let name = photos.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    photos.with_file_name(format!("{name}-scene"))
+}
+
+/// An absolute path without links and dots; its last folders need not exist.
+pub(crate) fn resolved(path: &Path) -> Result<PathBuf> {
+    if path.as_os_str().is_empty() {
+        bail!("no output folder was named");
+    }
+    let mut known = PathBuf::new();
+    for part in std::path::absolute(path).map_err(Error::io(path))?.components() {
+        match part {
+            Component::ParentDir => drop(known.pop()),
+            Component::CurDir => {}
+            part => known.push(part),
+        }
+        // A link is resolved before the parts that follow it.
+        known = known.canonicalize().unwrap_or(known);
+    }
+    Ok(known)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The sentence with its causes.
+    fn refusal<T>(result: Result<T>) -> String {
+        crate::one_sentence(&result.err().expect("a refusal"))
+    }
+
+    #[test]
+    fn only_new_empty_and_own_folders_are_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let new = dir.path().join("a/b/scene");
+        drop(SceneLock::take(&new, "preprocess").unwrap());
+        assert!(!new.exists(), "a run that wrote nothing leaves nothing");
+        let album = dir.path().join("album");
+        std::fs::create_dir(&album).unwrap();
+        drop(SceneLock::take(&album, "preprocess").unwrap());
+        std::fs::create_dir(&album).unwrap();
+        std::fs::write(album.join("IMG_1.CR3"), "raw").unwrap();
+        let refused = refusal(SceneLock::take(&album, "preprocess"));
+        assert!(refused.contains("IMG_1.CR3") && refused.contains("not a scene"), "{refused}");
+        // Another program's scene.json.
+        std::fs::write(album.join(MANIFEST), r#"{"nodes": []}"#).unwrap();
+        assert!(refusal(SceneLock::take(&album, "preprocess")).contains("none that FastLGS wrote"));
+        assert_eq!(std::fs::read_dir(&album).unwrap().count(), 2, "nothing was written");
+        // What a killed run left.
+        let killed = dir.path().join("killed");
+        let lock = SceneLock::take(&killed, "make").unwrap();
+        std::fs::create_dir(killed.join("cache")).unwrap();
+        let second = refusal(SceneLock::take(&killed, "preprocess"));
+        assert!(second.contains("'fastlgs make'") && second.contains(&format!("process {}", std::process::id())), "{second}");
+        drop(lock);
+        SceneLock::take(&killed, "preprocess").unwrap();
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn photos_and_scene_lie_apart_whatever_links_say() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        std::fs::create_dir_all(at("album/images")).unwrap();
+        std::fs::create_dir_all(at("scene/photos")).unwrap();
+        std::os::unix::fs::symlink(at("album"), at("link")).unwrap();
+        for scene in ["album", "album/scene", "link", "link/images/../new", ".", "album/../link", "new/../album/x"] {
+            let refused = refusal(check_apart(&at("album"), &at(scene)));
+            assert!(refused.contains("nothing was written"), "{scene}: {refused}");
+        }
+        for scene in ["scene", "album-scene", "album/../scene"] {
+            check_apart(&at("album"), &at(scene)).unwrap();
+        }
+        // Photos that are linked from within the scene.
+        std::fs::create_dir(at("linked")).unwrap();
+        std::os::unix::fs::symlink(at("scene/photos"), at("linked/images")).unwrap();
+        refusal(check_apart(&at("linked"), &at("scene")));
+        std::fs::write(at("scene/clip.mp4"), "").unwrap();
+        refusal(check_apart(&at("scene/clip.mp4"), &at("scene")));
+    }
+}

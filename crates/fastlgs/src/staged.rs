@@ -1,0 +1,263 @@
+//! What a stage writes is staged beside its place until all of it is there: a run that fails or is killed leaves the earlier scene.
+
+use crate::Result;
+use crate::error::bail;
+use fastlgs_core::scene_folder::{MANIFEST, Manifest};
+use fastlgs_core::{Error, SceneFolder};
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// Holds the replaced files until they are removed with the rest.
+const BEFORE: &str = "before";
+
+/// A folder within the scene's; it is removed when this is dropped.
+pub(crate) struct StagedOutput {
+    /// The stage writes here.
+    pub folder: SceneFolder,
+    /// Whether it must stay, as it holds files that could not be put back.
+    stays: bool,
+}
+
+impl StagedOutput {
+    /// An empty folder for a stage.
+    pub fn new(scene: &SceneFolder, stage: &str) -> Result<Self> {
+        let root = scene.root.join(format!("{stage}.partial"));
+        let _ = std::fs::remove_dir_all(&root);
+        std::fs::create_dir_all(&root).map_err(Error::io(&root))?;
+        Ok(Self { folder: SceneFolder::new(root), stays: false })
+    }
+
+    /// Moves the staged files into the scene and lists them in its manifest, together with `reserved`, which later stages write in place.
+    /// Of the earlier scene only files that its manifest lists and that are, or lie in, one of `replaced` are removed.
+    /// The manifest, without which there is no scene, is moved away first and arrives last.
+    ///
+    /// # Errors
+    /// A file in the way that the manifest does not list, or the system's refusal. The earlier scene is then put back.
+    pub fn publish(
+        mut self,
+        scene: &SceneFolder,
+        replaced: &[&str],
+        reserved: impl IntoIterator<Item = String>,
+        manifest: &Manifest,
+    ) -> Result<()> {
+        let listed = scene.manifest().map(|earlier| earlier.files).unwrap_or_default();
+        let made = files_in(&self.folder.root)?;
+        let new: BTreeSet<String> = made.iter().cloned().chain(reserved).collect();
+        if let Some(foreign) = new.iter().find(|file| !listed.contains(*file) && scene.root.join(file).exists()) {
+            let path = scene.root.join(foreign);
+            bail!("{}: this file is no part of the scene and is in the way; move it, or name a new folder", path.display());
+        }
+        let belongs = |file: &String| replaced.iter().any(|name| Path::new(file).starts_with(name));
+        let (old, kept): (BTreeSet<String>, BTreeSet<String>) = listed.into_iter().partition(belongs);
+        // A file that the stage writes anew is replaced as well.
+        let (old, kept) = (&old | &(&kept & &new), &kept - &new);
+        let files = &kept | &new;
+        self.folder.save_manifest(&Manifest { files, ..manifest.clone() })?;
+        let before = self.folder.root.join(BEFORE);
+        let manifest = [MANIFEST.to_owned()];
+        let away = manifest.iter().chain(&old).map(|name| (scene.root.join(name), before.join(name)));
+        let into = made.iter().chain(&manifest).map(|name| (self.folder.root.join(name), scene.root.join(name)));
+        let mut moved = Vec::new();
+        let done = away.chain(into).try_for_each(|(from, to)| {
+            if rename_if_there(&from, &to)? {
+                moved.push((from, to));
+            }
+            Ok(())
+        });
+        if done.is_err() {
+            self.stays = moved.iter().rev().any(|(from, to)| std::fs::rename(to, from).is_err());
+        } else {
+            old.iter().for_each(|file| remove_empty_folders(&scene.root, file));
+        }
+        done
+    }
+
+    /// Puts the earlier scene back where a run was killed between the first and the last of these moves.
+    pub fn recover(scene: &SceneFolder) -> Result<()> {
+        if scene.root.join(MANIFEST).exists() {
+            return Ok(());
+        }
+        let entries = scene.root.read_dir().map_err(Error::io(&scene.root))?.flatten().map(|entry| entry.path());
+        let staged = entries.filter(|path| path.extension().is_some_and(|ending| ending == "partial"));
+        let Some(staged) = staged.map(SceneFolder::new).find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file()) else {
+            return Ok(());
+        };
+        let before = staged.root.join(BEFORE);
+        let old = files_in(&before)?;
+        // What the killed run had moved into place is neither staged any more nor one of the earlier scene's other files.
+        let kept = SceneFolder::new(&before).manifest()?.files;
+        let moved_in = staged.manifest()?.files.into_iter().filter(|file| !kept.contains(file) || old.contains(file));
+        for name in moved_in.filter(|file| !staged.root.join(file).exists()) {
+            rename_if_there(&scene.root.join(&name), &before.join("new").join(&name))?;
+        }
+        for name in old.iter().chain([&MANIFEST.to_owned()]) {
+            rename_if_there(&before.join(name), &scene.root.join(name))?;
+        }
+        Ok(())
+    }
+}
+
+impl Drop for StagedOutput {
+    fn drop(&mut self) {
+        if !self.stays {
+            let _ = std::fs::remove_dir_all(&self.folder.root);
+        }
+    }
+}
+
+/// Paths of all files below a folder, relative to it, with '/' between their parts; without its own manifest.
+fn files_in(root: &Path) -> Result<BTreeSet<String>> {
+    let mut found = BTreeSet::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in folder.read_dir().map_err(Error::io(&folder))? {
+            let path = entry.map_err(Error::io(&folder))?.path();
+            if path.is_dir() {
+                folders.push(path);
+                continue;
+            }
+            let relative = path.strip_prefix(root).unwrap_or(&path);
+            let parts: Vec<_> = relative.iter().map(|part| part.to_string_lossy()).collect();
+            found.insert(parts.join("/"));
+        }
+    }
+    found.remove(MANIFEST);
+    Ok(found)
+}
+
+/// Removes the folders of a file that was moved away, as far as nothing is left in them.
+fn remove_empty_folders(root: &Path, file: &str) {
+    let folders = Path::new(file).ancestors().skip(1).filter(|folder| !folder.as_os_str().is_empty());
+    // A folder with anything in it is not removed by this.
+    folders.take_while(|folder| std::fs::remove_dir(root.join(folder)).is_ok()).for_each(drop);
+}
+
+/// Renames what is there; whether there was anything.
+fn rename_if_there(from: &Path, to: &Path) -> Result<bool> {
+    if !from.exists() {
+        return Ok(false);
+    }
+    if let Some(parent) = to.parent() {
+        std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
+    }
+    std::fs::rename(from, to).map_err(Error::io(from))?;
+    Ok(true)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn manifest(segmenter: &str) -> Manifest {
+        let fields =
+            json!({ "version": "0", "photos": "p", "holdout": 8, "segmenter": segmenter, "encoder": "offline", "seed": 0, "warnings": [] });
+        serde_json::from_value(fields).unwrap()
+    }
+
+    fn write(folder: &SceneFolder, name: &str, text: &str) {
+        let path = folder.root.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+
+    fn read(folder: &SceneFolder, name: &str) -> Option<String> {
+        std::fs::read_to_string(folder.root.join(name)).ok()
+    }
+
+    const REPLACED: [&str; 3] = ["photos", "alpha", "cameras"];
+
+    /// A scene of files that say "old".
+    fn earlier(root: &Path) -> SceneFolder {
+        let scene = SceneFolder::new(root);
+        let staged = StagedOutput::new(&scene, "first").unwrap();
+        for name in ["photos/a.png", "photos/same.png", "alpha/a.png", "cameras/trained.json", "scene.ply"] {
+            write(&staged.folder, name, "old");
+        }
+        staged.publish(&scene, &[], ["masks/objects/a.png".to_owned()], &manifest("offline")).unwrap();
+        scene
+    }
+
+    /// A new output that has not been published.
+    fn begun(scene: &SceneFolder) -> StagedOutput {
+        let staged = StagedOutput::new(scene, "preprocess").unwrap();
+        for name in ["photos/b.png", "photos/same.png", "cameras/cameras.json"] {
+            write(&staged.folder, name, "new");
+        }
+        staged
+    }
+
+    #[test]
+    fn a_scene_is_the_earlier_one_or_the_new_one() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = earlier(dir.path());
+        drop(begun(&scene));
+        assert_eq!((read(&scene, "photos/same.png").as_deref(), read(&scene, "photos/b.png")), (Some("old"), None));
+        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
+        for gone in ["photos/a.png", "alpha", "cameras/trained.json", "preprocess.partial"] {
+            assert!(!scene.root.join(gone).exists(), "{gone}");
+        }
+        let now = ["photos/b.png", "photos/same.png", "scene.ply"].map(|name| read(&scene, name).unwrap());
+        assert_eq!(now, ["new", "new", "old"]);
+        let known = scene.manifest().unwrap();
+        assert_eq!(known.segmenter, "sam");
+        let files: Vec<&str> = known.files.iter().map(String::as_str).collect();
+        assert_eq!(files, ["cameras/cameras.json", "masks/objects/a.png", "photos/b.png", "photos/same.png", "scene.ply"]);
+    }
+
+    #[test]
+    fn files_of_the_users_are_neither_moved_nor_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = earlier(dir.path());
+        write(&scene, "photos/IMG_1.CR3", "mine");
+        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
+        assert_eq!(read(&scene, "photos/IMG_1.CR3").as_deref(), Some("mine"));
+        // One that has the name of a file to be written.
+        write(&scene, "ignore/b.png", "mine");
+        let staged = begun(&scene);
+        write(&staged.folder, "ignore/b.png", "new");
+        let refused = staged.publish(&scene, &["photos", "ignore"], [], &manifest("import")).unwrap_err().to_string();
+        assert!(refused.contains("ignore/b.png") && refused.contains("move it"), "{refused}");
+        assert_eq!((read(&scene, "ignore/b.png").as_deref(), read(&scene, "photos/b.png").as_deref()), (Some("mine"), Some("new")));
+        assert_eq!(scene.manifest().unwrap().segmenter, "sam");
+    }
+
+    #[test]
+    fn a_move_that_fails_is_undone() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = earlier(dir.path());
+        // A file cannot replace a folder.
+        let staged = begun(&scene);
+        write(&staged.folder, "scene.ply", "new");
+        std::fs::create_dir_all(staged.folder.root.join(BEFORE).join("scene.ply")).unwrap();
+        staged.publish(&scene, &["photos", "scene.ply"], [], &manifest("import")).unwrap_err();
+        assert_eq!((read(&scene, "photos/same.png").as_deref(), read(&scene, "scene.ply").as_deref()), (Some("old"), Some("old")));
+        assert_eq!(scene.manifest().unwrap().segmenter, "offline");
+    }
+
+    #[test]
+    fn a_killed_move_is_undone_by_the_next_run() {
+        for moved_in in 0..3 {
+            let dir = tempfile::tempdir().unwrap();
+            let scene = earlier(dir.path());
+            let staged = begun(&scene);
+            let before = staged.folder.root.join(BEFORE);
+            // Killed after all of the earlier files were moved away, and some of the new ones into place.
+            let files = files_in(&staged.folder.root).unwrap();
+            let listed = &files | &scene.manifest().unwrap().files;
+            staged.folder.save_manifest(&Manifest { files: listed, ..manifest("sam") }).unwrap();
+            for name in ["scene.json", "photos/a.png", "photos/same.png", "cameras/trained.json"] {
+                rename_if_there(&scene.root.join(name), &before.join(name)).unwrap();
+            }
+            for name in files.iter().rev().take(moved_in) {
+                rename_if_there(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
+            }
+            std::mem::forget(staged);
+            StagedOutput::recover(&scene).unwrap();
+            for name in ["photos/a.png", "photos/same.png", "alpha/a.png", "cameras/trained.json", "scene.ply"] {
+                assert_eq!(read(&scene, name).as_deref(), Some("old"), "{name} with {moved_in}");
+            }
+            assert_eq!((read(&scene, "photos/b.png"), scene.manifest().unwrap().segmenter), (None, "offline".to_owned()));
+        }
+    }
+}
