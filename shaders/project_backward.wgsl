@@ -155,7 +155,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
     let dets = determinants(a_x, a_y);
-    let clamped = opacity * compensation(dets, view) >= ALPHA_MAX;
+    let clamped = kept_gain(view) * opacity * compensation(dets, view) >= ALPHA_MAX;
     let unclamped_opacity = select(1.0, 0.0, clamped && sum1.y < 0.0);
     put(OPACITY, i, sum1.y * (1.0 - opacity) * unclamped_opacity);
     if view.antialias == 1u && determinant_share(dets) > 1e-6 {

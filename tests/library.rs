@@ -169,8 +169,7 @@ fn moved_cameras_stay_with_their_gaussians() {
     assert!(fastlgs::train(&moving, &run).expect("a trained scene").aligned);
     let moved = cameras();
     assert_ne!(moved, given);
-    let lifting =
-        train::Config { iterations: Some(0), init_ply: Some(scene.join("scene.ply")), align: train::Align::Auto, ..moving.clone() };
+    let lifting = train::Config { iterations: Some(0), init: Some(scene.join("scene.ply")), align: train::Align::Auto, ..moving.clone() };
     assert!(fastlgs::train(&lifting, &run).expect("a lifted scene").aligned);
     assert_eq!(cameras(), moved, "objects are lifted with the cameras that the Gaussians were trained with");
     let anew = train::Config { align: train::Align::Auto, ..moving };

@@ -231,7 +231,7 @@ proptest! {
         prop_assume!(eye.length() > 0.5 && eye.normalize().y.abs() < 0.99);
         let camera = Camera::look_at("a.png", eye, Vec3::ZERO, Vec3::Y, size.0, size.1, fov);
         let text = serde_json::to_vec(&camera).expect("JSON");
-        let back = through(|p| std::fs::write(p, &text).expect("written"), |p| Camera::load(p).expect("read"));
+        let back = through(|p| std::fs::write(p, &text).expect("written"), |p| Camera::load(p, &fastlgs_core::WorldFrame::default()).expect("read"));
         prop_assert_eq!(&back, &camera);
         prop_assert!((camera.centre() - eye).length() < 1e-3);
         let seen = camera.to_pixel(camera.world_to_camera.transform_point3(Vec3::ZERO));

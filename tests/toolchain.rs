@@ -228,7 +228,7 @@ fn selections_and_camera_paths_go_out_and_in() {
 
     let path = out.join("cameras.json");
     let report = json(&["export", text(&room), text(&path)]);
-    let cameras: Vec<Camera> = camera_path::read(&path).expect("a path");
+    let cameras: Vec<Camera> = camera_path::read(&path, &fastlgs_core::WorldFrame::default()).expect("a path");
     assert_eq!(report["frames"].as_u64(), Some(cameras.len() as u64));
     // Two frames of it, as nerfstudio writes them: without names.
     let mut file: Value = serde_json::from_slice(&std::fs::read(&path).expect("the path")).expect("JSON");

@@ -116,7 +116,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 /// Gaussians by how much the training views would change without them, most first.
 fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
-    let trained = fastlgs::train::Report::of(&manifest).unwrap_or_default();
+    let trained = fastlgs::train::Report::of(&manifest, &folder.root)?.unwrap_or_default();
     let mut changes = Changes::of(scene);
     manifest.training(&folder.cameras()?).iter().for_each(|camera| changes.see(&trained.view(camera, scene), None));
     let mut order: Vec<usize> = (0..scene.len()).collect();

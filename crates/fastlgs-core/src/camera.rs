@@ -1,7 +1,7 @@
 //! Pinhole cameras.
 
-use crate::{Error, Result, fs};
-use glam::{Mat4, Vec2, Vec3};
+use crate::{Error, Result, WorldFrame, fs, world_frame};
+use glam::{DMat4, Mat4, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -118,12 +118,21 @@ impl Camera {
         Ok(())
     }
 
-    /// Reads a camera from JSON (the fields of this struct).
+    /// Reads a camera from JSON (the fields of this struct), its pose in the coordinates of the world, into the frame of a scene.
     ///
     /// # Errors
     /// [`Error::Io`] or [`Error::Format`], also for numbers that are not finite.
-    pub fn load(path: &Path) -> Result<Self> {
-        let camera: Self = fs::read_json(path)?;
+    pub fn load(path: &Path, frame: &WorldFrame) -> Result<Self> {
+        /// The pose with all its digits.
+        #[derive(Deserialize)]
+        struct Pose {
+            world_to_camera: DMat4,
+        }
+        let mut camera: Self = fs::read_json(path)?;
+        if !frame.is_identity() {
+            let pose: Pose = fs::read_json(path)?;
+            camera.world_to_camera = frame.local_pose(&world_frame::Pose::WorldToCamera(pose.world_to_camera));
+        }
         camera.check().map_err(|reason| Error::format(path, reason))?;
         Ok(camera)
     }

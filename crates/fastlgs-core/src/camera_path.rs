@@ -3,14 +3,15 @@
 //! Its cameras are x right, y up, looking along -z, given as camera-to-world with 16 numbers row by row; `fov` is vertical, in
 //! degrees. Principal points lie in the middle: a camera whose does not is written without that offset.
 
-use crate::{Camera, Error, Result, fs};
-use glam::{Mat4, Vec4};
+use crate::world_frame::{Pose, exact_decimal};
+use crate::{Camera, Error, Result, WorldFrame, fs};
+use glam::{DMat4, Mat4, Vec4};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 #[derive(Serialize, Deserialize)]
 struct Frame {
-    camera_to_world: Vec<f32>,
+    camera_to_world: Vec<f64>,
     fov: f32,
     #[serde(default)]
     aspect: Option<f32>,
@@ -41,14 +42,18 @@ const FLIP: Mat4 = Mat4::from_cols(Vec4::X, Vec4::new(0.0, -1.0, 0.0, 0.0), Vec4
 /// Frames a second of written paths.
 const FPS: f32 = 24.0;
 
-/// Writes cameras as a path, in the size of the first.
+/// Writes the cameras of a scene as a path in the world, in the size of the first.
 ///
 /// # Errors
 /// No cameras; the system's refusal.
-pub fn write(path: &Path, cameras: &[Camera]) -> Result<()> {
+pub fn write(path: &Path, cameras: &[Camera], frame: &WorldFrame) -> Result<()> {
     let first = cameras.first().ok_or_else(|| Error::Invalid(format!("{}: a path needs cameras", path.display())))?;
+    let pose = |camera: &Camera| match frame.is_identity() {
+        true => (camera.world_to_camera.inverse() * FLIP).transpose().to_cols_array().map(exact_decimal).to_vec(),
+        false => (frame.world_pose(&camera.world_to_camera) * FLIP.as_dmat4()).transpose().to_cols_array().to_vec(),
+    };
     let frame = |camera: &Camera| Frame {
-        camera_to_world: (camera.world_to_camera.inverse() * FLIP).transpose().to_cols_array().to_vec(),
+        camera_to_world: pose(camera),
         fov: (2.0 * (camera.height as f32 / 2.0 / camera.fy).atan()).to_degrees(),
         aspect: Some(camera.width as f32 / camera.height as f32),
         name: Some(camera.name.clone()),
@@ -64,18 +69,18 @@ pub fn write(path: &Path, cameras: &[Camera]) -> Result<()> {
     fs::write_json(path, &own)
 }
 
-/// Reads a path: a camera for each frame, all of the path's size, named `frame_00000` and so on unless the file names them.
+/// Reads a path into the frame of a scene: a camera for each of the path's frames, all of the path's size, named `frame_00000` and so on unless the file names them.
 ///
 /// # Errors
 /// Missing or damaged files, paths that are not of perspective cameras, poses that are no rotation and translation.
-pub fn read(path: &Path) -> Result<Vec<Camera>> {
+pub fn read(path: &Path, world: &WorldFrame) -> Result<Vec<Camera>> {
     let own: CameraPath = fs::read_json(path)?;
     if own.camera_type != "perspective" {
         return Err(Error::format(path, format!("its cameras are '{}'; only perspective ones can be rendered", own.camera_type)));
     }
     let (width, height) = (own.render_width, own.render_height);
     let camera = |(k, frame): (usize, &Frame)| -> Result<Camera> {
-        let numbers = <[f32; 16]>::try_from(frame.camera_to_world.as_slice()).map_err(|_| {
+        let numbers = <[f64; 16]>::try_from(frame.camera_to_world.as_slice()).map_err(|_| {
             Error::format(path, format!("frame {k} has {} numbers in camera_to_world, not 16", frame.camera_to_world.len()))
         })?;
         let focal = height as f32 / 2.0 / (frame.fov.to_radians() / 2.0).tan();
@@ -87,7 +92,7 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
             fy: focal,
             cx: width as f32 / 2.0,
             cy: height as f32 / 2.0,
-            world_to_camera: (Mat4::from_cols_array(&numbers).transpose() * FLIP).inverse(),
+            world_to_camera: world.local_pose(&Pose::CameraToWorld(DMat4::from_cols_array(&numbers).transpose() * FLIP.as_dmat4())),
         };
         camera.check().map_err(|reason| Error::format(path, reason))?;
         Ok(camera)
@@ -110,8 +115,8 @@ mod tests {
         let path = dir.path().join("cameras.json");
         let camera = |k: f32| Camera::look_at(&format!("{k}.png"), Vec3::new(k, 2.0, 3.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
         let cameras = [camera(1.0), camera(2.0)];
-        write(&path, &cameras).unwrap();
-        for (a, b) in cameras.iter().zip(read(&path).unwrap()) {
+        write(&path, &cameras, &WorldFrame::default()).unwrap();
+        for (a, b) in cameras.iter().zip(read(&path, &WorldFrame::default()).unwrap()) {
             assert_eq!((&a.name, a.width, a.height), (&b.name, b.width, b.height));
             assert!((a.fy - b.fy).abs() < 1e-3 && a.world_to_camera.abs_diff_eq(b.world_to_camera, 1e-5));
         }
@@ -123,7 +128,7 @@ mod tests {
         assert!(row(1, 1) > 0.0, "y is up");
 
         std::fs::write(&path, r#"{"render_height":4,"render_width":4,"camera_path":[{"camera_to_world":[1,2],"fov":50}]}"#).unwrap();
-        assert!(read(&path).unwrap_err().to_string().contains("frame 0 has 2 numbers"));
+        assert!(read(&path, &WorldFrame::default()).unwrap_err().to_string().contains("frame 0 has 2 numbers"));
         assert!(write(&path, &[]).is_err());
     }
 }

@@ -177,11 +177,78 @@ impl Gaussians {
         Quat::from_xyzw(x, y, z, w).normalize()
     }
 
-    /// Index of the first Gaussian with a value that is not finite.
-    pub fn first_not_finite(&self) -> Option<usize> {
-        (0..self.len()).find(|&i| !self.values(i).iter().all(|v| v.is_finite()) || !self.rest(i).iter().all(|v| v.is_finite()))
+    /// Drops Gaussians that cannot be drawn: with NaN or infinite values, or a rotation of zeros. Infinite opacities, as files with eight bits have
+    /// them, become the nearest that is drawn. Says in one sentence how many were dropped, and for which columns of a PLY file.
+    pub fn drop_invalid(&mut self) -> Option<String> {
+        for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
+            *logit = logit.signum() * SOLID;
+        }
+        const NAMES: [&str; BASE_CHANNELS] = [
+            "x",
+            "y",
+            "z",
+            "scale_0",
+            "scale_1",
+            "scale_2",
+            "rot_0",
+            "rot_1",
+            "rot_2",
+            "rot_3",
+            "opacity",
+            "f_dc_0",
+            "f_dc_1",
+            "f_dc_2",
+            "feature_0",
+            "feature_1",
+            "feature_2",
+        ];
+        let mut columns = std::collections::BTreeSet::new();
+        let (mut kept, mut infinite, mut unrotated) = (Vec::with_capacity(self.len()), 0, 0);
+        for i in 0..self.len() {
+            let own = self.values(i);
+            let bad = (0..BASE_CHANNELS).filter(|c| !own[*c].is_finite()).map(|c| NAMES[c]);
+            let rest = self.rest(i).iter().any(|v| !v.is_finite()).then_some("f_rest");
+            let bad: Vec<&str> = bad.chain(rest).collect();
+            if !bad.is_empty() {
+                infinite += 1;
+                columns.extend(bad);
+            } else if self.rotations[i].iter().map(|v| v * v).sum::<f32>() < f32::MIN_POSITIVE {
+                unrotated += 1;
+            } else {
+                kept.push(i);
+            }
+        }
+        let all = self.len();
+        if kept.len() == all {
+            return None;
+        }
+        *self = self.select(&kept);
+        let names: Vec<&str> = columns.into_iter().collect();
+        let infinite = (infinite > 0).then(|| format!("{infinite} with NaN or infinite values in {}", names.join(", ")));
+        let unrotated = (unrotated > 0).then(|| format!("{unrotated} with a rotation of zeros in rot_0 to rot_3"));
+        let why: Vec<String> = infinite.into_iter().chain(unrotated).collect();
+        Some(format!("{} of {all} Gaussians were dropped: {}", all - kept.len(), why.join("; ")))
+    }
+
+    /// The scene without Gaussians that lie so far outside that formats of few bits would spend their range on them; and how many these were.
+    pub fn without_far_outliers(&self) -> (Self, usize) {
+        let median = |mut values: Vec<f32>| {
+            values.sort_by(f32::total_cmp);
+            values.get(values.len() / 2).copied().unwrap_or(0.0)
+        };
+        let middle = Vec3::from_array([0, 1, 2].map(|k| median(self.means.iter().map(|m| m[k]).collect())));
+        let distances: Vec<f32> = self.means.iter().map(|m| m.distance(middle)).collect();
+        let most = FAR_OUTSIDE * median(distances.clone());
+        let kept: Vec<usize> = (0..self.len()).filter(|i| most == 0.0 || distances[*i] <= most).collect();
+        let count = self.len() - kept.len();
+        (if count == 0 { self.clone() } else { self.select(&kept) }, count)
     }
 }
+
+/// Logit of the opacity that stands for one of exactly 1; its negative for 0.
+const SOLID: f32 = 7.0;
+/// Distance from the middle of a scene, in medians of all, beyond which a Gaussian shows nothing of it.
+const FAR_OUTSIDE: f32 = 1000.0;
 
 /// Inverse of [`sigmoid`].
 pub fn logit(p: f32) -> f32 {

@@ -4,8 +4,8 @@
 //! Coordinates stay those of the scene; the node turns them so that the scene's up is glTF's +y. Programs that do not know the
 //! extension show coloured points. Features and object ids have no place in it.
 
-use crate::gaussians::{SH_C0, rest_len, sigmoid};
-use crate::{Gaussians, Result, fs};
+use crate::gaussians::{MAX_SH_DEGREE, SH_C0, logit, rest_len, sigmoid};
+use crate::{Error, Gaussians, Result, WorldFrame, fs};
 use glam::{Quat, Vec3};
 use serde_json::{Value, json};
 use std::io::Write;
@@ -46,7 +46,7 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
 }
 
 /// The JSON chunk for attributes that lie one after the other in the binary chunk.
-fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, bytes: usize) -> Value {
+fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, frame: &WorldFrame, bytes: usize) -> Value {
     let (mut views, mut accessors, mut names) = (Vec::new(), Vec::new(), serde_json::Map::new());
     let mut offset = 0;
     for (k, (name, kind, values)) in attributes.iter().enumerate() {
@@ -60,13 +60,19 @@ fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, bytes: usize)
     let bound = |by: fn(Vec3, Vec3) -> Vec3| scene.means.iter().copied().reduce(by).unwrap_or(Vec3::ZERO).to_array();
     accessors[0]["min"] = json!(bound(Vec3::min));
     accessors[0]["max"] = json!(bound(Vec3::max));
+    let turn = Quat::from_rotation_arc(up, Vec3::Y);
+    let mut node = json!({ "mesh": 0, "rotation": turn.to_array() });
+    if !frame.is_identity() {
+        node["translation"] = json!((turn.as_dquat() * frame.origin).to_array());
+        node["scale"] = json!([frame.scale, frame.scale, frame.scale]);
+    }
     let kernel = json!({ "kernel": "ellipse", "colorSpace": "srgb_rec709_display" });
     json!({
         "asset": { "version": "2.0", "generator": concat!("FastLGS ", env!("CARGO_PKG_VERSION")) },
         "extensionsUsed": ["KHR_gaussian_splatting"],
         "scene": 0,
         "scenes": [{ "nodes": [0] }],
-        "nodes": [{ "mesh": 0, "rotation": Quat::from_rotation_arc(up, Vec3::Y).to_array() }],
+        "nodes": [node],
         "meshes": [{ "primitives": [{
             "attributes": names,
             "mode": POINTS,
@@ -78,14 +84,14 @@ fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, bytes: usize)
     })
 }
 
-/// Writes a scene whose up, a unit vector of the world, becomes +y.
+/// Writes a scene whose up, a unit vector of the world, becomes +y. The node moves it to its place in the world.
 ///
 /// # Errors
 /// [`crate::Error::Invalid`] for an empty scene and for more than 4 GiB, which the format cannot hold; the system's refusal.
-pub fn write(path: &Path, scene: &Gaussians, up: Vec3) -> Result<()> {
+pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Result<()> {
     let attributes = attributes(scene);
     let bytes: usize = attributes.iter().map(|a| 4 * a.2.len()).sum();
-    let mut text = document(scene, &attributes, up, bytes).to_string();
+    let mut text = document(scene, &attributes, up, frame, bytes).to_string();
     text.extend(std::iter::repeat_n(' ', text.len().next_multiple_of(4) - text.len()));
     let total = u32::try_from(12 + 8 + text.len() + 8 + bytes).ok().filter(|_| !scene.is_empty());
     let Some(total) = total else {
@@ -106,6 +112,84 @@ pub fn write(path: &Path, scene: &Gaussians, up: Vec3) -> Result<()> {
     })
 }
 
+/// Parts of a binary glTF file: its document and its binary chunk.
+fn chunks<'a>(path: &Path, data: &'a [u8]) -> Result<(Value, &'a [u8])> {
+    let bad = |reason: &str| Error::format(path, format!("{reason}; copy or export it again"));
+    let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize);
+    let (Some(magic), Some(length)) = (word(0), word(12)) else { return Err(bad("not a whole glTF file")) };
+    if magic != MAGIC as usize {
+        return Err(bad("not a binary glTF file"));
+    }
+    let text = data.get(20..20usize.saturating_add(length)).ok_or_else(|| bad("its document is cut off"))?;
+    let document = serde_json::from_slice(text).map_err(|e| bad(&format!("its document is no JSON ({e})")))?;
+    Ok((document, data.get(20 + length + 8..).unwrap_or_default()))
+}
+
+/// Reads the first mesh of Gaussians of a binary glTF file, in its own coordinates: those of the node are left out, since this project writes
+/// scenes turned. Features are zero and object ids 0.
+///
+/// # Errors
+/// [`Error::Format`] for other and damaged files.
+pub fn read(path: &Path) -> Result<Gaussians> {
+    let data = fs::read(path)?;
+    let (document, body) = chunks(path, &data)?;
+    let bad = |reason: String| Error::format(path, reason);
+    let primitives = document["meshes"].as_array().into_iter().flatten().flat_map(|mesh| mesh["primitives"].as_array()).flatten();
+    let with_gaussians = |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
+    let names = primitives.into_iter().find(with_gaussians).map(|primitive| &primitive["attributes"]);
+    let names = names.ok_or_else(|| bad("it holds no Gaussians (KHR_gaussian_splatting)".to_owned()))?;
+    let values = |name: &str, width: usize| -> Result<Option<Vec<f32>>> {
+        let Some(accessor) = names[name].as_u64() else { return Ok(None) };
+        let accessor = &document["accessors"][accessor as usize];
+        if accessor["componentType"] != FLOAT {
+            return Err(bad(format!("{name} is not stored as floats; export it uncompressed")));
+        }
+        let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
+        let offset = |value: &Value| value["byteOffset"].as_u64().unwrap_or(0) as usize;
+        let (start, count) = (offset(view).saturating_add(offset(accessor)), accessor["count"].as_u64().unwrap_or(0) as usize);
+        let stride = view["byteStride"].as_u64().map_or(4 * width, |stride| stride as usize);
+        let row = |i: usize| {
+            let at = i.checked_mul(stride)?.checked_add(start)?;
+            body.get(at..at.checked_add(4 * width)?)
+        };
+        let mut out = Vec::new();
+        for i in 0..count {
+            let row = row(i).ok_or_else(|| bad(format!("{name} is cut off; copy the file again")))?;
+            out.extend(row.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+        }
+        Ok(Some(out))
+    };
+    let own = |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
+    let need = |found: Option<Vec<f32>>, name: &str| found.ok_or_else(|| bad(format!("its Gaussians have no attribute {name}")));
+    let vec3 = |values: &[f32]| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
+    let means = vec3(&need(values("POSITION", 3)?, "POSITION")?);
+    let n = means.len();
+    let (mut sh_degree, mut coefficients) = (0, Vec::new());
+    for degree in 1..=MAX_SH_DEGREE {
+        let count = rest_len(degree) - rest_len(degree - 1);
+        let found = (0..count).map(|k| own(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3)).collect::<Result<Option<Vec<_>>>>()?;
+        let Some(found) = found else { break };
+        coefficients.extend(found.iter().map(|values| vec3(values)));
+        sh_degree = degree;
+    }
+    let scene = Gaussians {
+        log_scales: vec3(&need(own("SCALE", 3)?, "SCALE")?).into_iter().map(|s| s.map(f32::ln)).collect(),
+        rotations: need(own("ROTATION", 4)?, "ROTATION")?.chunks_exact(4).map(|q| [q[3], q[0], q[1], q[2]]).collect(),
+        opacity_logits: need(own("OPACITY", 1)?, "OPACITY")?.into_iter().map(|o| logit(o.clamp(0.001, 0.999))).collect(),
+        sh_dc: vec3(&need(own("SH_DEGREE_0_COEF_0", 3)?, "SH_DEGREE_0_COEF_0")?),
+        sh_degree,
+        sh_rest: (0..n).flat_map(|i| coefficients.iter().map(move |values| values.get(i).copied().unwrap_or_default())).collect(),
+        features: vec![Vec3::ZERO; n],
+        object_ids: vec![0; n],
+        means,
+    };
+    let lengths = [scene.log_scales.len(), scene.rotations.len(), scene.opacity_logits.len(), scene.sh_dc.len()];
+    if lengths.iter().any(|length| *length != n) {
+        return Err(bad(format!("its attributes have {lengths:?} values for {n} Gaussians")));
+    }
+    Ok(scene)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -123,7 +207,7 @@ mod tests {
         scene.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scene.glb");
-        write(&path, &scene, Vec3::NEG_Y).unwrap();
+        write(&path, &scene, Vec3::NEG_Y, &WorldFrame::default()).unwrap();
         let data = std::fs::read(&path).unwrap();
         assert_eq!((word(&data, 0), word(&data, 4), word(&data, 8)), (MAGIC as usize, 2, data.len()));
         let length = word(&data, 12);
@@ -161,6 +245,21 @@ mod tests {
         // The last of degree 2 is the eighth coefficient; of the second Gaussian it is the sixteenth.
         assert!(close(&values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_4", 3), &[7.0, 7.0, 7.0, 15.0, 15.0, 15.0]));
         assert!(names.get("KHR_gaussian_splatting:SH_DEGREE_3_COEF_0").is_none());
-        assert!(write(&path, &Gaussians::default(), Vec3::Y).is_err());
+        let back = read(&path).unwrap();
+        assert_eq!((back.sh_degree, &back.sh_rest, &back.means), (2, &scene.sh_rest, &scene.means));
+        assert!(back.log_scales.iter().zip(&scene.log_scales).all(|(a, b)| a.distance(*b) < 1e-5));
+        assert!(back.opacity_logits.iter().zip(&scene.opacity_logits).all(|(a, b)| (a - b).abs() < 1e-4));
+        std::fs::write(&path, &data[..data.len() - 9]).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("cut off"));
+        // Far from the world's origin the node moves the scene there.
+        let frame = WorldFrame { origin: glam::DVec3::new(512_345.6, 5_403_210.9, 431.2), scale: 2.0 };
+        write(&path, &scene, Vec3::Y, &frame).unwrap();
+        let data = std::fs::read(&path).unwrap();
+        let document: Value = serde_json::from_slice(&data[20..20 + word(&data, 12)]).unwrap();
+        assert_eq!(
+            (&document["nodes"][0]["translation"], &document["nodes"][0]["scale"]),
+            (&json!(frame.origin.to_array()), &json!([2.0, 2.0, 2.0]))
+        );
+        assert!(write(&path, &Gaussians::default(), Vec3::Y, &WorldFrame::default()).is_err());
     }
 }

@@ -128,6 +128,21 @@ impl LabelMap {
         image_io::save_png(path, DynamicImage::ImageLuma16(picture))
     }
 
+    /// Reads a label map of another program, in which the largest number of its bits (255, 65535) means "no label" where it is not the next after
+    /// the others: COCO's, Cityscapes' and ScanNet's tools write it so. A map of it alone is a mask.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_with_void(path: &Path) -> Result<Self> {
+        let mut map = Self::load(path)?;
+        let void = if map.max() > u16::from(u8::MAX) { u16::MAX } else { u16::from(u8::MAX) };
+        let next = map.labels.iter().copied().filter(|label| *label != void).max().unwrap_or(0);
+        if next > 0 && next + 1 < void {
+            map.labels.iter_mut().filter(|label| **label == void).for_each(|label| *label = 0);
+        }
+        Ok(map)
+    }
+
     /// Reads a grey PNG of 8 or 16 bits, or the places in the palette of a PNG that has one: trackers and DAVIS's tools keep ids so.
     ///
     /// # Errors
@@ -170,6 +185,27 @@ impl LabelMap {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn void_is_no_label_where_it_stands_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let read = |labels: &[u16], eight: bool| {
+            let (width, height) = (labels.len() as u32, 1);
+            if eight {
+                let picture = image::GrayImage::from_raw(width, height, labels.iter().map(|l| *l as u8).collect()).unwrap();
+                image_io::save_png(&path, picture).unwrap();
+            } else {
+                LabelMap { width, height, labels: labels.to_vec() }.save(&path).unwrap();
+            }
+            LabelMap::load_with_void(&path).unwrap().labels
+        };
+        assert_eq!(read(&[0, 1, 7, 255], true), [0, 1, 7, 0]);
+        assert_eq!(read(&[0, 255, 255], true), [0, 255, 255], "a mask");
+        assert_eq!(read(&[1, 254, 255], true), [1, 254, 255], "as many objects");
+        assert_eq!(read(&[3, 300, 65535], false), [3, 300, 0]);
+        assert_eq!(read(&[3, 255, 300], false), [3, 255, 300]);
+    }
 
     #[test]
     fn png_keeps_all_16_bits() {

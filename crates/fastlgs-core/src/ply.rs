@@ -3,12 +3,16 @@
 //! Written columns: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3` (`f_rest` as in 3DGS: all of red,
 //! then green, then blue), then `feature_0..2` (float) and `object_id` (ushort), which other viewers skip. On reading,
 //! unknown columns are skipped, missing features are 0, and the SH degree is what the number of `f_rest` columns gives.
+//! Gaussians that cannot be drawn are dropped.
 
 use crate::gaussians::{MAX_SH_DEGREE, rest_len};
-use crate::{Error, Gaussians, Result, fs};
-use glam::Vec3;
-use std::io::Write;
+use crate::{Error, Gaussians, Result, WorldFrame, compressed_ply, fs};
+use glam::{DVec3, Vec3};
+use std::io::{Read, Write};
 use std::path::Path;
+
+/// Name of the column of object ids.
+const OBJECT_ID: &str = "object_id";
 
 /// Names of the float columns at an SH degree, in their order.
 fn float_columns(degree: u32) -> Vec<String> {
@@ -19,21 +23,39 @@ fn float_columns(degree: u32) -> Vec<String> {
     fixed.into_iter().chain(groups.concat()).chain(["opacity".to_owned()]).chain(tail.concat()).collect()
 }
 
-/// Writes the scene atomically.
+/// Writes the scene atomically, in its own coordinates.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
+    write_in(path, scene, &WorldFrame::default())
+}
+
+/// Writes the scene atomically, in the coordinates of the world. Far from its origin positions are doubles: floats would lose their digits there.
+///
+/// # Errors
+/// [`Error::Io`] with the path.
+pub fn write_in(path: &Path, scene: &Gaussians, frame: &WorldFrame) -> Result<()> {
+    let doubles = frame.origin != DVec3::ZERO;
+    let shift = frame.scale.ln() as f32;
     fs::write_atomic(path, |file| {
         writeln!(file, "ply\nformat binary_little_endian 1.0\ncomment FastLGS\nelement vertex {}", scene.len())?;
         for name in float_columns(scene.sh_degree) {
-            writeln!(file, "property float {name}")?;
+            let kind = if doubles && ["x", "y", "z"].contains(&name.as_str()) { "double" } else { "float" };
+            writeln!(file, "property {kind} {name}")?;
         }
-        writeln!(file, "property ushort object_id\nend_header")?;
+        writeln!(file, "property ushort {OBJECT_ID}\nend_header")?;
         for i in 0..scene.len() {
-            let (m, c, s, r) = (scene.means[i], scene.sh_dc[i], scene.log_scales[i], scene.rotations[i]);
+            let (m, c, r) = (scene.means[i], scene.sh_dc[i], scene.rotations[i]);
+            let s = if shift == 0.0 { scene.log_scales[i] } else { scene.log_scales[i] + shift };
             let (o, f) = (scene.opacity_logits[i], scene.features[i]);
-            let head = [m.x, m.y, m.z, 0.0, 0.0, 0.0, c.x, c.y, c.z];
+            if doubles {
+                frame.to_world(m).to_array().iter().try_for_each(|v| file.write_all(&v.to_le_bytes()))?;
+            } else {
+                let world = if frame.is_identity() { m } else { frame.to_world(m).as_vec3() };
+                world.to_array().iter().try_for_each(|v| file.write_all(&v.to_le_bytes()))?;
+            }
+            let head = [0.0, 0.0, 0.0, c.x, c.y, c.z];
             let rest = (0..3).flat_map(|color| scene.rest(i).iter().map(move |v| v[color]));
             let tail = [o, s.x, s.y, s.z, r[0], r[1], r[2], r[3], f.x, f.y, f.z];
             for value in head.into_iter().chain(rest).chain(tail) {
@@ -105,19 +127,33 @@ struct Header {
     body: usize,
 }
 
+/// Bytes in which a header must end.
+const LONGEST_HEADER: usize = 1 << 16;
+
+/// The lines of a header, and where the body begins. Comments may be in any encoding and hold any words.
+fn header_lines(data: &[u8]) -> Option<(Vec<String>, usize)> {
+    let (mut lines, mut at) = (Vec::<String>::new(), 0);
+    let limit = data.len().min(LONGEST_HEADER);
+    while let Some(length) = data[at..limit].iter().position(|b| *b == b'\n') {
+        let line = String::from_utf8_lossy(&data[at..at + length]).trim_end_matches('\r').to_owned();
+        at += length + 1;
+        if line.trim() == "end_header" {
+            return Some((lines, at)).filter(|(lines, _)| lines.first().is_some_and(|first| first.trim() == "ply"));
+        }
+        lines.push(line);
+    }
+    None
+}
+
 fn header(path: &Path, data: &[u8]) -> Result<Header> {
     let bad = |reason: String| Error::format(path, reason);
-    let marker = b"end_header";
-    let limit = data.len().min(1 << 16);
-    let end = data[..limit].windows(marker.len()).position(|w| w == marker).filter(|_| data.starts_with(b"ply"));
-    let end = end.ok_or_else(|| bad("not a PLY file, or its header is cut off".into()))?;
-    let body = end + marker.len() + data[end + marker.len()..].iter().take_while(|b| **b == b'\r').count() + 1;
-    let text = std::str::from_utf8(&data[..end]).map_err(|_| bad("its header is not text".into()))?;
+    let (lines, body) = header_lines(data).ok_or_else(|| bad("not a PLY file, or its header is cut off".into()))?;
     let mut header = Header { ascii: false, big_endian: false, count: 0, columns: Vec::new(), body };
     let mut in_vertex = false;
-    for line in text.lines() {
+    for line in &lines {
         let words: Vec<&str> = line.split_whitespace().collect();
         match words.as_slice() {
+            ["comment" | "obj_info", ..] => {}
             ["format", format, _] => {
                 header.ascii = *format == "ascii";
                 header.big_endian = *format == "binary_big_endian";
@@ -177,10 +213,21 @@ fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
     Ok(table)
 }
 
-/// Reads a 3DGS PLY of this or another program.
+/// Whether a PLY file names the objects of its Gaussians: what another program saved often does not.
 ///
 /// # Errors
-/// Truncation, missing columns and values that are not finite are [`Error::Format`].
+/// A missing file, or one that is no PLY.
+pub fn has_objects(path: &Path) -> Result<bool> {
+    let mut start = Vec::new();
+    let file = std::fs::File::open(path).map_err(Error::io(path))?;
+    file.take(LONGEST_HEADER as u64).read_to_end(&mut start).map_err(Error::io(path))?;
+    Ok(header(path, &start)?.columns.iter().any(|column| column.0 == OBJECT_ID))
+}
+
+/// Reads a 3DGS PLY of this or another program, positions relative to the frame. What cannot be drawn is dropped; the log says so.
+///
+/// # Errors
+/// Truncation and missing columns are [`Error::Format`].
 pub fn read(path: &Path) -> Result<Gaussians> {
     parse(path, &fs::read(path)?)
 }
@@ -190,10 +237,46 @@ pub fn read(path: &Path) -> Result<Gaussians> {
 /// # Errors
 /// As [`read`].
 pub fn parse(path: &Path, data: &[u8]) -> Result<Gaussians> {
+    let (scene, warning) = parse_in(path, data, &WorldFrame::default())?;
+    if let Some(warning) = warning {
+        tracing::warn!("{warning}");
+    }
+    Ok(scene)
+}
+
+/// Says what is missing in a file that has no Gaussians as 3DGS has them.
+fn missing_column(header: &Header, name: &str) -> String {
+    let has = |name: &str| header.columns.iter().any(|column| column.0 == name);
+    if name == "scale_2" && has("scale_1") {
+        return "its Gaussians are 2-D (scale_0 and scale_1, no scale_2), as 2DGS trains them; train the photos here or with a 3-D method"
+            .into();
+    }
+    if name.starts_with("f_dc") && has("scale_0") && ["red", "r", "f_rgb_0"].into_iter().any(has) {
+        return "its Gaussians have RGB colours and no SH coefficients (f_dc_0 to f_dc_2); export it with spherical harmonics".into();
+    }
+    if !has("scale_0") && has("x") {
+        return format!("no column '{name}': this is a point cloud or a mesh, not a Gaussian scene");
+    }
+    format!("no column '{name}': this is not a Gaussian scene")
+}
+
+/// Reads a PLY whose positions are those of the world into a frame; and a sentence about Gaussians that were dropped.
+///
+/// # Errors
+/// As [`read`].
+pub fn parse_in(path: &Path, data: &[u8], frame: &WorldFrame) -> Result<(Gaussians, Option<String>)> {
+    if let Some((lines, body)) = header_lines(data).filter(|(lines, _)| compressed_ply::is_compressed(lines)) {
+        let mut scene = compressed_ply::parse(path, &lines, &data[body..])?;
+        scene.means.iter_mut().for_each(|mean| *mean = frame.to_local(mean.as_dvec3()));
+        let shift = frame.scale.ln() as f32;
+        scene.log_scales.iter_mut().for_each(|s| *s -= shift);
+        let warning = scene.drop_invalid().map(|dropped| format!("{}: {dropped}", path.display()));
+        return Ok((scene, warning));
+    }
     let header = header(path, data)?;
     let table = columns(path, data, &header)?;
     let find = |name: &str| header.columns.iter().position(|c| c.0 == name).map(|i| table[i].as_slice());
-    let need = |name: &str| find(name).ok_or_else(|| Error::format(path, format!("no column '{name}': this is not a Gaussian scene")));
+    let need = |name: &str| find(name).ok_or_else(|| Error::format(path, missing_column(&header, name)));
     let vec3 = |a: &[f64], b: &[f64], c: &[f64]| -> Vec<Vec3> {
         a.iter().zip(b).zip(c).map(|((a, b), c)| Vec3::new(*a as f32, *b as f32, *c as f32)).collect()
     };
@@ -208,8 +291,10 @@ pub fn parse(path: &Path, data: &[u8]) -> Result<Gaussians> {
     let per_color = rest_len(sh_degree);
     let rest = (0..rest_columns).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<Vec<_>>>()?;
     let coefficient = |i: usize, k: usize| [0, 1, 2].map(|color| rest[color * per_color + k][i] as f32);
-    let scene = Gaussians {
-        means: vec3(need("x")?, need("y")?, need("z")?),
+    let (x, y, z) = (need("x")?, need("y")?, need("z")?);
+    let local = |i: usize| frame.to_local(DVec3::new(x[i], y[i], z[i]));
+    let mut scene = Gaussians {
+        means: (0..n).map(local).collect(),
         log_scales: vec3(need("scale_0")?, need("scale_1")?, need("scale_2")?),
         rotations: (0..n).map(|i| rot.map(|r| r[i] as f32)).collect(),
         opacity_logits: need("opacity")?.iter().map(|&v| v as f32).collect(),
@@ -217,12 +302,14 @@ pub fn parse(path: &Path, data: &[u8]) -> Result<Gaussians> {
         sh_degree,
         sh_rest: (0..n).flat_map(|i| (0..per_color).map(move |k| (i, k))).map(|(i, k)| coefficient(i, k).into()).collect(),
         features: vec3(feature(0), feature(1), feature(2)),
-        object_ids: find("object_id").unwrap_or(&zeros).iter().map(|&v| v as u16).collect(),
+        object_ids: find(OBJECT_ID).unwrap_or(&zeros).iter().map(|&v| v as u16).collect(),
     };
-    match scene.first_not_finite() {
-        Some(i) => Err(Error::format(path, format!("Gaussian {i} holds a value that is not a finite number"))),
-        None => Ok(scene),
+    let shift = (1.0 / frame.scale).ln() as f32;
+    if shift != 0.0 {
+        scene.log_scales.iter_mut().for_each(|s| *s += shift);
     }
+    let warning = scene.drop_invalid().map(|dropped| format!("{}: {dropped}", path.display()));
+    Ok((scene, warning))
 }
 
 #[cfg(test)]
@@ -251,6 +338,64 @@ mod tests {
         std::fs::write(&path, &data[..data.len() - 7]).unwrap();
         let message = read(&path).unwrap_err().to_string();
         assert!(message.contains("scene.ply") && message.contains("truncated"), "{message}");
+    }
+
+    #[test]
+    fn what_cannot_be_drawn_is_dropped_and_counted() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.ply");
+        let mut damaged = sample();
+        damaged.means[0].y = f32::NAN;
+        damaged.log_scales[1].x = f32::NEG_INFINITY;
+        damaged.rotations[2] = [0.0; 4];
+        // Solid, as files with eight bits of opacity have it.
+        damaged.opacity_logits[3] = f32::INFINITY;
+        write(&path, &damaged).unwrap();
+        let (scene, warning) = parse_in(&path, &std::fs::read(&path).unwrap(), &WorldFrame::default()).unwrap();
+        let warning = warning.unwrap();
+        assert_eq!(scene.len(), 2);
+        assert!(scene.opacity_logits[0].is_finite() && scene.opacity_logits[0] > 6.0);
+        assert!(["3 of 5", "y", "scale_0", "rot_0 to rot_3"].iter().all(|word| warning.contains(word)), "{warning}");
+    }
+
+    #[test]
+    fn headers_of_other_programs_are_read_and_other_content_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.ply");
+        write(&path, &sample()).unwrap();
+        let data = std::fs::read(&path).unwrap();
+        let with = |from: &str, to: &[u8]| {
+            let at = data.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
+            [&data[..at], to, &data[at + from.len()..]].concat()
+        };
+        for comment in [b"comment caf\xe9 end_header was here\n".as_slice(), b"comment end_header\r\nobj_info x\r\n"] {
+            assert_eq!(parse(&path, &with("comment FastLGS\n", comment)).unwrap(), sample());
+        }
+        assert!(has_objects(&path).unwrap());
+        std::fs::write(&path, with(OBJECT_ID, b"something")).unwrap();
+        assert!(!has_objects(&path).unwrap());
+        for (column, other, what) in [("scale_2", "flat_no", "2-D"), ("scale_0", "size_0", "not a Gaussian scene")] {
+            let refused = parse(&path, &with(column, other.as_bytes())).unwrap_err().to_string();
+            assert!(refused.contains(what), "{refused}");
+        }
+        let rgb = with("f_dc_0", b"red_0_").iter().copied().collect::<Vec<u8>>();
+        let at = rgb.windows(5).position(|w| w == b" nx\np").unwrap();
+        let refused = parse(&path, &[&rgb[..at], b" red\np", &rgb[at + 5..]].concat()).unwrap_err().to_string();
+        assert!(refused.contains("RGB"), "{refused}");
+    }
+
+    #[test]
+    fn far_scenes_keep_their_digits() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("scene.ply");
+        let frame = WorldFrame { origin: DVec3::new(512_345.6, 5_403_210.9, 431.2), scale: 4.0 };
+        write_in(&path, &sample(), &frame).unwrap();
+        let data = std::fs::read(&path).unwrap();
+        let (back, _) = parse_in(&path, &data, &frame).unwrap();
+        assert!(back.means.iter().zip(&sample().means).all(|(a, b)| a.distance(*b) < 1e-6), "{:?}", back.means);
+        let (world, _) = parse_in(&path, &data, &WorldFrame { scale: 1.0, ..frame }).unwrap();
+        assert!((world.means[2] - 4.0 * sample().means[2]).length() < 1e-5);
+        assert!((world.log_scales[2] - sample().log_scales[2] - 4f32.ln()).length() < 1e-5);
     }
 
     /// The same two Gaussians in both byte orders and in text.

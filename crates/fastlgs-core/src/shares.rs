@@ -19,7 +19,7 @@ pub struct Shares {
 
 /// One id with its weight.
 pub fn pack(id: u16, weight: f32) -> u32 {
-    u32::from(id) << 16 | (weight * 65_535.0 + 0.5) as u32
+    u32::from(id) << 16 | (weight.clamp(0.0, 1.0) * 65_535.0 + 0.5) as u32
 }
 
 /// Id and weight of [`pack`].

@@ -1,6 +1,8 @@
-//! SPZ, the compressed Gaussian format of Niantic (version 2 of its specification, github.com/nianticlabs/spz): gzip of a
+//! SPZ, the compressed Gaussian format of Niantic (github.com/nianticlabs/spz). Version 2 is written; 2 to 4 are read: gzip of a
 //! 16-byte header and then, for all Gaussians, positions (24-bit fixed point), opacities, colours, log-scales, rotations and
 //! SH coefficients (8 bits each). Features and object ids have no place in it.
+//!
+//! Version 3 has rotations of four bytes; version 4 packs each attribute by itself with Zstandard.
 //!
 //! The format's axes are right, up, back; PLY files of 3DGS are taken to be right, down, front, so y and z change sign.
 
@@ -15,6 +17,8 @@ use std::path::Path;
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 2;
+/// Versions that are read.
+const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 const HEADER: usize = 16;
 /// Colour coefficients are stored around one half with this scale.
 const COLOR_SCALE: f32 = 0.15;
@@ -75,60 +79,147 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     })
 }
 
-/// Reads a scene; features are zero and object ids 0.
+/// The attributes of a file, one after the other, unpacked.
+struct Packed {
+    version: u32,
+    count: usize,
+    sh_degree: u32,
+    fraction: u8,
+    /// Positions, opacities, colours, log-scales, rotations, and SH coefficients.
+    streams: [Vec<u8>; 6],
+}
+
+/// Header of version 4: that of the others, the place of its table, and reserved bytes.
+const HEADER_4: usize = 32;
+/// An entry of the table: packed and unpacked length of a stream.
+const ENTRY: usize = 16;
+
+/// Bytes of each attribute.
+fn lengths(version: u32, n: usize, sh_degree: u32) -> [usize; 6] {
+    let rotation = if version == 2 { 3 } else { 4 };
+    [9 * n, n, 3 * n, 3 * n, rotation * n, 3 * rest_len(sh_degree) * n]
+}
+
+/// Checks the header, which all versions begin with: version, count, SH degree, bits behind the point.
+fn checked_header(path: &Path, data: &[u8]) -> Result<(u32, usize, u32, u8)> {
+    let bad = |reason: String| Err(Error::format(path, reason));
+    let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+    if word(0) != Some(MAGIC) || data.len() < HEADER {
+        return bad("not an SPZ file".into());
+    }
+    let (version, count) = (word(4).unwrap_or(0), word(8).unwrap_or(0));
+    if !VERSIONS.contains(&version) {
+        let (first, last) = (VERSIONS.start(), VERSIONS.end());
+        return bad(format!("SPZ version {version}; versions {first} to {last} can be read"));
+    }
+    let sh_degree = u32::from(data[12]);
+    if sh_degree > MAX_SH_DEGREE {
+        return bad(format!("SH degree {sh_degree}; at most {MAX_SH_DEGREE} can be read, export it with fewer"));
+    }
+    Ok((version, count as usize, sh_degree, data[13]))
+}
+
+/// Versions 2 and 3: gzip of header and attributes.
+fn unpack_gzip(path: &Path, packed: &[u8]) -> Result<Packed> {
+    let bad = |reason: String| Error::format(path, reason);
+    let mut data = Vec::new();
+    GzDecoder::new(packed).read_to_end(&mut data).map_err(|e| bad(format!("not a whole SPZ file ({e}); copy it again")))?;
+    let (version, count, sh_degree, fraction) = checked_header(path, &data)?;
+    let lengths = lengths(version, count, sh_degree);
+    let expected = HEADER + lengths.iter().sum::<usize>();
+    if data.len() < expected {
+        return Err(bad(format!("truncated: {count} Gaussians need {expected} bytes, it holds {}; copy it again", data.len())));
+    }
+    let mut at = HEADER;
+    let streams = lengths.map(|length| {
+        at += length;
+        data[at - length..at].to_vec()
+    });
+    Ok(Packed { version, count, sh_degree, fraction, streams })
+}
+
+/// Version 4: a plain header, a table, and a Zstandard stream for each attribute.
+fn unpack_zstd(path: &Path, data: &[u8]) -> Result<Packed> {
+    let bad = |reason: String| Error::format(path, reason);
+    let (version, count, sh_degree, fraction) = checked_header(path, data)?;
+    let lengths = lengths(version, count, sh_degree);
+    let cut_off = || bad("truncated: its table or a stream ends early; copy it again".to_owned());
+    let number = |at: usize, bytes: usize| -> Result<usize> {
+        let raw = data.get(at..at.saturating_add(bytes)).ok_or_else(cut_off)?;
+        let value = raw.iter().rev().fold(0u64, |value, byte| value << 8 | u64::from(*byte));
+        usize::try_from(value).map_err(|_| cut_off())
+    };
+    let (used, table) = (usize::from(data[15]), number(16, 4)?);
+    if used != lengths.iter().filter(|length| **length > 0).count() && count > 0 || table < HEADER_4 {
+        return Err(bad(format!("its table names {used} streams, which do not fit an SH degree of {sh_degree}")));
+    }
+    let mut streams: [Vec<u8>; 6] = Default::default();
+    let mut at = table + used * ENTRY;
+    for (k, (stream, length)) in streams.iter_mut().zip(lengths).take(used).enumerate() {
+        let (packed, unpacked) = (number(table + k * ENTRY, 8)?, number(table + k * ENTRY + 8, 8)?);
+        if unpacked != length {
+            return Err(bad(format!("stream {k} has {unpacked} bytes, {count} Gaussians need {length}")));
+        }
+        let from = data.get(at..at.saturating_add(packed)).ok_or_else(cut_off)?;
+        let decoder = ruzstd::decoding::StreamingDecoder::new(from).map_err(|e| bad(format!("stream {k} is damaged ({e})")))?;
+        // No more than was announced is unpacked.
+        decoder.take(length as u64 + 1).read_to_end(stream).map_err(|e| bad(format!("stream {k} is damaged ({e})")))?;
+        if stream.len() != length {
+            return Err(bad(format!("stream {k} is damaged: it has {} bytes, not {length}", stream.len())));
+        }
+        at += packed;
+    }
+    Ok(Packed { version, count, sh_degree, fraction, streams })
+}
+
+/// A rotation (w, x, y, z) of version 3 and up: the place of the largest of (x, y, z, w) in two bits, and of the others, last first, nine bits of size and
+/// a sign each.
+fn smallest_three(b: &[u8]) -> [f32; 4] {
+    const SIZE: u32 = (1 << 9) - 1;
+    let mut bits = u32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+    let largest = (bits >> 30) as usize;
+    let mut q = [0.0f32; 4];
+    for k in (0..4).rev().filter(|k| *k != largest) {
+        let size = (bits & SIZE) as f32 / SIZE as f32 * std::f32::consts::FRAC_1_SQRT_2;
+        q[k] = if bits >> 9 & 1 == 1 { -size } else { size };
+        bits >>= 10;
+    }
+    q[largest] = (1.0 - q.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    [q[3], q[0], q[1], q[2]]
+}
+
+/// Reads a scene of version 2, 3 or 4; features are zero and object ids 0.
 ///
 /// # Errors
 /// [`Error::Format`] for files that are no SPZ, are cut off, or of another version.
 pub fn read(path: &Path) -> Result<Gaussians> {
-    let bad = |reason: String| Error::format(path, reason);
-    let mut data = Vec::new();
-    let packed = fs::read(path)?;
-    GzDecoder::new(packed.as_slice()).read_to_end(&mut data).map_err(|e| bad(format!("not a whole SPZ file ({e}); copy it again")))?;
-    let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-    if word(0) != Some(MAGIC) || data.len() < HEADER {
-        return Err(bad("not an SPZ file".into()));
-    }
-    if word(4) != Some(VERSION) {
-        return Err(bad(format!("SPZ version {}; only version {VERSION} can be read", word(4).unwrap_or(0))));
-    }
-    let (n, sh_degree, fraction) = (word(8).unwrap_or(0) as usize, u32::from(data[12]), data[13]);
-    if sh_degree > MAX_SH_DEGREE {
-        return Err(bad(format!("SH degree {sh_degree}; at most {MAX_SH_DEGREE} is known")));
-    }
-    let rest = rest_len(sh_degree);
-    let expected = HEADER + n * (9 + 1 + 3 + 3 + 3 + 3 * rest);
-    if data.len() < expected {
-        return Err(bad(format!("truncated: {n} Gaussians need {expected} bytes, it holds {}; copy it again", data.len())));
-    }
-    let mut at = HEADER;
-    let mut take = |bytes: usize| {
-        at += bytes;
-        &data[at - bytes..at]
-    };
-    let unit = f32::from(fraction).exp2();
+    let data = fs::read(path)?;
+    let packed = if data.starts_with(&MAGIC.to_le_bytes()) { unpack_zstd(path, &data)? } else { unpack_gzip(path, &data)? };
+    let (n, sh_degree) = (packed.count, packed.sh_degree);
+    let [positions, opacities, colors, scales, turns, rest] = &packed.streams;
+    let width = rest_len(sh_degree);
+    let unit = f32::from(packed.fraction).exp2();
     let flip = Vec3::new(1.0, -1.0, -1.0);
     let fixed = |b: &[u8]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 / unit;
     let vec3 = |b: &[u8], f: fn(f32) -> f32| Vec3::new(f(b[0].into()), f(b[1].into()), f(b[2].into()));
-    let means = take(9 * n).chunks_exact(9).map(|b| Vec3::new(fixed(b), fixed(&b[3..]), fixed(&b[6..])) * flip).collect();
-    // Opacities of exactly 0 and 1 have no finite logit.
-    let opacity_logits = take(n).iter().map(|b| logit((f32::from(*b) / 255.0).clamp(0.001, 0.999))).collect();
-    let sh_dc = take(3 * n).chunks_exact(3).map(|b| vec3(b, |v| (v - 127.5) / (COLOR_SCALE * 255.0))).collect();
-    let log_scales = take(3 * n).chunks_exact(3).map(|b| vec3(b, |v| v / 16.0 - 10.0)).collect();
-    let rotations = take(3 * n).chunks_exact(3).map(|b| {
-        let v = vec3(b, |v| v / 127.5 - 1.0) * flip;
-        [(1.0 - v.length_squared()).max(0.0).sqrt(), v.x, v.y, v.z]
-    });
-    let rotations = rotations.collect();
-    let sh_rest =
-        take(3 * n * rest).chunks_exact(3).enumerate().map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % rest]).collect();
+    let rotations = if packed.version == 2 {
+        let first_three = |b: &[u8]| {
+            let v = vec3(b, |v| v / 127.5 - 1.0);
+            [(1.0 - v.length_squared()).max(0.0).sqrt(), v.x, v.y, v.z]
+        };
+        turns.chunks_exact(3).map(first_three).collect::<Vec<_>>()
+    } else {
+        turns.chunks_exact(4).map(smallest_three).collect()
+    };
     Ok(Gaussians {
-        means,
-        log_scales,
-        rotations,
-        opacity_logits,
-        sh_dc,
+        means: positions.chunks_exact(9).map(|b| Vec3::new(fixed(b), fixed(&b[3..]), fixed(&b[6..])) * flip).collect(),
+        log_scales: scales.chunks_exact(3).map(|b| vec3(b, |v| v / 16.0 - 10.0)).collect(),
+        rotations: rotations.into_iter().map(|[w, x, y, z]| [w, x, -y, -z]).collect(),
+        // Opacities of exactly 0 and 1 have no finite logit.
+        opacity_logits: opacities.iter().map(|b| logit((f32::from(*b) / 255.0).clamp(0.001, 0.999))).collect(),
+        sh_dc: colors.chunks_exact(3).map(|b| vec3(b, |v| (v - 127.5) / (COLOR_SCALE * 255.0))).collect(),
         sh_degree,
-        sh_rest,
+        sh_rest: rest.chunks_exact(3).enumerate().map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % width]).collect(),
         features: vec![Vec3::ZERO; n],
         object_ids: vec![0; n],
     })

@@ -68,6 +68,11 @@ impl WorldFrame {
         self.origin + self.scale * local.as_dvec3()
     }
 
+    /// The coordinates of a place of the scene in the world, for reports.
+    pub fn reported(&self, local: [f32; 3]) -> [f64; 3] {
+        if self.is_identity() { local.map(exact_decimal) } else { self.to_world(local.into()).to_array() }
+    }
+
     /// A place of the world in the scene.
     pub fn to_local(&self, world: DVec3) -> Vec3 {
         ((world - self.origin) / self.scale).as_vec3()
@@ -101,6 +106,11 @@ impl WorldFrame {
         pose.w_axis = (self.origin + self.scale * pose.w_axis.truncate()).extend(1.0);
         pose
     }
+}
+
+/// The number with the fewest digits that a 32-bit float stands for: 0.1 and not 0.10000000149.
+pub fn exact_decimal(value: f32) -> f64 {
+    value.to_string().parse().unwrap_or(f64::from(value))
 }
 
 /// The middle of some values; 0 of none.

@@ -192,6 +192,19 @@ pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfi
     (!parts.is_empty()).then_some(Found { ranked: below, targets: parts })
 }
 
+impl Found {
+    /// Scores for a heat map that agrees with the mask: the targets have the best score, and what is no target at most that of the least of them.
+    pub fn heat(&self) -> Vec<Hit> {
+        let least = self.targets.iter().map(|hit| hit.score).fold(f32::INFINITY, f32::min);
+        let best = best_score(&self.ranked);
+        let shown = |hit: &Hit| {
+            let is_target = self.targets.iter().any(|target| target.id == hit.id);
+            Hit { score: if is_target { best } else { hit.score.min(least) }, ..*hit }
+        };
+        self.ranked.iter().map(shown).collect()
+    }
+}
+
 /// The objects of an answer.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Found {
@@ -244,6 +257,16 @@ pub(crate) mod tests {
         assert_eq!(find(&grid(), [0.8, 0.6], &config), [2], "a part that the text fits better");
         let lenient = QueryConfig { false_alarms: 1.0, ..config };
         assert_eq!(find(&grid(), [-1.0, 0.0], &lenient).len(), 1);
+    }
+
+    #[test]
+    fn the_heat_map_is_hottest_where_the_mask_is() {
+        // A small thing is more like the text, and a large one is meant.
+        let hit = |id, score| Hit { id, score };
+        let found = Found { ranked: vec![hit(1, 0.95), hit(2, 0.99), hit(3, 0.2)], targets: vec![hit(1, 0.95)] };
+        assert_eq!(found.heat(), [hit(1, 0.99), hit(2, 0.95), hit(3, 0.2)]);
+        let nothing = Found { targets: Vec::new(), ..found };
+        assert_eq!(nothing.heat(), nothing.ranked);
     }
 
     #[test]

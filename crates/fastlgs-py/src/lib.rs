@@ -3,6 +3,7 @@
 
 mod answer;
 mod camera;
+mod fork;
 mod options;
 mod scene;
 mod stage;

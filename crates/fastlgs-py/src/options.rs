@@ -2,13 +2,22 @@
 
 use crate::Error;
 use pyo3::prelude::*;
-use pyo3::types::{IntoPyDict, PyDict};
+use pyo3::types::{IntoPyDict, PyCFunction, PyDict, PyTupleMethods};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 fn refused(error: impl std::fmt::Display) -> PyErr {
     Error::new_err(error.to_string())
+}
+
+/// An option that JSON does not know as one that it does: numbers and arrays of NumPy, and paths.
+fn plain<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    if value.hasattr("tolist")? {
+        return value.call_method0("tolist");
+    }
+    let path = value.py().import("os")?.call_method1("fspath", (value,));
+    path.map_err(|_| Error::new_err(format!("'{value}' is no number, text, path or list")))
 }
 
 /// A configuration with some of its values replaced.
@@ -19,11 +28,14 @@ pub fn with<T: Serialize + DeserializeOwned>(known: &T, options: Option<&Bound<'
     let mut all = serde_json::to_value(known).map_err(refused)?;
     let Some(options) = options else { return serde_json::from_value(all).map_err(refused) };
     let py = options.py();
-    // Paths are options, too.
-    let how = [("default", py.import("os")?.getattr("fspath")?)].into_py_dict(py)?;
-    let plain = py.import("json")?.call_method("dumps", (options,), Some(&how))?;
+    let default = PyCFunction::new_closure(py, None, None, |arguments, _| plain(&arguments.get_item(0)?).map(Bound::unbind))?;
+    let how = [("default", default)].into_py_dict(py)?;
+    let dumped = py.import("json")?.call_method("dumps", (options,), Some(&how));
+    let plain = dumped.map_err(|error| Error::new_err(format!("an option does not fit: {error}")))?;
     let given: serde_json::Map<String, Value> = serde_json::from_str(&plain.extract::<String>()?).map_err(refused)?;
     for (name, value) in given {
+        // Its name in earlier versions.
+        let name = if name == "init_ply" { "init".to_owned() } else { name };
         let Some(place) = all.get_mut(&name) else {
             let names: Vec<&str> = all.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
             return Err(Error::new_err(format!("there is no option '{name}'; there are {}", names.join(", "))));

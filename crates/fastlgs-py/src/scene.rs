@@ -2,6 +2,7 @@
 
 use crate::answer::Answer;
 use crate::camera::Camera;
+use crate::fork;
 use crate::options::to_python;
 use crate::texts::Texts;
 use crate::{Error, raised};
@@ -59,7 +60,7 @@ struct Opened {
 enum Which {
     First,
     Named(String),
-    Given(fastlgs_core::Camera),
+    Given(Box<Camera>),
 }
 
 impl Which {
@@ -67,7 +68,7 @@ impl Which {
     fn of(view: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
         let Some(view) = view else { return Ok(Self::First) };
         if let Ok(camera) = view.cast::<Camera>() {
-            return Ok(Self::Given(camera.get().0.clone()));
+            return Ok(Self::Given(Box::new(camera.get().clone())));
         }
         view.extract().map(Self::Named).map_err(|_| Error::new_err("a view is the name of a photo, or a Camera"))
     }
@@ -76,6 +77,7 @@ impl Which {
 impl Scene {
     /// Works on the scene while Python is free. Python must not be held while waiting for the scene: who has the scene may wait for Python.
     fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut Opened) -> fastlgs::Result<T> + Send) -> PyResult<T> {
+        fork::check()?;
         py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner))).map_err(raised)
     }
 }
@@ -84,7 +86,7 @@ impl Opened {
     fn camera(&self, which: &Which) -> fastlgs::Result<fastlgs_core::Camera> {
         let cameras = &self.session.cameras;
         Ok(match which {
-            Which::Given(camera) => camera.clone(),
+            Which::Given(camera) => camera.within(&self.session.manifest.frame),
             Which::Named(name) => cameras[self.session.folder.view_index(cameras, name)?].clone(),
             Which::First => {
                 let first = cameras.first().cloned();
@@ -114,6 +116,7 @@ impl Scene {
     #[new]
     #[pyo3(signature = (path, *, device = "auto", clip_text = None, embed_text = None))]
     fn new(py: Python<'_>, path: PathBuf, device: &str, clip_text: Option<PathBuf>, embed_text: Option<Py<PyAny>>) -> PyResult<Self> {
+        fork::check()?;
         let open = || -> fastlgs::Result<Opened> {
             let mut session = Session::open(&path, device)?;
             session.clip_text = clip_text;
@@ -153,7 +156,7 @@ impl Scene {
     /// The camera of a view.
     fn camera(&self, py: Python<'_>, view: &Bound<'_, PyAny>) -> PyResult<Camera> {
         let which = Which::of(Some(view))?;
-        self.with(py, |opened| opened.camera(&which)).map(Camera)
+        self.with(py, |opened| Ok(Camera::of(opened.camera(&which)?, &opened.session.manifest.frame)))
     }
 
     /// Asks for a text, for what a pixel of the view shows (or several of one thing, as a list), or for what a picture (uint8, (height, width, 3)) shows.
@@ -188,7 +191,7 @@ impl Scene {
             let Some((_, field)) = shown else { unreachable!("rendered above") };
             let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates: CANDIDATES };
             let (answer, mut report) = question.put(session, grid, field, &camera, render_ms)?;
-            let relevancy = field.relevancy(grid, &answer.found.ranked);
+            let relevancy = field.relevancy(grid, &answer.found.heat());
             let mask = answer.mask;
             report.look_elsewhere(session, grid)?;
             Ok((camera, report, mask, relevancy))
@@ -248,7 +251,8 @@ impl Scene {
             "depth" => {
                 let (size, values) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
-                    Ok((size(&camera), opened.session.render_depth(&camera)?))
+                    let unit = opened.session.manifest.frame.scale as f32;
+                    Ok((size(&camera), opened.session.render_depth(&camera)?.into_iter().map(|depth| unit * depth).collect()))
                 })?;
                 table(py, values, &size)
             }
@@ -275,8 +279,11 @@ impl Scene {
     /// features (n, 3) and object_ids (n), places in object_lists.
     #[getter]
     fn gaussians<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let scene = self.with(py, |opened| Ok(opened.session.gaussians.clone()))?;
+        let (mut scene, frame) = self.with(py, |opened| Ok((opened.session.gaussians.clone(), opened.session.manifest.frame)))?;
         let n = scene.len();
+        if frame.scale != 1.0 {
+            scene.log_scales.iter_mut().for_each(|s| *s += frame.scale.ln() as f32);
+        }
         let rows = |values: &[Vec3]| -> Vec<f32> { values.iter().flat_map(|v| v.to_array()).collect() };
         let scales: Vec<f32> = scene.log_scales.iter().flat_map(|s| s.exp().to_array()).collect();
         let unit = |q: &[f32; 4]| {
@@ -287,7 +294,12 @@ impl Scene {
         let sh = (0..n).flat_map(|i| std::iter::once(scene.sh_dc[i]).chain(scene.sh_rest[i * rest..(i + 1) * rest].iter().copied()));
         let opacities: Vec<f32> = scene.opacity_logits.iter().map(|o| 1.0 / (1.0 + (-o).exp())).collect();
         let arrays = PyDict::new(py);
-        arrays.set_item("means", table(py, rows(&scene.means), &[n, 3])?)?;
+        // Floats would lose digits far from the origin.
+        let means = match frame.is_identity() {
+            true => table(py, rows(&scene.means), &[n, 3])?,
+            false => table(py, scene.means.iter().flat_map(|mean| frame.to_world(*mean).to_array()).collect(), &[n, 3])?,
+        };
+        arrays.set_item("means", means)?;
         arrays.set_item("scales", table(py, scales, &[n, 3])?)?;
         arrays.set_item("rotations", table(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?)?;
         arrays.set_item("opacities", table(py, opacities, &[n])?)?;
@@ -309,9 +321,12 @@ impl Scene {
         if rest && ids.is_none() {
             return Err(Error::new_err("rest leaves out some objects: give their ids"));
         }
-        self.with(py, |Opened { session: Session { gaussians, cameras, .. }, grid, .. }| match &ids {
-            None => selection::write(&path, gaussians, cameras),
-            Some(ids) => selection::export(&path, gaussians, cameras, &selection::gaussians(gaussians, grid, ids), !rest),
+        self.with(py, |Opened { session: Session { gaussians, cameras, manifest, .. }, grid, .. }| {
+            let world = selection::World::of(manifest, cameras);
+            match &ids {
+                None => selection::write(&path, gaussians, &world),
+                Some(ids) => selection::export(&path, gaussians, &world, &selection::gaussians(gaussians, grid, ids), !rest),
+            }
         })
     }
 

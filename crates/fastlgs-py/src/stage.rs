@@ -1,6 +1,6 @@
 //! Runs a stage on a thread of its own, while Python's main thread hears of its progress and of Ctrl-C.
 
-use crate::{options, raised};
+use crate::{fork, options, raised};
 use fastlgs::Run;
 use fastlgs::progress::{Message, Sink};
 use pyo3::prelude::*;
@@ -85,6 +85,7 @@ pub fn run<T: Send>(
     seed: u64,
     work: impl FnOnce(&Run) -> fastlgs::Result<T> + Send,
 ) -> PyResult<T> {
+    fork::check()?;
     let cancelled = AtomicBool::new(false);
     std::thread::scope(|scope| {
         let (events, mut heard) = channel();

@@ -1,7 +1,7 @@
 //! What training is towards: a camera and what it should see.
 
 use crate::engine::{TargetImage, pack};
-use crate::{Result, exposure};
+use crate::{Error, Result, exposure};
 use fastlgs_core::Camera;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -143,10 +143,16 @@ impl Targets {
     /// # Errors
     /// When a picture cannot be read.
     pub(crate) fn survey(&self) -> Result<(f32, u64)> {
-        let of_picture = |image: TargetImage| (image.contrast(), fingerprint(image.color.iter().chain(&image.feature).copied()));
-        let each = (0..self.len()).into_par_iter().map(|id| Ok(of_picture((self.read)(id)?))).collect::<Result<Vec<(f64, u64)>>>()?;
-        let contrast = each.iter().map(|(contrast, _)| contrast).sum::<f64>() / each.len().max(1) as f64;
-        Ok((contrast as f32, fingerprint(each.iter().flat_map(|(_, print)| [*print as u32, (print >> 32) as u32]))))
+        let of_picture = |image: TargetImage| {
+            let counts = image.color.iter().chain(&image.feature).any(|pixel| pixel.to_le_bytes()[3] == 255);
+            (image.contrast(), fingerprint(image.color.iter().chain(&image.feature).copied()), counts)
+        };
+        let each = (0..self.len()).into_par_iter().map(|id| Ok(of_picture((self.read)(id)?))).collect::<Result<Vec<(f64, u64, bool)>>>()?;
+        if !each.iter().any(|(.., counts)| *counts) {
+            return Err(Error::Invalid("no pixel of any training photo counts: their masks leave nothing to train on".to_owned()));
+        }
+        let contrast = each.iter().map(|(contrast, ..)| contrast).sum::<f64>() / each.len().max(1) as f64;
+        Ok((contrast as f32, fingerprint(each.iter().flat_map(|(_, print, _)| [*print as u32, (print >> 32) as u32]))))
     }
 }
 

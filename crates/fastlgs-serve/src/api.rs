@@ -15,6 +15,7 @@ use fastlgs::session::Pixels;
 use fastlgs::session::answer::{CANDIDATES, Question};
 use fastlgs::session::ask::Ask;
 use fastlgs::session::pictures::{heatmap, mask_picture, overlay};
+use fastlgs::session::selection::World;
 use fastlgs::session::{parse_size, selection};
 use fastlgs::teach::learn;
 use fastlgs_core::camera::mean_up;
@@ -234,7 +235,7 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates };
         let (answer, mut report) = question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
         let mask = (want_mask && report.found).then(|| mask_picture(&answer.mask, camera.width, camera.height));
-        let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.ranked));
+        let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.heat()));
         report.look_elsewhere(&mut desk.scene, &desk.grid)?;
         let mut value = serde_json::to_value(&report).map_err(anyhow::Error::from)?;
         if let Some(mask) = mask {
@@ -299,7 +300,7 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
             let field = desk.scene.field(&camera, None)?;
             let meaning = Ask::Text(text.clone()).meaning(&desk.scene, &[])?;
             let found = meaning.find(&desk.grid, &field, &camera, &QueryConfig::default())?;
-            heatmap(&color, &field.relevancy(&desk.grid, &found.ranked))
+            heatmap(&color, &field.relevancy(&desk.grid, &found.heat()))
         } else if wanted.selected.is_empty() {
             color
         } else {
@@ -350,7 +351,8 @@ pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejecti
         }
         let folder = tempfile::tempdir().map_err(|e| anyhow::anyhow!("no temporary folder: {e}"))?;
         let path = folder.path().join("selection").with_extension(&ending);
-        selection::export(&path, &desk.scene.gaussians, &desk.scene.cameras, &selected, wanted.keep)?;
+        let world = World::of(&desk.scene.manifest, &desk.scene.cameras);
+        selection::export(&path, &desk.scene.gaussians, &world, &selected, wanted.keep)?;
         Ok(fastlgs_core::fs::read(&path)?)
     };
     let data: Vec<u8> = app.ready()?.ask(work).await?;

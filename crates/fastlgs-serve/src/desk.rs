@@ -173,7 +173,7 @@ impl Desk {
                 "share": shares[usize::from(o.id) - 1],
                 "views": o.views,
                 "gaussians": own.len(),
-                "bbox3d": selection::robust_box(&self.scene.gaussians, own),
+                "bbox3d": selection::robust_box(&self.scene.gaussians, &self.scene.manifest.frame, own),
                 "color": turbo::id_color(o.id),
             })
         };

@@ -5,6 +5,7 @@ use crate::shared::views;
 use crate::{focus, page, splats};
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
+use fastlgs::session::phrase::normalised;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::fs::{write_atomic, write_json};
 use fastlgs_grid::Grid;
@@ -170,7 +171,8 @@ fn write(path: &Path, content: &[u8]) -> Result<()> {
 /// The words, a row of the table for each, and how many of them name something.
 fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
     let taught = desk.scene.taught_names()?.into_iter().map(|name| name.to_lowercase());
-    let words: BTreeSet<String> = names::common(common)?.into_iter().chain(taught).collect();
+    let common = names::common(common)?.into_iter().map(|word| normalised(&word));
+    let words: BTreeSet<String> = common.chain(taught).filter(|word| !word.is_empty()).collect();
     let mut words: Vec<String> = words.into_iter().collect();
     // Texts of like length waste no padding.
     words.sort_by_key(|word| (word.split_whitespace().count(), word.len()));

@@ -24,6 +24,15 @@ async function words() {
   return { list: new Map(list.map((word, place) => [word, place])), rows: new DataView(rows) };
 }
 
+// A text as src/session/phrase.rs normalises it, in small letters.
+function phrase(text) {
+  const invisible = /[\u00ad\u200b-\u200f\u202a-\u202e\u2060-\u2064\ufeff]/g;
+  const separators = /["`\u00b4\u00ab\u00bb()[\]{}<>\-_\u2010-\u2015\u2212\u2018-\u201f]|(?<![\p{L}\p{N}])'|'(?![\p{L}\p{N}])/gu;
+  const composed = text.normalize("NFC").toLowerCase().replace(invisible, "").replace(/(?<=[\p{L}\p{N}])\u2019(?=[\p{L}\p{N}])/gu, "'");
+  const words = composed.replace(separators, " ").trim().split(/\s+/).join(" ").replace(/^[.,;:!?\u00bf\u00a1]+|[.,;:!?]+$/g, "");
+  return words.replace(/^((a|an|the) )+(?=.)/, "");
+}
+
 // Letters that must be changed, added or taken away to make one word of another.
 function distance(a, b) {
   let row = Array.from({ length: b.length + 1 }, (_, k) => k);
@@ -53,7 +62,7 @@ export async function postJson(path, { text }) {
   });
   const { list, rows } = await table;
   const said = text.trim().toLowerCase().replace(/\s+/g, " ");
-  const plain = list.has(said) ? said : said.replace(/^(a|an|the) /, "");
+  const plain = list.has(said) ? said : phrase(text);
   const place = list.get(plain);
   if (place === undefined) {
     const known = `${list.size.toLocaleString("en")} words`;

@@ -25,7 +25,8 @@ async function request(path, options = {}) {
   if (token) headers.Authorization = `Bearer ${token}`;
   let response;
   try {
-    response = await fetch(path, { ...options, headers });
+    // Relative to the page, which a proxy may show below a prefix.
+    response = await fetch(new URL(path.slice(1), document.baseURI), { ...options, headers });
   } catch {
     throw new Error("the server does not answer; is fastlgs still running?");
   }

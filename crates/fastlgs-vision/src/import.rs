@@ -3,12 +3,13 @@
 use crate::runtime::Array;
 use crate::segmenter::Segmenter;
 use crate::{Encoder, Error, Result, encoder};
-use fastlgs_core::dataset::Dataset;
-use fastlgs_core::mask_list::{Mask, RunLengths};
+use fastlgs_core::dataset::{Dataset, images_folder, is_photo};
+use fastlgs_core::mask_image::MaskImage;
+use fastlgs_core::mask_list::{Mask, RunLengths, annotations};
 use fastlgs_core::npy::{self, Npy};
 use fastlgs_core::scene_folder::load_tensors;
 use fastlgs_core::undistort::Distortion;
-use fastlgs_core::{Camera, LabelMap, Level, MaskList, image_io};
+use fastlgs_core::{Camera, LabelMap, Level, MaskList};
 use image::RgbImage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,8 +19,8 @@ use std::path::{Path, PathBuf};
 pub enum Layout {
     /// `masks/NAME.png`: 16-bit labels, 0 for none; finer levels in `masks/part/` and `masks/subpart/`.
     Labels,
-    /// `masks/NAME.json` or `masks/STEM.json`: COCO's annotations with run lengths, as Segment Anything's own script writes them; masks may
-    /// overlap, and `track_id` is the same in all photos.
+    /// JSON in `masks/`, `annotations/` or `images/`, for each photo (`NAME.json` or `STEM.json`) or for all: COCO's annotations, labelme's and Label
+    /// Studio's; masks may overlap, and `track_id` is the same in all photos.
     Annotations,
     /// `masks/STEM/*.png`: one black-and-white picture a mask, which may overlap.
     MaskFolders,
@@ -90,7 +91,7 @@ impl Import {
         let some = |folder: &Path, want: &dyn Fn(&Path) -> bool| folder.read_dir().is_ok_and(|d| d.flatten().any(|e| want(&e.path())));
         let png = |p: &Path| p.extension().is_some_and(|e| e == "png");
         let level = |p: &Path| Level::ALL.iter().any(|l| p.ends_with(l.name()));
-        let layout = if some(&masks, &|p| p.extension().is_some_and(|e| e == "json")) {
+        let layout = if some(&masks, &is_json) {
             Layout::Annotations
         } else if some(&masks, &png) || some(&masks.join("whole"), &png) {
             Layout::Labels
@@ -102,9 +103,11 @@ impl Import {
             Layout::GaussianGrouping
         } else if spin_nerf_folder(photos).is_some() {
             Layout::SpinNerf
+        } else if annotation_folders(photos).iter().any(|folder| some(folder, &is_json)) {
+            Layout::Annotations
         } else {
             return Err(Error::Missing(format!(
-                "{}: no masks to import; expected masks/NAME.json (COCO's run lengths), masks/NAME.png (16-bit labels), masks/STEM/*.png, language_features/ (LangSplat), \
+                "{}: no masks to import; expected masks/*.json (COCO, labelme, Label Studio), masks/NAME.png (16-bit labels), masks/STEM/*.png, language_features/ (LangSplat), \
                  object_mask/ (Gaussian Grouping) or label/ (SPIn-NeRF) beside images/",
                 photos.display()
             )));
@@ -125,20 +128,42 @@ impl Import {
         })
     }
 
+    /// The masks of a view in its own file of annotations, or in one of several photos.
+    fn annotated(&self, view: &str) -> Result<MaskList> {
+        let sides = self.lenses.get(view).map(|(camera, _)| (camera.width, camera.height));
+        let folders = annotation_folders(&self.photos);
+        let named = |folder: &PathBuf| [view, stem(view)].map(|name| folder.join(format!("{name}.json")));
+        let own: Vec<PathBuf> = folders.iter().flat_map(named).filter(|path| path.is_file()).collect();
+        let mut shared: Vec<PathBuf> =
+            folders.iter().flat_map(|folder| folder.read_dir().into_iter().flatten().flatten()).map(|e| e.path()).collect();
+        shared.retain(|path| is_json(path));
+        shared.sort();
+        for path in own.iter().take(1).chain(&shared).filter(|path| own.first() == Some(*path) || own.is_empty()) {
+            if let Some(list) = annotations::load(path, Some(view), sides)? {
+                return Ok(list);
+            }
+        }
+        let looked_at: Vec<String> = own.iter().chain(&shared).take(5).map(|path| path.display().to_string()).collect();
+        Err(Error::Missing(format!(
+            "the photo '{view}' has no masks in {}; add them, or take the photo out of images/",
+            looked_at.join(", ")
+        )))
+    }
+
     /// The masks of a view as they are on disk.
     fn found(&self, view: &str) -> Result<Found> {
         let stem = stem(view);
         let named = |folder: PathBuf, ending: &str| [view, stem].map(|n| folder.join(format!("{n}.{ending}")));
         let masks = self.photos.join("masks");
         match self.layout {
-            Layout::Annotations => Ok(Found::in_order(MaskList::load(&self.find(view, &named(masks, "json"))?)?)),
+            Layout::Annotations => self.annotated(view).map(Found::in_order),
             Layout::Labels => {
                 let whole = self.find(view, &[named(masks.clone(), "png"), named(masks.join("whole"), "png")].concat())?;
                 let finer =
                     [Level::Part, Level::Subpart].map(|level| named(masks.join(level.name()), "png").into_iter().find(|p| p.is_file()));
-                let whole = LabelMap::load(&whole)?;
+                let whole = LabelMap::load_with_void(&whole)?;
                 let empty = || Ok(LabelMap::new(whole.width, whole.height));
-                let [part, subpart] = finer.map(|path| path.map_or_else(empty, |path| LabelMap::load(&path)));
+                let [part, subpart] = finer.map(|path| path.map_or_else(empty, |path| LabelMap::load_with_void(&path)));
                 Ok(Found::of_maps(&[whole.clone(), part?, subpart?]))
             }
             Layout::MaskFolders => Ok(Found::in_order(pictures(&self.find(view, &[masks.join(stem), masks.join(view)])?)?)),
@@ -158,7 +183,7 @@ impl Import {
                 Ok(if levels == 1 { Found::of_maps(&[level(0)]) } else { Found::of_maps(&[3, 2, 1].map(level)) })
             }
             Layout::GaussianGrouping => {
-                let map = LabelMap::load(&self.find(view, &named(self.photos.join("object_mask"), "png"))?)?;
+                let map = LabelMap::load_with_void(&self.find(view, &named(self.photos.join("object_mask"), "png"))?)?;
                 let mut found = Found::of_maps(&[map]);
                 // Rows follow the labels, and these are the things' numbers in all photos.
                 found.list.masks.iter_mut().zip(&found.rows).for_each(|(mask, row)| mask.track = row.map(|r| r as u32 + 1));
@@ -166,11 +191,10 @@ impl Import {
             }
             Layout::SpinNerf => {
                 let folder = spin_nerf_folder(&self.photos).expect("found when it was opened");
-                // Black and white, whatever a palette calls them.
-                let mask = image_io::load_gray(&self.find(view, &named(folder, "png"))?)?;
-                let labels = mask.pixels().map(|p| u16::from(p[0] > 0)).collect();
-                let map = LabelMap { width: mask.width(), height: mask.height(), labels };
-                Ok(Found::of_maps(&[map]))
+                let candidates = ["png", "jpg", "jpeg", "JPG"].map(|ending| named(folder.clone(), ending)).concat();
+                let mask = MaskImage::load(&self.find(view, &candidates)?)?;
+                let labels = mask.inside.iter().map(|inside| u16::from(*inside)).collect();
+                Ok(Found::of_maps(&[LabelMap { width: mask.width, height: mask.height, labels }]))
             }
         }
     }
@@ -245,20 +269,32 @@ fn spin_nerf_folder(photos: &Path) -> Option<PathBuf> {
     folders.iter().map(|f| photos.join(f)).find(|f| f.is_dir())
 }
 
+fn is_json(path: &Path) -> bool {
+    path.extension().is_some_and(|ending| ending == "json")
+}
+
+/// Where annotation programs leave their files.
+fn annotation_folders(photos: &Path) -> Vec<PathBuf> {
+    let mut folders = vec![photos.join("masks"), photos.join("annotations")];
+    folders.extend(images_folder(photos));
+    folders.retain(|folder| folder != photos);
+    folders
+}
+
 /// All black-and-white pictures of a folder as masks, in the order of their names.
 fn pictures(folder: &Path) -> Result<MaskList> {
     let entries = folder.read_dir().map_err(fastlgs_core::Error::io(folder))?;
-    let mut paths: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
+    let mut paths: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
     paths.sort();
     let mut list: Option<MaskList> = None;
     for path in paths {
-        let picture = image_io::load_gray(&path)?;
-        let (width, height) = picture.dimensions();
+        let picture = MaskImage::load(&path)?;
+        let (width, height) = (picture.width, picture.height);
         let list = list.get_or_insert_with(|| MaskList::new(width, height));
         if (list.width, list.height) != (width, height) {
             return Err(Error::Invalid(format!("{}: it differs in size from the other masks of its folder", path.display())));
         }
-        list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| picture.get_pixel(x, y)[0] > 127)));
+        list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| picture.inside[(y * width + x) as usize])));
     }
     list.ok_or_else(|| Error::Missing(format!("{}: no masks (*.png) in it", folder.display())))
 }
@@ -287,9 +323,19 @@ impl Encoder for Import {
         let embeddings = self.rows(view)?.ok_or_else(missing)?;
         let dimension = embeddings.shape[1];
         let Found { list, rows } = self.fitted(view, photo.width(), photo.height())?;
-        let needed = rows.iter().flatten().max().map_or(0, |r| r + 1);
-        if needed > embeddings.shape[0] {
-            return Err(Error::Invalid(format!("'{view}' has {needed} masks or labels but {} embeddings", embeddings.shape[0])));
+        // Of the masks on disk: undistorting may have lost some.
+        let needed = self.found(view)?.rows.iter().flatten().max().map_or(0, |r| r + 1);
+        let given = embeddings.shape[0];
+        // LangSplat's rows are those of all levels.
+        if needed > given || (needed < given && self.layout != Layout::LangSplat) {
+            let of = match self.layout {
+                Layout::Labels | Layout::GaussianGrouping | Layout::SpinNerf => "labels (row 0 is label 1; the background has no row)",
+                Layout::Annotations | Layout::MaskFolders | Layout::LangSplat => "masks (rows are in their order)",
+            };
+            return Err(Error::Invalid(format!(
+                "{}/embeddings: '{view}' has {given} embeddings for {needed} {of}; write one row for each",
+                self.photos.display()
+            )));
         }
         let with_row = MaskList { masks: list.masks.iter().zip(&rows).filter(|m| m.1.is_some()).map(|m| m.0.clone()).collect(), ..list };
         let rows: Vec<usize> = rows.into_iter().flatten().collect();
@@ -327,6 +373,7 @@ pub fn fitting(masks: &LabelMap, others: &MaskList) -> Vec<Option<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use fastlgs_core::image_io;
     use image::{GrayImage, Luma};
     use npyz::WriterBuilder;
 
@@ -393,6 +440,9 @@ mod tests {
         assert_eq!(import.embed_masks("a.jpg", &photo(), &other).unwrap(), [vec![0.0, 1.0], vec![1.0, 0.0], vec![0.0, 0.0]]);
         npy(&dir.path().join("embeddings/a.npy"), &[1, 2], &[3.0f32, 0.0]);
         assert!(import.embed_masks("a.jpg", &photo(), &other).unwrap_err().to_string().contains("1 embeddings"));
+        npy(&dir.path().join("embeddings/a.npy"), &[3, 2], &[9.0f32, 9.0, 3.0, 0.0, 0.0, 2.0]);
+        let background = import.embed_masks("a.jpg", &photo(), &other).unwrap_err().to_string();
+        assert!(background.contains("3 embeddings for 2 labels") && background.contains("background"), "{background}");
         // Of two that overlap, each answers for itself.
         let both = |x: u32| if x < 2 { 1 } else { 2 };
         let map = LabelMap { width: 8, height: 4, labels: (0..32).map(|p| both(p % 8)).collect() };
@@ -439,6 +489,12 @@ mod tests {
         assert_eq!((whole(&import).at(0, 0), whole(&import).at(5, 0)), (2, 1));
         let areas: Vec<usize> = import.segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.runs.area()).collect();
         assert_eq!(areas, [32, 8], "what lies below is whole");
+
+        // Masks of 0 and 1.
+        gray(&dir.path().join("masks/a/0.png"), |_, _| 1);
+        gray(&dir.path().join("masks/a/1.png"), |x, _| u8::from(x < 2));
+        let areas: Vec<usize> = import.segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.runs.area()).collect();
+        assert_eq!(areas, [32, 8]);
 
         import.segment("a.jpg", &photo()).unwrap().save(&dir.path().join("masks/a.json")).unwrap();
         assert_eq!(open(dir.path()).layout(), Layout::Annotations);

@@ -16,6 +16,8 @@ pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
 /// Forgets a run that was broken off.
 pub(crate) fn forget(folder: &SceneFolder) {
     fastlgs_raster::checkpoint::remove(&path(folder));
+    // What views were trained towards.
+    let _ = std::fs::remove_dir_all(folder.root.join("checkpoints/borders"));
     // It stays where anything else lies in it.
     let _ = std::fs::remove_dir(folder.root.join("checkpoints"));
 }

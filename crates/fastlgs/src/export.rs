@@ -9,7 +9,7 @@ use crate::{Result, Run, Session, train};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, ply, sog, spz};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, camera_path, splat_file};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -99,8 +99,9 @@ pub fn names_folder(path: &Path) -> bool {
 /// A scene that was never trained, a place that cannot be written, or a device that fails.
 pub fn export(config: &Config, run: &Run) -> Result<Report> {
     if config.output.extension().is_some_and(|e| e == "json") {
-        let cameras = SceneFolder::open(&config.scene)?.cameras()?;
-        camera_path::write(&config.output, &cameras)?;
+        let folder = SceneFolder::open(&config.scene)?;
+        let cameras = folder.cameras()?;
+        camera_path::write(&config.output, &cameras, &folder.manifest()?.frame)?;
         return Ok(Report::Path { scene: config.scene.clone(), output: config.output.clone(), frames: cameras.len() });
     }
     let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
@@ -118,15 +119,16 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     let shown = if held_out.is_empty() { scene.cameras.iter().take(1).cloned().collect() } else { held_out.clone() };
     let before = pictures(&mut scene, &shown)?;
     let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
-    scene.gaussians = scene.gaussians.clone().with_sh_degree(degree);
+    if degree < scene.gaussians.sh_degree {
+        scene.show(scene.gaussians.clone().with_sh_degree(degree))?;
+    }
     let (written, precision) = if file {
-        selection::write(&config.output, &scene.gaussians, &scene.cameras)?;
+        let world = selection::World::of(&scene.manifest, &scene.cameras);
+        selection::write(&config.output, &scene.gaussians, &world)?;
         let written = match ending {
-            "ply" => ply::read(&config.output)?,
-            "spz" => spz::read(&config.output)?,
-            "sog" => sog::read(&config.output)?,
             // It holds the same floats as before.
-            _ => scene.gaussians.clone(),
+            "glb" => scene.gaussians.clone(),
+            _ => splat_file::read(&config.output, &world.frame)?.0,
         };
         (written, None)
     } else {
@@ -209,7 +211,14 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
     }
     let precision = precision(scene)?;
     let staged = StagedOutput::new(&folder, "export")?;
-    compact::write(&staged.folder.compact_path(), &scene.gaussians, &precision)?;
+    let (kept, dropped) = scene.gaussians.without_far_outliers();
+    if dropped > 0 {
+        tracing::warn!(
+            "{}: {dropped} Gaussians far outside of the scene were left out, as the precision of all would suffer",
+            root.display()
+        );
+    }
+    compact::write(&staged.folder.compact_path(), &kept, &precision)?;
     grid.save(&staged.folder)?;
     staged.folder.save_cameras(&scene.cameras)?;
     // The export has none of the scene's other files.

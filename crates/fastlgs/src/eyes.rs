@@ -325,7 +325,7 @@ pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> 
         let root = folder.root.display();
         bail!(
             "{root}: its objects were embedded by another encoder than the scene's, or by an earlier version of it; \
-             'fastlgs train {root} --init-ply {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians"
+             'fastlgs train {root} --init {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians"
         );
     }
     Ok(())
@@ -336,8 +336,9 @@ fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
     let what = role.replace('_', " ");
     let file = manifest.models.get(role).with_context(|| format!("the scene does not say which {what} it was made with"))?;
     let bytes = std::fs::metadata(&file.path).with_context(|| format!("the {what} of the scene, {}", file.path.display()))?.len();
-    if bytes != file.bytes {
-        bail!("{}: not the {what} that the scene was made with ({} bytes then, {bytes} now)", file.path.display(), file.bytes);
+    // The length first: it costs nothing.
+    if bytes != file.bytes || places::digest(&file.path)?.1 != file.sha256 {
+        bail!("{}: not the {what} that the scene was made with; its content is another, name the right file", file.path.display());
     }
     Ok(&file.path)
 }

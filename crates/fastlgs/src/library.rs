@@ -176,11 +176,18 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
         let manifest = SceneFolder::new(&folder).manifest();
         let why = match &manifest {
             Err(error) => Some(error.to_string()),
-            Ok(own) if train::Report::of(own).is_none() => Some("it was never trained".to_owned()),
-            Ok(own) => scenes.first().map(|s| &s.1).filter(|first| eyes::identity_of(first) != eyes::identity_of(own)).map(|first| {
-                let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
-                format!("its encoder is another ('{own}') than that of the library ('{first}'); preprocess and train it again with that")
-            }),
+            Ok(own) => match train::Report::of(own, &folder) {
+                Err(error) => Some(error.to_string()),
+                Ok(None) => Some("it was never trained".to_owned()),
+                Ok(Some(_)) => {
+                    scenes.first().map(|s| &s.1).filter(|first| eyes::identity_of(first) != eyes::identity_of(own)).map(|first| {
+                        let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
+                        format!(
+                            "its encoder is another ('{own}') than that of the library ('{first}'); preprocess and train it again with that"
+                        )
+                    })
+                }
+            },
         };
         match (why, manifest, stamp(&folder)) {
             (None, Ok(manifest), Ok(stamp)) => scenes.push((Entry { path, stamp }, manifest)),
@@ -242,6 +249,14 @@ fn up_to_date(root: &Path, scenes: &[Scene], run: &Run) -> Result<Library> {
         Ok((entry.clone(), grid))
     };
     let tables = scenes.iter().map(load).collect::<Result<Vec<_>>>()?;
-    library::write(&path, &tables).context("the library's index cannot be written")?;
+    if let Err(error) = library::write(&path, &tables) {
+        // Where the folder may only be read, it is made in each run anew.
+        tracing::info!("{}: the index cannot be kept: {error}", path.display());
+        let folder = tempfile::tempdir()?;
+        let path = folder.path().join(INDEX);
+        library::write(&path, &tables).context("the library's index cannot be written")?;
+        // What is open can be read when its folder is gone.
+        return Ok(Library::open(&path)?);
+    }
     Ok(Library::open(&path)?)
 }

@@ -89,7 +89,7 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let made = json!([env!("CARGO_PKG_VERSION"), conse::VERSION, seeds, how, files(&photos)?]);
     let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
     let whole = [folder.ply_path(), folder.root.join("grid.json")].iter().all(|file| file.is_file());
-    if let Some(report) = known.as_ref().filter(|_| whole).and_then(train::Report::of) {
+    if let Some(report) = known.as_ref().filter(|_| whole).map(|known| train::Report::of(known, &folder.root)).transpose()?.flatten() {
         return Ok((State::Kept, report));
     }
     let lock = SceneLock::take(&preprocess.output, "make")?;

@@ -103,7 +103,9 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
         if config.what.contains(&What::Depth) {
-            let depth = timed(&mut rendered, || scene.render_depth(camera))?;
+            let mut depth = timed(&mut rendered, || scene.render_depth(camera))?;
+            let unit = scene.manifest.frame.scale as f32;
+            depth.iter_mut().for_each(|depth| *depth *= unit);
             exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
         }
         if config.what.contains(&What::Objects) {

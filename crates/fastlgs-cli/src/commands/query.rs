@@ -200,6 +200,18 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     }
 }
 
+/// Whether nobody reads the answers any more, which ends the dialogue quietly.
+///
+/// # Errors
+/// Every other refusal.
+fn ends(written: std::io::Result<()>) -> Result<bool> {
+    match written {
+        Ok(()) => Ok(false),
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(true),
+        Err(error) => Err(error.into()),
+    }
+}
+
 impl Asker<'_> {
     fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
         let texts = self.args.text.iter().cloned().map(Ask::Text);
@@ -248,20 +260,32 @@ impl Asker<'_> {
     /// Each line of standard input is a text; each answer a line of JSON, also where something is wrong with the question.
     fn answer_lines(&mut self) -> Result<Outcome> {
         let mut out = std::io::stdout();
-        for line in std::io::stdin().lock().lines() {
+        for line in std::io::stdin().lock().split(b'\n') {
             let line = line?;
-            let text = line.trim();
+            let Ok(line) = std::str::from_utf8(&line) else {
+                let shown = String::from_utf8_lossy(&line).trim().to_owned();
+                let answer = json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" });
+                if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? {
+                    return Ok(Outcome::Done);
+                }
+                continue;
+            };
+            let text = line.trim().trim_start_matches('\u{feff}');
             if text.is_empty() {
                 continue;
             }
             for place in 0..self.cameras.len() {
                 let answer = self.answer(&Ask::Text(text.to_owned()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
                 let answer = answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
-                writeln!(out, "{answer}")?;
+                if ends(writeln!(out, "{answer}"))? {
+                    return Ok(Outcome::Done);
+                }
                 // Lines make no sheet.
                 self.tiles.clear();
             }
-            out.flush()?;
+            if ends(out.flush())? {
+                return Ok(Outcome::Done);
+            }
         }
         Ok(Outcome::Done)
     }
@@ -300,7 +324,8 @@ impl Asker<'_> {
             if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
                 let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
                 let selected = selection::gaussians(&scene.gaussians, grid, &ids);
-                selection::export(path, &scene.gaussians, &scene.cameras, &selected, keep)?;
+                let world = selection::World::of(&scene.manifest, &scene.cameras);
+                selection::export(path, &scene.gaussians, &world, &selected, keep)?;
             }
         }
         report.look_elsewhere(&mut self.scene, &self.grid)?;

@@ -296,7 +296,7 @@ fn name_of(row: &str) -> Option<String> {
 /// Whether a line lists observations (x, y, point), possibly none; one of an image has ten fields or a name.
 fn is_observations(line: &str) -> bool {
     let fields: Vec<&str> = line.split_whitespace().collect();
-    fields.len() % 3 == 0 && fields.iter().all(|field| field.parse::<f64>().is_ok())
+    fields.len().is_multiple_of(3) && fields.iter().all(|field| field.parse::<f64>().is_ok())
 }
 
 fn points_txt(path: &Path) -> Result<Vec<Point>> {

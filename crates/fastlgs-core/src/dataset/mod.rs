@@ -287,6 +287,7 @@ pub fn is_photo(path: &Path) -> bool {
 
 /// The first names of a list, for a message.
 fn first_few(names: &[String]) -> String {
-    let shown = names.iter().take(5).cloned().collect::<Vec<_>>().join(", ");
+    let printable = |name: &String| name.chars().map(|c| if c.is_control() { '?' } else { c }).collect::<String>();
+    let shown = names.iter().take(5).map(printable).collect::<Vec<_>>().join(", ");
     if names.len() > 5 { format!("{shown}, ...") } else { shown }
 }

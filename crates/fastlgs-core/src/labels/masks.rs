@@ -1,7 +1,8 @@
 //! Labels as pictures: 3D-OVS's mask of each class and view, SPIn-NeRF's mask of each view.
 
 use super::{Label, LabelledView, Region};
-use crate::{Error, Result, fs, image_io};
+use crate::mask_image::MaskImage;
+use crate::{Error, Result, fs};
 use std::path::{Path, PathBuf};
 
 /// The last part of a path without its ending.
@@ -11,9 +12,8 @@ fn stem(path: &Path) -> String {
 
 /// A mask with its size; nothing where it is black all over.
 fn mask(path: &Path) -> Result<((u32, u32), Option<Region>)> {
-    let picture = image_io::load_gray(path)?;
-    let mask: Vec<bool> = picture.pixels().map(|p| p[0] > 0).collect();
-    Ok((picture.dimensions(), mask.contains(&true).then_some(Region::Mask(mask))))
+    let mask = MaskImage::load(path)?;
+    Ok(((mask.width, mask.height), (mask.area() > 0).then_some(Region::Mask(mask.inside))))
 }
 
 /// 3D-OVS: `VIEW/CLASS.png` for the classes that `classes.txt` lists, one a line. A class that a view does not show has no picture
@@ -74,6 +74,7 @@ pub fn spin_nerf(folder: &Path, pictures: &[PathBuf], text: Option<&str>) -> Res
 mod tests {
     use super::super::load;
     use super::*;
+    use crate::image_io;
     use image::{GrayImage, Luma};
 
     fn picture(path: &Path, white: u32) {

@@ -81,7 +81,7 @@ impl LabelledView {
 }
 
 /// Sets the pixels whose centre lies inside the polygon (even-odd rule).
-fn fill(polygon: &[[f64; 2]], width: u32, height: u32, mask: &mut [bool]) {
+pub(crate) fn fill(polygon: &[[f64; 2]], width: u32, height: u32, mask: &mut [bool]) {
     for row in 0..height {
         let y = f64::from(row) + 0.5;
         let mut crossings: Vec<f64> = Vec::new();

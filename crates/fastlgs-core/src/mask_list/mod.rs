@@ -1,5 +1,6 @@
 //! The masks of one photo. They may overlap: a cup, the cup on its saucer, the handle of the cup.
 
+pub mod annotations;
 mod atoms;
 mod file;
 mod gaps;

@@ -10,6 +10,10 @@ import numpy as np
 from ._fastlgs import Error
 
 
+# Endings of photos.
+PHOTOS = {".bmp", ".jfif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
+
+
 def write_masks(photos, name, masks, embeddings=None):
     """Keeps the masks of a photo, bool (n, height, width), which may overlap, and an embedding for each, float (n, numbers)."""
     masks = np.asarray(masks)
@@ -46,15 +50,42 @@ def _write(path, data):
     partial.replace(path)
 
 
+def _entry(entry):
+    """Name, masks and embeddings (or None) of what an iterable of masks gave."""
+    parts = tuple(entry) if isinstance(entry, (tuple, list)) else ()
+    if len(parts) not in (2, 3) or not isinstance(parts[0], str):
+        raise Error("masks are (name of a photo, masks) or (name, masks, embeddings), or a dict of name to masks or (masks, embeddings)")
+    return parts[0], parts[1], parts[2] if len(parts) == 3 else None
+
+
+def _entries(masks):
+    """All entries of an iterable, or of a dict."""
+    if not isinstance(masks, dict):
+        try:
+            return iter(masks)
+        except TypeError:
+            raise Error(f"masks are an iterable or a dict, not {type(masks).__name__}") from None
+    return ((name, *own) if isinstance(own, tuple) else (name, own) for name, own in masks.items())
+
+
 def imported(photos, masks):
-    """Writes what an iterable of (name, masks) or (name, masks, embeddings) gives; returns the options that make `preprocess` read it."""
-    embedded = set()
-    for entry in masks:
-        name, own, *embeddings = entry
-        write_masks(photos, name, own, *embeddings)
-        embedded.add(bool(embeddings) and embeddings[0] is not None)
+    """Writes what an iterable of (name, masks) or (name, masks, embeddings), or a dict, gives; returns the options that make `preprocess` read it.
+
+    All photos need masks: files of an earlier call would be read for the others.
+    """
+    embedded, given = set(), set()
+    for entry in _entries(masks):
+        name, own, embeddings = _entry(entry)
+        write_masks(photos, name, own, embeddings)
+        given.add(name)
+        embedded.add(embeddings is not None)
     if not embedded:
         raise Error(f"{photos}: no masks were given")
+    images = pathlib.Path(photos) / "images"
+    missing = sorted(path.name for path in images.iterdir() if path.suffix.lower() in PHOTOS and path.name not in given)
+    missing = [name for name in missing if not name.startswith(".")]
+    if missing:
+        raise Error(f"{photos}: {len(missing)} photos have no masks: {', '.join(missing[:5])}; give masks of all, an empty array for none")
     if len(embedded) > 1:
         raise Error(f"{photos}: some photos have embeddings and some have none; give them for all or for none")
     return {"segmenter": "import", "encoder": "import"} if embedded.pop() else {"segmenter": "import"}

@@ -117,7 +117,7 @@ pub(crate) fn backward_one(
     // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
     let opacity = sigmoid(param(10));
     let dets = covariance::determinants(a_x, a_y);
-    let clamped = opacity * covariance::compensation(dets, view) >= ALPHA_MAX;
+    let clamped = view.kept_gain() * opacity * covariance::compensation(dets, view) >= ALPHA_MAX;
     let unclamped_opacity = if clamped && slot[5] < 0.0 { 0.0 } else { 1.0 };
     put(10, slot[5] * (1.0 - opacity) * unclamped_opacity);
     let mut put3 = |c: usize, v: Vec3| (0..3).for_each(|k| put(c + k, v[k]));

@@ -305,7 +305,7 @@ impl Trainer {
                 self.prune()?;
                 removal_seconds += removing.elapsed().as_secs_f64();
             }
-            if iteration.is_multiple_of(20) {
+            if iteration.is_multiple_of(20) || self.course.config.couples_at == Some(iteration) {
                 let losses = self.engine.losses()?;
                 // For errors spread like a Gaussian, mean square = pi/2 x squared mean absolute error.
                 let psnr = -10.0 * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2).max(1e-12).log10();

@@ -189,8 +189,15 @@ pub struct Brightness {
 
 impl Brightness {
     /// What preprocessing noted; as if all were alike where it noted nothing.
-    pub fn of(manifest: &Manifest) -> Self {
-        manifest.notes.get(BRIGHTNESS).and_then(|note| serde_json::from_value(note.clone()).ok()).unwrap_or_default()
+    ///
+    /// # Errors
+    /// A note that cannot be read.
+    pub fn of(manifest: &Manifest) -> crate::Result<Self> {
+        let Some(note) = manifest.notes.get(BRIGHTNESS) else { return Ok(Self::default()) };
+        serde_json::from_value(note.clone()).map_err(|error| {
+            let mend = "run 'fastlgs preprocess' again";
+            crate::Error::Invalid(format!("scene.json: the note of the photos' brightness cannot be read ({error}); {mend}"))
+        })
     }
 
     pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {

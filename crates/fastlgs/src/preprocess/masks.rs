@@ -34,7 +34,7 @@ pub(super) fn segment(
             // Drawn on the photo before it was straightened.
             list = list.undistorted(&photo.camera, &Distortion { k1: photo.bend, ..Distortion::default() });
         }
-        list.masks.retain(|mask| config.eyes.keeps(mask.level));
+        list.masks.retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
         list.save(&folder.masks_path(name))?;
         work.advance()?;
         Ok(Level::ALL.map(|level| list.count(level)))
@@ -42,6 +42,11 @@ pub(super) fn segment(
     let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
     if counts.iter().flatten().all(|count| *count == 0) {
         bail!("{}: no mask was found in any photo to train on", config.photos.display());
+    }
+    let without: Vec<&str> =
+        training.iter().zip(&counts).filter(|(_, c)| c.iter().all(|n| *n == 0)).map(|(p, _)| p.camera.name.as_str()).collect();
+    if !without.is_empty() && config.eyes.segmenter == SegmenterKind::Import {
+        run.warn(&format!("{} of {} photos have no mask with any pixel: {}", without.len(), training.len(), without.join(", ")));
     }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
     let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));

@@ -131,7 +131,7 @@ pub struct ObjectReport {
     /// Left, top, right, bottom in pixels of the view, the last two excluded; nothing where the view does not show it.
     pub bbox2d: Option<[u32; 4]>,
     /// Its box in the world, without stray Gaussians.
-    pub bbox3d: Option<[[f32; 3]; 2]>,
+    pub bbox3d: Option<[[f64; 3]; 2]>,
     /// Its pixels in the view.
     pub pixels: usize,
     /// Its Gaussians.
@@ -222,7 +222,7 @@ impl Answer<'_> {
             support: object.support,
             score: hit.score,
             bbox2d: bounds,
-            bbox3d: selection::robust_box(&session.gaussians, own),
+            bbox3d: selection::robust_box(&session.gaussians, &session.manifest.frame, own),
             pixels: mask.iter().filter(|m| **m).count(),
             gaussians: own.len(),
         }
@@ -250,7 +250,7 @@ impl Answer<'_> {
             report.mask = Some(path("mask"));
         }
         if heat {
-            image_io::save_png(&path("heatmap"), heatmap(&color, &self.field.relevancy(self.grid, &self.found.ranked)))?;
+            image_io::save_png(&path("heatmap"), heatmap(&color, &self.field.relevancy(self.grid, &self.found.heat())))?;
             report.heatmap = Some(path("heatmap"));
         }
         Ok(lit)

@@ -1,6 +1,6 @@
 //! What is asked for: a text, a picture, or a point in a view; and the objects that it means.
 
-use super::{Pixels, Session, Texts, texts};
+use super::{Pixels, Session, Texts, phrase, texts};
 use crate::Result;
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
@@ -72,6 +72,8 @@ impl Embedded {
     /// Those of [`Texts::query`] and [`Texts::with_negatives`].
     pub fn words(text: &str, texts: &Texts, negatives: &[String]) -> Result<Self> {
         let embedded = |text: &str| texts.with_negatives(texts.query(text)?, negatives);
+        let plain = phrase::normalised(text);
+        let text = if texts.is_taught(text) { text } else { plain.as_str() };
         let split = part_of(text).filter(|_| !texts.is_taught(text));
         // What cannot be split, as half of it was taught and cannot be compared with a negative, is meant as a whole.
         let split = split.and_then(|(part, object)| Some([embedded(object).ok()?, embedded(part).ok()?]));

@@ -2,6 +2,7 @@
 
 pub mod answer;
 pub mod ask;
+pub mod phrase;
 pub mod pictures;
 mod pixels;
 pub mod selection;
@@ -13,7 +14,7 @@ use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use crate::{Result, eyes, train};
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_core::{Camera, Gaussians, SceneFolder};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::Hit;
@@ -59,7 +60,7 @@ impl Session {
         let folder = SceneFolder::open(root)?;
         let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
-        let Some(trained) = train::Report::of(&manifest) else {
+        let Some(trained) = train::Report::of(&manifest, root)? else {
             let root = root.display();
             bail!("{root}: its photos were preprocessed again after it was trained; run 'fastlgs train {root}' again");
         };
@@ -101,7 +102,19 @@ impl Session {
     }
 
     /// The object table.
+    ///
+    /// # Errors
+    /// A damaged table, or Gaussians that another program saved without the objects that they belong to.
     pub fn grid(&self) -> Result<Grid> {
+        if !self.folder.is_compact() && !ply::has_objects(&self.folder.ply_path())? {
+            let (path, root) = (self.folder.ply_path(), self.folder.root.display());
+            bail!(
+                "{}: another program saved it without the column object_id, so that it has no objects; \
+                 'fastlgs train {root} --init {} --iterations 0' finds them again and keeps the Gaussians",
+                path.display(),
+                path.display()
+            );
+        }
         Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
     }
 

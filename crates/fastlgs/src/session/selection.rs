@@ -3,8 +3,10 @@
 use crate::Result;
 use crate::error::{Context, bail};
 use fastlgs_core::camera::mean_up;
-use fastlgs_core::{Camera, Gaussians, glb, ply, sog, spz};
+use fastlgs_core::scene_folder::Manifest;
+use fastlgs_core::{Camera, Gaussians, WorldFrame, glb, ply, sog, spz};
 use fastlgs_grid::Grid;
+use glam::Vec3;
 use std::path::Path;
 
 /// Places of the Gaussians of some objects.
@@ -18,7 +20,7 @@ pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> 
 ///
 /// # Errors
 /// An empty rest, an unknown ending, or the system's refusal.
-pub fn export(path: &Path, scene: &Gaussians, cameras: &[Camera], selected: &[usize], keep: bool) -> Result<()> {
+pub fn export(path: &Path, scene: &Gaussians, world: &World, selected: &[usize], keep: bool) -> Result<()> {
     let mut inside = vec![false; scene.len()];
     selected.iter().for_each(|&i| inside[i] = true);
     let places: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
@@ -26,29 +28,64 @@ pub fn export(path: &Path, scene: &Gaussians, cameras: &[Camera], selected: &[us
         bail!("{}: nothing would be left to write", path.display());
     }
     let selected = scene.select(&places);
-    write(path, &selected, cameras).context("the selection cannot be written")
+    write(path, &selected, world).context("the selection cannot be written")
 }
 
 /// Files that Gaussians are written to, by their endings.
 pub const ENDINGS: [&str; 4] = ["ply", "spz", "sog", "glb"];
 
-/// Writes Gaussians as the file's ending says ([`ENDINGS`]); up in `.glb` is that of the cameras.
+/// How a scene stands in the world.
+pub struct World {
+    /// Its place and unit.
+    pub frame: WorldFrame,
+    /// Its upward direction, a unit vector.
+    pub up: Vec3,
+}
+
+impl World {
+    /// As the scene's manifest states it; up is that of the cameras.
+    pub fn of(manifest: &Manifest, cameras: &[Camera]) -> Self {
+        Self { frame: manifest.frame, up: mean_up(cameras) }
+    }
+}
+
+/// Writes Gaussians, in the coordinates of the world, as the file's ending says ([`ENDINGS`]). Formats of few bits hold positions relative to the
+/// frame's origin, and no Gaussians far outside, on which they would spend their range; the log says so.
 ///
 /// # Errors
 /// An unknown ending, or the system's refusal.
-pub fn write(path: &Path, gaussians: &Gaussians, cameras: &[Camera]) -> Result<()> {
+pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
+    let frame = &world.frame;
     match path.extension().and_then(|e| e.to_str()) {
-        Some("ply") => ply::write(path, gaussians)?,
-        Some("spz") => spz::write(path, gaussians)?,
-        Some("sog") => sog::write(path, gaussians)?,
-        Some("glb") => glb::write(path, gaussians, mean_up(cameras))?,
+        Some("ply") => ply::write_in(path, gaussians, frame)?,
+        Some("spz") => spz::write(path, &of_few_bits(path, gaussians, frame))?,
+        Some("sog") => sog::write(path, &of_few_bits(path, gaussians, frame))?,
+        Some("glb") => glb::write(path, gaussians, world.up, frame)?,
         _ => bail!("{}: name it .ply, .spz, .sog or .glb", path.display()),
     }
     Ok(())
 }
 
+/// The scene as formats of few bits hold it: relative to the frame's origin, in the world's units, without far outliers.
+fn of_few_bits(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> Gaussians {
+    let (mut written, dropped) = gaussians.without_far_outliers();
+    let path = path.display();
+    if dropped > 0 {
+        tracing::warn!("{path}: {dropped} Gaussians far outside of the scene were left out, as the format's precision would suffer");
+    }
+    if frame.origin != glam::DVec3::ZERO {
+        tracing::warn!("{path}: the format cannot hold coordinates this far from the origin; positions are relative to {}", frame.origin);
+    }
+    if frame.scale != 1.0 {
+        let shift = frame.scale.ln() as f32;
+        written.means.iter_mut().for_each(|mean| *mean *= frame.scale as f32);
+        written.log_scales.iter_mut().for_each(|scale| *scale += shift);
+    }
+    written
+}
+
 /// World box [min, max] between the 2nd and 98th percentile of the Gaussians' centres: a few floaters do not stretch it.
-pub fn robust_box(scene: &Gaussians, own: &[usize]) -> Option<[[f32; 3]; 2]> {
+pub fn robust_box(scene: &Gaussians, frame: &WorldFrame, own: &[usize]) -> Option<[[f64; 3]; 2]> {
     if own.is_empty() {
         return None;
     }
@@ -59,5 +96,5 @@ pub fn robust_box(scene: &Gaussians, own: &[usize]) -> Option<[[f32; 3]; 2]> {
         out[0][k] = values[values.len() * 2 / 100];
         out[1][k] = values[(values.len() - 1) * 98 / 100];
     }
-    Some(out)
+    Some(out.map(|corner| frame.reported(corner)))
 }

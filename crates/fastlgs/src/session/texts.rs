@@ -3,6 +3,7 @@
 use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
 use crate::names::Names;
+use crate::session::phrase;
 use crate::{Result, eyes};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
@@ -66,6 +67,9 @@ impl Texts {
     /// # Errors
     /// An empty text, or a name that was taught with another encoder only.
     pub fn query(&self, text: &str) -> Result<TextQuery> {
+        // What was taught under a name that looks like a phrase is asked for by it.
+        let plain = phrase::normalised(text);
+        let text = if self.is_taught(text) { text } else { plain.as_str() };
         if text.trim().is_empty() {
             bail!("the text is empty; say what to look for");
         }
@@ -85,6 +89,8 @@ impl Texts {
     /// # Errors
     /// When inference fails.
     pub fn queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
+        let plain = |text: &String| if self.of_examples(text).is_some() { text.clone() } else { phrase::normalised(text) };
+        let texts: Vec<String> = texts.iter().map(plain).collect();
         let embeddings = self.encoder.embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
         let query = |(text, embedding): (&String, Vec<f32>)| self.of_examples(text).unwrap_or_else(|| self.worded(text, embedding));
         Ok(texts.iter().zip(embeddings).map(query).collect())

@@ -39,10 +39,11 @@ impl ViewChoice {
     /// # Errors
     /// An unknown view, a damaged camera file, or a scene without views.
     pub fn cameras(&self, folder: &SceneFolder, known: &[Camera]) -> Result<Vec<Camera>> {
+        let frame = || Ok::<_, crate::Error>(folder.manifest()?.frame);
         let chosen = if let Some(path) = &self.camera {
-            vec![Camera::load(path)?]
+            vec![Camera::load(path, &frame()?)?]
         } else if let Some(path) = &self.path {
-            camera_path::read(path)?
+            camera_path::read(path, &frame()?)?
         } else if self.all_views {
             known.to_vec()
         } else if let Some(name) = &self.view {

@@ -14,9 +14,9 @@ use std::path::PathBuf;
 /// Share of the iterations after which masks shape the Gaussians: while these still grow, so that borders get what they need.
 const FROM: f32 = 0.15;
 
-/// The iteration after which masks shape the Gaussians; `Trainer::run` tells of every twentieth.
+/// The iteration after which masks shape the Gaussians; `Trainer::run` reports it.
 pub fn begin_at(iterations: u32) -> u32 {
-    ((iterations as f32 * FROM) as u32).next_multiple_of(20)
+    ((iterations as f32 * FROM) as u32).max(1)
 }
 
 /// Where it is kept what views are trained towards: a run that was broken off goes on with it.

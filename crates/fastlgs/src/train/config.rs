@@ -85,7 +85,7 @@ pub enum Mapping {
     Global,
     /// Algorithm 1 of the paper.
     Paper,
-    /// Those that the scene has; with --init-ply of the trained scene, either feature mode refines what the other made.
+    /// Those that the scene has; with --init of the trained scene, either feature mode refines what the other made.
     Keep,
 }
 
@@ -211,15 +211,15 @@ pub struct Config {
     /// How their number is controlled.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub strategy: Strategy,
-    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init-ply, else the preset's, but 1 where fewer than 25 photos are
+    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init, else the preset's, but 1 where fewer than 25 photos are
     /// trained on.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
     pub sh_degree: Option<u32>,
-    /// Anti-aliasing by the 2-D Mip filter; also where --init-ply names the scene's own Gaussians, which were trained with it.
+    /// Anti-aliasing by the 2-D Mip filter; also where --init names the scene's own Gaussians, which were trained with it.
     #[cfg_attr(feature = "clap", arg(long))]
     pub antialias: bool,
     /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`; by default black, but that which they were trained with
-    /// where --init-ply names the scene's own Gaussians.
+    /// where --init names the scene's own Gaussians.
     #[cfg_attr(feature = "clap", arg(long, value_parser = Background::parse))]
     pub background: Option<Background>,
     /// Learn an affine exposure for each training photo.
@@ -231,12 +231,13 @@ pub struct Config {
     /// Whether Gaussians learn from the masks where things end, with --mapping global and --feature-mode lift.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub borders: Borders,
-    /// Keep geometry and colour as --init-ply gives them; train features only.
-    #[cfg_attr(feature = "clap", arg(long, requires = "init_ply"))]
+    /// Keep geometry and colour as --init gives them; train features only.
+    #[cfg_attr(feature = "clap", arg(long, requires = "init"))]
     pub freeze: bool,
-    /// Start from an existing 3DGS scene instead of points.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
-    pub init_ply: Option<PathBuf>,
+    /// Start from the Gaussians of a file instead of points: .ply (also SuperSplat's compressed), .spz, .sog, .glb or .splat.
+    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", visible_alias = "init-ply"))]
+    #[serde(alias = "init_ply")]
+    pub init: Option<PathBuf>,
     /// How masks become objects.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub mapping: Mapping,
@@ -291,7 +292,7 @@ impl Default for Config {
             align: Align::default(),
             borders: Borders::default(),
             freeze: false,
-            init_ply: None,
+            init: None,
             mapping: Mapping::default(),
             feature_mode: FeatureMode::default(),
             tau: paper.tau,

@@ -56,7 +56,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let mut manifest = folder.manifest()?;
     let given = folder.given_cameras()?;
     // Gaussians that were trained before were trained with the cameras as they are now.
-    let mut cameras = if config.init_ply.is_some() { folder.cameras()? } else { given.clone() };
+    let mut cameras = if config.init.is_some() { folder.cameras()? } else { given.clone() };
     let mut training = manifest.training(&cameras);
     let known = match config.mapping {
         Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(&manifest.encoder), run)?),
@@ -64,8 +64,8 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         Mapping::Global => None,
     };
     let codes = known.as_ref().filter(|_| by_descent);
-    let light = preprocess::Brightness::of(&manifest);
-    let config = &start::as_before(config, &folder, &manifest);
+    let light = preprocess::Brightness::of(&manifest)?;
+    let config = &start::as_before(config, &folder, &manifest)?;
     let background = config.background.unwrap_or_default();
     let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &background, |name| light.gain(name));
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
@@ -76,7 +76,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     clear::take(&mut first);
     let kept_clear = if config.mapping == Mapping::Keep { clear::take(&mut folder.gaussians()?) } else { Gaussians::default() };
     let free = start::free_space(config, &folder, &training, &first)?;
-    if let Some(codes) = codes.filter(|_| config.init_ply.is_none() || config.mapping != Mapping::Keep) {
+    if let Some(codes) = codes.filter(|_| config.init.is_none() || config.mapping != Mapping::Keep) {
         // What most views say: where they disagree, descent from elsewhere ends between their codes.
         objects::lift(&mut first, &folder, &training, codes, config.antialias)?;
     }
@@ -85,7 +85,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
             "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
         );
     }
-    let settings = settings(config, &first, &targets, &manifest, run.seed);
+    let settings = settings(config, &first, &targets, &manifest, run.seed)?;
     let device = device(settings.iterations, run)?;
     let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
     let work = run.work("train", u64::from(settings.iterations));
@@ -179,7 +179,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         exposure: settings.exposure,
         alignment_gain: result.alignment_gain,
         aligned,
-        borders: settings.couples_at.is_some(),
+        borders: settings.couples_at.is_some() && result.iterations > 0,
         antialias: settings.antialias,
         background: [r, g, b],
         size: format!("{}x{}", cameras[0].width, cameras[0].height),

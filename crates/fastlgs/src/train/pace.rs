@@ -67,7 +67,7 @@ fn rounded(iterations: f64) -> u32 {
 fn trial(config: &Config, folder: &SceneFolder, manifest: &Manifest, targets: &Targets, run: &Run) -> Result<[f64; 2]> {
     let short = Config { iterations: Some(TRIAL), ..config.clone() };
     let first = start::gaussians(&short, folder, targets, run)?;
-    let settings = settings(&short, &first, targets, manifest, run.seed);
+    let settings = settings(&short, &first, targets, manifest, run.seed)?;
     let engine = fastlgs_raster::open_engine_as(&device(MOST, run)?.device, config.shape)?;
     let work = run.work("trial", u64::from(TRIAL));
     let couples_at = settings.couples_at;

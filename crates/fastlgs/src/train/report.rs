@@ -1,14 +1,14 @@
 //! What `train` reports, and the scene remembers.
 
 use super::config::{FeatureMode, Mapping, Preset};
-use crate::objects;
 use crate::progress::TrainStep;
+use crate::{Error, Result, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_raster::budget::Removal;
 use fastlgs_raster::{Choice, Shape, View};
 use serde::{Deserialize, Serialize};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What training found; also the manifest's note of it.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -91,9 +91,19 @@ impl From<TrainStep> for CurvePoint {
 const NOTE: &str = "train";
 
 impl Report {
-    /// How a scene was trained; nothing where it was not, or was preprocessed again since.
-    pub fn of(manifest: &Manifest) -> Option<Self> {
-        manifest.notes.get(NOTE).map(|note| serde_json::from_value(note.clone()).unwrap_or_default())
+    /// How the scene in a folder was trained; nothing where it was not, or was preprocessed again since.
+    ///
+    /// # Errors
+    /// A note that cannot be read: without it the scene would be drawn with another background and filter.
+    pub fn of(manifest: &Manifest, root: &Path) -> Result<Option<Self>> {
+        let Some(note) = manifest.notes.get(NOTE) else { return Ok(None) };
+        let read = serde_json::from_value(note.clone()).map_err(|error| {
+            let root = root.display();
+            Error::Invalid(format!(
+                "{root}/scene.json: the note of its training cannot be read ({error}); run 'fastlgs train {root}' again"
+            ))
+        });
+        read.map(Some)
     }
 
     /// The frame of a camera, in the way the scene was trained.
@@ -105,7 +115,7 @@ impl Report {
     }
 
     /// Notes it in the manifest.
-    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {
+    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<()> {
         manifest.notes.insert(NOTE.to_owned(), serde_json::to_value(self)?);
         Ok(())
     }

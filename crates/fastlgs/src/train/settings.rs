@@ -27,10 +27,10 @@ pub fn device(iterations: u32, run: &Run) -> Result<Choice> {
 }
 
 /// What the trainer is told: options, else what the preset says.
-pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> TrainConfig {
+pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> Result<TrainConfig> {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
-    TrainConfig {
+    Ok(TrainConfig {
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
@@ -44,7 +44,7 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
             // As the paper's authors train.
             (false, true) => Channels::Coupled,
         },
-        sh_degree: config.sh_degree.unwrap_or(if config.init_ply.is_some() { first.sh_degree } else { config.degree(views.len()) }),
+        sh_degree: config.sh_degree.unwrap_or(if config.init.is_some() { first.sh_degree } else { config.degree(views.len()) }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
         couples_at: config.masks_shape(&manifest.segmenter).then(|| borders::begin_at(config.iterations())),
@@ -52,7 +52,7 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
         background: background.color,
         learn_background: background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => Brightness::of(manifest).spread_stops >= VARYING,
+            Exposures::Auto => Brightness::of(manifest)?.spread_stops >= VARYING,
             Exposures::On => true,
             Exposures::Off => false,
         },
@@ -62,5 +62,5 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
             Align::Off => Alignment::Off,
         },
         ..TrainConfig::default()
-    }
+    })
 }

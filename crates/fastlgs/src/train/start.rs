@@ -6,7 +6,7 @@ use crate::error::bail;
 use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_core::{Camera, Gaussians, SceneFolder, image_io, ply};
+use fastlgs_core::{Camera, Gaussians, SceneFolder, WorldFrame, image_io, splat_file};
 use fastlgs_grid::Grid;
 use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
 use std::path::{Path, PathBuf};
@@ -19,11 +19,11 @@ const ENOUGH: usize = 5000;
 
 /// The given PLY, else the scene's points: with a backdrop where photos are few, and random ones where all these are too few.
 pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
-    if let Some(path) = &config.init_ply {
-        let first = ply::read(path)?;
-        if first.is_empty() {
-            bail!("{}: it has no Gaussians; name the PLY of a trained scene", path.display());
-        }
+    if let Some(path) = &config.init {
+        // The scene's own file is in its own coordinates.
+        let frame = if is_own(folder, path) { WorldFrame::default() } else { folder.manifest()?.frame };
+        let (first, warning) = splat_file::read(path, &frame)?;
+        warning.into_iter().for_each(|warning| run.warn(&warning));
         return Ok(first);
     }
     let mut rng = Rng::new(run.seed, "init");
@@ -50,13 +50,18 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     Ok(first)
 }
 
-/// The options, with what the scene's own Gaussians were trained with where training starts from these and nothing else was asked for.
-pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> Config {
+/// Whether a file is the scene's own.
+fn is_own(folder: &SceneFolder, path: &Path) -> bool {
     let place = |path: &Path| path.canonicalize().ok();
-    let is_own = |first: &&PathBuf| place(first).is_some_and(|first| Some(first) == place(&folder.ply_path()));
-    let earlier = config.init_ply.as_ref().filter(is_own).and_then(|_| Report::of(manifest)).unwrap_or_default();
+    place(path).is_some_and(|path| Some(path) == place(&folder.ply_path()))
+}
+
+/// The options, with what the scene's own Gaussians were trained with where training starts from these and nothing else was asked for.
+pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> Result<Config> {
+    let own = config.init.as_ref().filter(|path| is_own(folder, path));
+    let earlier = if own.is_some() { Report::of(manifest, &folder.root)?.unwrap_or_default() } else { Report::default() };
     let background = config.background.unwrap_or(Background { color: earlier.background, learn: false });
-    Config { background: Some(background), antialias: config.antialias || earlier.antialias, ..config.clone() }
+    Ok(Config { background: Some(background), antialias: config.antialias || earlier.antialias, ..config.clone() })
 }
 
 /// What the views of `cameras` look through, where density control asks for it.

@@ -1,0 +1,43 @@
+//! Files of Gaussians in all formats that are read: PLY (also SuperSplat's compressed one), SPZ, SOG, glTF and .splat.
+
+use crate::{Error, Gaussians, Result, WorldFrame, fs, glb, ply, sog, splat, spz};
+use std::path::Path;
+
+/// Endings of the files that are read.
+pub const ENDINGS: [&str; 5] = ["ply", "spz", "sog", "glb", "splat"];
+
+/// Reads a file as its ending says, its positions in the coordinates of the world, into the frame of a scene; and a sentence about Gaussians that
+/// cannot be drawn and were dropped.
+///
+/// # Errors
+/// Another ending, a file without Gaussians, and those of the formats.
+pub fn read(path: &Path, frame: &WorldFrame) -> Result<(Gaussians, Option<String>)> {
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let (scene, warning) = match ending.as_str() {
+        "ply" => ply::parse_in(path, &fs::read(path)?, frame)?,
+        "spz" => in_frame(path, spz::read(path)?, frame),
+        "sog" => in_frame(path, sog::read(path)?, frame),
+        // Its node has the frame's scale.
+        "glb" => in_frame(path, glb::read(path)?, &WorldFrame::default()),
+        "splat" => in_frame(path, splat::read(path)?, frame),
+        _ => {
+            let known = ENDINGS.map(|ending| format!(".{ending}")).join(", ");
+            return Err(Error::format(path, format!("its ending is none of those that are read: {known}")));
+        }
+    };
+    if scene.is_empty() {
+        return Err(Error::format(path, "it has no Gaussians; name the file of a trained scene"));
+    }
+    Ok((scene, warning))
+}
+
+/// Formats of few bits, and glTF's nodes, hold positions relative to the frame's origin, which is what they were written with.
+fn in_frame(path: &Path, mut scene: Gaussians, frame: &WorldFrame) -> (Gaussians, Option<String>) {
+    let warning = scene.drop_invalid().map(|dropped| format!("{}: {dropped}", path.display()));
+    if frame.scale != 1.0 {
+        let shift = frame.scale.ln() as f32;
+        scene.means.iter_mut().for_each(|mean| *mean /= frame.scale as f32);
+        scene.log_scales.iter_mut().for_each(|scale| *scale -= shift);
+    }
+    (scene, warning)
+}

@@ -1,0 +1,79 @@
+//! Texts as they are compared: the same words typed, pasted or spoken of in another way are the same text.
+
+use unicode_normalization::UnicodeNormalization;
+
+/// Words before a name that do not change what it means.
+const ARTICLES: [&str; 3] = ["a", "an", "the"];
+
+/// Characters that show nothing: a byte order mark, joiners, and marks of direction.
+fn is_invisible(c: char) -> bool {
+    matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2064}' | '\u{feff}')
+}
+
+/// Quotes, brackets, hyphens and other marks that separate words.
+fn separates(c: char) -> bool {
+    c.is_whitespace()
+        || c.is_control()
+        || "\"`\u{b4}\u{ab}\u{bb}()[]{}<>-_\u{2010}\u{2011}\u{2012}\u{2013}\u{2014}\u{2015}\u{2212}".contains(c)
+        || ('\u{2018}'..='\u{201f}').contains(&c)
+}
+
+/// A text without articles, quotes, brackets, hyphens and characters that show nothing, its letters composed (NFC), one space between words. A text of
+/// nothing else is empty.
+pub fn normalised(text: &str) -> String {
+    let composed: String = text.nfc().filter(|c| !is_invisible(*c)).collect();
+    let characters: Vec<char> = composed.chars().collect();
+    let letter = |at: Option<usize>| at.and_then(|k| characters.get(k)).is_some_and(|c| c.is_alphanumeric());
+    let plain = |(k, c): (usize, &char)| match c {
+        // Within a word it is an apostrophe.
+        '\'' | '\u{2019}' if letter(k.checked_sub(1)) && letter(Some(k + 1)) => '\'',
+        '\'' => ' ',
+        c if separates(*c) => ' ',
+        c => *c,
+    };
+    let spaced: String = characters.iter().enumerate().map(plain).collect();
+    let mut words: Vec<&str> = spaced.split_whitespace().collect();
+    if let Some(first) = words.first_mut() {
+        *first = first.trim_start_matches(|c: char| ".,;:!?\u{bf}\u{a1}".contains(c));
+    }
+    if let Some(last) = words.last_mut() {
+        *last = last.trim_end_matches(|c: char| ".,;:!?".contains(c));
+    }
+    words.retain(|word| !word.is_empty());
+    while words.len() > 1 && ARTICLES.iter().any(|article| words[0].eq_ignore_ascii_case(article)) {
+        words.remove(0);
+    }
+    words.join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_same_words_are_the_same_text() {
+        for text in [
+            "red bottle",
+            "a red bottle",
+            "The red bottle.",
+            "an  red\tbottle",
+            "\"red bottle\"",
+            "\u{201c}red bottle\u{201d}",
+            "'red bottle'",
+            "(red bottle)",
+            "[red] bottle",
+            "\u{feff}red bottle",
+            "red\u{200b} bottle",
+            "red-bottle",
+            "red_bottle",
+            "red \u{2014} bottle?",
+            "the a red bottle",
+        ] {
+            assert_eq!(normalised(text), "red bottle", "{text:?}");
+        }
+        assert_eq!(normalised("cafe\u{301}"), normalised("caf\u{e9}"));
+        assert_eq!(normalised("the child\u{2019}s toy"), "child's toy");
+        assert_eq!(["a", "The", "A4 sheet", "3.5 inch disk"].map(normalised), ["a", "The", "A4 sheet", "3.5 inch disk"]);
+        assert_eq!(["", "  ", "\u{200b}", "\"\"", "?"].map(normalised), [""; 5]);
+    }
+}
