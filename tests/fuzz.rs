@@ -4,9 +4,10 @@
 //! `target/fuzz/PARSER`, from which later runs go on. `FASTLGS_FUZZ_SECONDS` sets the time for each parser (default 0.5; `./test.sh --all` gives each 5).
 
 use fastlgs_core::compact::{self, Precision};
+use fastlgs_core::mask_list::annotations;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Camera, Gaussians, camera_path, dataset, fs, image_io, labels, npy, ply, sog, spz};
+use fastlgs_core::{Camera, Gaussians, WorldFrame, camera_path, dataset, fs, glb, image_io, labels, npy, ply, sog, splat, spz};
 use glam::Vec3;
 use image::{GrayImage, Luma, RgbImage};
 use std::collections::BTreeSet;
@@ -116,6 +117,31 @@ fn some_camera() -> Camera {
     Camera::look_at("a.png", Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::Y, 8, 6, 0.8)
 }
 
+/// One chunk with one Gaussian.
+fn compressed_ply() -> Vec<u8> {
+    let bounds =
+        ["x", "y", "z", "scale_x", "scale_y", "scale_z"].map(|name| ["min", "max"].map(|side| format!("property float {side}_{name}\n")));
+    let packed = ["position", "rotation", "scale", "color"].map(|name| format!("property uint packed_{name}\n"));
+    let elements = format!("element chunk 1\n{}element vertex 1\n{}", bounds.as_flattened().concat(), packed.concat());
+    [format!("ply\nformat binary_little_endian 1.0\n{elements}end_header\n").into_bytes(), vec![0; 12 * 4 + 4 * 4]].concat()
+}
+
+/// Version 4 with one Gaussian: a header, a table of five streams, and each stream as one raw block of Zstandard.
+fn spz_4() -> Vec<u8> {
+    let lengths = [9u8, 1, 3, 3, 4];
+    let mut data = [0x5053_474e_u32.to_le_bytes(), 4u32.to_le_bytes(), 1u32.to_le_bytes(), [0, 12, 0, 5], 32u32.to_le_bytes()].concat();
+    data.resize(32, 0);
+    let frame = |length: u8| {
+        [&[0x28, 0xb5, 0x2f, 0xfd, 0x20, length], [length << 3 | 1, 0, 0].as_slice(), &vec![128; usize::from(length)]].concat()
+    };
+    for length in lengths {
+        data.extend((frame(length).len() as u64).to_le_bytes());
+        data.extend(u64::from(length).to_le_bytes());
+    }
+    data.extend(lengths.into_iter().flat_map(frame));
+    data
+}
+
 fn targets() -> Vec<Target> {
     let camera = some_camera();
     let target = |name, file, prepare, seed, parse| Target { name, file, prepare, seed, parse };
@@ -125,6 +151,19 @@ fn targets() -> Vec<Target> {
         target("ply", "a.ply", nothing, written(|p| ply::write(p, &scene()).expect("a file")), |f| ply::read(&f.join("a.ply")).map(|_| ())),
         target("spz", "a.spz", nothing, written(|p| spz::write(p, &scene()).expect("a file")), |f| spz::read(&f.join("a.spz")).map(|_| ())),
         target("sog", "a.sog", nothing, written(|p| sog::write(p, &scene()).expect("a file")), |f| sog::read(&f.join("a.sog")).map(|_| ())),
+        target("splat", "a.splat", nothing, vec![64; 96], |f| splat::read(&f.join("a.splat")).map(|_| ())),
+        target("compressed_ply", "a.ply", nothing, compressed_ply(), |f| ply::read(&f.join("a.ply")).map(|_| ())),
+        target("glb", "a.glb", nothing, written(|p| glb::write(p, &scene(), Vec3::Y, &WorldFrame::default()).expect("a file")), |f| {
+            glb::read(&f.join("a.glb")).map(|_| ())
+        }),
+        target("spz_4", "a.spz", nothing, spz_4(), |f| spz::read(&f.join("a.spz")).map(|_| ())),
+        target(
+            "annotations",
+            "a.json",
+            nothing,
+            br#"{"images": [{"id": 1, "file_name": "a.png", "width": 8, "height": 6}], "annotations": [{"image_id": 1, "segmentation": [[1, 1, 5, 1, 5, 4.5]], "track_id": "x"}]}"#.to_vec(),
+            |f| annotations::load(&f.join("a.json"), Some("a.png"), None).map(|_| ()),
+        ),
         target("compact", "a.safetensors", nothing, written(|p| compact::write(p, &scene(), &Precision::default()).expect("a file")), |f| {
             compact::read(&f.join("a.safetensors")).map(|_| ())
         }),
@@ -132,9 +171,9 @@ fn targets() -> Vec<Target> {
             load_tensors(&f.join("t.safetensors")).map(|_| ())
         }),
         target("npy", "a.npy", nothing, npy_file("(2, 3)", &[0.5; 6]), |f| npy::read(&f.join("a.npy")).map(|_| ())),
-        target("camera", "camera.json", nothing, serde_json::to_vec(&camera).expect("JSON"), |f| Camera::load(&f.join("camera.json")).map(|_| ())),
-        target("camera_path", "path.json", nothing, written(|p| camera_path::write(p, &[some_camera()]).expect("a file")), |f| {
-            camera_path::read(&f.join("path.json")).map(|_| ())
+        target("camera", "camera.json", nothing, serde_json::to_vec(&camera).expect("JSON"), |f| Camera::load(&f.join("camera.json"), &WorldFrame::default()).map(|_| ())),
+        target("camera_path", "path.json", nothing, written(|p| camera_path::write(p, &[some_camera()], &WorldFrame::default()).expect("a file")), |f| {
+            camera_path::read(&f.join("path.json"), &WorldFrame::default()).map(|_| ())
         }),
         target(
             "lerf_labels",

@@ -129,6 +129,6 @@ mod tests {
 
         std::fs::write(&path, r#"{"render_height":4,"render_width":4,"camera_path":[{"camera_to_world":[1,2],"fov":50}]}"#).unwrap();
         assert!(read(&path, &WorldFrame::default()).unwrap_err().to_string().contains("frame 0 has 2 numbers"));
-        assert!(write(&path, &[]).is_err());
+        assert!(write(&path, &[], &WorldFrame::default()).is_err());
     }
 }

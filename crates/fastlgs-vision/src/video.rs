@@ -6,6 +6,7 @@ use crate::photo_quality::Impression;
 use crate::printed::lines;
 use crate::{Error, Result};
 use image::GrayImage;
+use serde::Deserialize;
 use std::collections::VecDeque;
 use std::io::{BufReader, Read};
 use std::path::Path;
@@ -56,9 +57,64 @@ fn write(video: &Path, frames: Vec<u32>, images: &Path) -> Result<usize> {
     std::fs::create_dir_all(images).map_err(fastlgs_core::Error::io(images))?;
     let these = frames.iter().map(|n| format!("eq(n,{n})")).collect::<Vec<_>>().join("+");
     // Times without gaps: else frames would be repeated to fill them.
-    let filter = format!("fps={RATE},select='{these}',setpts=N/({RATE}*TB)");
-    Ffmpeg::start(video, images, &filter, &["-r", &RATE.to_string(), "-q:v", "2", "%04d.jpg"])?.finish()?;
+    // By way of RGB: JPEG has one matrix of colours, videos have several.
+    let filter = format!("fps={RATE},select='{these}',setpts=N/({RATE}*TB),format=rgb24");
+    Ffmpeg::start(video, images, &filter, &["-r", &RATE.to_string(), "-pix_fmt", "yuvj420p", "-q:v", "2", "%04d.jpg"])?.finish()?;
     Ok(frames.len())
+}
+
+/// What ffprobe says about the pictures of a video.
+#[derive(Default, Deserialize)]
+struct Stream {
+    #[serde(default)]
+    color_transfer: String,
+    #[serde(default)]
+    color_primaries: String,
+    #[serde(default)]
+    color_space: String,
+    #[serde(default)]
+    sample_aspect_ratio: String,
+}
+
+#[derive(Default, Deserialize)]
+struct Probe {
+    #[serde(default)]
+    streams: Vec<Stream>,
+}
+
+impl Stream {
+    /// Asks ffprobe; as if nothing were known where it is missing or fails, since ffmpeg names what is wrong.
+    fn of(video: &Path) -> Self {
+        let entries = "stream=color_transfer,color_primaries,color_space,sample_aspect_ratio";
+        let mut command = Command::new("ffprobe");
+        command.args(["-v", "error", "-select_streams", "v:0", "-show_entries", entries, "-of", "json"]).arg(video);
+        let output = command.output().map(|output| output.stdout).unwrap_or_default();
+        serde_json::from_slice::<Probe>(&output).unwrap_or_default().streams.into_iter().next().unwrap_or_default()
+    }
+
+    /// Filters that make of its pictures what a camera for photos would have taken: bright parts of HDR (HLG, PQ) mapped to standard range, with white
+    /// at 203 cd/m2 (ITU-R BT.2408), and square pixels.
+    fn corrections(&self) -> String {
+        let mut filters = Vec::new();
+        if matches!(self.color_transfer.as_str(), "arib-std-b67" | "smpte2084") {
+            let known = |tag: &str| !matches!(tag, "" | "unknown" | "unspecified" | "reserved");
+            let primaries = if known(&self.color_primaries) { "" } else { ":pin=bt2020" };
+            let matrix = if known(&self.color_space) { "" } else { ":min=bt2020nc" };
+            filters.push(format!(
+                "zscale=t=linear:npl=203{primaries}{matrix},format=gbrpf32le,zscale=p=bt709,tonemap=clip,\
+                 zscale=t=bt709:m=bt709:r=tv,format=yuv420p"
+            ));
+        }
+        let sides: Option<Vec<u32>> = self.sample_aspect_ratio.split(':').map(|side| side.parse().ok()).collect();
+        if let Some([width, height]) = sides.as_deref()
+            && width != height
+            && *width > 0
+            && *height > 0
+        {
+            filters.push("scale='max(2,trunc(iw*sar/2)*2)':ih,setsar=1".to_owned());
+        }
+        filters.iter().map(|filter| format!("{filter},")).collect()
+    }
 }
 
 /// ffmpeg at work on a video.
@@ -73,8 +129,9 @@ impl<'a> Ffmpeg<'a> {
     /// Sends the pictures of a video through a filter; outputs without a folder are written to `folder`.
     fn start(video: &'a Path, folder: &Path, filter: &str, output: &[&str]) -> Result<Self> {
         let absolute = std::path::absolute(video).map_err(fastlgs_core::Error::io(video))?;
+        let filter = format!("{}{filter}", Stream::of(&absolute).corrections());
         let mut command = Command::new("ffmpeg");
-        command.args(["-nostdin", "-v", "error", "-i"]).arg(absolute).args(["-map", "0:v:0", "-vf", filter]).args(output);
+        command.args(["-nostdin", "-v", "error", "-i"]).arg(absolute).args(["-map", "0:v:0", "-vf", &filter]).args(output);
         let mut child = command.current_dir(folder).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(|_| {
             let mend = "install it ('apt-get install ffmpeg'), or give a folder of photos";
             Error::Missing(format!("{}: videos are read by ffmpeg, which cannot be started; {mend}", video.display()))
@@ -260,6 +317,56 @@ mod tests {
             }
         }
         imageops::blur(&wall, 0.8)
+    }
+
+    /// Runs ffmpeg; false where it is missing or lacks what is asked for.
+    fn ffmpeg(arguments: &[&str]) -> bool {
+        Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-y"]).args(arguments).status().is_ok_and(|status| status.success())
+    }
+
+    /// The first frame that becomes a photo of a video.
+    fn first_photo(video: &Path) -> image::RgbImage {
+        let images = video.with_extension("images");
+        write(video, vec![0, 2, 4], &images).unwrap();
+        fastlgs_core::image_io::load_rgb(&images.join("0001.jpg")).unwrap()
+    }
+
+    #[test]
+    fn pixels_become_square_and_hdr_looks_like_photos() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |name: &str| dir.path().join(name);
+        let wide = at("wide.mkv");
+        let source = ["-f", "lavfi", "-i", "testsrc2=size=160x120:rate=15:duration=1"];
+        let made = |filter: &str, codec: &[&str], path: &Path| {
+            let output = path.to_string_lossy().into_owned();
+            ffmpeg(&[source.as_slice(), &["-vf", filter], codec, &[&output]].concat())
+        };
+        if !made("setsar=3/2", &["-c:v", "ffv1"], &wide) {
+            println!("skipped: ffmpeg is missing");
+            return;
+        }
+        assert_eq!(first_photo(&wide).dimensions(), (240, 120));
+        let plain = at("plain.mkv");
+        let tagged = "format=yuv420p,setparams=color_primaries=bt709:color_trc=bt709:colorspace=bt709:range=tv";
+        assert!(made(tagged, &["-c:v", "ffv1"], &plain));
+        let truth = first_photo(&plain);
+        for (transfer, tag) in [("arib-std-b67", "hlg"), ("smpte2084", "pq")] {
+            let path = at(&format!("{tag}.mkv"));
+            // Standard white at 203 cd/m2, as broadcasters convert it.
+            let up = format!(
+                "{tagged},zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt2020:t={transfer}:m=bt2020nc:r=tv:npl=203,format=yuv420p10le"
+            );
+            let tags = ["-c:v", "ffv1", "-color_trc", transfer, "-color_primaries", "bt2020", "-colorspace", "bt2020nc"];
+            if !made(&up, &tags, &path) {
+                println!("skipped: ffmpeg has no zscale");
+                return;
+            }
+            let shown = first_photo(&path);
+            let squares = shown.as_raw().iter().zip(truth.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum::<f64>();
+            let psnr = -10.0 * (squares / truth.as_raw().len() as f64 / 255.0f64.powi(2)).log10();
+            // As it is stored it is at 12 dB; what is left is the loss of colours out of range.
+            assert!(psnr > 22.0, "{tag}: {psnr} dB from the colours before");
+        }
     }
 
     #[test]

@@ -225,8 +225,27 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     }
 }
 
+/// A Gaussian whose opacity reaches its limit only by the gain of DropGaussian: light that wants more of it moves nothing.
+fn check_limit(engine: &mut dyn Engine) {
+    let mut scene = Gaussians::default();
+    // 0.9 / (1 - 0.2) is above the largest opacity.
+    scene.push_sphere(Vec3::ZERO, 1.0, 0.9, [1.0; 3]);
+    let (w, h) = (SIZE.0 as u32, SIZE.1 as u32);
+    let drawn = |draw: u32| View::new(&camera(w, h), 1, 0).without(0.2, draw);
+    let is_drawn = |view: &View| crate::cpu::pcg3d(glam::UVec3::new(0, view.draw, 2)).x >= view.dropped;
+    let view = (0..).map(drawn).find(is_drawn).expect("most draws leave it in");
+    engine.set_state(&State::of(&scene)).unwrap();
+    let target = TargetImage { size: view.size, color: vec![pack([255; 3], true); SIZE.0 * SIZE.1], feature: Vec::new() };
+    engine.set_target(0, target).unwrap();
+    let exposure = Exposure { gain: [1.0; 3], offset: [0.0; 3] };
+    let options = StepOptions { channels: Channels::Color, lambda: 0.0, feature_weight: 0.0, exposure };
+    engine.step(view, 0, &options, &Step::new(1, 0..channels_of(0), &[0.0; BASE_CHANNELS + 1])).unwrap();
+    assert_eq!(engine.gradients().unwrap()[10], 0.0, "{}", engine.name());
+}
+
 #[test]
 fn on_the_cpu() {
+    check_limit(&mut CpuEngine::new());
     for (sh_degree, antialias) in [(0, 0), (1, 1), (2, 0), (3, 1)] {
         check(&mut CpuEngine::new(), sh_degree, antialias);
     }
@@ -236,6 +255,7 @@ fn on_the_cpu() {
 fn on_the_gpu() {
     for gpu in shaped() {
         let mut engine = GpuEngine::new(gpu);
+        check_limit(&mut engine);
         for (sh_degree, antialias) in [(0, 1), (1, 0), (2, 1), (3, 0)] {
             check(&mut engine, sh_degree, antialias);
         }
