@@ -123,6 +123,10 @@ fn only_those_may_ask_who_should() {
     assert!(own.token.is_none());
     assert_eq!((host(&own, "localhost:80"), host(&own, "[::1]:80"), host(&own, "evil.example")), (200, 200, 403));
 
+    // A proxy on this machine that keeps its own name as host.
+    let behind = Served::start(&["serve", text(scene), "--bind", "127.0.0.1:0", "--device", "cpu", "--host-name", "scenes.example"]);
+    assert_eq!((host(&behind, "scenes.example"), host(&behind, "localhost"), host(&behind, "evil.example")), (200, 200, 403));
+
     let mut open = Served::start(&["serve", text(scene), "--bind", "0.0.0.0:0", "--device", "cpu"]);
     open.url = open.url.replace("0.0.0.0", "127.0.0.1");
     let token = open.token.clone().expect("a token");

@@ -230,6 +230,16 @@ impl Gaussians {
         Some(format!("{} of {all} Gaussians were dropped: {}", all - kept.len(), why.join("; ")))
     }
 
+    /// The scene with y and z of the other sign: half a turn about x, from the axes of one program to those of another.
+    pub fn with_y_and_z_flipped(mut self) -> Self {
+        let flip = Vec3::new(1.0, -1.0, -1.0);
+        self.means.iter_mut().for_each(|mean| *mean *= flip);
+        self.rotations.iter_mut().for_each(|[_, _, y, z]| (*y, *z) = (-*y, -*z));
+        let width = rest_len(self.sh_degree).max(1);
+        self.sh_rest.iter_mut().enumerate().for_each(|(k, value)| *value *= SH_SIGNS[k % width]);
+        self
+    }
+
     /// The scene without Gaussians that lie so far outside that formats of few bits would spend their range on them; and how many these were.
     pub fn without_far_outliers(&self) -> (Self, usize) {
         let median = |mut values: Vec<f32>| {
@@ -245,6 +255,8 @@ impl Gaussians {
     }
 }
 
+/// Signs of the SH coefficients above degree 0 when y and z change theirs.
+pub(crate) const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 /// Logit of the opacity that stands for one of exactly 1; its negative for 0.
 const SOLID: f32 = 7.0;
 /// Distance from the middle of a scene, in medians of all, beyond which a Gaussian shows nothing of it.

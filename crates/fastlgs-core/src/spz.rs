@@ -6,7 +6,7 @@
 //!
 //! The format's axes are right, up, back; PLY files of 3DGS are taken to be right, down, front, so y and z change sign.
 
-use crate::gaussians::{MAX_SH_DEGREE, logit, rest_len, sigmoid};
+use crate::gaussians::{MAX_SH_DEGREE, SH_SIGNS, logit, rest_len, sigmoid};
 use crate::{Error, Gaussians, Result, fs};
 use flate2::Compression;
 use flate2::read::GzDecoder;
@@ -24,9 +24,6 @@ const HEADER: usize = 16;
 const COLOR_SCALE: f32 = 0.15;
 /// Largest coordinate in units of the fixed point.
 const POSITION_RANGE: f32 = 8_388_607.0;
-
-/// Signs of the SH coefficients above degree 0 when y and z change theirs.
-const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
 fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8

@@ -26,6 +26,8 @@ const PATIENT_FOR: Duration = Duration::from_secs(60);
 /// What every request is checked against.
 pub struct Guard {
     loopback: bool,
+    /// Names under which a proxy on this machine passes requests on.
+    hosts: Vec<String>,
     /// Hexadecimal digits that requests must know; nothing on the loopback.
     pub token: Option<String>,
     places: Semaphore,
@@ -33,13 +35,13 @@ pub struct Guard {
 
 impl Guard {
     /// The guard of a server at `address`; with a new token unless that is the machine itself.
-    pub fn new(address: SocketAddr) -> anyhow::Result<Self> {
+    pub fn new(address: SocketAddr, hosts: &[String]) -> anyhow::Result<Self> {
         let loopback = address.ip().is_loopback();
         let mut secret = [0u8; 16];
         // The one thing that must not follow from --seed.
         getrandom::fill(&mut secret).map_err(|e| anyhow::anyhow!("the system gives no random numbers for the token: {e}"))?;
         let token = (!loopback).then(|| secret.iter().map(|b| format!("{b:02x}")).collect());
-        Ok(Self { loopback, token, places: Semaphore::new(AT_ONCE) })
+        Ok(Self { loopback, hosts: hosts.to_vec(), token, places: Semaphore::new(AT_ONCE) })
     }
 
     /// Whether a request may pass. A foreign page that had its name resolve to this machine would send that name as host.
@@ -48,9 +50,15 @@ impl Guard {
             let host = request.headers.get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or_default();
             let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
             let bare = name.trim_start_matches('[').trim_end_matches(']');
-            let own = bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
+            let known = self.hosts.iter().any(|host| host.eq_ignore_ascii_case(bare));
+            let own = known || bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
             if !own {
-                return Some(Failure::new(StatusCode::FORBIDDEN, format!("this server is not '{name}'; use its loopback address")));
+                return Some(Failure::new(
+                    StatusCode::FORBIDDEN,
+                    format!(
+                        "this server is not '{name}'; use its loopback address, or start it with --host-name {bare} behind a proxy of that name"
+                    ),
+                ));
             }
             // Browsers say whose page asks. One may lead here, and nothing more.
             let from = request.headers.get("sec-fetch-site").and_then(|h| h.to_str().ok()).unwrap_or_default();

@@ -37,13 +37,13 @@ pub struct Server {
 }
 
 impl Server {
-    /// Binds and answers from now on. With `live` the scene is still in training; without it, [`Self::open_scene`] must follow.
-    pub fn start(folder: &SceneFolder, bind: SocketAddr, live: Option<Arc<Live>>) -> Result<Self> {
+    /// Binds and answers from now on; on the loopback also under the names `hosts` of a proxy. With `live` the scene is still in training; without it, [`Self::open_scene`] must follow.
+    pub fn start(folder: &SceneFolder, bind: SocketAddr, live: Option<Arc<Live>>, hosts: &[String]) -> Result<Self> {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
         let listener = runtime.block_on(TcpListener::bind(bind));
         let listener = listener.with_context(|| format!("{bind} cannot be listened on; name another address with --bind"))?;
         let address = listener.local_addr()?;
-        let guard = Arc::new(Guard::new(address)?);
+        let guard = Arc::new(Guard::new(address, hosts)?);
         let url = match &guard.token {
             Some(token) => format!("http://{address}/?token={token}"),
             None => format!("http://{address}/"),

@@ -21,6 +21,9 @@ pub struct Args {
     /// Address to listen on: IP, PORT or IP:PORT; port 0 takes a free one.
     #[arg(long, default_value = DEFAULT_BIND, value_parser = parse_bind)]
     bind: SocketAddr,
+    /// The name of a proxy on this machine that passes requests on with its own name as host, as nginx can; may be repeated.
+    #[arg(long, value_name = "NAME")]
+    host_name: Vec<String>,
     /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
     #[arg(long, value_name = "FILE")]
     clip_text: Option<PathBuf>,
@@ -32,7 +35,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     if scene.is_empty() {
         bail!("{}: the scene has no Gaussians; train it again", args.scene.display());
     }
-    let server = Server::start(&folder, args.bind, None)?;
+    let server = Server::start(&folder, args.bind, None, &args.host_name)?;
     server.set_focus(&scene.means);
     drop(scene);
     server.open_scene(&common.device, args.clip_text.clone())?;

@@ -42,7 +42,7 @@ pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcom
     };
     let config = &args.config;
     let live = Live::new(config.iterations(), config.antialias, config.background.unwrap_or_default().color);
-    let server = Server::start(&SceneFolder::open(&config.scene)?, bind, Some(Arc::new(live)))?;
+    let server = Server::start(&SceneFolder::open(&config.scene)?, bind, Some(Arc::new(live)), &[])?;
     // Standard output is the report's.
     eprintln!("watch it at {}", server.url);
     let report = train::train(config, &common.run(&Both(console, &server)))?;

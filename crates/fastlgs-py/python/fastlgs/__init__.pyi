@@ -1,6 +1,6 @@
 import pathlib
 from os import PathLike
-from typing import Any, Callable, Dict, Iterable, List, Literal, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Iterable, List, Literal, Mapping, Optional, Sequence, Tuple, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,7 +157,7 @@ def preprocess(
     photos: Path,
     output: Path,
     *,
-    masks: Optional[Iterable[OwnMasks]] = None,
+    masks: Optional[Union[Iterable[OwnMasks], Mapping[str, Any]]] = None,
     progress: Optional[Progress] = None,
     device: str = "auto",
     seed: int = 0,
@@ -165,7 +165,8 @@ def preprocess(
 ) -> Dict[str, Any]:
     """Photos to masks, key points, poses and points. Options are those of `fastlgs preprocess`, with underscores.
 
-    `masks`, of all photos, are written beside the photos and taken instead of the offline ones.
+    `masks`, of all photos, are written beside the photos and taken instead of the offline ones. A dict has the names of the photos as keys, and
+    masks or (masks, embeddings) as values.
     """
 
 def write_masks(

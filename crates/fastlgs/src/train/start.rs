@@ -8,7 +8,8 @@ use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, WorldFrame, image_io, splat_file};
 use fastlgs_grid::Grid;
-use fastlgs_raster::{FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, init, pack};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, View, init, pack};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -24,7 +25,7 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
         let frame = if is_own(folder, path) { WorldFrame::default() } else { folder.manifest()?.frame };
         let (first, warning) = splat_file::read(path, &frame)?;
         warning.into_iter().for_each(|warning| run.warn(&warning));
-        return Ok(first);
+        return if is_own(folder, path) { Ok(first) } else { with_axes_of_photos(first, path, views, config, run) };
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
@@ -47,6 +48,41 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
         first.log_scales.iter_mut().for_each(|s| *s += MCMC_SCALE.ln());
     }
     first.append(behind);
+    Ok(first)
+}
+
+/// Training views by which the axes of a file of another program are checked.
+const CHECKED_VIEWS: usize = 4;
+/// How many times smaller the squared error must be with turned axes.
+const PLAIN: f64 = 2.0;
+
+/// Gaussians of another program, in the axes of the photos' poses: some programs write y and z with the other sign, and the photos tell.
+fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &Config, run: &Run) -> Result<Gaussians> {
+    let background = config.background.unwrap_or_default();
+    let mut engine = fastlgs_raster::open_engine("cpu")?;
+    let mut error = |scene: &Gaussians| -> Result<f64> {
+        engine.set_state(&State::of(scene))?;
+        let mut sum = 0.0;
+        for id in (0..views.len()).step_by(views.len().div_ceil(CHECKED_VIEWS).max(1)) {
+            let Target { camera, image, .. } = views.get(id)?;
+            let mut view = View::new(&camera, scene.len(), scene.sh_degree);
+            view.background_color[..3].copy_from_slice(&background.color);
+            let frame = engine.render(view, Channels::Color)?;
+            let n = image.color.len();
+            let pixels = image.color.iter().enumerate().map(|(p, pixel)| (p, pixel.to_le_bytes())).filter(|(_, pixel)| pixel[3] == 255);
+            let difference = |(p, pixel): (usize, [u8; 4])| {
+                let shown = |c: usize| f64::from(frame.channels(0, 3)[c * n + p].clamp(0.0, 1.0)) - f64::from(pixel[c]) / 255.0;
+                (0..3).map(|c| shown(c).powi(2)).sum::<f64>()
+            };
+            sum += pixels.map(difference).sum::<f64>();
+        }
+        Ok(sum)
+    };
+    let turned = first.clone().with_y_and_z_flipped();
+    if error(&turned)? * PLAIN < error(&first)? {
+        run.warn(&format!("{}: its y and z have the other sign than those of the photos' poses; they were turned", path.display()));
+        return Ok(turned);
+    }
     Ok(first)
 }
 
