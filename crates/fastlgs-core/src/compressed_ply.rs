@@ -181,7 +181,7 @@ mod tests {
         // The low end, and the high one; the identity, with w left out, and a half turn about x.
         for word in [
             0u32,
-            0 << 30 | 512 << 20 | 512 << 10 | 512,
+            512 << 20 | 512 << 10 | 512,
             0,
             0x0000_0080,
             u32::MAX,

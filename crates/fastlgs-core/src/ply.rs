@@ -378,7 +378,7 @@ mod tests {
             let refused = parse(&path, &with(column, other.as_bytes())).unwrap_err().to_string();
             assert!(refused.contains(what), "{refused}");
         }
-        let rgb = with("f_dc_0", b"red_0_").iter().copied().collect::<Vec<u8>>();
+        let rgb = with("f_dc_0", b"red_0_");
         let at = rgb.windows(5).position(|w| w == b" nx\np").unwrap();
         let refused = parse(&path, &[&rgb[..at], b" red\np", &rgb[at + 5..]].concat()).unwrap_err().to_string();
         assert!(refused.contains("RGB"), "{refused}");
