@@ -179,16 +179,8 @@ mod tests {
         let values = [[-1.0f32, -2.0, -3.0], [1.0, 2.0, 3.0], [-5.0; 3], [-1.0; 3], [0.0; 3], [1.0, 1.0, 0.5]];
         data.extend(values.concat().into_iter().flat_map(f32::to_le_bytes));
         // The low end, and the high one; the identity, with w left out, and a half turn about x.
-        for word in [
-            0u32,
-            512 << 20 | 512 << 10 | 512,
-            0,
-            0x0000_0080,
-            u32::MAX,
-            1 << 30 | 512 << 20 | 512 << 10 | 512,
-            u32::MAX,
-            u32::MAX,
-        ] {
+        for word in [0u32, 512 << 20 | 512 << 10 | 512, 0, 0x0000_0080, u32::MAX, 1 << 30 | 512 << 20 | 512 << 10 | 512, u32::MAX, u32::MAX]
+        {
             data.extend(word.to_le_bytes());
         }
         data.extend([128u8; 9].into_iter().chain([255; 9]));
