@@ -277,6 +277,29 @@ mod tests {
     use super::*;
 
     #[test]
+    fn one_gaussian_far_outside_does_not_set_the_range() {
+        let mut scene = Gaussians::default();
+        (0..50).for_each(|k| scene.push_sphere(Vec3::new((k as f32).sin(), (k as f32).cos(), 0.1 * k as f32), 0.1, 0.5, [0.5; 3]));
+        assert_eq!(scene.without_far_outliers(), (scene.clone(), 0));
+        // A sky a hundred times as far as the rest stays.
+        scene.push_sphere(Vec3::new(0.0, 200.0, 0.0), 5.0, 0.5, [0.5; 3]);
+        let with_sky = scene.clone();
+        scene.push_sphere(Vec3::splat(1e6), 0.1, 0.5, [0.5; 3]);
+        assert_eq!(scene.without_far_outliers(), (with_sky, 1));
+    }
+
+    #[test]
+    fn two_flips_are_none() {
+        let mut scene = Gaussians { sh_degree: 2, ..Gaussians::default() };
+        scene.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.1, 0.5, [0.5; 3]);
+        scene.rotations[0] = [0.5, 0.1, 0.2, 0.3];
+        scene.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        let flipped = scene.clone().with_y_and_z_flipped();
+        assert_eq!((flipped.means[0], flipped.rotations[0]), (Vec3::new(1.0, -2.0, -3.0), [0.5, 0.1, -0.2, -0.3]));
+        assert_eq!(flipped.with_y_and_z_flipped(), scene);
+    }
+
+    #[test]
     fn channels_round_trip() {
         let mut g = Gaussians::default();
         g.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.5, 0.25, [0.1, 0.2, 0.3]);

@@ -183,6 +183,47 @@ def test_own_masks_and_embeddings(scene, tmp_path):
         fastlgs.Scene(folder, device="cpu", embed_text=lambda texts: "no array").query("thing 0")
 
 
+def test_numpys_numbers_are_options_and_poses(scene, tmp_path):
+    written = fastlgs.synth("table", tmp_path / "photos", views=np.int64(8), size=np.array([64, 48]))
+    assert written["views"] == 8 and written["size"] == "64x48"
+    camera = scene.camera(scene.views[0])
+    pose = camera.world_to_camera.astype(np.float32)
+    again = fastlgs.Camera(*camera.size, *map(np.float32, camera.intrinsics[:2]), pose)
+    assert np.allclose(again.world_to_camera, camera.world_to_camera, atol=1e-6)
+    with pytest.raises(fastlgs.Error, match="object"):
+        fastlgs.synth("table", tmp_path / "none", views=object())
+
+
+def test_masks_are_of_all_photos(tmp_path):
+    photos = tmp_path / "photos"
+    fastlgs.synth("table", photos, views=8, size=(64, 48))
+    whole = np.ones((1, 48, 64), dtype=bool)
+    names = sorted(path.name for path in (photos / "images").iterdir())
+    with pytest.raises(fastlgs.Error, match="3 photos have no masks"):
+        fastlgs.preprocess(photos, tmp_path / "scene", masks={name: whole for name in names[:5]})
+    for wrong in ({0: whole}, [whole], 5):
+        with pytest.raises(fastlgs.Error, match="masks are"):
+            fastlgs.preprocess(photos, tmp_path / "scene", masks=wrong)
+    assert not (tmp_path / "scene").exists()
+    made = fastlgs.preprocess(photos, tmp_path / "scene", masks={name: whole for name in names}, holdout=0, device="cpu")
+    assert made["masks"] == 8
+
+
+def test_a_forked_child_raises_at_once(scene):
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            scene.query("cat")
+            said = "no error"
+        except fastlgs.Error as error:
+            said = str(error)
+        os.write(writing, said.encode())
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert "spawn" in os.read(reading, 1000).decode()
+
+
 def test_run_lengths_go_down_columns():
     from fastlgs.own import run_lengths
 

@@ -288,6 +288,30 @@ mod tests {
     use image::{Luma, Rgb};
 
     #[test]
+    fn points_without_colours_take_them_from_the_photos_that_show_them() {
+        let dir = tempfile::tempdir().unwrap();
+        let photos = dir.path().join("photos");
+        for (name, color) in [("a.png", [200, 10, 20]), ("b.png", [100, 30, 40])] {
+            image_io::save_png(&photos.join("images").join(name), RgbImage::from_pixel(64, 64, Rgb(color))).unwrap();
+        }
+        let model = photos.join("sparse/0");
+        std::fs::create_dir_all(&model).unwrap();
+        let write = |name: &str, text: &str| std::fs::write(model.join(name), text).unwrap();
+        write("cameras.txt", "1 PINHOLE 64 64 60 60 32 32\n");
+        write("images.txt", "1 1 0 0 0 0 0 4 1 a.png\n\n2 1 0 0 0 0 0 4 1 b.png\n\n");
+        // The first is seen by both, the second by the second photo.
+        write("points3D.txt", "1 0 0 0 0 0 0 0.5 1 0 2 0\n2 0.1 0 0 0 0 0 0.5 2 1\n");
+        let mut dataset = fastlgs_core::dataset::load(&photos).unwrap();
+        let folder = SceneFolder::new(dir.path().join("scene"));
+        let (cache, run) = (Cache::new(&folder), Run { device: "cpu", seed: 0, progress: &crate::Silent });
+        let config = Config { photos, ..Config::default() };
+        let known = load(&dataset, &config, &folder, &cache, &run).unwrap();
+        color_points(&mut dataset, &known, &folder).unwrap();
+        let colors: Vec<[u8; 3]> = dataset.points.iter().map(|point| point.color).collect();
+        assert_eq!(colors, [[150, 20, 30], [100, 30, 40]]);
+    }
+
+    #[test]
     fn what_is_transparent_has_no_colour_to_mix_in() {
         // The left half is white; the right half is transparent, and black as files have it.
         let pixels = RgbImage::from_fn(6, 2, |x, _| Rgb([if x < 3 { 255 } else { 0 }; 3]));
