@@ -134,6 +134,13 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let (document, body) = chunks(path, &data)?;
     let bad = |reason: String| Error::format(path, reason);
+    let is_ours = document["asset"]["generator"].as_str().is_some_and(|name| name.starts_with("FastLGS"));
+    let moves = |node: &Value| ["matrix", "rotation", "translation", "scale"].iter().any(|part| !node[*part].is_null());
+    if !is_ours && document["nodes"].as_array().into_iter().flatten().any(moves) {
+        return Err(bad(
+            "a node moves or turns its Gaussians; apply the transforms in the program that made it, and export it again".to_owned()
+        ));
+    }
     let primitives = document["meshes"].as_array().into_iter().flatten().flat_map(|mesh| mesh["primitives"].as_array()).flatten();
     let with_gaussians = |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
     let names = primitives.into_iter().find(with_gaussians).map(|primitive| &primitive["attributes"]);
@@ -147,7 +154,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
         let offset = |value: &Value| value["byteOffset"].as_u64().unwrap_or(0) as usize;
         let (start, count) = (offset(view).saturating_add(offset(accessor)), accessor["count"].as_u64().unwrap_or(0) as usize);
-        let stride = view["byteStride"].as_u64().map_or(4 * width, |stride| stride as usize);
+        let stride = view["byteStride"].as_u64().map_or(4 * width, |stride| stride as usize).max(4 * width);
         let row = |i: usize| {
             let at = i.checked_mul(stride)?.checked_add(start)?;
             body.get(at..at.checked_add(4 * width)?)

@@ -135,6 +135,16 @@ pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(|e| Error::format(path, format!("the photo cannot be read ({e})")))
 }
 
+/// Channels and bits of a picture, without decoding its pixels.
+///
+/// # Errors
+/// As [`load_rgb`].
+pub fn color_type(path: &Path) -> Result<image::ColorType> {
+    let reader = ImageReader::open(path).map_err(Error::io(path))?.with_guessed_format().map_err(Error::io(path))?;
+    let decoder = reader.into_decoder().map_err(|e| Error::format(path, format!("the picture cannot be read ({e})")))?;
+    Ok(decoder.color_type())
+}
+
 /// Area-like downscaling (triangle filter over the footprint).
 pub fn resize(photo: &RgbImage, width: u32, height: u32) -> RgbImage {
     if photo.dimensions() == (width, height) {

@@ -3,7 +3,7 @@
 use crate::undistort::Distortion;
 use crate::{Camera, Error, Result, fs, image_io};
 use glam::Vec2;
-use image::{DynamicImage, ImageBuffer, ImageReader, Luma};
+use image::{ColorType, DynamicImage, ImageBuffer, ImageReader, Luma};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -135,7 +135,8 @@ impl LabelMap {
     /// As [`Self::load`].
     pub fn load_with_void(path: &Path) -> Result<Self> {
         let mut map = Self::load(path)?;
-        let void = if map.max() > u16::from(u8::MAX) { u16::MAX } else { u16::from(u8::MAX) };
+        let has_16_bits = image_io::color_type(path)? == ColorType::L16;
+        let void = if has_16_bits { u16::MAX } else { u16::from(u8::MAX) };
         let next = map.labels.iter().copied().filter(|label| *label != void).max().unwrap_or(0);
         if next > 0 && next + 1 < void {
             map.labels.iter_mut().filter(|label| **label == void).for_each(|label| *label = 0);
@@ -205,6 +206,7 @@ mod tests {
         assert_eq!(read(&[1, 254, 255], true), [1, 254, 255], "as many objects");
         assert_eq!(read(&[3, 300, 65535], false), [3, 300, 0]);
         assert_eq!(read(&[3, 255, 300], false), [3, 255, 300]);
+        assert_eq!(read(&[3, 17, 255], false), [3, 17, 255], "16 bits have another void");
     }
 
     #[test]

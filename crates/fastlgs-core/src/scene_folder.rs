@@ -6,7 +6,7 @@ use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// What makes a folder a scene.
 pub const MANIFEST: &str = "scene.json";
@@ -126,7 +126,14 @@ impl SceneFolder {
     /// # Errors
     /// Missing or damaged file.
     pub fn manifest(&self) -> Result<Manifest> {
-        fs::read_json(&self.manifest_path())
+        let manifest: Manifest = fs::read_json(&self.manifest_path())?;
+        let leads_out = |file: &&String| !Path::new(file).components().all(|part| matches!(part, Component::Normal(_)));
+        match manifest.files.iter().find(leads_out) {
+            Some(file) => {
+                Err(Error::format(self.manifest_path(), format!("it lists the file '{file}', which is not below the scene's folder")))
+            }
+            None => Ok(manifest),
+        }
     }
 
     /// Writes `scene.json`; the last act of a stage.

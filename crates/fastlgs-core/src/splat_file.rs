@@ -1,6 +1,7 @@
 //! Files of Gaussians in all formats that are read: PLY (also SuperSplat's compressed one), SPZ, SOG, glTF and .splat.
 
 use crate::{Error, Gaussians, Result, WorldFrame, fs, glb, ply, sog, splat, spz};
+use glam::DVec3;
 use std::path::Path;
 
 /// Endings of the files that are read.
@@ -17,8 +18,7 @@ pub fn read(path: &Path, frame: &WorldFrame) -> Result<(Gaussians, Option<String
         "ply" => ply::parse_in(path, &fs::read(path)?, frame)?,
         "spz" => in_frame(path, spz::read(path)?, frame),
         "sog" => in_frame(path, sog::read(path)?, frame),
-        // Its node has the frame's scale.
-        "glb" => in_frame(path, glb::read(path)?, &WorldFrame::default()),
+        "glb" => in_frame(path, glb::read(path)?, frame),
         "splat" => in_frame(path, splat::read(path)?, frame),
         _ => {
             let known = ENDINGS.map(|ending| format!(".{ending}")).join(", ");
@@ -31,12 +31,14 @@ pub fn read(path: &Path, frame: &WorldFrame) -> Result<(Gaussians, Option<String
     Ok((scene, warning))
 }
 
-/// Formats of few bits, and glTF's nodes, hold positions relative to the frame's origin, which is what they were written with.
+/// Formats of few bits, and glTF with its node, hold the scene's own coordinates where this project wrote them. Another program's may be those of the
+/// world: where they lie tells.
 fn in_frame(path: &Path, mut scene: Gaussians, frame: &WorldFrame) -> (Gaussians, Option<String>) {
     let warning = scene.drop_invalid().map(|dropped| format!("{}: {dropped}", path.display()));
-    if frame.scale != 1.0 {
+    let mean = scene.means.iter().map(|mean| mean.as_dvec3()).sum::<DVec3>() / scene.len().max(1) as f64;
+    if frame.origin != DVec3::ZERO && mean.distance(frame.origin) < 0.5 * frame.origin.length() {
         let shift = frame.scale.ln() as f32;
-        scene.means.iter_mut().for_each(|mean| *mean /= frame.scale as f32);
+        scene.means.iter_mut().for_each(|mean| *mean = frame.to_local(mean.as_dvec3()));
         scene.log_scales.iter_mut().for_each(|scale| *scale -= shift);
     }
     (scene, warning)

@@ -58,6 +58,12 @@ impl WorldFrame {
         Self { origin: if is_far || (scale != 1.0 && middle.length() > FAR * spread) { middle } else { DVec3::ZERO }, scale }
     }
 
+    /// Whether cameras at these places of the world keep their digits in this frame.
+    pub fn holds(&self, centres: &[DVec3]) -> bool {
+        let local: Vec<DVec3> = centres.iter().map(|centre| (*centre - self.origin) / self.scale).collect();
+        Self::around(&local).is_identity()
+    }
+
     /// Whether local coordinates are those of the world.
     pub fn is_identity(&self) -> bool {
         *self == Self::default()
@@ -145,6 +151,7 @@ mod tests {
             centres.push(DVec3::splat(1e9));
             let frame = WorldFrame::around(&centres);
             let plain = WorldFrame::around(&ring(DVec3::ZERO, 1.0));
+            assert!(frame.holds(&centres) && !plain.holds(&centres));
             assert!(plain.is_identity() && !frame.is_identity());
             for (k, world) in ring(origin, unit).into_iter().enumerate() {
                 let turn = DQuat::from_rotation_y(k as f64) * DQuat::from_rotation_x(0.3);

@@ -8,7 +8,7 @@ use axum::body::Bytes;
 use axum::http::StatusCode;
 use fastlgs::Session;
 use fastlgs::session::selection;
-use fastlgs_core::{Camera, Gaussians, turbo};
+use fastlgs_core::{Camera, Gaussians, WorldFrame, turbo};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::grid::Object;
@@ -150,6 +150,8 @@ impl Desk {
             "segmenter": self.scene.manifest.segmenter,
             "encoder": self.scene.manifest.encoder,
             "adapter": self.scene.engine.name(),
+            // Cameras, boxes and Gaussians of this interface are in the scene's own coordinates: world = origin + scale x own.
+            "frame": self.scene.manifest.frame,
         })
     }
 
@@ -173,7 +175,7 @@ impl Desk {
                 "share": shares[usize::from(o.id) - 1],
                 "views": o.views,
                 "gaussians": own.len(),
-                "bbox3d": selection::robust_box(&self.scene.gaussians, &self.scene.manifest.frame, own),
+                "bbox3d": selection::robust_box(&self.scene.gaussians, &WorldFrame::default(), own),
                 "color": turbo::id_color(o.id),
             })
         };

@@ -18,7 +18,7 @@ use serde::Serialize;
 use serde_json::json;
 use std::collections::BTreeSet;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Common words that are answered, unless another number is asked for.
 pub const WORDS: usize = 20_000;
@@ -67,7 +67,8 @@ pub struct Report {
 /// A scene that cannot be asked, a folder that holds something else, and a place that cannot be written.
 pub fn share(config: &Config, run: &Run) -> Result<Report> {
     let root = &config.output;
-    let ours = root.join("data/scene.json").is_file() && root.join("files.txt").is_file();
+    let listed = listed(root);
+    let ours = !listed.is_empty();
     if root.exists() && !ours && root.read_dir().map_or(true, |mut entries| entries.next().is_some()) {
         bail!("{}: something else is there; name a new folder", root.display());
     }
@@ -84,10 +85,20 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
     let size = bytes(partial.path());
     if ours {
         // Only what is ours: the folder may be somebody's repository.
-        let entries = std::fs::read_dir(partial.path())?.collect::<std::io::Result<Vec<_>>>()?;
-        for made in entries.into_iter().map(|entry| entry.path()) {
-            let place = root.join(made.file_name().unwrap_or_default());
-            replace(&made, &place, &partial.path().join(".before")).with_context(|| place.display().to_string())?;
+        let made = files_below(partial.path(), Path::new(""))?;
+        if let Some(foreign) =
+            made.iter().map(|file| root.join(file)).find(|path| path.exists() && !listed.iter().any(|own| root.join(own) == *path))
+        {
+            bail!("{}: this file is not of FastLGS and is in the way; move it, or name a new folder", foreign.display());
+        }
+        for file in &made {
+            let place = root.join(file);
+            let parent = place.parent().unwrap_or(root);
+            std::fs::create_dir_all(parent).with_context(|| parent.display().to_string())?;
+            std::fs::rename(partial.path().join(file), &place).with_context(|| place.display().to_string())?;
+        }
+        for old in listed.iter().filter(|old| !made.contains(old)) {
+            let _ = std::fs::remove_file(root.join(old));
         }
     } else {
         let partial = partial.keep();
@@ -97,14 +108,32 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
     Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: size, gaussians: desk.gaussians(), words, found })
 }
 
-/// Puts a file or a folder where there may be an earlier one, which is kept `aside` until then.
-fn replace(made: &Path, place: &Path, aside: &Path) -> std::io::Result<()> {
-    if !place.is_dir() {
-        return std::fs::rename(made, place);
+/// First line of the list of files.
+const SHARED: &str = "A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.";
+
+/// The files that an earlier call wrote; none where the folder is not ours.
+fn listed(root: &Path) -> BTreeSet<PathBuf> {
+    let text = std::fs::read_to_string(root.join("files.txt")).unwrap_or_default();
+    let is_below = |file: &PathBuf| file.components().all(|part| matches!(part, Component::Normal(_)));
+    match text.strip_prefix(SHARED) {
+        Some(list) => list.lines().filter(|line| !line.is_empty()).map(PathBuf::from).filter(is_below).collect(),
+        None => BTreeSet::new(),
     }
-    std::fs::rename(place, aside)?;
-    std::fs::rename(made, place).inspect_err(|_| drop(std::fs::rename(aside, place)))?;
-    std::fs::remove_dir_all(aside)
+}
+
+/// Paths of all files below a folder, relative to it.
+fn files_below(root: &Path, folder: &Path) -> Result<BTreeSet<PathBuf>> {
+    let mut found = BTreeSet::new();
+    for entry in std::fs::read_dir(root.join(folder))? {
+        let entry = entry?;
+        let path = folder.join(entry.file_name());
+        if entry.path().is_dir() {
+            found.extend(files_below(root, &path)?);
+        } else {
+            found.insert(path);
+        }
+    }
+    Ok(found)
 }
 
 /// Temporary folders are their owner's alone; this one is for a web server.
@@ -151,10 +180,10 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     for (name, content) in page::files() {
         write(&root.join(name), content.as_bytes())?;
     }
-    write(
-        &root.join("files.txt"),
-        b"A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.\n",
-    )?;
+    let list = root.join("files.txt");
+    write(&list, b"")?;
+    let files: String = files_below(root, Path::new(""))?.iter().map(|file| format!("{}\n", file.display())).collect();
+    write(&list, format!("{SHARED}\n{files}").as_bytes())?;
     Ok((words.len(), found))
 }
 

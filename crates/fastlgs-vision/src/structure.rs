@@ -128,11 +128,18 @@ fn by_program(
     let one_camera = ["--ImageReader.single_camera", single, "--ImageReader.camera_model", CAMERA_MODEL];
     let stages: [(&str, &str, &[&str]); 3] =
         [("features", "feature_extractor", &one_camera), ("matches", matcher, &[]), ("mapping", "mapper", &[])];
+    let list = work.join("photos.txt");
+    let names: String = files.iter().filter_map(|file| file.file_name()).map(|name| format!("{}\n", name.to_string_lossy())).collect();
+    std::fs::write(&list, names).map_err(fastlgs_core::Error::io(&list))?;
     for (stage, name, options) in stages {
         let mut command = Command::new(program);
         command.arg(name).arg("--database_path").arg(work.join("database.db"));
         if name != matcher {
             command.arg("--image_path").arg(images);
+        }
+        if name == "feature_extractor" {
+            // Else masks and other pictures below the folder would be photos.
+            command.arg("--image_list_path").arg(&list);
         }
         if name == "mapper" {
             command.arg("--output_path").arg(models);

@@ -3,6 +3,7 @@
 use crate::Result;
 use crate::error::{Context, bail};
 use crate::staged::StagedOutput;
+use fastlgs_core::dataset::images_folder;
 use fastlgs_core::scene_folder::{MANIFEST, Manifest};
 use fastlgs_core::{Error, SceneFolder, fs};
 use std::fs::{File, TryLockError};
@@ -17,6 +18,8 @@ const MARK: &str = "FastLGS";
 /// While it lives, no other run writes the scene. The system releases it when the process ends.
 pub(crate) struct SceneLock {
     folder: PathBuf,
+    /// Whether the folder was made for this run.
+    created: bool,
     _file: File,
 }
 
@@ -29,6 +32,7 @@ impl SceneLock {
     pub fn take(scene: &Path, stage: &str) -> Result<Self> {
         let folder = resolved(scene)?;
         check_writable(&folder).with_context(|| format!("{} cannot be written", scene.display()))?;
+        let created = !folder.exists();
         std::fs::create_dir_all(&folder).map_err(Error::io(scene))?;
         let path = folder.join(LOCK);
         let open = File::options().create(true).truncate(false).read(true).write(true).open(&path);
@@ -47,7 +51,7 @@ impl SceneLock {
         let note = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(line.as_bytes()));
         note.map_err(Error::io(&path))?;
         StagedOutput::recover(&SceneFolder::new(&folder))?;
-        Ok(Self { folder, _file: file })
+        Ok(Self { folder, created, _file: file })
     }
 }
 
@@ -67,11 +71,13 @@ impl SceneLock {
 
 impl Drop for SceneLock {
     fn drop(&mut self) {
-        // A run that failed before it wrote anything leaves no folder behind.
+        // A run that failed before it wrote anything leaves nothing behind.
         let only_lock = self.folder.read_dir().is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == LOCK));
         if only_lock {
             let _ = std::fs::remove_file(self.folder.join(LOCK));
-            let _ = std::fs::remove_dir(&self.folder);
+            if self.created {
+                let _ = std::fs::remove_dir(&self.folder);
+            }
         }
     }
 }
@@ -87,10 +93,15 @@ fn check_writable(folder: &Path) -> Result<()> {
     names.sort();
     let manifest = folder.join(MANIFEST);
     if manifest.is_file() {
-        if let Err(error) = fs::read_json::<Manifest>(&manifest) {
-            bail!("its {MANIFEST} is none that FastLGS wrote ({error}); name a folder that does not exist yet");
-        }
-        return Ok(());
+        return match fs::read_json::<Manifest>(&manifest) {
+            Err(error) => bail!("its {MANIFEST} is none that FastLGS wrote ({error}); name a folder that does not exist yet"),
+            Ok(manifest) if manifest.files.is_empty() => {
+                bail!(
+                    "its {MANIFEST} does not list the scene's files, as an earlier version wrote it; name a folder that does not exist yet"
+                )
+            }
+            Ok(_) => Ok(()),
+        };
     }
     let ours = std::fs::read_to_string(folder.join(LOCK)).is_ok_and(|text| text.is_empty() || text.starts_with(MARK));
     match names.first() {
@@ -109,19 +120,20 @@ fn check_writable(folder: &Path) -> Result<()> {
 /// A sentence that names both places.
 pub(crate) fn check_apart(photos: &Path, scene: &Path) -> Result<()> {
     let folder = resolved(scene)?;
-    let mut places = vec![resolved(photos)?];
-    for entry in photos.read_dir().into_iter().flatten().flatten() {
-        if entry.file_type().is_ok_and(|kind| kind.is_symlink()) {
-            places.extend(entry.path().canonicalize());
-        }
-    }
-    let Some(place) = places.iter().find(|place| place.starts_with(&folder) || folder.starts_with(place)) else { return Ok(()) };
-    let how = match (*place == folder, place.starts_with(&folder)) {
+    let album = resolved(photos)?;
+    // Photos that are linked from elsewhere must not come from the scene, which is replaced while they are read.
+    let folders = std::iter::once(photos.to_owned()).chain(images_folder(photos));
+    let links = folders.flat_map(|folder| folder.read_dir().into_iter().flatten().flatten());
+    let links =
+        links.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).filter_map(|entry| entry.path().canonicalize().ok());
+    let within = std::iter::once(album.clone()).chain(links).find(|place| place.starts_with(&folder));
+    let Some(place) = within.or_else(|| folder.starts_with(&album).then(|| album.clone())) else { return Ok(()) };
+    let how = match (place == folder, place.starts_with(&folder)) {
         (true, _) => "it is the folder of the photos",
         (_, true) => "the photos lie in it",
         _ => "it lies in the folder of the photos",
     };
-    let (scene, photos, other) = (scene.display(), photos.display(), beside(&places[0]));
+    let (scene, photos, other) = (scene.display(), photos.display(), beside(&album));
     bail!(
         "{scene} cannot be the scene of the photos {photos}: {how}; nothing was written, name a folder beside the photos, such as {}",
         other.display()
@@ -170,7 +182,7 @@ mod tests {
         let album = dir.path().join("album");
         std::fs::create_dir(&album).unwrap();
         drop(SceneLock::take(&album, "preprocess").unwrap());
-        std::fs::create_dir(&album).unwrap();
+        assert_eq!(std::fs::read_dir(&album).unwrap().count(), 0, "a folder that was there stays, as it was");
         std::fs::write(album.join("IMG_1.CR3"), "raw").unwrap();
         let refused = refusal(SceneLock::take(&album, "preprocess"));
         assert!(refused.contains("IMG_1.CR3") && refused.contains("not a scene"), "{refused}");

@@ -72,29 +72,41 @@ impl StagedOutput {
         done
     }
 
-    /// Puts the earlier scene back where a run was killed between the first and the last of these moves.
+    /// Undoes what a killed run left: moves that were not finished, and the folders of staged output.
     pub fn recover(scene: &SceneFolder) -> Result<()> {
-        if scene.root.join(MANIFEST).exists() {
-            return Ok(());
-        }
         let entries = scene.root.read_dir().map_err(Error::io(&scene.root))?.flatten().map(|entry| entry.path());
-        let staged = entries.filter(|path| path.extension().is_some_and(|ending| ending == "partial"));
-        let Some(staged) = staged.map(SceneFolder::new).find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file()) else {
-            return Ok(());
-        };
-        let before = staged.root.join(BEFORE);
-        let old = files_in(&before)?;
-        // What the killed run had moved into place is neither staged any more nor one of the earlier scene's other files.
-        let kept = SceneFolder::new(&before).manifest()?.files;
-        let moved_in = staged.manifest()?.files.into_iter().filter(|file| !kept.contains(file) || old.contains(file));
-        for name in moved_in.filter(|file| !staged.root.join(file).exists()) {
-            rename_if_there(&scene.root.join(&name), &before.join("new").join(&name))?;
+        let staged: Vec<SceneFolder> = entries
+            .filter(|path| path.extension().is_some_and(|ending| ending == "partial") && path.is_dir())
+            .map(SceneFolder::new)
+            .collect();
+        if !scene.root.join(MANIFEST).exists() {
+            let with_earlier = staged.iter().find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file());
+            // The first output of a scene has no earlier one.
+            if let Some(staged) = with_earlier.or_else(|| staged.iter().find(|staged| staged.root.join(MANIFEST).is_file())) {
+                put_back(scene, staged)?;
+            }
         }
-        for name in old.iter().chain([&MANIFEST.to_owned()]) {
-            rename_if_there(&before.join(name), &scene.root.join(name))?;
+        for staged in staged {
+            let _ = std::fs::remove_dir_all(&staged.root);
         }
         Ok(())
     }
+}
+
+/// Moves the files of a killed run out of the scene, and the earlier ones back into it.
+fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
+    let before = staged.root.join(BEFORE);
+    let old = if before.is_dir() { files_in(&before)? } else { BTreeSet::new() };
+    let kept = SceneFolder::new(&before).manifest().map(|manifest| manifest.files).unwrap_or_default();
+    // What was moved into place is neither staged any more nor one of the earlier scene's other files.
+    let moved_in = staged.manifest()?.files.into_iter().filter(|file| !kept.contains(file) || old.contains(file));
+    for name in moved_in.filter(|file| !staged.root.join(file).exists()) {
+        rename_if_there(&scene.root.join(&name), &staged.root.join(&name))?;
+    }
+    for name in old.iter().chain([&MANIFEST.to_owned()]) {
+        rename_if_there(&before.join(name), &scene.root.join(name))?;
+    }
+    Ok(())
 }
 
 impl Drop for StagedOutput {
@@ -258,6 +270,23 @@ mod tests {
                 assert_eq!(read(&scene, name).as_deref(), Some("old"), "{name} with {moved_in}");
             }
             assert_eq!((read(&scene, "photos/b.png"), scene.manifest().unwrap().segmenter), (None, "offline".to_owned()));
+            assert!(!scene.root.join("preprocess.partial").exists());
         }
+    }
+
+    #[test]
+    fn a_first_run_that_was_killed_leaves_nothing_in_the_way() {
+        let dir = tempfile::tempdir().unwrap();
+        let scene = SceneFolder::new(dir.path());
+        let staged = begun(&scene);
+        let files = files_in(&staged.folder.root).unwrap();
+        staged.folder.save_manifest(&Manifest { files: files.clone(), ..manifest("sam") }).unwrap();
+        for name in files.iter().take(2) {
+            rename_if_there(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
+        }
+        std::mem::forget(staged);
+        StagedOutput::recover(&scene).unwrap();
+        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
+        assert_eq!(read(&scene, "photos/b.png").as_deref(), Some("new"));
     }
 }

@@ -1,5 +1,6 @@
 //! `fastlgs query --library`: which scenes of a folder hold what a text names.
 
+use crate::commands::query::{Question, ends, question};
 use crate::outcome::Outcome;
 use crate::ui::say;
 use crate::{report, ui};
@@ -15,16 +16,17 @@ pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, r
     let search = Search::open(root, config, run)?;
     if texts == ["-"] {
         let mut out = std::io::stdout();
-        for line in std::io::stdin().lock().lines() {
-            let line = line?;
-            let text = line.trim();
-            if !text.is_empty() {
-                let answer = match search.ask(text) {
+        for line in std::io::stdin().lock().split(b'\n') {
+            let answer = match question(&line?) {
+                Question::None => continue,
+                Question::Unreadable(answer) => answer,
+                Question::Text(text) => match search.ask(&text) {
                     Ok(report) => serde_json::to_value(&report)?,
                     Err(error) => json!({ "text": text, "error": fastlgs::one_sentence(&error) }),
-                };
-                writeln!(out, "{answer}")?;
-                out.flush()?;
+                },
+            };
+            if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? {
+                break;
             }
         }
         return Ok(Outcome::Done);

@@ -200,11 +200,34 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     }
 }
 
+/// What a line of standard input asks.
+pub(super) enum Question {
+    /// Nothing: the line is empty.
+    None,
+    /// A text.
+    Text(String),
+    /// The line is not text; this is the answer to it.
+    Unreadable(serde_json::Value),
+}
+
+pub(super) fn question(line: &[u8]) -> Question {
+    match std::str::from_utf8(line) {
+        Err(_) => {
+            let shown = String::from_utf8_lossy(line).trim().to_owned();
+            Question::Unreadable(json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }))
+        }
+        Ok(line) => match line.trim().trim_start_matches('\u{feff}') {
+            "" => Question::None,
+            text => Question::Text(text.to_owned()),
+        },
+    }
+}
+
 /// Whether nobody reads the answers any more, which ends the dialogue quietly.
 ///
 /// # Errors
 /// Every other refusal.
-fn ends(written: std::io::Result<()>) -> Result<bool> {
+pub(super) fn ends(written: std::io::Result<()>) -> Result<bool> {
     match written {
         Ok(()) => Ok(false),
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(true),
@@ -261,21 +284,14 @@ impl Asker<'_> {
     fn answer_lines(&mut self) -> Result<Outcome> {
         let mut out = std::io::stdout();
         for line in std::io::stdin().lock().split(b'\n') {
-            let line = line?;
-            let Ok(line) = std::str::from_utf8(&line) else {
-                let shown = String::from_utf8_lossy(&line).trim().to_owned();
-                let answer = json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" });
-                if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? {
-                    return Ok(Outcome::Done);
-                }
-                continue;
+            let text = match question(&line?) {
+                Question::None => continue,
+                Question::Text(text) => text,
+                Question::Unreadable(answer) if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? => return Ok(Outcome::Done),
+                Question::Unreadable(_) => continue,
             };
-            let text = line.trim().trim_start_matches('\u{feff}');
-            if text.is_empty() {
-                continue;
-            }
             for place in 0..self.cameras.len() {
-                let answer = self.answer(&Ask::Text(text.to_owned()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
+                let answer = self.answer(&Ask::Text(text.clone()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
                 let answer = answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
                 if ends(writeln!(out, "{answer}"))? {
                     return Ok(Outcome::Done);

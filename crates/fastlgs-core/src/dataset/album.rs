@@ -2,7 +2,7 @@
 
 use super::{first_few, is_photo};
 use std::collections::{BTreeMap, HashMap, HashSet};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
 /// Folders of photos within PHOTOS: of COLMAP and nerfstudio, and of the original 3DGS's conversion script.
@@ -114,7 +114,10 @@ impl Album {
         let named = |file: &&Path| {
             let below = file.strip_prefix(&self.root).unwrap_or(file);
             let below = FOLDERS.iter().find_map(|folder| below.strip_prefix(folder).ok()).unwrap_or(below);
-            let parts: Vec<_> = below.iter().map(|part| part.to_string_lossy()).collect();
+            // A name never leads out of the folder that it is a name in.
+            let own_part =
+                |part: Component<'_>| matches!(part, Component::Normal(_)).then(|| part.as_os_str().to_string_lossy().into_owned());
+            let parts: Vec<String> = below.components().filter_map(own_part).collect();
             if counts[&own(file)] > 1 { parts.join("_") } else { own(file) }
         };
         files.iter().map(named).collect()

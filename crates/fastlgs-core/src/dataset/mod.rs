@@ -77,6 +77,8 @@ pub struct Dataset {
     pub held_out: Vec<String>,
     /// What was wrong but survivable, one sentence each.
     pub warnings: Vec<String>,
+    /// A frame that is kept as long as the cameras fit it: that of an earlier scene, whose Gaussians stay.
+    pub earlier_frame: Option<WorldFrame>,
     /// Points in the world.
     stated_points: Vec<DVec3>,
 }
@@ -85,7 +87,8 @@ impl Dataset {
     /// Reads the poses by a convention; the frame is chosen anew.
     pub fn read_poses_by(&mut self, convention: PoseConvention) {
         let poses: Vec<_> = self.photos.iter().map(|photo| photo.stated.by(convention)).collect();
-        self.frame = WorldFrame::around(&poses.iter().map(|pose| pose.centre()).collect::<Vec<_>>());
+        let centres: Vec<DVec3> = poses.iter().map(|pose| pose.centre()).collect();
+        self.frame = self.earlier_frame.filter(|frame| frame.holds(&centres)).unwrap_or_else(|| WorldFrame::around(&centres));
         for (photo, pose) in self.photos.iter_mut().zip(&poses) {
             photo.camera.world_to_camera = self.frame.local_pose(pose);
         }

@@ -5,7 +5,7 @@ use super::pose::{PoseConvention, StatedPose};
 use super::{PosedPhoto, Stated, text};
 use crate::undistort::{Bend, Distortion};
 use crate::{Camera, Error, Result};
-use glam::{DMat4, DVec4, Mat4};
+use glam::{DMat4, DVec3, DVec4, Mat4};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
@@ -69,39 +69,50 @@ pub fn files(photos: &Path) -> Vec<(PathBuf, bool)> {
 /// Damaged JSON, a matrix entry that is no number, or no focal length.
 pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<Stated> {
     let mut stated = Stated { conventions: PoseConvention::OF_MATRICES.to_vec(), ..Stated::default() };
-    for (path, held_out) in files {
-        load_file(photos, album, path, *held_out, &mut stated)?;
+    let read = files.iter().map(|(path, _)| read(path)).collect::<Result<Vec<_>>>()?;
+    // All at once, so that a photo is found by one name only.
+    let names: Vec<String> = read.iter().flat_map(|file| &file.frames).map(|frame| frame.file_path.clone()).collect();
+    let mut found = album.find(&names, photos).into_iter();
+    for ((path, held_out), file) in files.iter().zip(&read) {
+        let photos: Vec<Option<PathBuf>> = found.by_ref().take(file.frames.len()).collect();
+        add(album, path, *held_out, file, photos, &mut stated)?;
     }
     Ok(stated)
 }
 
-fn load_file(photos: &Path, album: &Album, path: &Path, held_out: bool, stated: &mut Stated) -> Result<()> {
+fn read(path: &Path) -> Result<Transforms> {
     // JSON has no NaN, but Python writes it: such entries become null and are refused by name below.
     let text = without_what_is_no_number(&text(path)?);
     let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))?;
     if file.frames.is_empty() {
         return Err(Error::format(path, "it lists no frames"));
     }
-    let names: Vec<String> = file.frames.iter().map(|frame| frame.file_path.clone()).collect();
+    Ok(file)
+}
+
+/// Adds the frames of a file whose photos are there.
+fn add(album: &Album, path: &Path, held_out: bool, file: &Transforms, photos: Vec<Option<PathBuf>>, stated: &mut Stated) -> Result<()> {
+    let matrices = file.frames.iter().map(|frame| matrix(path, frame)).collect::<Result<Vec<_>>>()?;
+    // A pose at the origin looks the same by rows and by columns: the others tell.
+    let by_columns = matrices.iter().any(|(_, by_columns)| *by_columns);
     let mut missing = Vec::new();
-    let mut transposed = 0;
-    for (frame, photo) in file.frames.iter().zip(album.find(&names, photos)) {
+    for ((frame, photo), (matrix, transposed)) in file.frames.iter().zip(photos).zip(matrices) {
         let Some(photo) = photo else {
             missing.push(frame.file_path.clone());
             continue;
         };
-        let matrix = matrix(path, frame)?;
-        transposed += usize::from(matrix.1);
+        let at_origin = matrix.w_axis.truncate() == DVec3::ZERO;
+        let matrix = if by_columns && !transposed && at_origin { matrix.transpose() } else { matrix };
         if held_out {
             stated.held_out.push(photo.clone());
         }
-        stated.photos.push(posed(path, photo, frame, &file.lens, matrix.0)?);
+        stated.photos.push(posed(path, photo, frame, &file.lens, matrix)?);
     }
-    if transposed > 0 {
-        let why = "have their translation in the last row: they were read as transposed matrices";
-        stated.warnings.push(format!("{}: the poses of {transposed} of {} frames {why}", path.display(), names.len()));
+    if by_columns {
+        let why = "its poses have their translation in the last row: they were read as transposed matrices";
+        stated.warnings.push(format!("{}: {why}", path.display()));
     }
-    stated.warnings.extend(album.missing(&missing, names.len(), path));
+    stated.warnings.extend(album.missing(&missing, file.frames.len(), path));
     Ok(())
 }
 
@@ -174,7 +185,7 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
             return Err(Error::format(file, format!("the camera_model '{other}' is not supported; undistort the photos first")));
         }
     };
-    let ignore = frame.mask_path.as_ref().map(|mask| find_mask(file, &name, mask)).transpose()?;
+    let ignore = frame.mask_path.as_ref().map(|mask| find_mask(file, &photo, mask)).transpose()?;
     Ok(PosedPhoto {
         path: photo,
         camera: Camera {
@@ -203,11 +214,14 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
     })
 }
 
-/// The mask that a frame names, by its path or the last parts of it.
-fn find_mask(file: &Path, photo: &str, mask: &str) -> Result<PathBuf> {
+/// The mask that a frame names, by its path or the last parts of it; never the photo itself.
+fn find_mask(file: &Path, photo: &Path, mask: &str) -> Result<PathBuf> {
     let folder = file.parent().unwrap_or(Path::new("."));
-    by_last_parts(mask, &[folder.to_owned()]).ok_or_else(|| {
-        Error::format(file, format!("the mask '{}' of '{photo}' is missing; add it or remove its mask_path", folder.join(mask).display()))
+    let same = |path: &PathBuf| path.canonicalize().ok() == photo.canonicalize().ok();
+    let found = by_last_parts(mask, &[folder.to_owned()]).filter(|path| !same(path));
+    found.ok_or_else(|| {
+        let (mask, photo) = (folder.join(mask), photo.display());
+        Error::format(file, format!("the mask '{}' of '{photo}' is missing; add it or remove its mask_path", mask.display()))
     })
 }
 

@@ -169,6 +169,11 @@ fn names_photo(name: &str, view: &str) -> bool {
         let own = name.rsplit(['/', '\\']).next().unwrap_or(name).to_lowercase();
         Path::new(&own).file_stem().map_or(own.clone(), |stem| stem.to_string_lossy().into_owned())
     };
+    // Views of photos in several folders have these in their names.
+    let joined = name.replace(['/', '\\'], "_");
+    if bare(&joined) == bare(view) || joined.to_lowercase().ends_with(&format!("_{}", view.to_lowercase())) {
+        return true;
+    }
     let (name, view) = (bare(name), bare(view));
     name == view || name.strip_suffix(view.as_str()).is_some_and(|code| code.len() == 9 && code.ends_with('-'))
 }
@@ -193,6 +198,7 @@ pub fn load(path: &Path, view: Option<&str>, sides: Option<(u32, u32)>) -> Resul
             coco(path, of_image, Some((image.width, image.height)), sides).map(Some)
         }
         File::Labelme(file) => labelme(path, &file, sides).map(Some),
+        File::LabelStudio(tasks) if tasks.is_empty() => Ok(Some(MaskList::default())),
         File::LabelStudio(tasks) => {
             let names = |task: &&Task| {
                 task.data.values().any(|value| value.as_str().is_some_and(|name| view.is_none_or(|view| names_photo(name, view))))
@@ -441,6 +447,9 @@ mod tests {
         assert_eq!(areas(&text, "a.jpg"), Some(vec![14]));
         assert_eq!(areas(&format!("\u{feff}{text}"), "b.png"), Some(vec![3]));
         assert_eq!(areas(&text, "c.jpg"), None);
+        assert_eq!(areas("[]", "a.jpg"), Some(Vec::new()), "a photo without masks");
+        let folders = text.replace("album/a.jpg", "images/left/1.jpg").replace("B.JPG", "images/right/1.jpg");
+        assert_eq!((areas(&folders, "left_1.jpg"), areas(&folders, "right_1.jpg")), (Some(vec![14]), Some(vec![3])));
     }
 
     #[test]

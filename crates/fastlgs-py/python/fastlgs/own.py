@@ -10,6 +10,23 @@ import numpy as np
 from ._fastlgs import Error
 
 
+# Marks the files that are written here, which may be replaced.
+OWN = {"made_by": "fastlgs.write_masks"}
+
+
+def _is_own(path):
+    try:
+        return json.loads(path.read_bytes()).get("info") == OWN
+    except (ValueError, AttributeError):
+        return False
+
+
+def _images(photos):
+    """The folder that photos lie in, as `preprocess` finds it."""
+    named = [pathlib.Path(photos) / name for name in ("images", "input")]
+    return next((folder for folder in named if folder.is_dir()), pathlib.Path(photos))
+
+
 # Endings of photos.
 PHOTOS = {".bmp", ".jfif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 
@@ -20,15 +37,18 @@ def write_masks(photos, name, masks, embeddings=None):
     if masks.ndim != 3 or masks.dtype not in (np.bool_, np.uint8):
         raise Error(f"{name}: masks are bool of (n, height, width), not {masks.dtype} of {masks.shape}")
     photos = pathlib.Path(photos)
-    if not (photos / "images" / name).is_file():
-        raise Error(f"{photos / 'images' / name}: there is no such photo")
+    if not (_images(photos) / name).is_file():
+        raise Error(f"{_images(photos) / name}: there is no such photo")
+    place = photos / "masks" / f"{name}.json"
+    if place.exists() and not _is_own(place):
+        raise Error(f"{place}: this file was not written by write_masks; move it elsewhere")
     if embeddings is not None:
         embeddings = np.asarray(embeddings, dtype=np.float32)
         if embeddings.ndim != 2 or len(embeddings) != len(masks) or not np.isfinite(embeddings).all():
             raise Error(f"{name}: {len(masks)} masks need as many rows of finite numbers as embeddings, not {embeddings.shape}")
     height, width = masks.shape[1:]
     listed = [{"segmentation": {"size": [height, width], "counts": run_lengths(mask)}} for mask in masks]
-    _write(photos / "masks" / f"{name}.json", json.dumps(listed).encode())
+    _write(place, json.dumps({"info": OWN, "annotations": listed}).encode())
     if embeddings is not None:
         data = io.BytesIO()
         np.save(data, embeddings)
@@ -81,8 +101,7 @@ def imported(photos, masks):
         embedded.add(embeddings is not None)
     if not embedded:
         raise Error(f"{photos}: no masks were given")
-    images = pathlib.Path(photos) / "images"
-    missing = sorted(path.name for path in images.iterdir() if path.suffix.lower() in PHOTOS and path.name not in given)
+    missing = sorted(path.name for path in _images(photos).iterdir() if path.suffix.lower() in PHOTOS and path.name not in given)
     missing = [name for name in missing if not name.startswith(".")]
     if missing:
         raise Error(f"{photos}: {len(missing)} photos have no masks: {', '.join(missing[:5])}; give masks of all, an empty array for none")

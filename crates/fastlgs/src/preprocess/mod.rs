@@ -72,6 +72,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     } else {
         dataset::load(&config.photos)?
     };
+    dataset.earlier_frame = scene.manifest().ok().map(|earlier| earlier.frame);
     let lenses = import::lenses(&dataset);
     // Opened first: a missing model should not cost the minutes before.
     let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;

@@ -22,7 +22,7 @@ pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm,
     let images = structure::photos_in(&dataset::images_folder(photos).unwrap_or_else(|| photos.join("images")))?;
     let mut inputs = vec![format!("{sfm:?} {} {}", run.seed, keypoints::version()).into_bytes()];
     for image in &images {
-        inputs.extend([image.file_name().unwrap_or_default().as_encoded_bytes().to_vec(), fs::read(image)?]);
+        inputs.extend([image.file_name().unwrap_or_default().as_encoded_bytes().to_vec(), cache::key(&[&fs::read(image)?]).to_vec()]);
     }
     let key = cache::key(&inputs.iter().map(Vec::as_slice).collect::<Vec<_>>());
     let model = folder.root.join("sparse/0");

@@ -73,14 +73,18 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
 /// Removes the frames of an earlier video. Other files that lie among them are the user's: they stay, and the folder is then in the way.
 fn remove_frames(photos: &Path, earlier: &Note) -> Result<()> {
     let images = photos.join("images");
+    let names = |folder: &Path| -> Vec<String> {
+        let entries = folder.read_dir().into_iter().flatten().flatten();
+        entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect()
+    };
+    let others = names(&images).iter().any(|name| !earlier.images.contains(name));
+    if others || names(photos).iter().any(|name| name != NOTE && name != "images") {
+        bail!("{}: files that are not of FastLGS lie among the frames of an earlier video; move them elsewhere", photos.display());
+    }
     for name in earlier.images.iter().filter(|name| Path::new(name).file_name().is_some_and(|own| own == name.as_str())) {
         let _ = std::fs::remove_file(images.join(name));
     }
     let _ = std::fs::remove_dir(&images);
-    let others = photos.read_dir()?.flatten().any(|entry| entry.file_name() != NOTE);
-    if others {
-        bail!("{}: files that are not of FastLGS lie among the frames of an earlier video; move them elsewhere", photos.display());
-    }
     let _ = std::fs::remove_file(photos.join(NOTE));
     Ok(std::fs::remove_dir(photos)?)
 }

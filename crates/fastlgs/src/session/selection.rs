@@ -49,8 +49,8 @@ impl World {
     }
 }
 
-/// Writes Gaussians, in the coordinates of the world, as the file's ending says ([`ENDINGS`]). Formats of few bits hold positions relative to the
-/// frame's origin, and no Gaussians far outside, on which they would spend their range; the log says so.
+/// Writes Gaussians, in the coordinates of the world, as the file's ending says ([`ENDINGS`]). Formats of few bits hold the scene's
+/// own coordinates, and no Gaussians far outside, on which they would spend their range; the log says so.
 ///
 /// # Errors
 /// An unknown ending, or the system's refusal.
@@ -68,18 +68,14 @@ pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
 
 /// The scene as formats of few bits hold it: relative to the frame's origin, in the world's units, without far outliers.
 fn of_few_bits(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> Gaussians {
-    let (mut written, dropped) = gaussians.without_far_outliers();
+    let (written, dropped) = gaussians.without_far_outliers();
     let path = path.display();
     if dropped > 0 {
         tracing::warn!("{path}: {dropped} Gaussians far outside of the scene were left out, as the format's precision would suffer");
     }
-    if frame.origin != glam::DVec3::ZERO {
-        tracing::warn!("{path}: the format cannot hold coordinates this far from the origin; positions are relative to {}", frame.origin);
-    }
-    if frame.scale != 1.0 {
-        let shift = frame.scale.ln() as f32;
-        written.means.iter_mut().for_each(|mean| *mean *= frame.scale as f32);
-        written.log_scales.iter_mut().for_each(|scale| *scale += shift);
+    if !frame.is_identity() {
+        let (origin, scale) = (frame.origin, frame.scale);
+        tracing::warn!("{path}: the format cannot hold the world's coordinates; they are origin + scale x those in it: {origin}, {scale}");
     }
     written
 }

@@ -49,11 +49,15 @@ impl Asker<'_> {
             self.tiles.clear();
             print!("{}> ", self.cameras[0].name);
             std::io::stdout().flush()?;
-            let mut line = String::new();
-            if std::io::stdin().read_line(&mut line)? == 0 {
+            let mut line = Vec::new();
+            if std::io::stdin().lock().read_until(b'\n', &mut line)? == 0 {
                 say!("");
                 return Ok(Outcome::Done);
             }
+            let Ok(line) = String::from_utf8(line) else {
+                say!("the line is not UTF-8 text; send it in UTF-8");
+                continue;
+            };
             let said = match Said::of(&line) {
                 Said::Quit => return Ok(Outcome::Done),
                 Said::Nothing => continue,
