@@ -1,6 +1,6 @@
 //! `fastlgs query --library`: which scenes of a folder hold what a text names.
 
-use crate::commands::query::{Question, ends, question};
+use crate::commands::query::{Line, ends, line_of};
 use crate::outcome::Outcome;
 use crate::ui::say;
 use crate::{report, ui};
@@ -17,10 +17,10 @@ pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, r
     if texts == ["-"] {
         let mut out = std::io::stdout();
         for line in std::io::stdin().lock().split(b'\n') {
-            let answer = match question(&line?) {
-                Question::None => continue,
-                Question::Unreadable(answer) => answer,
-                Question::Text(text) => match search.ask(&text) {
+            let answer = match line_of(&line?) {
+                Line::None => continue,
+                Line::Unreadable(answer) => answer,
+                Line::Text(text) => match search.ask(&text) {
                     Ok(report) => serde_json::to_value(&report)?,
                     Err(error) => json!({ "text": text, "error": fastlgs::one_sentence(&error) }),
                 },

@@ -201,7 +201,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
 }
 
 /// What a line of standard input asks.
-pub(super) enum Question {
+pub(super) enum Line {
     /// Nothing: the line is empty.
     None,
     /// A text.
@@ -210,15 +210,15 @@ pub(super) enum Question {
     Unreadable(serde_json::Value),
 }
 
-pub(super) fn question(line: &[u8]) -> Question {
+pub(super) fn line_of(line: &[u8]) -> Line {
     match std::str::from_utf8(line) {
         Err(_) => {
             let shown = String::from_utf8_lossy(line).trim().to_owned();
-            Question::Unreadable(json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }))
+            Line::Unreadable(json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }))
         }
         Ok(line) => match line.trim().trim_start_matches('\u{feff}') {
-            "" => Question::None,
-            text => Question::Text(text.to_owned()),
+            "" => Line::None,
+            text => Line::Text(text.to_owned()),
         },
     }
 }
@@ -284,11 +284,11 @@ impl Asker<'_> {
     fn answer_lines(&mut self) -> Result<Outcome> {
         let mut out = std::io::stdout();
         for line in std::io::stdin().lock().split(b'\n') {
-            let text = match question(&line?) {
-                Question::None => continue,
-                Question::Text(text) => text,
-                Question::Unreadable(answer) if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? => return Ok(Outcome::Done),
-                Question::Unreadable(_) => continue,
+            let text = match line_of(&line?) {
+                Line::None => continue,
+                Line::Text(text) => text,
+                Line::Unreadable(answer) if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? => return Ok(Outcome::Done),
+                Line::Unreadable(_) => continue,
             };
             for place in 0..self.cameras.len() {
                 let answer = self.answer(&Ask::Text(text.clone()), place).and_then(|report| Ok(serde_json::to_value(&report)?));
