@@ -97,7 +97,7 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
             std::fs::create_dir_all(parent).with_context(|| parent.display().to_string())?;
             std::fs::rename(partial.path().join(file), &place).with_context(|| place.display().to_string())?;
         }
-        for old in listed.iter().filter(|old| !made.contains(old)) {
+        for old in listed.difference(&made) {
             let _ = std::fs::remove_file(root.join(old));
         }
     } else {

@@ -165,7 +165,6 @@ fn without_what_is_no_number(text: &str) -> String {
 }
 
 fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat4) -> Result<PosedPhoto> {
-    let name = photo.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let either = |f: fn(&Lens) -> Option<f64>| f(&frame.lens).or(f(shared));
     let (w, h) = match (either(|l| l.w), either(|l| l.h)) {
         (Some(w), Some(h)) => (w, h),
