@@ -5,7 +5,7 @@ use crate::outcome::Outcome;
 use crate::ui::say;
 use anyhow::{Result, bail};
 use fastlgs::session::ask::Ask;
-use std::io::Write;
+use std::io::{BufRead, Write};
 use std::path::PathBuf;
 
 /// A line of a dialogue.
