@@ -200,8 +200,11 @@ fn write(path: &Path, content: &[u8]) -> Result<()> {
 /// The words, a row of the table for each, and how many of them name something.
 fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
     let taught = desk.scene.taught_names()?.into_iter().map(|name| name.to_lowercase());
-    let common = names::common(common)?.into_iter().map(|word| normalised(&word));
-    let words: BTreeSet<String> = common.chain(taught).filter(|word| !word.is_empty()).collect();
+    // Some words differ only by a hyphen.
+    let mut seen = BTreeSet::new();
+    let known = names::common(usize::MAX)?.into_iter().map(|word| normalised(&word));
+    let known = known.filter(|word| !word.is_empty() && seen.insert(word.clone())).take(common);
+    let words: BTreeSet<String> = known.chain(taught).collect();
     let mut words: Vec<String> = words.into_iter().collect();
     // Texts of like length waste no padding.
     words.sort_by_key(|word| (word.split_whitespace().count(), word.len()));
