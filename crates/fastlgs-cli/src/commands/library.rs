@@ -1,6 +1,6 @@
 //! `fastlgs query --library`: which scenes of a folder hold what a text names.
 
-use crate::commands::query::{Line, ends, line_of};
+use super::lines::{Line, ends, line_of};
 use crate::outcome::Outcome;
 use crate::ui::say;
 use crate::{report, ui};

@@ -5,6 +5,7 @@ mod bind;
 pub mod export;
 pub mod info;
 mod library;
+mod lines;
 pub mod make;
 pub mod models;
 pub mod names;
