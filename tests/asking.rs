@@ -116,22 +116,6 @@ fn names_can_be_taught() {
     assert_eq!(ask("w srodku")["objects"][0]["id"], shown["object"]);
     assert_eq!(json(&["teach", "w srodku", text(&f.scene), "--image", text(&f.photos.join("images/008.png"))])["examples"], 2);
 
-    // Clicks into the middle of every label teach what is found again in all views.
-    let labels = f.photos.join("labels");
-    let bench = json(&["bench", "teach", text(&f.scene), "--labels", text(&labels)]);
-    let same = &bench["same_scene"];
-    assert_eq!(
-        (same["known"].as_u64(), same["asked"].as_u64()),
-        (Some(64), Some(64)),
-        "four things, four views to learn and to ask in: {bench}"
-    );
-    // And what was measured on a scene is the same as what was left out, where both are one.
-    let labels = format!("{0},{0}", text(&labels));
-    let names = json(&["bench", "names", text(&f.scene), text(&f.scene), "--labels", &labels]);
-    assert_eq!(names["gap"], 0.0, "{names}");
-    assert!(names["auroc_pooled"].as_f64().is_some_and(|auroc| auroc > 0.6), "{names}");
-    fails(&["bench", "names", text(&f.scene), "--labels", text(&f.photos)], &["name two at least"]);
-
     // Names go out and come back; those of another encoder are refused where they are asked for.
     let kept = file("names.json");
     json(&["names", "export", text(&kept)]);

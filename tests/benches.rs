@@ -1,122 +1,132 @@
-//! The quick suite of benches on generated scenes: that they run, that their figures add up, and the bounds that are promised. Of the
-//! rows that take longest only some, unless everything is tested.
+//! The benches on generated scenes: that they run, that their figures are consistent, and the bounds
+//! that are promised. All but the first take minutes: `./test.sh --all` runs them.
 
-#[path = "support/browser.rs"]
-mod browser;
-#[path = "support/run.rs"]
-mod run;
-
-use run::{json, text};
+use fastlgs::eyes::SegmenterKind;
+use fastlgs::{Run, preprocess, synth, train};
 use serde_json::Value;
-use std::path::Path;
-use std::time::Instant;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Runs `fastlgs-bench` on the CPU backend and returns its figures.
+fn bench(args: &[&str]) -> Value {
+    let program = env!("CARGO_BIN_EXE_fastlgs-bench");
+    let output = Command::new(program).args(args).args(["--device", "cpu", "--json", "-"]).output().expect("the binary starts");
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).expect("JSON")
+}
+
+/// A trained table with exact masks, 32 views of 240x180, in `folder`.
+fn table(folder: &Path) -> PathBuf {
+    let (photos, scene) = (folder.join("photos"), folder.join("table"));
+    let run = Run::silent("cpu", 0);
+    let kind = synth::Config { kind: "table".into(), output: photos.clone(), views: Some(32), size: (240, 180), ..Default::default() };
+    fastlgs::synth(&kind, &run).expect("generated photos");
+    let mut config = preprocess::Config { photos, output: scene.clone(), ..Default::default() };
+    config.eyes.segmenter = SegmenterKind::Import;
+    fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
+    let config = train::Config { scene: scene.clone(), iterations: Some(1000), ..Default::default() };
+    fastlgs::train(&config, &run).expect("a trained scene");
+    scene
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("a UTF-8 path")
+}
 
 fn number(row: &Value, name: &str) -> f64 {
     row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"))
 }
 
-fn written(folder: &Path, files: &[&str]) {
+fn rows(figures: &Value) -> &[Value] {
+    figures["rows"].as_array().expect("rows")
+}
+
+fn row<'a>(figures: &'a Value, column: &str, value: &str) -> &'a Value {
+    rows(figures).iter().find(|row| row[column] == value).unwrap_or_else(|| panic!("no row {value} in {figures}"))
+}
+
+fn assert_written(folder: &Path, files: &[&str]) {
     for file in files {
-        assert!(std::fs::metadata(folder.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")).len() > 100, "{file}");
+        let length = std::fs::metadata(folder.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")).len();
+        assert!(length > 100, "{file} has {length} bytes");
     }
-    assert!(!folder.join(".trials").exists(), "trials are cleaned away");
+    assert!(!folder.join(".trials").exists(), "trials are removed");
 }
 
 #[test]
-fn quick_suite() {
-    if !run::ready() {
-        return;
+fn speed() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let out = text(folder.path());
+    let devices = if fastlgs_raster::adapters().is_empty() { "cpu" } else { "0,cpu" };
+    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", devices];
+    let figures = bench(&[&["speed", "-o", out], &settings[..]].concat());
+    let tables = figures["devices"].as_array().expect("devices");
+    assert_eq!(tables.len(), devices.split(',').count());
+    for table in tables {
+        let settings = table["settings"].as_array().expect("settings");
+        assert_eq!(settings.len(), 4);
+        assert!(settings.iter().all(|row| number(row, "train_iterations_per_second") > 0.0 && number(row, "render_ms") > 0.0));
+        assert!(table["growth"]["train_ms"]["gaussians"].is_number() && table["growth"]["render_ms"]["pixels"].is_number(), "{table}");
+        assert!(settings[0]["train_pass_ms"]["blend"].is_number() && settings[0]["memory"]["state"].is_number(), "{table}");
     }
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let out = dir.path();
-    let mut began = Instant::now();
-    let mut lap = |what: &str| println!("{what}: {:.0} s", std::mem::replace(&mut began, Instant::now()).elapsed().as_secs_f64());
-    let bench = |what: &str, scene: &[&str], dose: &[&str]| {
-        let quick = ["bench", what, "--quick", "--device", "cpu", "-o", text(out)];
-        json(&[&quick[..], scene, if run::all() { &[] } else { dose }].concat())
-    };
-    // Photos and masks for all but one, which makes its own; chart and paper keep its Gaussians as well.
-    let (photos, table) = (out.join("photos"), out.join("table"));
-    json(&["synth", "table", "-o", text(&photos), "--views", "32", "--size", "240x180"]);
-    json(&["preprocess", text(&photos), "-o", text(&table), "--segmenter", "import", "--device", "cpu"]);
-    json(&["train", text(&table), "--iterations", "1000", "--device", "cpu"]);
-    let table = text(&table);
-    lap("a trained scene");
+    assert_written(folder.path(), &["speed.json", "speed.svg"]);
+}
 
-    let chart = bench("chart", &[table], &["--ways", "embeddings,global,no grid,paper 300 steps"]);
-    let rows = chart["rows"].as_array().expect("rows");
-    let oracle = |way: &str| number(rows.iter().find(|r| r["way"] == way).expect("a way"), "oracle_miou");
-    println!(
-        "chart: {} ways, global {:.3}, embeddings {:.3}, no grid {:.3}",
-        rows.len(),
-        oracle("global"),
-        oracle("embeddings"),
-        oracle("no grid")
-    );
+#[test]
+#[ignore = "minutes; ./test.sh --all runs it"]
+fn chart_and_paper() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (out, scene) = (folder.path(), table(folder.path()));
+    let chart = bench(&["chart", text(&scene), "--quick", "-o", text(out)]);
+    let oracle = |way: &str| number(row(&chart, "way", way), "oracle_miou");
     assert!(oracle("global") > 0.75 && oracle("global") > oracle("embeddings") && oracle("global") > oracle("no grid"), "{chart}");
-    assert!(rows.iter().any(|r| r["pareto"] == true) && rows.iter().all(|r| number(r, "seconds") > 0.0));
-    written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
-    lap("chart");
-
-    let few = ["--ways", "matching: embeddings,matching: + colour,all: as the paper"];
-    let paper = ["bench", "paper", table, "--iterations", "500", "--device", "cpu", "-o", text(out)];
-    let paper = json(&[&paper[..], if run::all() { &[] } else { &few }].concat());
-    let row = |way: &str| paper["rows"].as_array().expect("rows").iter().find(|r| r["way"] == way).expect("a way").clone();
-    let oracle = |way: &str| number(&row(way), "oracle_miou");
+    assert!(rows(&chart).iter().any(|r| r["pareto"] == true) && rows(&chart).iter().all(|r| number(r, "seconds") > 0.0));
+    assert_written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
+    let paper = bench(&["paper", text(&scene), "--iterations", "500", "-o", text(out)]);
+    let way = |way: &str| row(&paper, "way", way);
+    let oracle = |name: &str| number(way(name), "oracle_miou");
     let (embeddings, matching, all) = (oracle("matching: embeddings"), oracle("matching: + colour"), oracle("all: as the paper"));
-    println!("paper: embeddings {embeddings:.3}, with key points and colour {matching:.3}, trained with the scene {all:.3}");
-    assert!(matching > embeddings && matching > 0.8 && all > 0.45 && number(&row("all: as the paper"), "large_ms") > 0.0, "{paper}");
-    written(out, &["paper.md", "paper.csv", "paper.json"]);
-    lap("paper");
+    assert!(matching > embeddings && matching > 0.8 && all > 0.45, "{paper}");
+    assert!(number(way("all: as the paper"), "large_ms") > 0.0, "{paper}");
+    assert_written(out, &["paper.md", "paper.csv", "paper.json"]);
+}
 
-    let size = bench("size", &[], &["--iterations", "400"]);
-    let verdict = &size["auto"][0];
-    println!("size: {verdict}");
-    // So short a run differs by 1.5 dB from seed to seed.
+#[test]
+#[ignore = "minutes; ./test.sh --all runs it"]
+fn size() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let figures = bench(&["size", "--quick", "--iterations", "400", "-o", text(folder.path())]);
+    let verdict = &figures["auto"][0];
+    // So short a training differs by 1.5 dB from seed to seed.
     assert!(number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 4.0, "{verdict}");
-    let rows = size["rows"].as_array().expect("rows");
-    let bytes = |model: &str| number(rows.iter().find(|r| r["model"] == model).expect("a model"), "scene_bytes");
+    let bytes = |model: &str| number(row(&figures, "model", model), "scene_bytes");
     assert!(bytes("auto, compact") < bytes("auto") && bytes("degree 0") < bytes("full"));
-    written(out, &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
-    lap("size");
+    assert_written(folder.path(), &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
+}
 
-    let stability = bench("stability", &[table], &["--cases", "photos shuffled,masks split,masks dropped"]);
-    let rows = stability["rows"].as_array().expect("rows");
-    let row = |disturbance: &str| rows.iter().find(|r| r["disturbance"] == disturbance).expect("a row");
-    println!("stability: {} rows hold, {} fail", stability["holds"], stability["fails"]);
-    for row in rows {
-        println!(
-            "stability: {} {} {}: {:+.1} of {} ({})",
-            row["scene"],
-            row["disturbance"],
-            row["strength"],
-            number(row, "change"),
-            row["bound"],
-            row["verdict"]
-        );
-    }
-    // What is promised; the other rows are measured.
+#[test]
+#[ignore = "minutes; ./test.sh --all runs it"]
+fn stability() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let (out, scene) = (folder.path(), table(folder.path()));
+    let figures = bench(&["stability", text(&scene), "--quick", "-o", text(out)]);
     for promised in ["photos shuffled", "masks split", "masks dropped"] {
-        assert_eq!(row(promised)["verdict"], "holds", "{}", row(promised));
+        let row = row(&figures, "disturbance", promised);
+        assert_eq!(row["verdict"], "holds", "{row}");
     }
-    let twins = rows.iter().find(|r| r["scene"] == "twins").expect("twins");
+    let twins = row(&figures, "scene", "twins");
     assert!(number(twins, "apart") >= 0.95, "{twins}");
-    written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
-    lap("stability");
+    assert_written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
+}
 
-    let report = json(&["bench", "report", text(out), "-o", text(&out.join("report.html"))]);
-    assert_eq!(report["results"].as_array().map(Vec::len), Some(4));
-    let page = std::fs::read_to_string(out.join("report.html")).expect("the report");
-    assert!(page.matches("<svg").count() == 5 && page.contains("photos shuffled") && !page.contains("src=\"http"), "self-contained");
-    if browser::installed() {
-        let browser = browser::Browser::open(900, 700, &[]);
-        browser.go(&format!("file://{}", text(&out.join("report.html"))));
-        let drawn = browser.run("return [...document.querySelectorAll('img, svg')].filter((p) => p.getBoundingClientRect().width > 0 && (p.naturalWidth ?? 1) > 0).length;");
-        let all = browser.run("return document.querySelectorAll('img, svg').length;");
-        assert!(all.as_u64() >= Some(5) && drawn == all, "{drawn} of {all} pictures are drawn");
-        assert_eq!(browser.errors(), Vec::<String>::new(), "nothing on the console");
-    } else {
-        assert!(std::env::var_os("FASTLGS_REQUIRE_GPU").is_none(), "chromium and chromedriver are missing");
-        eprintln!("SKIPPED: the report is not opened: needs chromium and chromedriver");
-    }
+#[test]
+#[ignore = "minutes; ./test.sh --all runs it"]
+fn names() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let scene = table(folder.path());
+    let labels = text(&folder.path().join("photos/labels")).to_owned();
+    let figures = bench(&["names", text(&scene), text(&scene), "--labels", &format!("{labels},{labels}")]);
+    // What was measured on a scene holds on the left-out one, where both are the same.
+    assert_eq!(figures["gap"], 0.0, "{figures}");
+    assert!(number(&figures, "auroc_pooled") > 0.6, "{figures}");
 }

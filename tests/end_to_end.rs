@@ -192,24 +192,6 @@ fn onnx_exports_of_sam_and_clip() {
 }
 
 #[test]
-fn speed_is_charted_for_several_devices() {
-    let Some(f) = fixture() else { return };
-    let out = f.dir.path().join("speed");
-    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", "0,cpu", "-o", text(&out)];
-    let report = json(&[&["bench", "speed", text(&f.scene)], &settings[..]].concat());
-    let devices = report["devices"].as_array().expect("a table");
-    assert_eq!(devices.len(), 2);
-    for device in devices {
-        assert_eq!(device["settings"].as_array().map(Vec::len), Some(4));
-        assert!(device["ceiling_gflops"].as_f64().is_some_and(|v| v > 0.1), "{device}");
-        assert!(device["growth"]["train_ms"]["gaussians"].is_number() && device["growth"]["render_ms"]["pixels"].is_number(), "{device}");
-        assert!(device["settings"][0]["train_pass_ms"]["blend"].is_number() && device["settings"][0]["memory"]["state"].is_number());
-    }
-    assert!(std::fs::read_to_string(out.join("speed.svg")).expect("a chart").contains("iterations a second"));
-    assert!(out.join("speed.json").is_file());
-}
-
-#[test]
 fn renders_every_kind_of_picture_and_any_camera() {
     let Some(f) = fixture() else { return };
     let out = f.dir.path().join("pictures");

@@ -225,7 +225,6 @@ fn places_that_cannot_be_written_are_named() {
         vec!["query", scene, "table", "--false-alarms", "1", "-o", nowhere, "--device", "cpu"],
         vec!["export", scene, "/proc/fastlgs/out.ply", "--device", "cpu"],
         vec!["eval", scene, "--json", "/proc/fastlgs/report.json", "--device", "cpu"],
-        vec!["bench", "size", scene, "-o", nowhere, "--device", "cpu"],
     ] {
         let line = complaint(&args, &run::fastlgs(&args));
         assert!(line.contains(nowhere), "{args:?}: {line}");

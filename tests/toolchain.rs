@@ -1,4 +1,4 @@
-//! What lies around a scene: batches, libraries, exchange with other programs, scripts, manual pages.
+//! What lies around a scene: libraries, exchange with other programs, scripts, manual pages.
 //!
 //! Needs the offline models and any Vulkan device; skips loudly without them unless FASTLGS_REQUIRE_GPU is set.
 
@@ -7,14 +7,11 @@ mod run;
 
 use fastlgs_core::gaussians::sigmoid;
 use fastlgs_core::{Camera, Gaussians, camera_path, ply, sog, spz};
-use run::{complaint, copy_folder, fails, fastlgs, json, text};
+use run::{copy_folder, fails, fastlgs, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::OnceLock;
-
-const PREPROCESS: &str = "--segmenter import";
-const TRAIN: &str = "--iterations 500 --budget 8000";
 
 struct Library {
     dir: tempfile::TempDir,
@@ -22,7 +19,7 @@ struct Library {
     scenes: PathBuf,
 }
 
-/// Two generated scenes and a folder without photos, through one batch.
+/// Two generated and trained scenes.
 fn library() -> Option<&'static Library> {
     static LIBRARY: OnceLock<Option<Library>> = OnceLock::new();
     let make = || {
@@ -32,57 +29,14 @@ fn library() -> Option<&'static Library> {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let (photos, scenes) = (dir.path().join("photos"), dir.path().join("scenes"));
         for kind in ["room", "table"] {
-            json(&["synth", kind, "-o", text(&photos.join(kind)), "--views", "20", "--size", "200x150"]);
+            let (photos, scene) = (photos.join(kind), scenes.join(kind));
+            json(&["synth", kind, "-o", text(&photos), "--views", "20", "--size", "200x150"]);
+            json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"]);
+            json(&["train", text(&scene), "--iterations", "500", "--budget", "8000", "--device", "cpu"]);
         }
-        std::fs::create_dir(photos.join("empty")).expect("a folder");
-        let folders = ["room", "empty", "table"].map(|name| photos.join(name));
-        let [a, b, c] = folders.each_ref().map(|f| text(f));
-        let report = dir.path().join("report.json");
-        let args = [
-            "batch",
-            a,
-            b,
-            c,
-            "-o",
-            text(&scenes),
-            "--preprocess",
-            PREPROCESS,
-            "--train",
-            TRAIN,
-            "--device",
-            "cpu",
-            "--json",
-            text(&report),
-        ];
-        let line = complaint(&args, &fastlgs(&args));
-        assert!(line.contains("1 of 3 scenes"), "{line}");
-        let rows: Value = serde_json::from_slice(&std::fs::read(&report).expect("a report")).expect("JSON");
-        let states: Vec<&str> = rows["scenes"].as_array().expect("rows").iter().map(|r| r["state"].as_str().expect("a state")).collect();
-        assert_eq!(states, ["failed", "made", "made"], "{rows}");
-        assert!(rows["scenes"][0]["error"].as_str().is_some_and(|e| e.contains("empty")), "{rows}");
         Some(Library { dir, photos, scenes })
     };
     LIBRARY.get_or_init(make).as_ref()
-}
-
-#[test]
-fn a_batch_keeps_what_is_there_and_makes_what_changed() {
-    let Some(l) = library() else { return };
-    let scenes = l.dir.path().join("kept");
-    copy_folder(&l.scenes, &scenes);
-    let stamp = |name: &str| std::fs::metadata(scenes.join(name).join("scene.ply")).expect("a scene").modified().expect("a time");
-    let before = (stamp("room"), stamp("table"));
-    let (room, table) = (l.photos.join("room"), l.photos.join("table"));
-    let batch = |train: &str| {
-        json(&["batch", text(&room), text(&table), "-o", text(&scenes), "--preprocess", PREPROCESS, "--train", train, "--device", "cpu"])
-    };
-    let kept = batch(TRAIN);
-    assert!(kept["scenes"].as_array().expect("rows").iter().all(|r| r["state"] == "kept" && r["objects"].as_u64() > Some(0)), "{kept}");
-    assert_eq!(before, (stamp("room"), stamp("table")));
-    let made = batch("--iterations 50 --budget 5000");
-    assert_eq!((made["failed"].as_u64(), made["scenes"][0]["state"].as_str()), (Some(0), Some("made")));
-    assert_ne!(before.0, stamp("room"));
-    fails(&["batch", text(&room), text(&room), "-o", text(&scenes)], &["room", "would both become"]);
 }
 
 #[test]
@@ -135,11 +89,7 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
     let absent = fastlgs(&["query", "--library", library, "aircraft carrier", "--json", "-"]);
     assert_eq!(absent.status.code(), Some(3), "{}", String::from_utf8_lossy(&absent.stdout));
 
-    // A scene that is new is found without being told of; one that is no scene is named.
-    let index = scenes.join("library.index");
-    let stamp = std::fs::metadata(&index).expect("an index").modified().expect("a time");
-    json(&["query", "--library", library, "cat"]);
-    assert_eq!(stamp, std::fs::metadata(&index).expect("an index").modified().expect("a time"), "nothing changed");
+    // A new scene is found; a folder that is no scene is reported.
     copy_folder(&scenes.join("room"), &scenes.join("more/room again"));
     std::fs::create_dir(scenes.join("broken")).expect("a folder");
     std::fs::write(scenes.join("broken/scene.json"), "{").expect("a file");
@@ -158,9 +108,6 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
     assert!(names.contains(&"room") && names.contains(&"more/room again"), "{names:?}");
     assert_eq!(answers[0]["skipped"][0]["scene"], "broken");
 
-    // A damaged index is made anew.
-    std::fs::write(&index, b"nonsense").expect("a file");
-    assert_eq!(json(&["query", "--library", library, "cat"])["scenes"][0]["scene"].as_str().map(|s| s.contains("room")), Some(true));
     fails(&["query", "--library", text(&l.photos), "cat"], &["no trained scenes"]);
     fails(&["query", "--library", library], &["say what to look for"]);
     fails(&["query", "--library", library, "cat", "--point", "1,1"], &["--library"]);

@@ -5,7 +5,7 @@
 //!
 //! * `#import NAME`: the text of `shared/NAME.wgsl`, the first time that it is asked for;
 //! * `#ifdef FLAG` ... `#else` ... `#endif`: one of both, by the flags of the permutation. Flags are `WITH_COLOR`, `WITH_FEATURE`,
-//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `LANES64` or `WIDE` (`Shape`; none of them: workgroups of 32);
+//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `WIDE` (`Shape`);
 //! * `#each K 8` ... `#end`: the lines 8 times, with 0 to 7 for `$K`: loops that must be unrolled for their values to stay in registers;
 //! * `#each Q` ... `#end`: once for each quad (four pixels of a row) of an invocation, with its number for `$Q` and its column of quads for
 //!   `$C`: 16 quads in 2 columns where one invocation owns the 8x8 tile (`WIDE`), else one.
@@ -54,7 +54,7 @@ fn main() {
 const WORKGROUP_BYTES: u32 = 16_384;
 
 /// Flags of `Shape` in `src/shape.rs`.
-const SHAPES: [&[&str]; 3] = [&[], &["LANES64"], &["WIDE"]];
+const SHAPES: [&[&str]; 2] = [&[], &["WIDE"]];
 /// Flags of `Channels` in `src/channels.rs`.
 const CHANNELS: [&[&str]; 4] =
     [&["WITH_COLOR"], &["WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"]];

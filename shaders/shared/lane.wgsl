@@ -9,11 +9,7 @@ const LANES: u32 = 8u;
 const TILE_LANES: u32 = 1u;
 const QUADS_X: u32 = 2u;
 #else
-#ifdef LANES64
-const LANES: u32 = 64u;
-#else
 const LANES: u32 = 32u;
-#endif
 const TILE_LANES: u32 = 16u;
 const QUADS_X: u32 = 1u;
 #endif

@@ -1,4 +1,4 @@
-//! `fastlgs bench baseline`: other ways to a field of language, on the same Gaussians, masks and embeddings.
+//! `fastlgs-bench baseline`: other ways to a field of language, on the same Gaussians, masks and embeddings.
 //!
 //! Each gives every Gaussian a vector by the views' votes, renders the vectors three numbers at a time, and decides pixel by pixel.
 
@@ -24,7 +24,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench baseline scenes/fox --method raw --device cpu")]
+#[command(after_help = "Example: fastlgs-bench baseline scenes/fox --method raw --device cpu")]
 pub struct Args {
     /// Trained scene whose photos have labels/ beside them.
     scene: PathBuf,

@@ -1,4 +1,4 @@
-//! `fastlgs bench chart`: accuracy against time, for the ways from masks to a field that answers.
+//! `fastlgs-bench chart`: accuracy against time, for the ways from masks to a field that answers.
 
 use crate::plot::{self, Axes, Scatter, Spot};
 use crate::table::{self, number};
@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench chart scenes/fox scenes/bonsai -o out")]
+#[command(after_help = "Example: fastlgs-bench chart scenes/fox scenes/bonsai -o out")]
 pub struct Args {
     /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
     scenes: Vec<PathBuf>,

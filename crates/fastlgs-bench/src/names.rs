@@ -1,4 +1,4 @@
-//! `fastlgs bench names`: what texts give on scenes that nothing was chosen on.
+//! `fastlgs-bench names`: what texts give on scenes that nothing was chosen on.
 //!
 //! What a cosine is worth and how high absent names score is measured on all scenes but one and applied to that one; and, to compare, measured on
 //! all of them. The gap between the two says how much the figures owe to having seen the scene.
@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
+#[command(after_help = "Example: fastlgs-bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
 pub struct Args {
     #[command(flatten)]
     labelled: Labelled,

@@ -1,4 +1,4 @@
-//! `fastlgs bench paper`: the paper's ablations, with its own figures beside ours.
+//! `fastlgs-bench paper`: the paper's ablations, with its own figures beside ours.
 
 use crate::table;
 use crate::trial::{self, Trial};
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench paper scenes/table scenes/fox -o out --device cpu")]
+#[command(after_help = "Example: fastlgs-bench paper scenes/table scenes/fox -o out --device cpu")]
 pub struct Args {
     /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
     scenes: Vec<PathBuf>,

@@ -1,4 +1,4 @@
-//! `fastlgs bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
+//! `fastlgs-bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
 
 use crate::command::call;
 use crate::plot::{self, Axes, Scatter, Spot};
@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench size scenes/fox scenes/bonsai -o out --device cpu")]
+#[command(after_help = "Example: fastlgs-bench size scenes/fox scenes/bonsai -o out --device cpu")]
 pub struct Args {
     /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table.
     scenes: Vec<PathBuf>,

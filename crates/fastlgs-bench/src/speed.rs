@@ -1,4 +1,4 @@
-//! `fastlgs bench speed`: milliseconds of every pass over devices x Gaussians x resolutions, and how they grow.
+//! `fastlgs-bench speed`: milliseconds of every pass over devices x Gaussians x resolutions, and how they grow.
 //!
 //! Every setting renders and trains the same views of the scene with learning rates of zero, so that all steps cost the
 //! same; kernels are compiled before the clock starts.
@@ -19,7 +19,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench speed scenes/fox --gaussians 20000,50000 --size 270x480")]
+#[command(after_help = "Example: fastlgs-bench speed scenes/fox --gaussians 20000,50000 --size 270x480")]
 pub struct Args {
     /// Trained scene; without it a generated cloud.
     scene: Option<PathBuf>,
@@ -66,9 +66,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let stride = cameras.len().div_ceil(VIEWS);
     let (mut tables, mut lines) = (Vec::new(), Vec::new());
     for device in &devices {
-        let tuning = fastlgs_raster::tuning::tune(device, true)?;
         let mut engine = fastlgs_raster::open_engine(device)?;
-        let ceiling = engine.ceiling()?;
         let mut settings = Vec::new();
         for &count in &counts {
             let resized = resampled(&scene, count, run.seed);
@@ -76,7 +74,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             for &(w, h) in &sizes {
                 let views: Vec<View> =
                     cameras.iter().step_by(stride).map(|c| View::new(&c.resized(w, h), count, resized.sh_degree)).collect();
-                settings.push(Setting { gaussians: count, size: (w, h), row: setting(engine.as_mut(), &views, args.steps, ceiling)? });
+                settings.push(Setting { gaussians: count, size: (w, h), row: setting(engine.as_mut(), &views, args.steps)? });
             }
         }
         for &(w, h) in &sizes {
@@ -86,8 +84,6 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         }
         tables.push(json!({
             "adapter": engine.name(),
-            "kernel_shapes": tuning,
-            "ceiling_gflops": ceiling / 1e9,
             "growth": growth(&settings),
             "settings": settings.into_iter().map(|s| s.row).collect::<Vec<_>>(),
         }));
@@ -152,12 +148,8 @@ pub fn peak_process_bytes() -> Option<u64> {
     line.trim().strip_suffix(" kB")?.trim().parse::<u64>().ok().map(|kib| 1024 * kib)
 }
 
-/// Floating-point operations of one evaluated pair of pixel and Gaussian in forward blending: exponent 4, exp2 counted as 10
-/// (what a polynomial takes), weight 1, six channels 12, transmittance 1.
-const FLOPS_A_PAIR: f64 = 28.0;
-
 /// Times one number of Gaussians at one resolution.
-fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) -> Result<Value> {
+fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
     let pixels = views[0].pixels();
     let zero = [0.0; BASE_CHANNELS + 1];
     let degree = views[0].sh_degree;
@@ -222,7 +214,6 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32, ceiling: f64) ->
         "pairs": pairs,
         "evaluated_per_pixel": walked,
         "evaluated_per_second": evaluated,
-        "share_of_ceiling": evaluated * FLOPS_A_PAIR / ceiling,
         "memory": memory,
         "train_iterations_per_second": 1.0 / full_seconds,
         "train_color_only_iterations_per_second": 1.0 / color_seconds,

@@ -1,4 +1,4 @@
-//! `fastlgs bench stability`: what remains of accuracy when the input is disturbed, and on scenes that methods fail at.
+//! `fastlgs-bench stability`: what remains of accuracy when the input is disturbed, and on scenes that methods fail at.
 
 use crate::command::call;
 use crate::disturb::{self, Album, Masks, Photos};
@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench stability scenes/fox -o out --device cpu")]
+#[command(after_help = "Example: fastlgs-bench stability scenes/fox -o out --device cpu")]
 pub struct Args {
     /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table is disturbed.
     scenes: Vec<PathBuf>,

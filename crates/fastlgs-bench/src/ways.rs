@@ -24,7 +24,7 @@ pub enum How {
     Descent(&'static str),
     /// `train` from the photos on.
     Train(&'static [&'static str]),
-    /// `bench baseline` on the scene as it is.
+    /// `fastlgs-bench baseline` on the scene as it is.
     Baseline(&'static str),
 }
 

@@ -1,7 +1,6 @@
 //! Progress for people: bars on a terminal, now and then a line elsewhere.
 
 use crate::ui::Common;
-use crate::whole::WHOLE;
 use fastlgs::progress::{Message, Sink};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::collections::BTreeMap;
@@ -50,10 +49,7 @@ impl Console {
 
     fn start(&self, stage: &'static str, total: u64) {
         let bar = if self.medium == Medium::Bars { ProgressBar::new(total) } else { ProgressBar::hidden() };
-        let template = match stage {
-            WHOLE => "{msg:44!} {bar:30} {percent} % {elapsed} (eta {eta})",
-            _ => "{msg:32!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})",
-        };
+        let template = "{msg:44!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})";
         bar.set_style(ProgressStyle::with_template(template).expect("a fixed template"));
         bar.set_message(stage);
         let now = Instant::now();
@@ -125,10 +121,6 @@ fn line(name: &str, done: u64, total: u64, facts: &str, elapsed: Duration) -> St
         return format!("{name}{facts}, {seconds:.0} s so far");
     }
     let rate = done as f64 / seconds;
-    if name == WHOLE {
-        let left = total.saturating_sub(done) as f64 / rate.max(1e-9);
-        return format!("{name} {} %{facts}, about {left:.0} s left", 100 * done / total);
-    }
     let rate_text = if rate >= 1.0 { format!("{rate:.1} it/s") } else { format!("{:.1} s each", 1.0 / rate.max(1e-9)) };
     let left = total.saturating_sub(done) as f64 / rate.max(1e-9);
     format!("{name} {}/{}{facts}, {rate_text}, {left:.0} s left", grouped(done), grouped(total))
@@ -157,7 +149,6 @@ mod tests {
         assert_eq!(training, "train 400/2,000, loss 0.0410, 20.0 it/s, 80 s left");
         assert_eq!(line("masks", 4, 44, "", Duration::from_secs(8)), "masks 4/44, 2.0 s each, 80 s left");
         assert_eq!(line("poses", 0, 0, "matching: 12", Duration::from_secs(31)), "poses, matching: 12, 31 s so far");
-        assert_eq!(line(WHOLE, 3_000, 10_000, "masks", Duration::from_secs(60)), "make 30 %, masks, about 140 s left");
         assert_eq!(grouped(1_234_567), "1,234,567");
     }
 

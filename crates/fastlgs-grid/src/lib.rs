@@ -12,7 +12,6 @@ pub mod evidence;
 pub mod field;
 pub mod grid;
 pub mod hull;
-pub mod library;
 pub mod mapping;
 pub mod objects;
 pub mod overlaps;

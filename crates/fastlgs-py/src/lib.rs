@@ -23,7 +23,7 @@ fn raised(error: impl Into<fastlgs::Error>) -> PyErr {
 
 /// From photos to a scene that answers; what was made before from the same photos with the same options is kept.
 #[pyfunction]
-#[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, effort = None, minutes = None, **options))]
+#[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, effort = None, **options))]
 #[expect(clippy::too_many_arguments, reason = "they are keywords")]
 fn make<'py>(
     py: Python<'py>,
@@ -33,16 +33,12 @@ fn make<'py>(
     device: &str,
     seed: u64,
     effort: Option<&str>,
-    minutes: Option<f64>,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let known = fastlgs::preprocess::Config { photos, output, ..Default::default() };
-    if effort.is_some() && minutes.is_some() {
-        return Err(Error::new_err("give effort or minutes, not both"));
-    }
     let usual = fastlgs::make::Config::default();
     let effort = effort.map(|effort| options::value_of("effort", effort)).transpose()?.unwrap_or(usual.effort);
-    let config = fastlgs::make::Config { preprocess: options::with(&known, options)?, effort, minutes };
+    let config = fastlgs::make::Config { preprocess: options::with(&known, options)?, effort };
     let made = stage::run(py, progress, device, seed, move |run| fastlgs::make(&config, run))?;
     options::to_python(py, &made)
 }

@@ -3,7 +3,6 @@
 use crate::channels::Channels;
 use crate::cpu::RUN;
 use crate::density::State;
-use crate::shape::Shape;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
 use fastlgs_core::Shares;
@@ -137,10 +136,6 @@ pub struct Losses {
 pub trait Engine: Send {
     /// The adapter, for reports.
     fn name(&self) -> String;
-    /// How the kernels divide their work; nothing where there are no kernels. The same bytes come of the same shape alone.
-    fn shape(&self) -> Option<Shape> {
-        None
-    }
     /// Number of Gaussians.
     fn len(&self) -> usize;
     /// Whether there are no Gaussians.
@@ -205,11 +200,6 @@ pub trait Engine: Send {
     /// # Errors
     /// When the device failed.
     fn losses(&self) -> Result<Losses>;
-    /// Floating-point operations a second that the device reaches at best, a multiply-add being two: measured now.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn ceiling(&self) -> Result<f64>;
     /// Bytes that the engine holds for itself now, and of these what Gaussians, moments and key lists take.
     fn memory(&self) -> Memory;
     /// Starts or stops taking the time of each pass; false where the device cannot.

@@ -18,10 +18,8 @@ pub struct Gpu {
     pub queue: wgpu::Queue,
     /// Name of the adapter.
     pub name: String,
-    /// How the kernels divide their work: a guess, until [`crate::tuning`] knows better.
+    /// How the kernels divide their work.
     pub shape: Shape,
-    /// The adapter with its driver's version: what measurements hold for.
-    pub identity: String,
     /// Whether it is a software rasteriser.
     pub software: bool,
     /// Largest storage binding in bytes.
@@ -83,8 +81,7 @@ impl Gpu {
         let info = adapter.get_info();
         let limits = adapter.limits();
         let software = info.device_type == wgpu::DeviceType::Cpu;
-        let guess = if software { Shape::Wide } else { Shape::Lanes32 };
-        let identity = format!("{} ({} {})", info.name, info.driver, info.driver_info);
+        let shape = if software { Shape::Wide } else { Shape::Lanes };
         let features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("fastlgs"),
@@ -119,8 +116,7 @@ impl Gpu {
             device,
             queue,
             name: info.name,
-            shape: guess,
-            identity,
+            shape,
             software,
             max_binding: limits.max_storage_buffer_binding_size,
             profile: None,

@@ -30,7 +30,6 @@ mod shader;
 mod shape;
 mod target;
 mod trainer;
-pub mod tuning;
 mod view;
 
 #[cfg(test)]
@@ -42,7 +41,7 @@ pub use floaters::{FEW_VIEWS, FreeSpace};
 pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
-pub use open::{Choice, choice, open_engine, open_engine_as};
+pub use open::{Choice, choice, open_engine};
 
 pub use schedule::{Alignment, Budget, Strategy, TrainConfig};
 pub use shape::Shape;

@@ -206,20 +206,6 @@ pub struct Perturb {
     pub amount: f32,
 }
 
-/// Uniform of the pass that measures the adapter's ceiling.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Ceiling {
-    /// Invocations.
-    pub invocations: u32,
-    /// Rounds of fused multiply-adds.
-    pub rounds: u32,
-    /// Factor of each.
-    pub factor: f32,
-    /// Summand of each.
-    pub summand: f32,
-}
-
 /// Uniform of the loss passes; `shaders/shared/window.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]

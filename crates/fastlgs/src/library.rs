@@ -7,14 +7,12 @@ use crate::{Result, Run, eyes, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
-use fastlgs_grid::library::{self, Entry, Found, Library};
 use fastlgs_grid::query::{self, QueryConfig};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use std::time::{Instant, UNIX_EPOCH};
+use std::time::Instant;
 
-/// The index of a library, in its folder.
-const INDEX: &str = "library.index";
 /// How deep below the library's folder scenes are looked for.
 const DEPTH: usize = 3;
 
@@ -33,12 +31,18 @@ pub struct Config {
 
 /// An opened library with the encoder of its texts.
 pub struct Search {
-    root: PathBuf,
     config: Config,
     texts: Texts,
-    index: Library,
+    scenes: Vec<Opened>,
     skipped: Vec<Skipped>,
-    index_ms: f64,
+    load_ms: f64,
+}
+
+/// The object table of a scene.
+struct Opened {
+    /// Path below the library's folder.
+    path: String,
+    grid: Grid,
 }
 
 /// What a library answers.
@@ -94,8 +98,8 @@ pub struct Skipped {
 /// Milliseconds of an answer.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Milliseconds {
-    /// Opening the index, or making it.
-    pub index: f64,
+    /// Loading the object tables of all scenes.
+    pub load: f64,
     /// Embedding the text.
     pub encode: f64,
     /// Comparing it.
@@ -103,69 +107,70 @@ pub struct Milliseconds {
 }
 
 impl Search {
-    /// Opens all trained scenes of one encoder below `root`, and makes their index anew where that is out of date.
+    /// Loads the object tables of all trained scenes of one encoder below `root`.
     ///
     /// # Errors
-    /// A folder without trained scenes, or one that cannot be read or written.
+    /// A folder without trained scenes, or a file that cannot be read.
     pub fn open(root: &Path, config: Config, run: &Run) -> Result<Self> {
         let started = Instant::now();
-        let (scenes, skipped) = scenes_below(root)?;
+        let (trained, skipped) = scenes_below(root)?;
         for row in &skipped {
             run.warn(&format!("{}: left out: {}", row.scene, row.why));
         }
-        let Some((first, manifest)) = scenes.first() else { bail!("{}: no trained scenes are in it", root.display()) };
-        let first_folder = SceneFolder::new(root.join(&first.path));
-        let index = up_to_date(root, &scenes, run)?;
-        let index_ms = started.elapsed().as_secs_f64() * 1e3;
-        let texts = Texts::load(&first_folder, manifest, config.clip_text.as_deref())?;
-        let search = Self { root: root.to_owned(), config, texts, index, skipped, index_ms };
+        let Some((first, manifest)) = trained.first() else { bail!("{}: no trained scenes are in it", root.display()) };
+        let work = run.work("library", trained.len() as u64);
+        let load = |(path, manifest): &(String, Manifest)| -> Result<Opened> {
+            work.advance()?;
+            let folder = SceneFolder::new(root.join(path));
+            let grid = Grid::load(&folder).with_context(|| format!("{path}: its object table cannot be read; train it again"))?;
+            eyes::check_version(manifest, &grid, &folder)?;
+            Ok(Opened { path: path.clone(), grid })
+        };
+        let scenes = trained.iter().map(load).collect::<Result<Vec<_>>>()?;
+        let load_ms = started.elapsed().as_secs_f64() * 1e3;
+        let texts = Texts::load(&SceneFolder::new(root.join(first)), manifest, config.clip_text.as_deref())?;
+        let search = Self { config, texts, scenes, skipped, load_ms };
         search.ask("warm up")?;
         Ok(search)
     }
 
-    /// The scenes that hold what `text` names.
+    /// Returns the scenes that contain what `text` names: each scene answers by itself.
     ///
     /// # Errors
     /// A text that cannot be embedded.
     pub fn ask(&self, text: &str) -> Result<Report> {
         let started = Instant::now();
-        let meant = Embedded::words(text, &self.texts, &self.config.negatives)?;
+        let embedded = Embedded::words(text, &self.texts, &self.config.negatives)?;
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
-        let mut best: Vec<Found> = Vec::new();
-        for query in meant.sought() {
-            let found = self.index.search(query, self.config.scenes)?;
-            best.extend(found.into_iter().filter(|f| best.iter().all(|known| known.scene != f.scene)).collect::<Vec<_>>());
-        }
-        let search_ms = started.elapsed().as_secs_f64() * 1e3;
         let config = QueryConfig { false_alarms: self.config.false_alarms, ..QueryConfig::default() };
-        // As the scene itself would answer.
-        let row = |f: &Found| -> Result<Row> {
-            let scene = self.index.scenes[f.scene].path.clone();
-            let grid = Grid::load(&SceneFolder::new(self.root.join(&scene)))?;
-            let answer = meant.find(&grid, &config);
-            let object = answer.targets.first().or(answer.ranked.first()).map_or(f.object, |hit| hit.id);
-            let (support, score) = (grid.objects[usize::from(object) - 1].support, query::best_score(&answer.ranked));
-            Ok(Row { scene, object, score, support, found: !answer.targets.is_empty() })
+        let row = |scene: &Opened| -> Option<Row> {
+            let answer = embedded.find(&scene.grid, &config);
+            let object = answer.targets.first().or(answer.ranked.first())?.id;
+            let support = scene.grid.objects[usize::from(object) - 1].support;
+            let score = query::best_score(&answer.ranked);
+            Some(Row { scene: scene.path.clone(), object, score, support, found: !answer.targets.is_empty() })
         };
-        let mut rows = best.iter().map(row).collect::<Result<Vec<Row>>>()?;
+        let mut rows: Vec<Row> = self.scenes.par_iter().filter_map(row).collect();
         rows.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.scene.cmp(&b.scene)));
         rows.truncate(self.config.scenes);
+        let search_ms = started.elapsed().as_secs_f64() * 1e3;
+        let objects = self.scenes.iter().map(|scene| scene.grid.objects.len()).sum();
         Ok(Report {
             text: text.to_owned(),
             found: rows.iter().any(|r| r.found),
             scenes: rows,
-            searched: Searched { scenes: self.index.scenes.len(), objects: self.index.len() },
+            searched: Searched { scenes: self.scenes.len(), objects },
             skipped: self.skipped.clone(),
-            ms: Milliseconds { index: self.index_ms, encode: encode_ms, search: search_ms },
+            ms: Milliseconds { load: self.load_ms, encode: encode_ms, search: search_ms },
         })
     }
 }
 
-/// A scene of a library with what made it.
-type Scene = (Entry, Manifest);
+/// The path of a scene below the library's folder, and its manifest.
+type Scene = (String, Manifest);
 
-/// Trained scenes of one encoder below a folder, sorted by path, with the stamp of their tables; and what was passed over, with why.
+/// Trained scenes of one encoder below a folder, sorted by path; and those that were left out, with the reason.
 fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
     let mut folders = Vec::new();
     collect(root, DEPTH, &mut folders)?;
@@ -189,10 +194,9 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
                 }
             },
         };
-        match (why, manifest, stamp(&folder)) {
-            (None, Ok(manifest), Ok(stamp)) => scenes.push((Entry { path, stamp }, manifest)),
-            (None, _, Err(error)) => skipped.push(Skipped { scene: path, why: error.to_string() }),
-            (why, ..) => skipped.push(Skipped { scene: path, why: why.unwrap_or_default() }),
+        match (why, manifest) {
+            (None, Ok(manifest)) => scenes.push((path, manifest)),
+            (why, _) => skipped.push(Skipped { scene: path, why: why.unwrap_or_default() }),
         }
     }
     Ok((scenes, skipped))
@@ -216,47 +220,4 @@ fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
         }
     }
     Ok(())
-}
-
-/// Length and time of change of a scene's table.
-fn stamp(folder: &Path) -> Result<String> {
-    let one = |name: &str| -> Result<String> {
-        let path = folder.join(name);
-        let data = std::fs::metadata(&path).with_context(|| format!("{}: the scene has no table; train it again", path.display()))?;
-        let changed = data.modified()?.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
-        Ok(format!("{}@{changed}", data.len()))
-    };
-    Ok(format!("{} {}", one("grid.json")?, one("grid.safetensors")?))
-}
-
-/// The library's index, made anew where a scene came, went or changed.
-fn up_to_date(root: &Path, scenes: &[Scene], run: &Run) -> Result<Library> {
-    let path = root.join(INDEX);
-    let entries: Vec<&Entry> = scenes.iter().map(|s| &s.0).collect();
-    if path.is_file() {
-        match Library::open(&path) {
-            Ok(library) if library.scenes.iter().eq(entries.iter().copied()) => return Ok(library),
-            Ok(_) => tracing::info!("{}: scenes have changed; it is made anew", path.display()),
-            Err(error) => tracing::warn!("{error}; doing that now"),
-        }
-    }
-    let work = run.work("library", entries.len() as u64);
-    let load = |(entry, manifest): &Scene| -> Result<(Entry, Grid)> {
-        work.advance()?;
-        let folder = SceneFolder::new(root.join(&entry.path));
-        let grid = Grid::load(&folder).with_context(|| format!("{}: its table cannot be read; train it again", entry.path))?;
-        eyes::check_version(manifest, &grid, &folder)?;
-        Ok((entry.clone(), grid))
-    };
-    let tables = scenes.iter().map(load).collect::<Result<Vec<_>>>()?;
-    if let Err(error) = library::write(&path, &tables) {
-        // Where the folder may only be read, it is made in each run anew.
-        tracing::info!("{}: the index cannot be kept: {error}", path.display());
-        let folder = tempfile::tempdir()?;
-        let path = folder.path().join(INDEX);
-        library::write(&path, &tables).context("the library's index cannot be written")?;
-        // What is open can be read when its folder is gone.
-        return Ok(Library::open(&path)?);
-    }
-    Ok(Library::open(&path)?)
 }

@@ -11,7 +11,6 @@ use fastlgs_vision::conse;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 /// What is made, and how thoroughly.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -24,14 +23,11 @@ pub struct Config {
     /// How long is trained.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = Config::default().effort))]
     pub effort: train::Preset,
-    /// Train for as long as all of it fits into so many minutes on this machine, instead of an effort.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "N", conflicts_with = "effort", value_parser = train::parse_minutes))]
-    pub minutes: Option<f64>,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { preprocess: preprocess::Config::default(), effort: train::Preset::Quick, minutes: None }
+        Self { preprocess: preprocess::Config::default(), effort: train::Preset::Quick }
     }
 }
 
@@ -61,8 +57,7 @@ pub struct Report {
 /// # Errors
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
 pub fn make(config: &Config, run: &Run) -> Result<Report> {
-    let train =
-        train::Config { scene: config.preprocess.output.clone(), preset: config.effort, minutes: config.minutes, ..Default::default() };
+    let train = train::Config { scene: config.preprocess.output.clone(), preset: config.effort, ..Default::default() };
     let mut preprocess = config.preprocess.clone();
     if config.effort == train::Preset::LikePaper {
         preprocess.eyes.sam_preset.get_or_insert(SamPreset::LangSplat);
@@ -95,7 +90,6 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let lock = SceneLock::take(&preprocess.output, "make")?;
     // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
     let begun = known.is_some() && checkpoints::is_begun(&folder);
-    let started = Instant::now();
     if !begun {
         checkpoints::forget(&folder);
         crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
@@ -103,9 +97,7 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         manifest.notes.insert(train::MADE.to_owned(), made.clone());
         folder.save_manifest(&manifest)?;
     }
-    // Minutes are those of all stages.
-    let minutes = train.minutes.map(|minutes| minutes - started.elapsed().as_secs_f64() / 60.0);
-    let report = train::train_locked(&train::Config { resume: begun || train.resume, minutes, ..train.clone() }, &lock, runs[1])?;
+    let report = train::train_locked(&train::Config { resume: begun || train.resume, ..train.clone() }, &lock, runs[1])?;
     let mut manifest = folder.manifest()?;
     // Photos that came or changed while it trained are not in it.
     manifest.notes.insert(train::MADE.to_owned(), made);

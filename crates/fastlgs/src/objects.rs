@@ -256,32 +256,6 @@ fn embed(
     Ok((found, object_of))
 }
 
-/// Objects that global mapping finds, for each mask of a photo.
-const OBJECTS_A_MASK: f64 = 1.4;
-/// Masks by which the encoder's speed is measured.
-const TRIED: u16 = 16;
-
-/// About how long it will take to embed the objects, which is nearly all of the mapping's time; measured on some masks of one view.
-pub fn seconds_of_embedding(folder: &SceneFolder, training: &[Camera]) -> Result<f64> {
-    let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
-    let Some(camera) = training.first() else { return Ok(0.0) };
-    let labels = masks::whole(folder, camera)?;
-    let few = LabelMap { labels: labels.labels.iter().map(|l| if *l > TRIED { 0 } else { *l }).collect(), ..labels };
-    let photo = folder.photo(&camera.name)?;
-    let mut seconds = 0.0;
-    // The first time the encoder warms up.
-    for _ in 0..2 {
-        let started = std::time::Instant::now();
-        let count = masks::described(&camera.name, &photo, 0, &few, encoder.as_ref())?.len();
-        seconds = started.elapsed().as_secs_f64() / count.max(1) as f64;
-    }
-    let mut masks = 0;
-    for camera in training {
-        masks += folder.masks(camera)?.masks.len();
-    }
-    Ok(seconds * OBJECTS_A_MASK * EMBEDDED_VIEWS as f64 * masks as f64 / training.len() as f64)
-}
-
 /// What global mapping found, and why sets are no objects.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]

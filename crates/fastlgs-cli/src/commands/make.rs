@@ -1,7 +1,6 @@
 //! `fastlgs make`: from photos to a scene that answers, and what to do with it.
 
 use crate::outcome::Outcome;
-use crate::whole::Whole;
 use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::Result;
@@ -9,11 +8,7 @@ use fastlgs::Run;
 use fastlgs::make::{self, Config, State};
 
 pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
-    let whole = Whole::new(run.progress, config.effort);
-    let made = fastlgs::make(config, &Run { progress: &whole, ..*run });
-    // The bar goes before the report, or the error, comes.
-    drop(whole);
-    let made = made?;
+    let made = fastlgs::make(config, run)?;
     report::tell(common, &made, |made| words(made, &config.preprocess.output.display().to_string()))
 }
 

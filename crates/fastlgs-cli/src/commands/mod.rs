@@ -1,6 +1,5 @@
 //! One module a command that does more than call the pipeline.
 
-pub mod batch;
 mod bind;
 pub mod export;
 pub mod info;

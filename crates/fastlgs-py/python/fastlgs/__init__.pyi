@@ -142,10 +142,9 @@ def make(
     device: str = "auto",
     seed: int = 0,
     effort: Optional[Literal["quick", "standard", "paper", "like-paper"]] = None,
-    minutes: Optional[float] = None,
     **options: Any,
 ) -> Dict[str, Any]:
-    """From photos to a scene that answers, with an effort or in about so many minutes. Options are those of `fastlgs make`, with underscores."""
+    """From photos to a scene that answers, with an effort. Options are those of `fastlgs make`, with underscores."""
 
 OwnMasks = Union[
     Tuple[str, NDArray[np.bool_]],

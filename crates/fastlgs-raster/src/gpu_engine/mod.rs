@@ -8,14 +8,12 @@ mod picture;
 mod sorting;
 
 use crate::channels::Channels;
-use crate::cpu::CHAINS;
 use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
-use crate::pass::{Recorder, Typed};
+use crate::pass::Recorder;
 use crate::profile::Profile;
-use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, Ceiling as CeilingKernel, CeilingBuffers, PerturbBuffers};
-use crate::shape::Shape;
-use crate::view::{Ceiling, Perturb, Step, View};
+use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, PerturbBuffers};
+use crate::view::{Perturb, Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
 use fastlgs_core::Shares;
@@ -25,12 +23,11 @@ use lists::{ListMaker, Lists};
 use pages::Gaussians;
 use picture::{Loss, Picture};
 use std::collections::{BTreeMap, HashMap};
-use std::time::Instant;
 use wgpu::Buffer;
 
 /// [`Engine`] on a wgpu adapter.
 pub struct GpuEngine {
-    gpu: Gpu,
+    pub(crate) gpu: Gpu,
     kernels: Kernels,
     lists: ListMaker,
     gaussians: Option<Gaussians>,
@@ -107,10 +104,6 @@ impl GpuEngine {
 impl Engine for GpuEngine {
     fn name(&self) -> String {
         self.gpu.name.clone()
-    }
-
-    fn shape(&self) -> Option<Shape> {
-        Some(self.gpu.shape)
     }
 
     fn len(&self) -> usize {
@@ -239,30 +232,6 @@ impl Engine for GpuEngine {
             (Some((view, channels)), Some(loss)) => loss.read(&self.gpu, view, *channels),
             _ => Ok(Losses::default()),
         }
-    }
-
-    fn ceiling(&self) -> Result<f64> {
-        let pass: Typed<CeilingKernel> = Typed::new(&self.gpu, Channels::Both, false);
-        let out = &self.gpu.storage("the ceiling", 4 * 65_536)?;
-        let mut best = 0.0f64;
-        let mut rounds = 100;
-        // The first run compiles the kernel; each later one is longer, until the launch no longer counts.
-        for attempt in 0..6 {
-            let job = Ceiling { invocations: 65_536, rounds, factor: 0.999, summand: 0.001 };
-            let started = Instant::now();
-            let mut r = Recorder::new(&self.gpu, 0);
-            r.run(&pass, &job, CeilingBuffers { out }, job.invocations / GROUP)?;
-            r.submit();
-            self.gpu.read::<f32>(out, 1)?;
-            let seconds = started.elapsed().as_secs_f64();
-            if attempt > 0 {
-                best = best.max(f64::from(rounds) * (65_536 * CHAINS * 4 * 2) as f64 / seconds);
-            }
-            if attempt > 0 && seconds < 0.05 {
-                rounds *= 4;
-            }
-        }
-        Ok(best)
     }
 
     fn memory(&self) -> Memory {

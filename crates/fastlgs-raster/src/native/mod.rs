@@ -2,7 +2,6 @@
 
 mod adam;
 pub(crate) mod blend;
-mod ceiling;
 mod lists;
 mod loss;
 mod picture;
@@ -356,10 +355,6 @@ impl Engine for CpuEngine {
 
     fn losses(&self) -> Result<Losses> {
         Ok(self.losses)
-    }
-
-    fn ceiling(&self) -> Result<f64> {
-        Ok(ceiling::flops())
     }
 
     fn memory(&self) -> Memory {

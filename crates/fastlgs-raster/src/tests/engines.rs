@@ -44,7 +44,7 @@ fn gpu_and_cpu_agree() {
         for channels in CHANNELS.into_iter().take(if n > 100_000 { 1 } else { 4 }) {
             let b = once(&mut cpu, view, channels, &state, (w, h));
             for device in &mut devices {
-                let what = format!("{n} Gaussians at {w}x{h}, {channels:?}, {:?}", device.shape());
+                let what = format!("{n} Gaussians at {w}x{h}, {channels:?}, {:?}", device.gpu.shape);
                 let a = once(device, view, channels, &state, (w, h));
                 assert_close(&format!("frame, {what}"), &a.0, &b.0, 2e-3, 0.002);
                 for c in 0..channels_of(degree) {
@@ -77,12 +77,12 @@ fn many_bindings_give_what_one_gives() {
         for channels in CHANNELS {
             let a = once(&mut whole, view, channels, &state, (96, 64));
             let b = once(&mut small, view, channels, &state, (96, 64));
-            assert_eq!(a.0, b.0, "{channels:?}, {shape}");
+            assert_eq!(a.0, b.0, "{channels:?}, {shape:?}");
             // Windows begin runs of slots elsewhere, and so add them up in another order.
             if shape.fold() == 1 {
-                assert_eq!(a.1, b.1, "{channels:?}, {shape}");
+                assert_eq!(a.1, b.1, "{channels:?}, {shape:?}");
             }
-            assert_close(&format!("gradients, {channels:?}, {shape}"), &a.1, &b.1, 1e-3, 0.001);
+            assert_close(&format!("gradients, {channels:?}, {shape:?}"), &a.1, &b.1, 1e-3, 0.001);
         }
     }
     // Half of that does not hold the splats: said, not drawn wrong.
@@ -102,7 +102,7 @@ fn any_number_of_first_passes_may_run_as_twins() {
         for passes in [1, 14, 30, 34, 40, 58, 1000] {
             engine.passes_on_cpu = passes;
             let mixed = once(&mut engine, view, Channels::Both, &state, (40, 30));
-            let what = format!("{passes} passes, {:?}", engine.shape());
+            let what = format!("{passes} passes, {:?}", engine.gpu.shape);
             assert_close(&format!("frame, {what}"), &mixed.0, &reference.0, 2e-3, 0.002);
             assert_close(&format!("gradients, {what}"), &mixed.1, &reference.1, 0.03, 0.01);
         }

@@ -6,7 +6,7 @@ use crate::cpu;
 use crate::gpu::UNIFORM_SLOTS;
 use crate::pass::{Groups, Pass, Recorder};
 use crate::shader::{Kernel, Shader, shaders};
-use crate::view::{Ceiling, Job, Perturb, Plane, Planes, Step, View, stride};
+use crate::view::{Job, Perturb, Plane, Planes, Step, View, stride};
 use crate::{Channels, Gpu};
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::rng::Rng;
@@ -140,7 +140,7 @@ fn sorting_and_scanning() {
     let Some(mut gpu) = gpu() else { return };
     let mut rng = Rng::new(3, "sort");
     for (shape, n) in
-        [Shape::Wide, Shape::Lanes32].into_iter().flat_map(|shape| [1usize, 255, 256, 257, 2048, 2049, 600_003].map(|n| (shape, n)))
+        [Shape::Wide, Shape::Lanes].into_iter().flat_map(|shape| [1usize, 255, 256, 257, 2048, 2049, 600_003].map(|n| (shape, n)))
     {
         gpu.shape = shape;
         let keys: Vec<u32> = (0..n).map(|_| rng.next_u64() as u32 & 0xffff).collect();
@@ -150,7 +150,7 @@ fn sorting_and_scanning() {
         // Results of the buffers from `judged` on are the twin's.
         let exact = |shader: &'static Shader, job: &Job, buffers: &[&[u32]], groups: u32, judged: usize| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, groups);
-            assert_eq!(device[judged..], twin[judged..], "{} of {n} in the shape {shape}", shader.name);
+            assert_eq!(device[judged..], twin[judged..], "{} of {n} in the shape {shape:?}", shader.name);
             device
         };
         let histogram = exact(shaders::RadixCount::SHADER, &job, &[&keys, &vec![7; 256 * chunks as usize]], groups, 0).remove(1);
@@ -176,7 +176,7 @@ fn sorting_and_scanning() {
 #[test]
 fn listing() {
     let Some(mut gpu) = gpu() else { return };
-    for (shape, (n, w, h)) in [Shape::Wide, Shape::Lanes32].into_iter().flat_map(|shape| SIZES.map(|size| (shape, size))) {
+    for (shape, (n, w, h)) in [Shape::Wide, Shape::Lanes].into_iter().flat_map(|shape| SIZES.map(|size| (shape, size))) {
         gpu.shape = shape;
         let l = lists(n, w, h, 0, false);
         let b = |name: &str| &l.buffers[name][..];
@@ -224,7 +224,7 @@ fn more_passes_than_uniforms_fit_a_submission() {
 #[test]
 fn room_that_emit_leaves_over_is_nobodys() {
     let Some(mut gpu) = gpu() else { return };
-    gpu.shape = Shape::Lanes32;
+    gpu.shape = Shape::Lanes;
     let l = lists(300, 64, 48, 0, false);
     let b = |name: &str| &l.buffers[name][..];
     let n = l.view.gaussians as usize;
@@ -366,14 +366,6 @@ fn loss() {
         let back = run(shaders::SsimBackwardRows::SHADER, &[&ssim[1], &blurred[2]], row_groups, &[(1, 1e-3)]);
         run(shaders::LossGradient::SHADER, &[&frame, &targets, &back[1], &zeros(6 * n), &sums], column_groups, &[(3, 1e-2), (4, 2e-3)]);
     }
-}
-
-#[test]
-fn ceiling() {
-    let Some(gpu) = gpu() else { return };
-    let job = Ceiling { invocations: 100, rounds: 50, factor: 0.99, summand: 0.01 };
-    let [device, twin] = both(&gpu, shaders::Ceiling::SHADER, Channels::Both, false, &job, &[&zeros(100)], 2);
-    assert_close("ceiling", floats(&device[0]), floats(&twin[0]), 1e-4, 0.0);
 }
 
 #[test]

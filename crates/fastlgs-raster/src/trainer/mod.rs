@@ -13,7 +13,6 @@ use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
 use crate::schedule::{Budget, Strategy, TrainConfig};
-use crate::shape::Shape;
 use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
@@ -58,16 +57,12 @@ pub struct TrainReport {
     pub gaussians: usize,
     /// What the automatic budget removed.
     pub removals: Vec<Removal>,
-    /// Seconds, of those above, in which it was chosen.
-    pub removal_seconds: f64,
     /// Colour and feature behind everything.
     pub background: [f32; 6],
     /// What the watched views gained by aligning their poses, in dB, where that was looked at.
     pub alignment_gain: Option<f64>,
     /// Adapter.
     pub adapter: String,
-    /// Shape of its kernels, where it has any.
-    pub shape: Option<Shape>,
 }
 
 /// A training run; drive it with [`Trainer::run`].
@@ -281,7 +276,6 @@ impl Trainer {
         let mut started = Instant::now();
         // Time of what `report` does is not the run's.
         let mut aside = 0.0;
-        let mut removal_seconds = 0.0;
         while self.course.iteration < self.course.config.iterations {
             self.step()?;
             let iteration = self.course.iteration;
@@ -301,9 +295,7 @@ impl Trainer {
                 self.align()?;
             }
             if self.course.config.prunes(iteration) {
-                let removing = Instant::now();
                 self.prune()?;
-                removal_seconds += removing.elapsed().as_secs_f64();
             }
             if iteration.is_multiple_of(20) || self.course.config.couples_at == Some(iteration) {
                 let losses = self.engine.losses()?;
@@ -327,11 +319,9 @@ impl Trainer {
             iterations_per_second: f64::from(steps.saturating_sub(1)) / seconds.max(1e-9),
             gaussians: self.engine.len(),
             removals: self.course.removals.clone(),
-            removal_seconds,
             background: self.course.background.values,
             alignment_gain: self.course.alignment_gain,
             adapter: self.engine.name(),
-            shape: self.engine.shape(),
         })
     }
 

@@ -42,14 +42,6 @@ impl Sink for Amid<'_> {
     }
 }
 
-/// Has the steps cost what they cost with masks, for a trial.
-pub fn pretend(trainer: &mut Trainer) -> Result<()> {
-    trainer.couple(|_, _| Ok::<_, crate::Error>(()))?;
-    let pixels: Vec<usize> = trainer.cameras().iter().map(|camera| (camera.width * camera.height) as usize).collect();
-    trainer.towards(move |id| Ok(vec![pack([0; 3], true); pixels[id]]));
-    Ok(())
-}
-
 /// Has the views trained towards the masks that [`begin`] found.
 pub fn go_on(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()> {
     let codes: Vec<[u8; 3]> = fs::read_json(&place(folder, "codes.json"))?;

@@ -4,7 +4,7 @@ use crate::eyes::{EncoderKind, SegmenterKind};
 use crate::objects;
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::objects as chosen;
-use fastlgs_raster::{Budget, FEW_VIEWS, Shape};
+use fastlgs_raster::{Budget, FEW_VIEWS};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
@@ -180,13 +180,6 @@ fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
     text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
 }
 
-/// Parses a time above zero.
-#[cfg(feature = "clap")]
-pub(crate) fn parse_minutes(text: &str) -> Result<f64, String> {
-    let minutes = text.parse().ok().filter(|n: &f64| n.is_finite() && *n > 0.0);
-    minutes.ok_or_else(|| format!("'{text}' is no number of minutes"))
-}
-
 /// What is trained, and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
@@ -200,10 +193,6 @@ pub struct Config {
     /// Iterations, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub iterations: Option<u32>,
-    /// As many iterations as fit into so many minutes, objects included, on this machine, instead of the preset's; the report says how many, and
-    /// --iterations does the same again elsewhere.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "N", conflicts_with_all = ["iterations", "preset"], value_parser = parse_minutes))]
-    pub minutes: Option<f64>,
     /// Gaussians: `auto` (as many as held-out quality gains from; at most one for 20 pixels of the training photos, and 200,000 with the preset
     /// quick, 300,000 with standard, a million with paper), or exactly how many there may be.
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
@@ -259,10 +248,6 @@ pub struct Config {
     /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
-    /// How the adapter's kernels divide their work: lanes32, lanes64 or wide; by default what was fastest here. The report of a training names its
-    /// shape, with which the same comes out again.
-    #[cfg_attr(feature = "clap", arg(long))]
-    pub shape: Option<Shape>,
     /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
     pub curve: Option<u32>,
@@ -282,7 +267,6 @@ impl Default for Config {
             scene: PathBuf::new(),
             preset: Preset::default(),
             iterations: None,
-            minutes: None,
             budget: None,
             strategy: Strategy::default(),
             sh_degree: None,
@@ -300,7 +284,6 @@ impl Default for Config {
             alpha: paper.alpha,
             cues: vec![Cue::Keypoints, Cue::Color],
             support: objects.min_support,
-            shape: None,
             curve: None,
             feature_weight: FEATURE_WEIGHT,
             resume: false,

@@ -2,7 +2,6 @@
 
 mod borders;
 mod config;
-mod pace;
 mod report;
 mod settings;
 mod start;
@@ -12,15 +11,13 @@ use crate::output::SceneLock;
 use crate::progress::{Message, TrainStep};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, checkpoints, clear, objects, preprocess};
-#[cfg(feature = "clap")]
-pub(crate) use config::parse_minutes;
 pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset, Strategy};
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::Trainer;
 pub use report::{CurvePoint, Report};
-use settings::{device, settings};
+use settings::settings;
 pub(crate) use start::target;
 use std::time::Instant;
 
@@ -45,7 +42,6 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         bail!("--preset like-paper finds objects as the paper does: leave out --mapping keep, or name another preset");
     }
     let config = &config.resolved();
-    let began = Instant::now();
     let by_descent = config.feature_mode == FeatureMode::Train;
     if by_descent && config.mapping == Mapping::Global {
         bail!(
@@ -70,7 +66,6 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &background, |name| light.gain(name));
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
     held_out.check()?;
-    let config = &pace::fitted(config, &folder, &mut manifest, &training, &targets, began, run)?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     // There is nothing to train in what photos see through.
     clear::take(&mut first);
@@ -86,8 +81,8 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         );
     }
     let settings = settings(config, &first, &targets, &manifest, run.seed)?;
-    let device = device(settings.iterations, run)?;
-    let engine = fastlgs_raster::open_engine_as(&device.device, config.shape)?;
+    let device = fastlgs_raster::choice(run.device);
+    let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
     trainer.keep_free(free);
@@ -186,14 +181,12 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         psnr_held_out: psnr,
         curve,
         adapter: result.adapter,
-        shape: result.shape,
         device,
     };
     manifest.seconds.insert("train".to_owned(), result.seconds);
     // It is no more what `make` once made; where that called, it says so again.
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
-    manifest.notes.remove(pace::NOTE);
     staged.publish(&folder, &LEFT, [], &manifest)?;
     objects::end_maps(&folder);
     // Checkpoints serve a broken run only.

@@ -6,7 +6,7 @@ use crate::{Error, Result, objects};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_raster::budget::Removal;
-use fastlgs_raster::{Choice, Shape, View};
+use fastlgs_raster::{Choice, View};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -62,8 +62,6 @@ pub struct Report {
     pub curve: Vec<CurvePoint>,
     /// The device's name.
     pub adapter: String,
-    /// Shape of its kernels, where it has any.
-    pub shape: Option<Shape>,
     /// What `--device` meant, and why.
     pub device: Choice,
 }

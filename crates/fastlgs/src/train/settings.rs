@@ -3,28 +3,13 @@
 use super::borders;
 use super::config::{Align, Config, Exposures, FeatureMode, Strategy};
 use crate::preprocess::Brightness;
-use crate::{Result, Run};
+use crate::Result;
 use fastlgs_core::Gaussians;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_raster::{Alignment, Channels, Choice, Targets, TrainConfig};
+use fastlgs_raster::{Alignment, Channels, Targets, TrainConfig};
 
 /// Difference of two photos in stops from which exposures are learned.
 const VARYING: f32 = 0.15;
-
-/// Iterations from which it pays to find out first which kernels the device is fastest with.
-const WORTH_TUNING: u32 = 500;
-
-/// The device for so many iterations.
-pub fn device(iterations: u32, run: &Run) -> Result<Choice> {
-    if iterations >= WORTH_TUNING {
-        match fastlgs_raster::tuning::tune(run.device, false) {
-            // Where nothing was asked for, a device that fails is none.
-            Err(error) if run.device == "auto" => return Ok(Choice { device: "cpu".to_owned(), why: error.to_string() }),
-            measured => drop(measured?),
-        }
-    }
-    Ok(fastlgs_raster::choice(run.device))
-}
 
 /// What the trainer is told: options, else what the preset says.
 pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> Result<TrainConfig> {

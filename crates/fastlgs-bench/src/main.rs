@@ -1,35 +1,38 @@
-//! `fastlgs bench`: what the program costs and what it gives. Each bench writes its files into a folder and returns its figures.
+//! `fastlgs-bench`: speed, accuracy, stability and size of the program.
+//!
+//! Each bench writes its files into a folder and returns its figures.
 
 mod autoencoder;
 mod baseline;
 mod chart;
 mod command;
 mod disturb;
-mod growth;
 mod labelled;
 mod names;
 mod paper;
 mod plot;
-mod report;
 mod size;
 mod speed;
 mod stability;
 mod table;
-mod teach;
 mod trial;
-mod vision;
 mod ways;
 
 use anyhow::Result;
+use clap::Parser;
 use fastlgs::Run;
+use fastlgs_cli::{console::Console, report, ui};
 use serde_json::Value;
+use std::process::ExitCode;
 
-#[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs bench speed scenes/fox --gaussians 50000 --size 270x480")]
-/// Which bench, with its options.
-pub struct Args {
+/// Measures FastLGS.
+#[derive(Parser)]
+#[command(name = "fastlgs-bench", version, after_help = "Example: fastlgs-bench speed scenes/fox --gaussians 50000 --size 270x480")]
+struct Cli {
     #[command(subcommand)]
     what: What,
+    #[command(flatten)]
+    common: ui::Common,
 }
 
 #[derive(clap::Subcommand)]
@@ -46,34 +49,27 @@ enum What {
     Stability(stability::Args),
     /// The paper's ablations, with its own figures beside ours.
     Paper(paper::Args),
-    /// Seconds and memory of global mapping as photos, masks and Gaussians grow.
-    Growth(growth::Args),
     /// What texts give on scenes that nothing was chosen on, and how much more where they were seen.
     Names(names::Args),
-    /// Whether what is taught by a click in one view is found by its name in other views and scenes.
-    Teach(teach::Args),
-    /// The other benches' results and sample pictures in one HTML file.
-    Report(report::Args),
-    /// Masks and embeddings alone, on labelled photos.
-    Vision(vision::Args),
 }
 
-/// Runs a bench; its figures.
-///
-/// # Errors
-/// What a stage of the pipeline refuses, or a folder that cannot be written.
-pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    match &args.what {
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    fastlgs_cli::start(&cli.common);
+    let console = Console::new(&cli.common);
+    let figures = bench(&cli.what, &cli.common.run(&console));
+    fastlgs_cli::end(figures.and_then(|figures| report::give(&cli.common, &figures)))
+}
+
+/// Runs a bench and returns its figures.
+fn bench(what: &What, run: &Run) -> Result<Value> {
+    match what {
         What::Speed(args) => speed::run(args, run),
         What::Baseline(args) => baseline::run(args, run),
         What::Chart(args) => chart::run(args, run),
         What::Size(args) => size::run(args, run),
         What::Stability(args) => stability::run(args, run),
         What::Paper(args) => paper::run(args, run),
-        What::Growth(args) => growth::run(args, run),
         What::Names(args) => names::run(args, run),
-        What::Teach(args) => teach::run(args, run),
-        What::Report(args) => report::run(args, run),
-        What::Vision(args) => vision::run(args, run),
     }
 }
