@@ -1,5 +1,4 @@
-// Adam (Kingma & Ba 2015) over the trained values, with one learning rate a channel, and the regularisers of MCMC
-// (Kheradmand et al. 2024) on opacity and scale. Works on one page, four Gaussians an invocation; shared/channels.wgsl.
+// Adam (Kingma & Ba 2015) over the trained values, with one learning rate a channel, and a penalty on opacity. Works on one page, four Gaussians an invocation; shared/channels.wgsl.
 #import channels
 #import flat
 
@@ -13,9 +12,9 @@ struct Step {
     // First trained channel, and the one after the last.
     first_channel: u32,
     end_channel: u32,
-    // Weights of the sums of opacity and of scale in the loss.
+    // Weight of the sum of opacities in the loss.
     opacity_weight: f32,
-    scale_weight: f32,
+    unused: u32,
     // Learning rates of the channels below SH_REST, in fours, then that of all SH coefficients above degree 0.
     rates: array<vec4<f32>, 5>,
 }
@@ -41,9 +40,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         if channel == OPACITY {
             let opacity = 1.0 / (1.0 + exp(-value));
             g += step.opacity_weight * opacity * (1.0 - opacity);
-        }
-        if channel >= LOG_SCALE && channel < ROTATION {
-            g += step.scale_weight * exp(value);
         }
         let m1 = 0.9 * moment1[k] + 0.1 * g;
         let m2 = 0.999 * moment2[k] + 0.001 * g * g;

@@ -1,5 +1,5 @@
 //! Density control as small named operations on the training state: clone, split, prune and opacity reset of 3DGS
-//! (section 5), and relocation and growth of 3DGS-MCMC (Kheradmand et al. 2024).
+//! (section 5).
 
 use fastlgs_core::Gaussians;
 use fastlgs_core::curve::along_curve;
@@ -203,85 +203,6 @@ pub fn reset_opacity(state: &mut State, ceiling: f32) {
     }
 }
 
-/// Opacity at or below which MCMC calls a Gaussian dead.
-const DEAD: f32 = 0.005;
-
-/// Moves dead Gaussians onto live ones, chosen with the probability of their opacity; the place looks as before.
-/// Returns how many moved.
-pub fn relocate(state: &mut State, rng: &mut Rng) -> usize {
-    let dead: Vec<usize> = (0..state.len()).filter(|&i| !state.is_finite(i) || state.opacity(i) <= DEAD).collect();
-    if dead.len() == state.len() {
-        return 0;
-    }
-    let mut sources: Vec<usize> = (0..state.len()).collect();
-    for (&place, source) in dead.iter().zip(sampled(state, dead.len(), rng)) {
-        sources[place] = source;
-    }
-    share(state, &sources);
-    dead.len()
-}
-
-/// Adds copies of Gaussians chosen with the probability of their opacity, so many that equal rates reach the budget in `rounds`, this one
-/// among them. Returns how many were added.
-pub fn grow(state: &mut State, budget: usize, rounds: u32, rng: &mut Rng) -> usize {
-    let n = state.len();
-    let rate = (budget as f64 / n as f64).powf(1.0 / f64::from(rounds.max(1)));
-    let added = ((n as f64 * rate).round() as usize).min(budget).saturating_sub(n);
-    let sources: Vec<usize> = (0..n).chain(sampled(state, added, rng)).collect();
-    share(state, &sources);
-    added
-}
-
-/// `count` live Gaussians, drawn with the probability of their opacity.
-fn sampled(state: &State, count: usize, rng: &mut Rng) -> Vec<usize> {
-    let mut sum = 0.0f64;
-    let live = |o: f32| if o > DEAD { f64::from(o) } else { 0.0 };
-    let cumulative: Vec<f64> = (0..state.len())
-        .map(|i| {
-            sum += if state.is_finite(i) { live(state.opacity(i)) } else { 0.0 };
-            sum
-        })
-        .collect();
-    let mut draw = || {
-        let drawn = f64::from(rng.uniform()) * sum;
-        cumulative.partition_point(|c| *c <= drawn).min(state.len() - 1)
-    };
-    (0..count).map(|_| draw()).collect()
-}
-
-/// The state whose Gaussian k is a copy of `sources[k]`, copies of one being made fainter and smaller so that together
-/// they look like it (MCMC, eq. 9); those start without momentum.
-fn share(state: &mut State, sources: &[usize]) {
-    let mut copies = vec![0usize; state.len()];
-    sources.iter().for_each(|&s| copies[s] += 1);
-    let fresh: Vec<(usize, bool)> = sources.iter().map(|&s| (s, copies[s] > 1)).collect();
-    *state = state.gathered(&fresh);
-    let n = state.len();
-    for (i, &source) in sources.iter().enumerate().filter(|(_, s)| copies[**s] > 1) {
-        let (opacity, shrink) = shared(state.opacity(i), copies[source]);
-        state.params[10 * n + i] = logit(opacity.clamp(DEAD, 1.0 - f32::EPSILON));
-        (3..6).for_each(|c| state.params[c * n + i] += shrink.ln());
-    }
-}
-
-/// Opacity of each of `copies` in one place, and the factor on their scales.
-fn shared(opacity: f32, copies: usize) -> (f32, f32) {
-    // More copies than these change nothing that can be seen, and their binomials overflow.
-    let copies = copies.min(50);
-    let old = f64::from(opacity).min(1.0 - 1e-7);
-    let new = 1.0 - (1.0 - old).powf(1.0 / copies as f64);
-    let mut denominator = 0.0;
-    for i in 0..copies {
-        let mut binomial = 1.0f64;
-        for k in 0..=i {
-            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
-            denominator += binomial * sign * new.powi(k as i32 + 1) / ((k + 1) as f64).sqrt();
-            binomial *= (i - k) as f64 / (k + 1) as f64;
-        }
-    }
-    (new as f32, (old / denominator) as f32)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -335,45 +256,5 @@ mod tests {
         let mut s = state(&scene);
         assert_eq!(refine(&mut s, &[0.0; 8], 1.0, &Config::default(), &mut Rng::new(1, "test")).pruned, 2);
         assert_eq!(s.len(), 2);
-    }
-
-    #[test]
-    fn sources_are_drawn_by_their_opacity() {
-        let mut scene = Gaussians::default();
-        (0..100).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, if i < 50 { 0.2 } else { 0.6 }, [0.5; 3]));
-        scene.means[99].x = f32::NAN;
-        let drawn = sampled(&state(&scene), 100_000, &mut Rng::new(1, "test"));
-        let mut counts = [0u32; 100];
-        drawn.iter().for_each(|&i| counts[i] += 1);
-        assert_eq!(counts[99], 0, "what is nowhere is copied nowhere");
-        for (i, count) in counts[..99].iter().enumerate() {
-            let wanted = 100_000.0 * if i < 50 { 0.2 } else { 0.6 } / (50.0 * 0.2 + 49.0 * 0.6);
-            assert!((f64::from(*count) - wanted).abs() < 5.0 * wanted.sqrt(), "{i}: {count} of {wanted}");
-        }
-    }
-
-    #[test]
-    fn relocation_revives_the_dead_where_it_is_dense() {
-        let mut scene = Gaussians::default();
-        scene.push_sphere(Vec3::ZERO, 0.5, 0.9, [0.5; 3]);
-        scene.push_sphere(Vec3::X, 0.5, 0.001, [0.5; 3]);
-        let mut s = state(&scene);
-        assert_eq!(relocate(&mut s, &mut Rng::new(1, "test")), 1);
-        assert_eq!(s.vec3(0, 1), Vec3::ZERO);
-        // Two of them, one behind the other, let through what the one did.
-        assert!(((1.0 - s.opacity(0)).powi(2) - 0.1).abs() < 1e-3);
-        assert!(s.largest_scale(0) < 0.5 && s.largest_scale(0) > 0.3, "{}", s.largest_scale(0));
-        assert_eq!(shared(0.7, 1), (0.7, 1.0));
-    }
-
-    #[test]
-    fn growth_stops_at_the_budget() {
-        let mut scene = Gaussians::default();
-        (0..100).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
-        let mut s = state(&scene);
-        assert_eq!(grow(&mut s, 121, 2, &mut Rng::new(1, "test")), 10);
-        assert_eq!(grow(&mut s, 121, 1, &mut Rng::new(1, "test")), 11);
-        assert_eq!(s.len(), 121);
-        assert_eq!(grow(&mut s, 121, 3, &mut Rng::new(1, "test")), 0);
     }
 }

@@ -190,11 +190,6 @@ pub trait Engine: Send {
     /// # Errors
     /// As [`Self::render`].
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()>;
-    /// Adds the noise of MCMC to the means.
-    ///
-    /// # Errors
-    /// When the device failed.
-    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()>;
     /// Losses of the last step.
     ///
     /// # Errors

@@ -3,7 +3,7 @@
 //!
 //! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles -> `tile_ranges` ->
 //! `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`, `ssim_columns`, `ssim_backward_rows`,
-//! `loss_gradient` -> `blend_backward` -> `project_backward` -> `adam` (-> `perturb` with MCMC).
+//! `loss_gradient` -> `blend_backward` -> `project_backward` -> `adam`.
 //!
 //! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as vectorised Rust ([`CpuEngine`]).
 
@@ -43,7 +43,7 @@ pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
 pub use open::{Choice, choice, open_engine};
 
-pub use schedule::{Alignment, Budget, Strategy, TrainConfig};
+pub use schedule::{Alignment, Budget, TrainConfig};
 pub use shape::Shape;
 pub use target::{Target, Targets};
 pub use trainer::{Progress, TrainReport, Trainer};

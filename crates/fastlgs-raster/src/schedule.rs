@@ -5,15 +5,6 @@ use crate::view::Rates;
 use fastlgs_core::gaussians::BASE_CHANNELS;
 use serde::{Deserialize, Serialize};
 
-/// How the number of Gaussians is controlled.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Strategy {
-    /// Clone, split and prune with opacity resets (3DGS).
-    Classic,
-    /// Relocation, growth and noise (3DGS-MCMC).
-    Mcmc,
-}
-
 /// How many Gaussians there may be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Budget {
@@ -48,12 +39,10 @@ pub enum Alignment {
 pub struct TrainConfig {
     /// Optimiser steps.
     pub iterations: u32,
-    /// Seed of view order, splitting, relocation and noise.
+    /// Seed of view order, splitting and left-out Gaussians.
     pub seed: u64,
     /// How many Gaussians there may be.
     pub budget: Budget,
-    /// How their number is controlled.
-    pub strategy: Strategy,
     /// What is trained.
     pub channels: crate::Channels,
     /// Highest SH degree of colour; it grows step by step.
@@ -89,7 +78,6 @@ impl Default for TrainConfig {
             iterations: 3000,
             seed: 0,
             budget: Budget::Fixed(60_000),
-            strategy: Strategy::Classic,
             channels: crate::Channels::Color,
             sh_degree: 0,
             first_degree: 0,
@@ -117,21 +105,14 @@ const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
 const RESET_EVERY: u32 = 3000;
 /// Shares of the iterations after the end of growth at which unimportant Gaussians are removed under an automatic budget.
 const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
-/// Share of the iterations for which MCMC moves Gaussians, as its authors do: 25,000 of 30,000.
-const MCMC_UNTIL: f32 = 0.83;
 /// Shares of the iterations after which cameras are aligned: once shapes stand, and so that what is left can follow.
 const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
-/// Weights of the means of opacity and scale in the loss, as MCMC's authors have them.
-const OPACITY_WEIGHT: f32 = 0.01;
-const SCALE_WEIGHT: f32 = 0.01 / 3.0;
-/// What a mean opacity of 1 costs in the classic strategy, in standard deviations of the photos' brightness: the loss is a difference of brightness, and
+/// What a mean opacity of 1 costs in standard deviations of the photos' brightness: the loss is a difference of brightness, and
 /// a fixed price that suits bright photos takes from dark ones what they show. It stands for opacity resets, from which runs of a few thousand steps
 /// would not recover, and ends with the first removal: what no photo asks for fades, and goes.
 const OPACITY_PRICE: f32 = 0.04;
 /// Share of the Gaussians that the last step leaves out where photos are few (DropGaussian).
 const LEFT_OUT: f32 = 0.2;
-/// Noise scale of MCMC against the means' learning rate.
-const NOISE: f32 = 5e5;
 
 impl TrainConfig {
     /// Share of the run that is done at a step.
@@ -182,7 +163,7 @@ impl TrainConfig {
 
     /// Steps between two rounds of density control.
     fn between_rounds(&self) -> u32 {
-        let growing = self.step_at(self.density_until()).saturating_sub(self.step_at(REFINE_FROM));
+        let growing = self.step_at(self.refine_until).saturating_sub(self.step_at(REFINE_FROM));
         (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
@@ -191,31 +172,16 @@ impl TrainConfig {
         iteration <= self.step_at(self.refine_until)
     }
 
-    /// Rounds of density control in which the scene may grow, from the one at `iteration` on.
-    pub(crate) fn rounds_left(&self, iteration: u32) -> u32 {
-        1 + self.step_at(self.refine_until).saturating_sub(iteration) / self.between_rounds()
-    }
-
-    /// Share of the iterations after which density control ends: with MCMC, which moves Gaussians as well, later than growth.
-    fn density_until(&self) -> f32 {
-        match self.strategy {
-            Strategy::Classic => self.refine_until,
-            Strategy::Mcmc => self.refine_until.max(MCMC_UNTIL),
-        }
-    }
-
     /// Whether a round of density control follows the step that made it `iteration` steps.
     pub(crate) fn refines(&self, iteration: u32) -> bool {
-        let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.density_until()));
+        let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.refine_until));
         let due = iteration.checked_sub(from).is_some_and(|since| since.is_multiple_of(self.between_rounds()));
         self.channels.color() && due && iteration > 0 && iteration <= until
     }
 
     /// Whether opacities are reset then: not so late that they could not recover before growth ends.
     pub(crate) fn resets_opacity(&self, iteration: u32) -> bool {
-        self.strategy == Strategy::Classic
-            && iteration.is_multiple_of(RESET_EVERY)
-            && iteration + RESET_EVERY / 2 <= self.step_at(self.refine_until)
+        iteration.is_multiple_of(RESET_EVERY) && iteration + RESET_EVERY / 2 <= self.step_at(self.refine_until)
     }
 
     /// Whether unimportant Gaussians are removed then.
@@ -230,20 +196,11 @@ impl TrainConfig {
         asked && ALIGN_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
     }
 
-    /// Weights of each of so many Gaussians' opacity and scale in the loss of a step. `contrast`: standard deviation of the photos' brightness.
-    pub(crate) fn regularisers(&self, iteration: u32, gaussians: usize, contrast: f32) -> [f32; 2] {
+    /// Weight of each Gaussian's opacity in the loss of a step. `contrast`: standard deviation of the photos' brightness.
+    pub(crate) fn opacity_weight(&self, iteration: u32, gaussians: usize, contrast: f32) -> f32 {
+        let fades = self.channels.color() && iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]);
         let each = 1.0 / gaussians as f32;
-        match self.strategy {
-            _ if !self.channels.color() => [0.0; 2],
-            Strategy::Mcmc => [OPACITY_WEIGHT * each, SCALE_WEIGHT * each],
-            Strategy::Classic if iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]) => [OPACITY_PRICE * contrast * each, 0.0],
-            Strategy::Classic => [0.0; 2],
-        }
-    }
-
-    /// Amount of the MCMC noise, where there is any.
-    pub(crate) fn noise(&self, mean_rate: f32) -> Option<f32> {
-        (self.strategy == Strategy::Mcmc).then_some(NOISE * mean_rate)
+        if fades { OPACITY_PRICE * contrast * each } else { 0.0 }
     }
 }
 
@@ -273,7 +230,7 @@ mod tests {
         assert!(config.prunes(3600) && config.prunes(5200) && !config.prunes(5201));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
-        assert_eq!([3599, 3600].map(|i| config.regularisers(i, 1, 0.5)), [[0.5 * OPACITY_PRICE, 0.0], [0.0; 2]]);
+        assert_eq!([3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)), [0.5 * OPACITY_PRICE, 0.0]);
         let continued = TrainConfig { first_degree: 2, ..config.clone() };
         assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };

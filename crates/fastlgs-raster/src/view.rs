@@ -163,8 +163,7 @@ pub struct Step {
     pub end_channel: u32,
     /// Weight of the sum of opacities in the loss.
     pub opacity_weight: f32,
-    /// Weight of the sum of scales in the loss.
-    pub scale_weight: f32,
+    pub(crate) unused: u32,
     /// Learning rates of the base channels, then that of all SH coefficients above degree 0.
     pub rates: [f32; 20],
 }
@@ -186,24 +185,10 @@ impl Step {
             first_channel: range.start as u32,
             end_channel: range.end as u32,
             opacity_weight: 0.0,
-            scale_weight: 0.0,
+            unused: 0,
             rates: all,
         }
     }
-}
-
-/// Uniform of the MCMC noise pass.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Perturb {
-    /// Gaussians of the page.
-    pub n: u32,
-    /// The first of them.
-    pub first: u32,
-    /// Number of this step in the run's random sequence.
-    pub seed: u32,
-    /// Noise scale times the means' learning rate.
-    pub amount: f32,
 }
 
 /// Uniform of the loss passes; `shaders/shared/window.wgsl`.

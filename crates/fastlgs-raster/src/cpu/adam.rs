@@ -14,25 +14,21 @@ pub fn adam(step: &Step, gradients: &[f32], params: &mut [f32], moment1: &mut [f
 /// One trained value.
 #[inline]
 fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f32, moment1: &mut f32, moment2: &mut f32) {
-    let g = gradient + price(step, channel, *param);
+    let g = if channel == OPACITY { gradient + opacity_penalty(step, *param) } else { gradient };
     let next = moved(step, step.rates[channel.min(BASE_CHANNELS)], g, *param, moment1, moment2);
     *param = if FEATURES.contains(&channel) { next.clamp(0.0, 1.0) } else { next };
 }
 
+/// Channel of the opacity.
+pub(crate) const OPACITY: usize = 10;
 /// Channels of the feature, which stays in the unit cube.
 pub(crate) const FEATURES: std::ops::Range<usize> = 14..BASE_CHANNELS;
 
-/// What a value's price adds to its gradient: opacity and scales have one.
+/// Gradient of the opacity penalty.
 #[inline]
-pub(crate) fn price(step: &Step, channel: usize, param: f32) -> f32 {
-    match channel {
-        10 if step.opacity_weight != 0.0 => {
-            let opacity = sigmoid(param);
-            step.opacity_weight * opacity * (1.0 - opacity)
-        }
-        3..6 if step.scale_weight != 0.0 => step.scale_weight * param.exp(),
-        _ => 0.0,
-    }
+pub(crate) fn opacity_penalty(step: &Step, opacity_logit: f32) -> f32 {
+    let opacity = sigmoid(opacity_logit);
+    step.opacity_weight * opacity * (1.0 - opacity)
 }
 
 /// The next value; moments change with it.

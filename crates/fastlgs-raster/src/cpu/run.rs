@@ -66,7 +66,6 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         ("adam", [gradients, params, moment1, moment2]) => {
             adam(&uniform_of(uniform), read(gradients), write(params), write(moment1), write(moment2));
         }
-        ("perturb", [params]) => perturb(&uniform_of(uniform), write(params)),
         (name, buffers) => panic!("no twin '{name}' of {} buffers", buffers.len()),
     }
 }

@@ -33,7 +33,6 @@ pub struct Training {
     pub ssim_backward_rows: Typed<shaders::SsimBackwardRows>,
     pub loss_gradient: Typed<shaders::LossGradient>,
     pub adam: Typed<shaders::Adam>,
-    pub perturb: Typed<shaders::Perturb>,
 }
 
 /// Passes that differ with what is trained.
@@ -79,7 +78,6 @@ impl Kernels {
                 ssim_backward_rows: pass!(),
                 loss_gradient: pass!(),
                 adam: pass!(),
-                perturb: pass!(),
             },
             blend_ids: pass!(),
             blending: HashMap::new(),

@@ -12,13 +12,13 @@ use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
 use crate::pass::Recorder;
 use crate::profile::Profile;
-use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers, PerturbBuffers};
-use crate::view::{Perturb, Step, View};
+use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers};
+use crate::view::{Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
 use fastlgs_core::Shares;
 use fastlgs_core::shares::KEPT;
-use kernels::{GROUP, Kernels, kind};
+use kernels::{Kernels, kind};
 use lists::{ListMaker, Lists};
 use pages::Gaussians;
 use picture::{Loss, Picture};
@@ -214,16 +214,6 @@ impl Engine for GpuEngine {
         adam(&self.kernels.training, &mut r, g, step)?;
         r.submit();
         self.last = Some((view, channels));
-        Ok(())
-    }
-
-    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()> {
-        let mut r = Recorder::new(&self.gpu, 0);
-        for page in self.gaussians.iter().flat_map(|g| &g.pages) {
-            let job = Perturb { n: page.n as u32, first: page.first as u32, seed, amount };
-            r.run(&self.kernels.training.perturb, &job, PerturbBuffers { params: &page.params }, job.n.div_ceil(GROUP))?;
-        }
-        r.submit();
         Ok(())
     }
 

@@ -1,7 +1,7 @@
 //! Adam over the values of some Gaussians at once.
 
 use super::simd::vectorised;
-use crate::cpu::{FEATURES, moved, price};
+use crate::cpu::{FEATURES, OPACITY, moved, opacity_penalty};
 use crate::view::Step;
 
 /// Gaussians whose values lie together in the cache.
@@ -26,7 +26,9 @@ pub fn block(step: &Step, width: usize, rates: &[f32], values: Values) {
     let priced = &mut priced[..params.len()];
     priced.copy_from_slice(gradients);
     for (row, gradients) in params.chunks_exact(width).zip(priced.chunks_exact_mut(width)) {
-        [3, 4, 5, 10].into_iter().filter(|c| trained.contains(c)).for_each(|c| gradients[c] += price(step, c, row[c]));
+        if trained.contains(&OPACITY) {
+            gradients[OPACITY] += opacity_penalty(step, row[OPACITY]);
+        }
     }
     if trained == (0..width) {
         adam(step, &rates[..params.len()], priced, params, moment1, moment2);

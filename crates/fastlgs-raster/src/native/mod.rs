@@ -8,10 +8,10 @@ mod picture;
 mod simd;
 
 use crate::channels::Channels;
-use crate::cpu::{self, perturb_one};
+use crate::cpu;
 use crate::density::State;
 use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered};
-use crate::view::{Perturb, Step, View};
+use crate::view::{Step, View};
 use crate::{Error, Result};
 use blend::{Blended, EDGE, Given, Job, Tile};
 use fastlgs_core::Shares;
@@ -341,15 +341,6 @@ impl Engine for CpuEngine {
         {
             self.cached.extend(self.lists.take().map(|lists| (id, lists)));
         }
-        Ok(())
-    }
-
-    fn perturb(&mut self, seed: u32, amount: f32) -> Result<()> {
-        let job = Perturb { n: self.n as u32, first: 0, seed, amount };
-        self.params.par_chunks_exact_mut(channels_of(self.sh_degree)).enumerate().for_each(|(i, row)| {
-            let offset = perturb_one(&job, i as u32, |c| row[c]);
-            (0..3).for_each(|k| row[k] += offset[k]);
-        });
         Ok(())
     }
 

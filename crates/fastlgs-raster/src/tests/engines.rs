@@ -141,7 +141,6 @@ fn the_gpu_repeats_itself_to_the_byte() {
         for t in 1..=5 {
             let step = Step::new(t, 0..channels_of(2), &[1e-3; BASE_CHANNELS + 1]);
             engine.step(View::new(&camera(96, 64), 2000, 2), 0, &options(Channels::Coupled), &step).unwrap();
-            engine.perturb(t, 0.01).unwrap();
         }
         engine.state().unwrap().params.iter().map(|v| v.to_bits()).collect::<Vec<_>>()
     };

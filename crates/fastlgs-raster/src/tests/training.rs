@@ -1,7 +1,7 @@
 //! Whole runs: resumed ones, all strategies, and what is learned beside the Gaussians.
 
 use super::{camera, cloud, gpu, target};
-use crate::{Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Strategy, Target, TrainConfig, TrainReport, Trainer};
+use crate::{Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, TrainConfig, TrainReport, Trainer};
 use fastlgs_core::Camera;
 use fastlgs_core::dataset::SfmPoint;
 use glam::Vec3;
@@ -27,42 +27,39 @@ fn run(config: TrainConfig) -> (Trainer, TrainReport) {
 #[test]
 fn resumes_to_the_same_bytes() {
     let Some(_) = gpu() else { return };
-    for strategy in [Strategy::Classic, Strategy::Mcmc] {
-        let dir = tempfile::tempdir().unwrap();
-        let config = TrainConfig {
-            iterations: 600,
-            budget: Budget::Auto(400),
-            strategy,
-            sh_degree: 1,
-            exposure: true,
-            learn_background: true,
-            ..TrainConfig::default()
-        };
-        let start = || trainer(Box::new(GpuEngine::new(Gpu::open("auto").unwrap())), config.clone());
-        let bytes = |trainer: &Trainer, name: &str| {
-            let path = dir.path().join(name);
-            fastlgs_core::ply::write(&path, &trainer.gaussians().unwrap()).unwrap();
-            std::fs::read(path).unwrap()
-        };
-        let checkpoint = dir.path().join("train");
-        let mut whole = start();
-        whole.run(Some(&checkpoint), |_, _| Ok::<_, crate::Error>(())).unwrap();
-        let mut again = start();
-        again.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
-        assert_eq!(bytes(&whole, "a.ply"), bytes(&again, "b.ply"), "{strategy:?}: twice in a row");
-        let mut resumed = start();
-        assert!(resumed.resume(&checkpoint).unwrap(), "a checkpoint was left at step 500");
-        let report = resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
-        assert_eq!(report.steps_here, 100);
-        assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "{strategy:?}: resumed");
-        assert_eq!(whole.exposures(), resumed.exposures());
-        let fewer = Trainer::new(Box::new(CpuEngine::new()), &cloud(200, 8, 0, false), views(23), config.clone()).unwrap();
-        let message = { fewer }.resume(&checkpoint).unwrap_err().to_string();
-        assert!(message.contains("other photos"), "{message}");
-        let other = TrainConfig { lambda: 0.3, ..config };
-        let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
-        assert!(message.contains("other options"), "{message}");
-    }
+    let dir = tempfile::tempdir().unwrap();
+    let config = TrainConfig {
+        iterations: 600,
+        budget: Budget::Auto(400),
+        sh_degree: 1,
+        exposure: true,
+        learn_background: true,
+        ..TrainConfig::default()
+    };
+    let start = || trainer(Box::new(GpuEngine::new(Gpu::open("auto").unwrap())), config.clone());
+    let bytes = |trainer: &Trainer, name: &str| {
+        let path = dir.path().join(name);
+        fastlgs_core::ply::write(&path, &trainer.gaussians().unwrap()).unwrap();
+        std::fs::read(path).unwrap()
+    };
+    let checkpoint = dir.path().join("train");
+    let mut whole = start();
+    whole.run(Some(&checkpoint), |_, _| Ok::<_, crate::Error>(())).unwrap();
+    let mut again = start();
+    again.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
+    assert_eq!(bytes(&whole, "a.ply"), bytes(&again, "b.ply"), "twice in a row");
+    let mut resumed = start();
+    assert!(resumed.resume(&checkpoint).unwrap(), "a checkpoint was left at step 500");
+    let report = resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
+    assert_eq!(report.steps_here, 100);
+    assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "resumed");
+    assert_eq!(whole.exposures(), resumed.exposures());
+    let fewer = Trainer::new(Box::new(CpuEngine::new()), &cloud(200, 8, 0, false), views(23), config.clone()).unwrap();
+    let message = { fewer }.resume(&checkpoint).unwrap_err().to_string();
+    assert!(message.contains("other photos"), "{message}");
+    let other = TrainConfig { lambda: 0.3, ..config };
+    let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
+    assert!(message.contains("other options"), "{message}");
 }
 
 #[test]
@@ -123,13 +120,10 @@ fn what_views_look_through_stays_empty() {
 }
 
 #[test]
-fn strategies_keep_the_budget() {
-    let config = TrainConfig { iterations: 800, budget: Budget::Fixed(300), ..TrainConfig::default() };
-    for strategy in [Strategy::Classic, Strategy::Mcmc] {
-        let (_, report) = run(TrainConfig { strategy, ..config.clone() });
-        assert!(report.gaussians <= 300 && report.gaussians > 200, "{strategy:?}: {}", report.gaussians);
-        assert!(report.removals.is_empty());
-    }
+fn density_control_keeps_the_budget() {
+    let (_, report) = run(TrainConfig { iterations: 800, budget: Budget::Fixed(300), ..TrainConfig::default() });
+    assert!(report.gaussians <= 300 && report.gaussians > 200, "{}", report.gaussians);
+    assert!(report.removals.is_empty());
 }
 
 #[test]

@@ -12,7 +12,7 @@ use crate::density::{self, State};
 use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
-use crate::schedule::{Budget, Strategy, TrainConfig};
+use crate::schedule::{Budget, TrainConfig};
 use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
@@ -166,13 +166,10 @@ impl Trainer {
             Channels::Color | Channels::Both | Channels::Coupled => 0..gaussians::channels(degree),
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
-        [step.opacity_weight, step.scale_weight] = config.regularisers(iteration, self.engine.len(), self.contrast);
+        step.opacity_weight = config.opacity_weight(iteration, self.engine.len(), self.contrast);
         let left_out = config.left_out(iteration, self.targets.len());
         self.engine.step(self.view(&camera, degree).trained().without(left_out, config.draw(iteration)), id, &options, &step)?;
         self.make_room(id);
-        if let Some(amount) = config.noise(rates[0]).filter(|_| config.channels.color()) {
-            self.engine.perturb(config.draw(iteration), amount)?;
-        }
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;
             if let Some(exposure) = self.course.exposures.get_mut(id) {
@@ -195,19 +192,10 @@ impl Trainer {
         let config = &self.course.config;
         let before = state.len();
         let budget = if self.grows() { config.budget.most() } else { before };
-        match config.strategy {
-            Strategy::Classic => {
-                let limits = density::Config { budget, ..density::Config::default() };
-                let counts = density::refine(&mut state, &self.engine.stats()?, self.extent, &limits, &mut self.course.rng);
-                let floaters = state.remove_in(|mean| self.free.holds(mean));
-                tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), ?counts, floaters, "density control");
-            }
-            Strategy::Mcmc => {
-                let moved = density::relocate(&mut state, &mut self.course.rng);
-                let added = density::grow(&mut state, budget, config.rounds_left(self.course.iteration), &mut self.course.rng);
-                tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), moved, added, "density control");
-            }
-        }
+        let limits = density::Config { budget, ..density::Config::default() };
+        let counts = density::refine(&mut state, &self.engine.stats()?, self.extent, &limits, &mut self.course.rng);
+        let floaters = state.remove_in(|mean| self.free.holds(mean));
+        tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), ?counts, floaters, "density control");
         state.sort_along_curve();
         self.replace(&state)
     }

@@ -35,18 +35,6 @@ impl Preset {
     }
 }
 
-/// How the number of Gaussians is controlled.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
-pub enum Strategy {
-    /// Clone, split, prune, opacity reset.
-    #[default]
-    Classic,
-    /// Relocation and noise.
-    Mcmc,
-}
-
 /// Whether each training photo has an affine exposure of its own.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -197,9 +185,6 @@ pub struct Config {
     /// quick, 300,000 with standard, a million with paper), or exactly how many there may be.
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
     pub budget: BudgetChoice,
-    /// How their number is controlled.
-    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
-    pub strategy: Strategy,
     /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init, else the preset's, but 1 where fewer than 25 photos are
     /// trained on.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
@@ -268,7 +253,6 @@ impl Default for Config {
             preset: Preset::default(),
             iterations: None,
             budget: None,
-            strategy: Strategy::default(),
             sh_degree: None,
             antialias: false,
             background: None,

@@ -11,7 +11,7 @@ use crate::output::SceneLock;
 use crate::progress::{Message, TrainStep};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, checkpoints, clear, objects, preprocess};
-pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset, Strategy};
+pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset};
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;

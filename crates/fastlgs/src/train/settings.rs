@@ -1,7 +1,7 @@
 //! What the trainer is told, and on which device it runs.
 
 use super::borders;
-use super::config::{Align, Config, Exposures, FeatureMode, Strategy};
+use super::config::{Align, Config, Exposures, FeatureMode};
 use crate::preprocess::Brightness;
 use crate::Result;
 use fastlgs_core::Gaussians;
@@ -19,10 +19,6 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
-        strategy: match config.strategy {
-            Strategy::Classic => fastlgs_raster::Strategy::Classic,
-            Strategy::Mcmc => fastlgs_raster::Strategy::Mcmc,
-        },
         channels: match (config.freeze, by_descent) {
             (true, _) => Channels::Feature,
             (false, false) => Channels::Color,

@@ -1,6 +1,6 @@
 //! What training starts from: first Gaussians, and the pictures that they shall show.
 
-use super::config::{Background, Config, Strategy};
+use super::config::{Background, Config};
 use super::report::Report;
 use crate::error::bail;
 use crate::{Result, Run};
@@ -13,8 +13,6 @@ use fastlgs_raster::{Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Target
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Share of the distance to its neighbours that a Gaussian has at first with MCMC.
-const MCMC_SCALE: f32 = 0.1;
 /// What training starts from; where less is known, random points make up for the rest.
 const ENOUGH: usize = 5000;
 
@@ -42,11 +40,6 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     rng.shuffle(&mut points);
     points.truncate(most - behind.len());
     let mut first = init::from_points(&points);
-    if config.strategy == Strategy::Mcmc {
-        // As its authors start: what is small and solid is moved, rather than grown.
-        first.opacity_logits.fill(0.0);
-        first.log_scales.iter_mut().for_each(|s| *s += MCMC_SCALE.ln());
-    }
     first.append(behind);
     Ok(first)
 }
@@ -102,7 +95,7 @@ pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> 
 
 /// What the views of `cameras` look through, where density control asks for it.
 pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], first: &Gaussians) -> Result<FreeSpace> {
-    if cameras.len() >= FEW_VIEWS || config.strategy != Strategy::Classic || config.iterations() == 0 {
+    if cameras.len() >= FEW_VIEWS || config.iterations() == 0 {
         return Ok(FreeSpace::default());
     }
     Ok(FreeSpace::of(cameras, &first.means, &folder.points()?))
