@@ -1,21 +1,24 @@
-// Adam (Kingma & Ba 2015) over the trained values, with one learning rate a channel, and a penalty on opacity. Works on one page, four Gaussians an invocation; shared/channels.wgsl.
+// Adam (Kingma & Ba 2015) on the trained values, with a learning rate for each channel, and a
+// penalty on opacity. Works on one page (shared/channels.wgsl); an invocation updates four
+// Gaussians.
 #import channels
 #import flat
 
 struct Step {
-    // Stride of the page's channels, in fours.
+    // Stride of the page's channels, in vec4s.
     quads: u32,
-    // 1 - beta^t of both moments.
+    // 1 - beta^t of the first and of the second moment.
     correction1: f32,
     correction2: f32,
     epsilon: f32,
-    // First trained channel, and the one after the last.
+    // First trained channel, and the end (excluded).
     first_channel: u32,
     end_channel: u32,
     // Weight of the sum of opacities in the loss.
     opacity_weight: f32,
     unused: u32,
-    // Learning rates of the channels below SH_REST, in fours, then that of all SH coefficients above degree 0.
+    // Learning rates of the channels below SH_REST, then one for all SH coefficients above degree
+    // 0.
     rates: array<vec4<f32>, 5>,
 }
 
@@ -46,7 +49,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         moment1[k] = m1;
         moment2[k] = m2;
         let next = value - rate * (m1 / step.correction1) / (sqrt(m2 / step.correction2) + step.epsilon);
-        // Codes lie in (0, 1)^3 (paper): a Gaussian that hardly shows must not leave it to make up for others.
+        // Codes lie in (0, 1)^3 (paper). Without the clamp, a nearly invisible Gaussian would leave
+        // this range to compensate others.
         let is_feature = channel >= FEATURE && channel < SH_REST;
         params[k] = select(next, clamp(next, vec4(0.0), vec4(1.0)), is_feature);
     }

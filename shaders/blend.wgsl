@@ -1,7 +1,7 @@
-// Front-to-back blending of colour and feature in one pass (paper, rendering features; 3DGS eq. 3).
+// Blends colour and feature front to back in one pass (paper, rendering features; 3DGS eq. 3).
 //
-// frame [8][tile rows * 8][tile columns * 8]: r, g, b, f0, f1, f2 with the background blended in, transmittance left,
-//       and number of pairs walked through before the tile was finished.
+// frame [8][tile rows * 8][tile columns * 8]: r, g, b, f0, f1, f2 including the background,
+//       transmittance behind all Gaussians, and number of pairs processed for the tile.
 #import view
 #import flat
 #import lane
@@ -57,17 +57,17 @@ fn store_quad(quad: Quad, x: u32, y: u32, walked: f32) {
     frame[quad_at(7u, x, y, view)] = vec4<f32>(walked);
 }
 
-// Gaussians between two looks at whether the tile is finished.
+// Number of Gaussians after which blending checks whether a tile is finished.
 const BATCH: u32 = 8u;
 
 #ifdef WIDE
 #else
 #import stage
 
-// What is written out below goes by this, and Gaussians are put down every second batch.
+// The unrolled loop below requires these values; Gaussians are staged in every second batch.
 const_assert BATCH == 8u && TILE_LANES == 2u * BATCH;
 
-// The workgroup's tiles through which light still passes, as bits.
+// Bit mask of the workgroup's tiles that are not finished.
 var<workgroup> open: atomic<u32>;
 #endif
 
@@ -82,7 +82,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let py = f32(y) + 0.5;
 #each Q
     var q$Q: Quad;
-    // Nothing reaches the pixels outside the picture.
+    // Pixels outside the image start with transmittance 0.
     q$Q.transmittance = inside(x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X, view);
 #end
     var walked = 0u;

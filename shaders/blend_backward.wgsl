@@ -1,11 +1,14 @@
-// Gradients of blending, front to back from the stored final picture: one slot for each pair; docs/gradients.md, section 1.
+// Computes the gradients of blending, front to back from the stored frame, and writes one slot for
+// each (tile, Gaussian) pair; docs/gradients.md, section 1.
 //
-// With R the light still to come behind Gaussian i (background included), dL/dalpha_i = T_i c_i.g - (R.g) / (1 - alpha_i).
-// Only the scalar R.g is carried, so the pass needs one value a pixel whatever the number of channels.
+// R is the colour behind Gaussian i, including the background:
+//     dL/dalpha_i = T_i c_i.g - (R.g) / (1 - alpha_i)
+// Only the scalar R.g is carried: one value for each pixel, whatever the number of channels.
 //
 // gradient [6][tile rows * 8][tile columns * 8]  dL/d(colour, feature) of the frame
-// slots    [window]  sums over the tile's pixels, p being dL/d(exponent); vec4s of a pair:
-//                    (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, r, g) (b, f0, f1, f2); with frozen geometry only the last
+// slots    [window]  sums over the tile's pixels, with p = dL/d(exponent); the vec4s of a pair are
+//                    (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, r, g) (b, f0, f1, f2);
+//                    with frozen geometry only the last one
 #import view
 #import flat
 #import lane
@@ -22,13 +25,14 @@
 #ifdef WIDE
 @group(0) @binding(8) var<storage, read_write> slots: array<vec4<f32>>;
 #else
-// Number by number, as several invocations write a slot: to some languages a part of a vector is the whole of it, read, changed and written back.
+// An array of floats, because several invocations write to one slot. In some shading languages,
+// writing a component of a vector reads and writes the whole vector.
 @group(0) @binding(8) var<storage, read_write> slots: array<f32>;
 #endif
 
 struct Quad {
     transmittance: vec4<f32>,
-    // R.g of what lies behind the Gaussians that were walked so far.
+    // R.g, with R the colour behind the Gaussians processed so far.
     r_dot_g: vec4<f32>,
     gr: vec4<f32>,
     gg: vec4<f32>,
@@ -38,7 +42,8 @@ struct Quad {
     g2: vec4<f32>,
 }
 
-// Sums over the rows of an invocation, still one for each column: dx does not change within them.
+// Sums over the rows of an invocation, one for each pixel column, as dx is constant within a
+// column.
 struct Column {
     p: vec4<f32>,
     py: vec4<f32>,
@@ -114,7 +119,8 @@ struct Slot {
     c: vec4<f32>,
 }
 
-// What the quads of an invocation add up for one Gaussian, in two columns; where there is one, the second is zero.
+// Returns the slot of one Gaussian from the sums of an invocation's two columns of quads. With only
+// one column of quads, c1 is zero.
 fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
     var slot: Slot;
 #ifdef WITH_COLOR
@@ -137,16 +143,17 @@ fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
 #else
 #import stage
 
-// Gaussians between two sums over the invocations of a tile, and the numbers that are added up for each.
+// Number of Gaussians whose sums are added over a tile's invocations in one round.
 const ROUND: u32 = 4u;
-// What is written out below goes by these.
+// The unrolled loops below require these values.
 const_assert ROUND == 4u && TILE_LANES == 16u;
+// Floats of a slot.
 const NUMBERS: u32 = 4u * SLOT;
 
-// [tile][Gaussian of the round][number][invocation], the invocations of each row turned by its number, so that those who write a column and those
-// who read a row both find all banks.
+// [tile][Gaussian of the round][float of the slot][invocation]. Each row is rotated by its index,
+// so that neither writing columns nor reading rows causes bank conflicts.
 var<workgroup> exchange: array<f32, TILES * ROUND * NUMBERS * TILE_LANES>;
-// The longest walk of the workgroup's tiles.
+// Largest number of pairs to process among the workgroup's tiles.
 var<workgroup> longest: atomic<u32>;
 
 fn exchange_at(tile: u32, row: u32, number: u32) -> u32 {
@@ -172,7 +179,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #each Q
     var q$Q = load_quad(x + 4u * ($Qu % QUADS_X), y + $Qu / QUADS_X);
 #end
-    // How far the forward pass walked.
+    // Number of pairs that the forward pass processed.
     let length = select(0u, u32(frame[quad_at(7u, x, y, view)].x), lane.exists);
 #ifdef WIDE
     for (var k = 0u; k < length; k++) {
@@ -213,7 +220,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             fetched = fetch(start, k + TILE_LANES + lane.number, length);
         }
         workgroupBarrier();
-        // Written out, so that the four are computed side by side.
+        // Unrolled, so that four Gaussians are computed in parallel.
 #each K 4
         let s0_$K = staged_splats[staged_at(lane.tile, k + $Ku)][0];
         let s1_$K = staged_splats[staged_at(lane.tile, k + $Ku)][1];
@@ -245,7 +252,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
     }
 #endif
-    // Pairs that no pixel of the tile reached.
+    // Zeros the slots of pairs that the forward pass did not process.
 #ifdef WIDE
     for (var k = start + length; k < lane.end; k++) {
         let e = sorted_pairs[k];
@@ -256,7 +263,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
     }
 #else
-    // Neighbours write what lies side by side: of dense scenes these are most of all pairs.
+    // Neighbouring invocations write neighbouring floats. In dense scenes, most pairs are of this
+    // kind.
     for (var i = lane.number; i < NUMBERS * (lane.end - start - length); i += TILE_LANES) {
         let e = sorted_pairs[start + length + i / NUMBERS];
         if in_window(e, view) {

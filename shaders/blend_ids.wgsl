@@ -1,10 +1,10 @@
-// Which objects a pixel shows: the blending weights alpha * transmittance summed by object id, front to back.
+// Sums the blending weights alpha * transmittance of each pixel by object id, front to back.
 //
-// A pixel keeps the four heaviest ids it has met; a fifth takes the lightest one's place where it weighs more by itself.
-// Only one pixel in some thousands meets so many.
+// A pixel keeps four ids. A further id replaces the lightest one if its own weight is larger. Fewer
+// than one pixel in a thousand has more than four ids.
 //
 // ids    [gaussian]: object id below 65,536
-// shares [4][tile rows * 8][tile columns * 8]: id << 16 | weight of 0 to 1 as 0 to 65,535, in no order
+// shares [4][tile rows * 8][tile columns * 8]: id << 16 | weight of 0 to 1 as 0 to 65,535, unsorted
 #import view
 #import flat
 #import quad
@@ -51,10 +51,10 @@ fn packed(id: vec4<u32>, weight: vec4<f32>) -> vec4<u32> {
     return id << vec4<u32>(16u) | vec4<u32>(weight * 65535.0 + 0.5);
 }
 
-// Gaussians between two looks at whether the block is finished.
+// Number of Gaussians after which an invocation checks whether its pixels are finished.
 const BATCH: u32 = 8u;
 
-// Eight invocations of two quads, one above the other, share a tile: none of them needs the others.
+// Eight invocations share a tile and do not communicate. Each has two quads, one above the other.
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) index: u32) {
     let tile = flat_group(group, groups) * 8u + index / 8u;
@@ -68,7 +68,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let py = f32(y) + 0.5;
 #each K 2
     var q$K: Quad;
-    // Nothing reaches the pixels outside the picture.
+    // Pixels outside the image start with transmittance 0.
     q$K.transmittance = inside(x, y + $Ku, view);
     q$K.id0 = vec4<u32>(NO_ID);
     q$K.id1 = vec4<u32>(NO_ID);

@@ -1,12 +1,13 @@
 // Writes the (tile, Gaussian) pairs of each Gaussian, in depth order.
 //
 // pair_tiles     [pairs]  tile number: the key of the second sort
-// pair_gaussians [pairs]  Gaussian of pair e
-// first_pair     [n]      first pair of each Gaussian: its gradient slots are contiguous from there
+// pair_gaussians [pairs]  Gaussian of each pair
+// first_pair     [n]      first pair of each Gaussian; its gradient slots are contiguous from there
 // touched        [n]      lowered to the number of pairs written
 //
-// The tiles are found by the same formula as in `project`, but another kernel may round it differently. So room that is
-// left over gets the tile after the last one, which nobody draws, and what has no room is left out.
+// The formula for the tiles is the same as in `project`, but two kernels may round differently.
+// Surplus room gets the tile number after the last tile, which is never drawn. Tiles without room
+// are left out.
 #import view
 #import flat
 #import footprint
@@ -20,7 +21,8 @@
 @group(0) @binding(6) var<storage, read_write> pair_gaussians: array<u32>;
 @group(0) @binding(7) var<storage, read_write> first_pair: array<u32>;
 
-// Invocations of a Gaussian: on real GPUs several write its tiles, as those of large ones are thousands.
+// Invocations that write the tiles of one Gaussian. Real GPUs use several, because a large Gaussian
+// touches thousands of tiles.
 #ifdef WIDE
 const WRITERS: u32 = 1u;
 #else
@@ -37,7 +39,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     }
     let g = order[rank];
     let start = offsets[rank];
-    // The first writer may have lowered it already, to what there is to write: that changes nothing for the others.
+    // The first writer may already have lowered `touched` to the number of pairs found. This does
+    // not change the result of the other writers.
     let end = start + touched[g];
     if writer == 0u {
         first_pair[g] = start;

@@ -1,5 +1,6 @@
-// Adds up the gradient slots of each Gaussian within runs of `fold` pairs, into the first of its slots in the run: of a large Gaussian
-// project_backward would read thousands one after the other.
+// Adds up the gradient slots of each Gaussian within runs of `fold` pairs, into its first slot of
+// the run. Without this pass, one invocation of project_backward would read thousands of slots of a
+// large Gaussian in sequence.
 #import view
 #import flat
 #import slot
@@ -13,7 +14,7 @@
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let run = flat_group(group, groups) * 64u + lane;
-    // Places in the window.
+    // Number of slots in the window.
     let slots_of_window = min(view.pairs - view.slot_first, view.slot_count + view.tiles.x * view.tiles.y);
     let end = min(slots_of_window, (run + 1u) * view.fold);
     var e = run * view.fold;
@@ -22,7 +23,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         let pairs_until = first_pair[g] + touched[g];
         let kept = e;
         e++;
-        // Room that emit left over has nobody's gradient in it.
+        // Surplus room of emit has no gradient.
         if view.slot_first + kept >= pairs_until {
             continue;
         }

@@ -1,4 +1,5 @@
-// Tile counts in depth order, so that their prefix sum numbers the (tile, Gaussian) pairs front to back.
+// Writes tile counts in depth order, so that their prefix sum numbers the (tile, Gaussian) pairs
+// front to back.
 #import view
 #import flat
 

@@ -1,8 +1,10 @@
-// Gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for the loss and the exposure.
+// Computes the gradient of (1 - lambda) L1 + lambda (1 - SSIM) (paper, optimisation), and sums for
+// the loss and the exposure.
 //
 // rows     [planes][4][padded rows][quads]  three maps from ssim_backward_rows
 // gradient [6][padded rows][quads]          dL/d frame
-// sums     [4][6][tile rows][quads]         sums over eight rows of |x - y|, and of dL/d gain, dL/d offset, dL/d background
+// sums     [4][6][tile rows][quads]         sums over eight rows of |x - y|, dL/d gain,
+//                                           dL/d offset and dL/d background
 #import columns
 #import flat
 
@@ -34,7 +36,7 @@ fn add(totals: ptr<function, Totals>, quad: u32, row: u32, by_mean: vec4<f32>, b
     (*totals).error += weight * abs(x - y);
     (*totals).gain = fma(value, rendered, (*totals).gain);
     (*totals).offset += value;
-    // What is left of the light behind everything.
+    // Transmittance behind all Gaussians.
     let transmittance = frame[6u * plane.rows * plane.quads + place];
     (*totals).background = fma(plane.gain * value, transmittance, (*totals).background);
 }

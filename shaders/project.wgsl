@@ -1,8 +1,8 @@
-// Projects every Gaussian: splat (what blending reads), depth key, and how many tiles it touches.
+// Projects every Gaussian: its splat (input of blending), depth key and number of tiles it touches.
 //
 // params  [page]            trained values: shared/channels.wgsl
 // splats  [n][3] vec4       (mean.xy, q.xy) (q.z, log2 of opacity, r, g) (b, f0, f1, f2);
-//                           q: the exponent in base 2, q.x dx^2 + q.y dx dy + q.z dy^2
+//                           q: base-2 exponent q.x dx^2 + q.y dx dy + q.z dy^2
 // depths  [n]               24-bit key, ascending with depth
 // footprints [n][2] vec4    the tiles it may touch: shared/footprint.wgsl
 // touched [n]               number of tiles; 0 for Gaussians that are not drawn
@@ -29,13 +29,13 @@ fn param3(channel: u32, i: u32) -> vec3<f32> {
     return vec3<f32>(param(channel, i), param(channel + 1u, i), param(channel + 2u, i));
 }
 
-// Colour before it is cut off at zero.
+// Returns the colour before it is clamped at 0.
 fn color_of(i: u32, mean: vec3<f32>) -> vec3<f32> {
     var color = vec3<f32>(0.5) + SH_C0 * param3(COLOR, i);
 #ifdef WITH_SH
     let b = basis(normalize(mean - view.camera.xyz));
     let rest = rest_of(view.sh_degree);
-    // Written out, so that the basis stays in registers.
+    // Unrolled, so that the basis stays in registers.
 #each K 15
     if $Ku < rest {
         color += b[$K] * param3(SH_REST + 3u * $Ku, i);
@@ -51,7 +51,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     if i >= view.page {
         return;
     }
-    // Number among all Gaussians.
+    // Index among all Gaussians.
     let g = view.first + i;
     depths[g] = 0xffffffu;
     touched[g] = 0u;
@@ -61,7 +61,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let mean = param3(MEAN, i);
     let t = (view.world_to_camera * vec4<f32>(mean, 1.0)).xyz;
     let s = exp(param3(LOG_SCALE, i));
-    // Written so that a NaN is not drawn either.
+    // The negation also rejects a NaN.
     if !(t.z > NEAR * length(s)) {
         return;
     }
@@ -84,7 +84,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         return;
     }
     let center = view.focal * t.xy / t.z + view.centre;
-    // The ellipse on which alpha falls to ALPHA_MIN, a hair larger so that rounding loses no pixel.
+    // The ellipse on which alpha equals ALPHA_MIN, slightly enlarged so that rounding loses no
+    // pixel.
     let reach2 = 2.002 * log(opacity / ALPHA_MIN) + 1e-4;
     let half_height = sqrt(reach2 * cyy);
     let finite = det > 0.0 && det < 1e30 && abs(center.x) < 1e9 && abs(center.y) < 1e9 && half_height < 1e9 && cxx < 1e15;
@@ -114,7 +115,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     splats[3u * g] = vec4<f32>(center, -0.5 * log2e * conic.x, -log2e * conic.y);
     splats[3u * g + 1u] = vec4<f32>(-0.5 * log2e * conic.z, log2(min(opacity, ALPHA_MAX)), color.r, color.g);
     splats[3u * g + 2u] = vec4<f32>(color.b, feature);
-    // Positive floats ascend with their bits; sign and the last 7 bits are dropped.
+    // The bits of positive floats ascend with their values. The sign and the last 7 bits are
+    // dropped.
     depths[g] = min(bitcast<u32>(t.z) >> 7u, 0xfffffeu);
     footprints[2u * g] = f0;
     footprints[2u * g + 1u] = f1;

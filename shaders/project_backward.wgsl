@@ -1,10 +1,11 @@
-// Sums each Gaussian's gradient slots and carries them through the projection to the trained values: docs/gradients.md, sections 2 to 6, whose
-// symbols the names follow (d_x is dL/dx).
+// Sums the gradient slots of each Gaussian and propagates them through the projection to the
+// trained values: docs/gradients.md, sections 2 to 6, with the same symbols (d_x is dL/dx).
 //
-// Invocations take the Gaussians in depth order: neighbours then touch about as many tiles, and their slots lie in a row.
+// Invocations take the Gaussians in depth order. Neighbours then touch similar numbers of tiles,
+// and their slots are contiguous.
 //
-// gradients [page]  dL/d(params), laid out like them; channels that are not trained are left alone
-// stats     [2][n]  += norm of the 2-D mean's gradient (in half-image units), += 1 when drawn
+// gradients [page]  dL/d(params), with the same layout; untrained channels are not written
+// stats     [2][n]  += length of the projected mean's gradient (half-image units), += 1 if drawn
 #import view
 #import channels
 #import harmonics
@@ -40,9 +41,10 @@ fn put3(channel: u32, i: u32, value: vec3<f32>) {
     put(channel + 2u, i, value.z);
 }
 
-// Section 6: colour's gradient to the SH coefficients; returns that of the mean, on which the viewing direction depends.
+// Section 6: computes the gradients of the SH coefficients from that of the colour. Returns the
+// gradient of the mean, on which the viewing direction depends.
 fn color_backward(i: u32, mean: vec3<f32>, splat_color: vec3<f32>, gradient: vec3<f32>) -> vec3<f32> {
-    // Colour is cut off at 0 from below.
+    // Colour is clamped at 0 from below.
     let d_color = select(vec3<f32>(0.0), gradient, splat_color > vec3<f32>(0.0));
     put3(COLOR, i, SH_C0 * d_color);
 #ifdef WITH_SH
@@ -53,7 +55,7 @@ fn color_backward(i: u32, mean: vec3<f32>, splat_color: vec3<f32>, gradient: vec
     let slopes = basis_slopes(direction);
     let rest = rest_of(view.sh_degree);
     var d_direction = vec3<f32>(0.0);
-    // Written out, so that the basis stays in registers.
+    // Unrolled, so that the basis stays in registers.
 #each K 15
     if $Ku < rest {
         put3(SH_REST + 3u * $Ku, i, y[$K] * d_color);
@@ -93,11 +95,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         put3(FEATURE, i, vec3<f32>(0.0));
         return;
     }
-    // Sums of section 1 over all pixels: (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, dL/dr, dL/dg) (dL/db, dL/df).
+    // Sums of section 1 over all pixels:
+    // (p dx, p dy, p dx^2, p dx dy) (p dy^2, p, dL/dr, dL/dg) (dL/db, dL/df).
     var sum0 = vec4<f32>(0.0);
     var sum1 = vec4<f32>(0.0);
     var sum2 = vec4<f32>(0.0);
-    // Of slots that were folded, the first of the Gaussian counts, and then those that begin a run.
+    // After fold_slots, sums are in the first slot of the Gaussian and in the first slot of each
+    // further run.
     let first = start - view.slot_first;
     let end = first + count;
     var e = first;
@@ -126,7 +130,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let q_xy = -ln2 * s0.w;
     let q_yy = -2.0 * ln2 * s1.x;
     let d_center = vec2<f32>(q_xx * sum0.x + q_xy * sum0.y, q_xy * sum0.x + q_yy * sum0.y);
-    // Half-image units make the threshold of density control independent of the resolution.
+    // In half-image units, the threshold of density control does not depend on the resolution.
     stats[g] += length(d_center * 0.5 * vec2<f32>(view.size));
     stats[view.gaussians + g] += 1.0;
 
@@ -152,7 +156,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let a_x = (jw.x * r) * s;
     let a_y = (jw.y * r) * s;
     let cov = dilated(a_x, a_y);
-    // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
+    // Section 2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
     let opacity = 1.0 / (1.0 + exp(-param(OPACITY, i)));
     let dets = determinants(a_x, a_y);
     let clamped = kept_gain(view) * opacity * compensation(dets, view) >= ALPHA_MAX;
@@ -176,7 +180,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let d_m2 = jw.x * d_a_x.z + jw.y * d_a_y.z;
     put3(LOG_SCALE, i, s * vec3<f32>(dot(r[0], d_m0), dot(r[1], d_m1), dot(r[2], d_m2)));
 
-    // Columns of dL/dR, then through the quaternion and its normalisation.
+    // Columns of dL/dR, propagated to the quaternion and through its normalisation.
     let d_r0 = d_m0 * s.x;
     let d_r1 = d_m1 * s.y;
     let d_r2 = d_m2 * s.z;

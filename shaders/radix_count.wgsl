@@ -1,4 +1,4 @@
-// Histogram of one 8-bit digit for each chunk: histogram [256][chunks].
+// Counts the values of one 8-bit digit in each chunk: histogram [256][chunks].
 #import chunks
 #import flat
 

@@ -1,4 +1,5 @@
-// Moves each (key, value) to its place for one digit; stable. `histogram` holds exclusive prefix sums on entry.
+// Moves each (key, value) to its sorted position for one digit. The sort is stable. On entry
+// `histogram` holds exclusive prefix sums; the pass may overwrite it.
 #import chunks
 #import flat
 
@@ -27,12 +28,13 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
 }
 #else
-// Where the next key of each digit goes.
+// Position of the next key of each digit.
 var<workgroup> next: array<u32, 256>;
-// The invocations that hold a key of each digit, as 256 bits.
+// Bit mask of 256 bits for each digit: the invocations that hold a key with it.
 var<workgroup> holders: array<atomic<u32>, 2048>;
 
-// 256 keys at a time, one for each invocation: its place among those of its digit is the number of invocations before it that hold one.
+// Each round moves 256 keys, one for each invocation. A key's rank within its digit is the number
+// of earlier invocations that hold the same digit.
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let chunk = chunk_of(flat_group(group, groups), job);
@@ -67,7 +69,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             move_item(i, key, next[digit] + before);
         }
         workgroupBarrier();
-        // The last of a digit makes way for the next round.
+        // The last invocation of a digit prepares the next round.
         if holds && before + 1u == all {
             next[digit] += all;
             for (var word = 0u; word < 8u; word++) {

@@ -1,5 +1,5 @@
-// Second step: replaces items by their exclusive prefix sums; the grand total goes to totals[chunks].
-// Each chunk adds up the totals before it: cheaper than a third pass.
+// Second step of an exclusive prefix sum: replaces items by their prefix sums and writes the total
+// to totals[chunks]. Each chunk sums the totals before it, which is cheaper than a third pass.
 #import prefix
 #import flat
 
@@ -7,7 +7,8 @@
 @group(0) @binding(1) var<storage, read_write> items: array<u32>;
 @group(0) @binding(2) var<storage, read_write> totals: array<u32>;
 
-// Replaces the items of [start, end), before which there is `sum`; returns what there is before the one after.
+// Replaces the items of [start, end) by prefix sums that start at `sum`. Returns the sum after the
+// last item.
 fn replace(start: u32, end: u32, sum: u32) -> u32 {
     var before = sum;
     for (var i = start; i < end; i++) {
@@ -43,7 +44,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         sum = saturating(sum, totals[t]);
     }
     let before = group_sum(sum, lane);
-    // Each invocation has a run of the chunk.
+    // Each invocation has a contiguous part of the chunk.
     let length = (chunk.end - chunk.start + 255u) / 256u;
     let start = min(chunk.end, chunk.start + lane * length);
     let end = min(chunk.end, start + length);
@@ -52,7 +53,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         own = saturating(own, items[i]);
     }
     add_up(own, lane);
-    // What lies before a run is the sum of those up to the one before it.
+    // The sum before a part is the inclusive prefix sum of the previous invocation.
     var earlier = 0u;
     if lane > 0u {
         earlier = prefix_sums[lane - 1u];

@@ -1,4 +1,4 @@
-// First step of an exclusive prefix sum: total of each chunk.
+// First step of an exclusive prefix sum: the total of each chunk.
 #import prefix
 #import flat
 

@@ -1,4 +1,5 @@
-// Finishes the blur along columns and differentiates SSIM (Wang et al. 2004) by the three local moments that x is in.
+// Blurs along columns and differentiates SSIM (Wang et al. 2004) by the three local moments that
+// depend on x.
 //
 // rows     [planes][4][padded rows][quads]  from ssim_rows
 // partials [planes][3][padded rows][quads]  d SSIM / d (mean x, mean x^2 + y^2, mean x y)
@@ -11,7 +12,7 @@
 @group(0) @binding(2) var<storage, read_write> partials: array<vec4<f32>>;
 @group(0) @binding(3) var<storage, read_write> sums: array<vec4<f32>>;
 
-// SSIM of four pixels from their four local moments; stores its derivatives.
+// Returns the SSIM of four pixels from their four local moments. Stores its derivatives.
 fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, squares: vec4<f32>, xy: vec4<f32>) -> vec4<f32> {
     let a = 2.0 * mx * my + 0.0001;
     let b = 2.0 * (xy - mx * my) + 0.0009;
@@ -23,7 +24,7 @@ fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, squares: vec4<f32>, x
     let value = a * b * inverse;
     let size = plane.rows * plane.quads;
     let place = 3u * number * size + row * plane.quads + quad;
-    // sigma terms depend on the mean too: b and d lose 2 mx my and mx^2.
+    // The sigma terms also depend on the mean: b contains -2 mx my and d contains -mx^2.
     partials[place] = weight * (2.0 * my * (b - a) * inverse - 2.0 * mx * value * (d - c) * inverse);
     partials[size + place] = -weight * value / d;
     partials[2u * size + place] = weight * 2.0 * a * inverse;

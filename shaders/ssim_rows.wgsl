@@ -1,8 +1,8 @@
-// Blurs x, y, x^2 + y^2 and x y along rows: the first half of SSIM's window.
+// Blurs x, y, x^2 + y^2 and x y along rows: the first half of the SSIM window.
 //
-// frame  [..][padded rows][quads]  rendered x
-// targets [2][padded rows][quads]   8-bit y of colour and feature; where a pixel does not count, y := x
-// rows   [planes][4][padded rows][quads]
+// frame   [..][padded rows][quads]  rendered x
+// targets [2][padded rows][quads]   8-bit y of colour and feature; y = x for ignored pixels
+// rows    [planes][4][padded rows][quads]
 #import rows
 #import flat
 
@@ -16,7 +16,7 @@ struct Pair {
     y: vec4<f32>,
 }
 
-// Loading in any case and choosing afterwards avoids branches.
+// Loading always and selecting afterwards avoids branches.
 fn load(quad: i32, row: u32) -> Pair {
     let q = u32(clamp(quad, 0, i32(plane.quads) - 1));
     let place = row * plane.quads + q;

@@ -1,6 +1,6 @@
-// Sort key of each tile: the longer its list, the smaller (in steps of 4 %).
+// Computes the sort key of each tile: the longer its list, the smaller the key, in steps of 4 %.
 //
-// Tiles with lists of like length share a workgroup, and the longest start first.
+// Tiles with lists of similar length then share a workgroup, and the longest lists start first.
 #import view
 
 @group(0) @binding(0) var<uniform> view: View;

@@ -1,4 +1,5 @@
-// First and end pair of each tile in the sorted list. Tiles without pairs keep (0, 0): clear `ranges` before.
+// Writes first and end pair of each tile in the sorted list. Tiles without pairs keep their values:
+// `ranges` must be cleared before.
 #import view
 #import flat
 

@@ -101,7 +101,7 @@ fn a_killed_make_goes_on() {
     let output = run::fastlgs(&[&make[..], &["-v"]].concat());
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("training goes on from its checkpoint"), "{said}");
+    assert!(said.contains("training continues from its checkpoint"), "{said}");
     assert_eq!(json(&[&make[..], &["-q"]].concat())["state"], "kept");
     let anew = f.dir.path().join("anew");
     json(&["make", text(&photos), "-o", text(&anew), "--segmenter", "import", "--device", "cpu"]);

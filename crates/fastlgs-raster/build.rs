@@ -1,16 +1,22 @@
-//! Puts the WGSL passes together, validates every permutation with naga, translates it for Vulkan, Metal and Direct3D 12, and writes `shaders.rs`: for each pass a type with its
-//! sources, its uniform, and its buffers by name.
+//! Assembles and validates the WGSL passes, and writes `shaders.rs`.
 //!
-//! The shaders are WGSL with these lines beside, each alone on its line (`#` first, after spaces):
+//! naga validates every permutation and translates it for Vulkan, Metal and Direct3D 12. For each
+//! pass, `shaders.rs` holds a type with its sources, its uniform, and its buffers by name.
 //!
-//! * `#import NAME`: the text of `shared/NAME.wgsl`, the first time that it is asked for;
-//! * `#ifdef FLAG` ... `#else` ... `#endif`: one of both, by the flags of the permutation. Flags are `WITH_COLOR`, `WITH_FEATURE`,
-//!   `FEATURE_MOVES` (`Channels`), `WITH_SH` (colour depends on the view), and `WIDE` (`Shape`);
-//! * `#each K 8` ... `#end`: the lines 8 times, with 0 to 7 for `$K`: loops that must be unrolled for their values to stay in registers;
-//! * `#each Q` ... `#end`: once for each quad (four pixels of a row) of an invocation, with its number for `$Q` and its column of quads for
-//!   `$C`: 16 quads in 2 columns where one invocation owns the 8x8 tile (`WIDE`), else one.
+//! The shaders are WGSL with these directives, each alone on its line (spaces may precede the `#`):
 //!
-//! Blocks of `#ifdef` may be nested, those of `#each` may not. `shared/lane.wgsl` says which pixels a lane's quads are.
+//! * `#import NAME`: the text of `shared/NAME.wgsl`, inserted at its first import only;
+//! * `#ifdef FLAG` ... `#else` ... `#endif`: conditional text. The flags are `WITH_COLOR`,
+//!   `WITH_FEATURE` and `FEATURE_MOVES` (from `Channels`), `WITH_SH` (colour depends on the view)
+//!   and `WIDE` (from `Shape`);
+//! * `#each K 8` ... `#end`: repeats the lines 8 times, with `$K` replaced by 0 to 7. It unrolls
+//!   loops whose values must stay in registers;
+//! * `#each Q` ... `#end`: repeats the lines for each quad (four pixels of a row) of an invocation.
+//!   `$Q` is the number of the quad and `$C` its column of quads. With `WIDE`, an invocation owns
+//!   an 8x8 tile: 16 quads in 2 columns. Otherwise it owns one quad.
+//!
+//! Blocks of `#ifdef` may be nested, those of `#each` may not. `shared/lane.wgsl` defines which
+//! pixels the quads of a lane cover.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -30,7 +36,7 @@ fn main() {
     for path in passes {
         println!("cargo::rerun-if-changed={}", path.display());
         let name = path.file_stem().expect("a file").to_str().expect("UTF-8").to_owned();
-        // Shapes and channels of which the pass knows nothing would only repeat a source.
+        // Skip permutations that differ only in flags that the pass does not use.
         let mut sources: Vec<(Vec<&str>, String)> = Vec::new();
         let choices = SHAPES.iter().flat_map(|s| CHANNELS.iter().flat_map(move |c| HARMONICS.iter().map(move |h| [*s, *c, *h].concat())));
         for flags in choices {
@@ -43,14 +49,14 @@ fn main() {
         }
         let bound = validate(&name, &sources[0].1);
         for (_, source) in &sources[1..] {
-            assert_eq!(bound, validate(&name, source), "{name}: all permutations bind the same");
+            assert_eq!(bound, validate(&name, source), "{name}: all permutations must have the same bindings");
         }
         out.push_str(&rust_of(&name, &sources, &bound));
     }
     fs::write(Path::new(&env::var("OUT_DIR").expect("cargo sets OUT_DIR")).join("shaders.rs"), out).expect("writable OUT_DIR");
 }
 
-/// Workgroup memory that every adapter of WebGPU grants.
+/// Bytes of workgroup memory that every WebGPU adapter grants.
 const WORKGROUP_BYTES: u32 = 16_384;
 
 /// Flags of `Shape` in `src/shape.rs`.
@@ -59,10 +65,11 @@ const SHAPES: [&[&str]; 2] = [&[], &["WIDE"]];
 const CHANNELS: [&[&str]; 4] =
     [&["WITH_COLOR"], &["WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE"], &["WITH_COLOR", "WITH_FEATURE", "FEATURE_MOVES"]];
 
-/// Whether colour depends on the view: a software rasteriser does not skip branches, even if all invocations would.
+/// Permutations without and with view-dependent colour. They are separate because software adapters
+/// do not skip branches, even if all invocations would.
 const HARMONICS: [&[&str]; 2] = [&[], &["WITH_SH"]];
 
-/// The text of a pass; `used` collects the flags that it asks for.
+/// Returns the source of a pass, and adds the flags that it uses to `used`.
 fn assemble(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>) -> String {
     let mut seen = BTreeSet::new();
     let mut out = String::new();
@@ -72,7 +79,7 @@ fn assemble(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String
 
 fn expand(root: &Path, path: &Path, flags: &[&str], used: &mut BTreeSet<String>, seen: &mut BTreeSet<String>, out: &mut String) {
     let text = fs::read_to_string(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-    // An 8x8 tile has 16 quads; it is one invocation's, or shared by sixteen.
+    // An 8x8 tile has 16 quads. With WIDE one invocation owns all, else sixteen share them.
     let (quads, columns) = if flags.contains(&"WIDE") { (16, 2) } else { (1, 1) };
     let mut active = vec![true];
     let mut repeated: Option<(&str, usize, String)> = None;
@@ -123,11 +130,11 @@ struct Bound {
     /// Its name in the shader.
     name: String,
     kind: &'static str,
-    /// Name and size of its type, if that is a structure.
+    /// Name and size in bytes of its type, if the type is a structure.
     structure: Option<(String, u32)>,
 }
 
-/// Parses and validates; returns what is bound, in order.
+/// Parses and validates a source. Returns its bound variables in the order of their bindings.
 fn validate(name: &str, source: &str) -> Vec<Bound> {
     let module = naga::front::wgsl::parse_str(source).unwrap_or_else(|e| panic!("shaders/{name}.wgsl:\n{}", e.emit_to_string(source)));
     let info = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::all())
@@ -136,7 +143,7 @@ fn validate(name: &str, source: &str) -> Vec<Bound> {
     translate(name, &module, &info);
     let shared = module.global_variables.iter().filter(|(_, v)| v.space == naga::AddressSpace::WorkGroup);
     let bytes: u32 = shared.map(|(_, v)| module.types[v.ty].inner.size(module.to_ctx()).next_multiple_of(16)).sum();
-    assert!(bytes <= WORKGROUP_BYTES, "shaders/{name}.wgsl: {bytes} bytes of workgroup memory");
+    assert!(bytes <= WORKGROUP_BYTES, "shaders/{name}.wgsl needs {bytes} bytes of workgroup memory, which not every adapter grants");
     let mut bound: Vec<Bound> = module
         .global_variables
         .iter()
@@ -157,12 +164,13 @@ fn validate(name: &str, source: &str) -> Vec<Bound> {
         })
         .collect();
     bound.sort_by_key(|b| b.place);
-    assert!(bound.iter().enumerate().all(|(k, b)| b.place == k as u32), "{name}: bindings are 0, 1, 2, ...");
-    assert_eq!(bound[0].kind, "Binding::Uniform", "{name}: binding 0 is the uniform");
+    assert!(bound.iter().enumerate().all(|(k, b)| b.place == k as u32), "{name}: bindings must be 0, 1, 2, ...");
+    assert_eq!(bound[0].kind, "Binding::Uniform", "{name}: binding 0 must be the uniform");
     bound
 }
 
-/// Says it in the languages of all platforms, most of which are not at hand: that one of them cannot say it must not be found there.
+/// Translates the module for all platforms. A shader that one of them cannot express then fails
+/// this build, not a later one on that platform.
 fn translate(name: &str, module: &naga::Module, info: &naga::valid::ModuleInfo) {
     use naga::back::{hlsl, msl, spv};
     let failed = |to: &str, e: &dyn std::fmt::Display| -> ! { panic!("shaders/{name}.wgsl cannot be translated to {to}: {e}") };
@@ -183,7 +191,7 @@ fn translate(name: &str, module: &naga::Module, info: &naga::valid::ModuleInfo) 
     }
 }
 
-/// A pass as Rust: a type with its shader, and its buffers by name.
+/// Generates the Rust code of a pass: a type with its shader, and its buffers by name.
 fn rust_of(name: &str, sources: &[(Vec<&str>, String)], bound: &[Bound]) -> String {
     let title: String = name.split('_').map(|word| format!("{}{}", word[..1].to_uppercase(), &word[1..])).collect();
     let (uniform, bytes) = bound[0].structure.as_ref().expect("a uniform is a structure");
@@ -197,7 +205,7 @@ fn rust_of(name: &str, sources: &[(Vec<&str>, String)], bound: &[Bound]) -> Stri
         out,
         "/// `shaders/{name}.wgsl`
 pub enum {title} {{}}
-/// Buffers of `shaders/{name}.wgsl`, as it names them.
+/// Buffers of `shaders/{name}.wgsl`, with the names in the shader.
 pub struct {title}Buffers<'a> {{
 {fields}}}
 impl Kernel for {title} {{
@@ -208,7 +216,7 @@ impl Kernel for {title} {{
         vec![{in_order}]
     }}
 }}
-const _: () = assert!(size_of::<crate::view::{uniform}>() == {bytes}, \"{uniform} has another size in shaders/{name}.wgsl\");
+const _: () = assert!(size_of::<crate::view::{uniform}>() == {bytes}, \"{uniform} has a different size in shaders/{name}.wgsl\");
 const _: () = assert!({bytes} <= crate::gpu::UNIFORM_SLOT, \"{uniform} needs larger slots\");
 ",
         sources = sources.join(", "),

@@ -1,4 +1,4 @@
-//! With the feature `opencv`: compiles the functions that call OpenCV, and links the system's OpenCV.
+//! Compiles the C++ wrappers of OpenCV and links the system's OpenCV, with the feature `opencv`.
 
 fn main() {
     println!("cargo::rerun-if-changed=src/opencv");
@@ -7,7 +7,7 @@ fn main() {
     }
     let mut build = cc::Build::new();
     build.cpp(true).std("c++14").warnings(false).files(["src/opencv/sift.cpp", "src/opencv/inpaint.cpp"]);
-    // Where pkg-config does not know it (Debian's single modules), the usual place will do.
+    // Debian's packages of single modules have no pkg-config file: use their usual header folder.
     match pkg_config::Config::new().cargo_metadata(false).probe("opencv4") {
         Ok(library) => {
             build.includes(&library.include_paths);

@@ -1,6 +1,7 @@
-// Trained floats of a Gaussian. They are stored in pages, each as [channel][gaussian of the page, padded to fours], so
-// that no binding exceeds the adapter's limit. Mirrors `fastlgs_core::gaussians::BASE_CHANNELS`; SH coefficients of degree 1 and up
-// follow, coefficient by coefficient.
+// Channels of the trained values of a Gaussian. Values are stored in pages of [channel][Gaussian of
+// the page, padded to a multiple of four], so that no binding exceeds the adapter's limit.
+// Mirrors `fastlgs_core::gaussians::BASE_CHANNELS`. SH coefficients from degree 1 on follow,
+// coefficient by coefficient.
 const MEAN: u32 = 0u;
 const LOG_SCALE: u32 = 3u;
 const ROTATION: u32 = 6u;

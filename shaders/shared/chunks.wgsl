@@ -1,13 +1,15 @@
-// n items in contiguous chunks of like length, each of which is counted, added up or moved in order: so sorting is stable.
+// Splits n items into contiguous chunks of equal length. Each chunk is processed in order, so that
+// sorting is stable.
 //
-// A software rasteriser runs invocations as vector lanes, for which atomics and barriers are dear: there (WIDE) an invocation owns a chunk, and
-// goes through it item by item. On real GPUs a workgroup of 256 shares a chunk, which then has at most 2,048 items.
+// A software adapter runs invocations as vector lanes and has slow atomics and barriers. There
+// (WIDE) an invocation processes a chunk item by item. On real GPUs a workgroup of 256 shares a
+// chunk of at most 2,048 items.
 struct Job {
     // Number of items.
     n: u32,
-    // Bits that a radix digit is shifted by.
+    // Right shift in bits of the radix digit.
     shift: u32,
-    // 1: values are made up as 0, 1, 2, ... instead of read.
+    // 1: the values are 0, 1, 2, ... and are not read.
     first: u32,
     // Number of chunks; the last may be shorter, or empty.
     chunks: u32,
@@ -15,7 +17,7 @@ struct Job {
 
 struct Chunk {
     number: u32,
-    // Its first item, and the one after its last.
+    // First item and end (excluded).
     start: u32,
     end: u32,
 }
@@ -29,7 +31,7 @@ fn digit_of(key: u32, job: Job) -> u32 {
     return (key >> job.shift) & 255u;
 }
 
-// A sum beyond 32 bits stays at the largest value, which the host takes for "too many".
+// Returns a + b, saturated at 2^32 - 1, which the host reports as too many pairs.
 fn saturating(a: u32, b: u32) -> u32 {
     return select(a + b, 0xffffffffu, b > 0xffffffffu - a);
 }

@@ -1,4 +1,5 @@
-// The blur along columns of `rows` [planes][4][padded rows][quads], a buffer that the pass declares: eight rows of a quad.
+// Blur along the columns of `rows` [planes][4][padded rows][quads], which the pass declares.
+// Returns eight rows of a quad.
 #import window
 
 fn at(map: u32, quad: u32, j: i32) -> vec4<f32> {

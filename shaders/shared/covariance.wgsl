@@ -1,7 +1,8 @@
 // Geometry of one projected Gaussian (3DGS, section 4; EWA splatting).
 #import rotation
 
-// Ray slopes beyond what the image shows and 0.3 x its half extent beside it are clamped: the affine approximation explodes there.
+// Returns the ray slopes x/z and y/z, clamped to the image extended by 0.3 x its half extent on
+// each side. The affine approximation diverges beyond.
 fn clamped_slope(t: vec3<f32>, view: View) -> vec2<f32> {
     let size = vec2<f32>(view.size);
     let beside = 0.15 * size;
@@ -10,7 +11,7 @@ fn clamped_slope(t: vec3<f32>, view: View) -> vec2<f32> {
     return clamp(t.xy / t.z, low, high);
 }
 
-// The two rows of J W: derivative of the pixel position by the world position.
+// The two rows of J W, the derivative of the pixel position by the world position.
 struct Affine {
     x: vec3<f32>,
     y: vec3<f32>,
@@ -25,25 +26,27 @@ fn affine(t: vec3<f32>, view: View) -> Affine {
     );
 }
 
-// Covariance (xx, xy, yy) in the image from the rows of A, dilated.
+// Returns the dilated covariance (xx, xy, yy) in the image from the rows of A.
 fn dilated(ax: vec3<f32>, ay: vec3<f32>) -> vec3<f32> {
     return vec3<f32>(dot(ax, ax) + DILATION, dot(ax, ay), dot(ay, ay) + DILATION);
 }
 
-// Determinants of the covariance before and after dilation, by Lagrange's identity: of a needle nothing of xx yy - xy^2 is left once it is rounded.
+// Returns the determinants of the covariance before and after dilation. Lagrange's identity is used
+// because xx yy - xy^2 cancels in f32 for long, thin Gaussians.
 fn determinants(ax: vec3<f32>, ay: vec3<f32>) -> vec2<f32> {
     let across = cross(ax, ay);
     let before = dot(across, across);
     return vec2<f32>(before, before + DILATION * (dot(ax, ax) + dot(ay, ay)) + DILATION * DILATION);
 }
 
-// What dilation leaves of the determinant, at least a millionth: squared share of light that stays (Mip-Splatting, 2-D
-// filter).
+// Returns the determinant before dilation divided by the one after it, at least 1e-6. Its square
+// root is the share of brightness that remains (Mip-Splatting, 2-D filter).
 fn determinant_share(determinants: vec2<f32>) -> f32 {
     return max(determinants.x / determinants.y, 1e-6);
 }
 
-// Factor on the opacity that keeps a dilated Gaussian as bright as it was.
+// Returns the factor on opacity that keeps the brightness of a dilated Gaussian; 1 without
+// antialiasing.
 fn compensation(determinants: vec2<f32>, view: View) -> f32 {
     return select(1.0, sqrt(determinant_share(determinants)), view.antialias == 1u);
 }

@@ -1,10 +1,11 @@
-// Where alpha reaches ALPHA_MIN: an ellipse. Two vec4 a Gaussian:
+// The ellipse on which alpha equals ALPHA_MIN. Two vec4s for each Gaussian:
 // (mean.xy, lean, spread) (squared half height, apex, first tile row, end tile row), with
-//   lean    shift of the row's middle for each pixel down: cov_xy / cov_yy
-//   spread  squared half width of a row for each unit of (half height^2 - dy^2): det / cov_yy^2
-//   apex    dy of the rightmost point; the leftmost lies at -apex
+//   lean    shift in x of the middle of the ellipse for each pixel in y: cov_xy / cov_yy
+//   spread  squared half width in a row divided by (half height^2 - dy^2): det / cov_yy^2
+//   apex    dy of the rightmost point; the leftmost point is at -apex
 //
-// First and end tile (excluded) that the ellipse touches in a row of tiles, by their pixels' centres.
+// Returns first and end (excluded) tile that the ellipse touches in a row of tiles, measured at
+// pixel centres.
 fn footprint_span(f0: vec4<f32>, f1: vec4<f32>, row: u32, tiles_x: u32) -> vec2<u32> {
     let half_height = sqrt(f1.x);
     let top = max(f32(row * TILE) + 0.5 - f0.y, -half_height);

@@ -24,7 +24,7 @@ fn basis(d: vec3<f32>) -> array<f32, 15> {
     );
 }
 
-// Derivatives of the basis by the direction.
+// Returns the derivatives of the basis by the direction.
 fn basis_slopes(d: vec3<f32>) -> array<vec3<f32>, 15> {
     let xx = d.x * d.x;
     let yy = d.y * d.y;
@@ -48,7 +48,7 @@ fn basis_slopes(d: vec3<f32>) -> array<vec3<f32>, 15> {
     );
 }
 
-// Number of coefficients above degree 0.
+// Returns the number of coefficients above degree 0.
 fn rest_of(degree: u32) -> u32 {
     return (degree + 1u) * (degree + 1u) - 1u;
 }

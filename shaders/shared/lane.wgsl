@@ -1,9 +1,11 @@
-// Who blends which pixels. Pixels are handled in quads of four neighbours in a row.
+// Assigns pixels to invocations. Pixels are processed in quads: four neighbours in a row.
 //
-// On real GPUs an 8x8 tile is shared by 16 invocations of one quad each, and a workgroup of LANES has the tiles that follow each other in
-// `tile_order`, whose lists are about as long. A software rasteriser runs invocations as vector lanes, for which adding across lanes and scattered
-// access are dear: there (WIDE) an invocation owns a whole tile, and its neighbours in the vector the tiles that follow. `#each Q` repeats its
-// lines for the quads of an invocation, so that their state stays in registers.
+// On real GPUs 16 invocations share an 8x8 tile, one quad each. A workgroup of LANES invocations
+// has consecutive tiles of `tile_order`, whose lists have similar lengths.
+// A software adapter runs invocations as vector lanes; sums across lanes and scattered access are
+// slow there. So with WIDE an invocation has a whole tile, and neighbouring lanes have consecutive
+// tiles of `tile_order`. `#each Q` repeats its lines for the quads of an invocation, so that their
+// state stays in registers.
 #ifdef WIDE
 const LANES: u32 = 8u;
 const TILE_LANES: u32 = 1u;
@@ -13,16 +15,16 @@ const LANES: u32 = 32u;
 const TILE_LANES: u32 = 16u;
 const QUADS_X: u32 = 1u;
 #endif
-// Tiles of a workgroup.
+// Number of tiles of a workgroup.
 const TILES: u32 = LANES / TILE_LANES;
 
 #import quad
 
 struct Lane {
-    // Which of the workgroup's tiles, and which of its invocations.
+    // Index of the tile in the workgroup, and of the invocation in the tile.
     tile: u32,
     number: u32,
-    // Whether there is such a tile; where not, its list is empty.
+    // Whether the tile exists. If not, its list is empty.
     exists: bool,
     // First and end pair of the tile's list.
     start: u32,
@@ -32,7 +34,8 @@ struct Lane {
     y: u32,
 }
 
-// By `view`, `tile_order` and `ranges`, which the pass declares.
+// Returns the lane of an invocation. Uses `view`, `tile_order` and `ranges`, which the pass
+// declares.
 fn lane_of(group: u32, index: u32) -> Lane {
     var lane: Lane;
     lane.tile = index / TILE_LANES;

@@ -1,10 +1,11 @@
 // Sums over a workgroup of 256 invocations.
 #import chunks
 
-// Two sides, of which one is read while the other is written.
+// Two halves: one is read while the other is written.
 var<workgroup> prefix_sums: array<u32, 512>;
 
-// Leaves the sum of the first k + 1 invocations' values in prefix_sums[k] (Hillis & Steele 1986).
+// Writes the sum of the values of the first k + 1 invocations to prefix_sums[k] (Hillis & Steele
+// 1986).
 fn add_up(value: u32, lane: u32) {
     var side = 0u;
     prefix_sums[lane] = value;
@@ -20,7 +21,7 @@ fn add_up(value: u32, lane: u32) {
     }
 }
 
-// Sum of the values of all invocations.
+// Returns the sum of the values of all invocations.
 fn group_sum(value: u32, lane: u32) -> u32 {
     add_up(value, lane);
     let all = prefix_sums[255];

@@ -1,4 +1,4 @@
-// PCG3D (Jarzynski & Olano 2020): three random words from three.
+// Returns three random words from three words (PCG3D, Jarzynski & Olano 2020).
 fn pcg3d(seed: vec3<u32>) -> vec3<u32> {
     var v = seed * 1664525u + 1013904223u;
     v.x += v.y * v.z;

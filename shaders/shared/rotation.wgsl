@@ -1,4 +1,4 @@
-// Rotation matrix of a unit quaternion (w, x, y, z).
+// Returns the rotation matrix of a unit quaternion (w, x, y, z).
 fn rotation_matrix(q: vec4<f32>) -> mat3x3<f32> {
     let w = q.x;
     let x = q.y;

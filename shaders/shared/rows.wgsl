@@ -1,4 +1,4 @@
-// The blur along a row: two neighbouring quads from six, of which they are the middle.
+// Blur along a row: returns the two middle quads of six neighbouring ones.
 #import window
 
 fn blurred_row(v: array<vec4<f32>, 6>) -> array<vec4<f32>, 2> {

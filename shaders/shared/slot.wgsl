@@ -1,7 +1,8 @@
-// Gradient slots: SLOT vec4s for each (tile, Gaussian) pair; shaders/blend_backward.wgsl says what they hold.
+// Gradient slots: SLOT vec4s for each (tile, Gaussian) pair; layout in shaders/blend_backward.wgsl.
 //
-// Where all pairs do not fit one binding, they are done in windows. The slots of a Gaussian are neighbours and belong to
-// the window in which the first of them lies; so a window holds the pairs of one Gaussian more than it counts.
+// If the slots of all pairs do not fit one binding, they are processed in windows. The slots of a
+// Gaussian are contiguous and belong to the window that contains the first of them. So a window
+// needs room beyond slot_count for the rest of its last Gaussian: at most one pair for each tile.
 #ifdef WITH_COLOR
 const SLOT: u32 = 3u;
 #else

@@ -1,5 +1,6 @@
-// Gaussians of a tile's list on their way through workgroup memory: each invocation of a tile fetches one of the next 16 while the present 16 are
-// blended, so that nobody waits for the three reads that lead to a splat. The pass declares `sorted_pairs`, `pair_gaussians` and `splats`.
+// Stages the Gaussians of a tile's list in workgroup memory. While 16 Gaussians are blended, each
+// invocation of the tile fetches one of the next 16. This hides the latency of the three dependent
+// reads of a splat. The pass declares `sorted_pairs`, `pair_gaussians` and `splats`.
 struct Staged {
     pair: u32,
     s0: vec4<f32>,
@@ -7,11 +8,13 @@ struct Staged {
     s2: vec4<f32>,
 }
 
-// Pairs of the 16 before as well: who adds up is still at them when others put down the next.
+// Also holds the pairs of the previous 16, because some invocations still add up those while others
+// stage the next ones.
 var<workgroup> staged_pairs: array<u32, 2u * LANES>;
 var<workgroup> staged_splats: array<array<vec4<f32>, 3>, LANES>;
 
-// The k-th of the list; after its end, one that is not drawn, so that nobody needs to ask where it ends.
+// Fetches the k-th Gaussian of the list. Beyond the end, returns one that is not drawn, so that the
+// loop needs no bounds check.
 fn fetch(start: u32, k: u32, length: u32) -> Staged {
     var out: Staged;
     out.s1.y = -1e9;
@@ -25,7 +28,7 @@ fn fetch(start: u32, k: u32, length: u32) -> Staged {
     return out;
 }
 
-// Where the k-th lies.
+// Returns the index of the k-th Gaussian in the staged arrays.
 fn staged_at(tile: u32, k: u32) -> u32 {
     return tile * TILE_LANES + k % TILE_LANES;
 }

@@ -1,5 +1,6 @@
-// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the job of its passes: some channels at once, one for each z of the workgroups, in quads of
-// four neighbouring pixels, over pictures padded to whole tiles. What is outside the picture is zero.
+// The 11-tap Gaussian window (sigma 1.5) of SSIM, and the uniform of the loss passes. They process
+// several channels at once, one for each z of the workgroups, in quads of four neighbouring pixels.
+// Images are padded to whole tiles; the padding is zero.
 struct Planes {
     each: array<Plane, 6>,
     count: u32,
@@ -9,18 +10,18 @@ struct Planes {
 }
 
 struct Plane {
-    // Pixels of the picture.
+    // Image size in pixels.
     size: vec2<u32>,
-    // Quads of a padded row, and padded rows.
+    // Quads in a padded row, and padded rows.
     quads: u32,
     rows: u32,
-    // Channel of the picture.
+    // Channel of the frame.
     channel: u32,
-    // Weight of this channel's loss / number of its pixels.
+    // Weight of this channel's loss divided by 3 x the number of pixels.
     scale: f32,
-    // The paper's lambda: share of D-SSIM against L1.
+    // The paper's lambda: weight of D-SSIM against L1.
     lambda: f32,
-    // Exposure of the view: what is compared is gain * rendered + offset.
+    // Exposure of the view: the target is compared with gain * rendered + offset.
     gain: f32,
     offset: f32,
     unused0: u32,
@@ -28,7 +29,8 @@ struct Plane {
     unused2: u32,
 }
 
-// The invocation's plane, and its number among those that are done at once: each of these has maps of its own.
+// The invocation's plane, and its index among the planes processed at once. Each of them has its
+// own maps.
 var<private> plane: Plane;
 var<private> number: u32;
 
@@ -37,12 +39,12 @@ fn take_plane(group: vec3<u32>) {
     plane = planes.each[number];
 }
 
-// One output from the middle input and the sums of the pairs beside it, from near to far.
+// Returns one output from the middle input and the sums of the pairs beside it, from near to far.
 fn window(a0: vec4<f32>, a1: vec4<f32>, a2: vec4<f32>, a3: vec4<f32>, a4: vec4<f32>, a5: vec4<f32>) -> vec4<f32> {
     return 0.2660117249 * a0 + 0.2130055377 * a1 + 0.1093606895 * a2 + 0.0360007721 * a3 + 0.0075987581 * a4 + 0.0010283801 * a5;
 }
 
-// 1 for the pixels of a quad that lie in the picture, else 0.
+// Returns 1 for pixels of a quad that lie in the image, else 0.
 fn shown(quad: u32, row: u32) -> vec4<f32> {
     let in_row = vec4<u32>(4u * quad) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(plane.size.x);
     return select(vec4<f32>(0.0), vec4<f32>(1.0), in_row & vec4<bool>(row < plane.size.y));
@@ -53,13 +55,13 @@ struct Wanted {
     counts: vec4<bool>,
 }
 
-// A quad of an 8-bit target: three channels, then 255 where the pixel counts.
+// Unpacks a quad of an 8-bit target: three channels, then 255 for pixels that enter the loss.
 fn wanted(packed: vec4<u32>, channel: u32) -> Wanted {
     let value = vec4<f32>((packed >> vec4<u32>(8u * (channel % 3u))) & vec4<u32>(255u)) / 255.0;
     return Wanted(value, packed >= vec4<u32>(0x80000000u));
 }
 
-// What the loss sees of a rendered quad.
+// Returns a rendered quad with exposure applied, and 0 outside the image.
 fn exposed(rendered: vec4<f32>, quad: u32, row: u32) -> vec4<f32> {
     return shown(quad, row) * (plane.gain * rendered + plane.offset);
 }

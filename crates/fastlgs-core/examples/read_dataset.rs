@@ -1,4 +1,5 @@
-//! Reads posed photos in any layout that is known (COLMAP, transforms.json, LLFF) and tells where the cameras stand.
+//! Loads posed photos in any supported layout (COLMAP, transforms.json, LLFF) and prints their
+//! cameras.
 //!
 //! `cargo run --release -p fastlgs-core --example read_dataset -- PHOTOS`
 

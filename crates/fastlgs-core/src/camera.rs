@@ -1,4 +1,4 @@
-//! Pinhole cameras.
+//! Pinhole cameras, and the extent and up direction of a set of cameras.
 
 use crate::{Error, Result, WorldFrame, fs, world_frame};
 use glam::{DMat4, Mat4, Vec2, Vec3};
@@ -22,24 +22,26 @@ pub struct Camera {
     pub cx: f32,
     /// Principal point in pixels, y.
     pub cy: f32,
-    /// World to camera, column-major as glam stores it.
+    /// World-to-camera matrix in scene coordinates, column-major as in glam.
     pub world_to_camera: Mat4,
 }
 
 impl Camera {
-    /// The same view at another resolution; field of view is kept along each axis.
+    /// Returns the same view at another resolution. The field of view stays the same along each
+    /// axis.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (width as f32 / self.width as f32, height as f32 / self.height as f32);
         Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..self.clone() }
     }
 
-    /// The same view on pixels of twice the size; where sides are odd, the last of these stick out by half.
+    /// Returns the same view at half resolution. Odd sizes are rounded up, so the last column or
+    /// row extends half a pixel beyond the image.
     pub fn halved(&self) -> Self {
         let (width, height) = (self.width.div_ceil(2), self.height.div_ceil(2));
         Self { width, height, fx: self.fx / 2.0, fy: self.fy / 2.0, cx: self.cx / 2.0, cy: self.cy / 2.0, ..self.clone() }
     }
 
-    /// The same view with its longer side at most `max_side` pixels; never enlarged.
+    /// Returns the same view with its longer side at most `max_side` pixels. Never enlarges.
     pub fn shrunk_to(&self, max_side: u32) -> Self {
         let scale = max_side as f32 / self.width.max(self.height) as f32;
         if scale >= 1.0 {
@@ -49,22 +51,23 @@ impl Camera {
         self.resized(size(self.width), size(self.height))
     }
 
-    /// Position of the camera in the world.
+    /// Returns the position of the camera in scene coordinates.
     pub fn centre(&self) -> Vec3 {
         self.world_to_camera.inverse().w_axis.truncate()
     }
 
-    /// Unit viewing direction in the world.
+    /// Returns the unit viewing direction in scene coordinates.
     pub fn forward(&self) -> Vec3 {
         self.world_to_camera.transpose().z_axis.truncate().normalize()
     }
 
-    /// A point of camera space on the image plane, in pixels.
+    /// Projects a point of camera space into the image. The result is in pixels.
     pub fn to_pixel(&self, p: Vec3) -> Vec2 {
         Vec2::new(self.fx * p.x / p.z + self.cx, self.fy * p.y / p.z + self.cy)
     }
 
-    /// Number of the pixel in which a point of the world lies, row by row, and its depth; nothing behind the camera or beside its picture.
+    /// Projects a point in scene coordinates. Returns its row-major pixel index and depth, or
+    /// `None` behind the camera or outside the image.
     pub fn see(&self, point: Vec3) -> Option<(usize, f32)> {
         let q = self.world_to_camera.transform_point3(point);
         let pixel = self.to_pixel(q);
@@ -72,12 +75,13 @@ impl Camera {
         (q.z > 0.0 && inside).then(|| (pixel.y as usize * self.width as usize + pixel.x as usize, q.z))
     }
 
-    /// Direction of a pixel's ray in camera space, with z = 1.
+    /// Returns the direction of a pixel's ray in camera space, with z = 1.
     pub fn ray(&self, pixel: Vec2) -> Vec3 {
         Vec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
     }
 
-    /// A camera at `eye` that looks at `target`, with `up` pointing to the top of the image.
+    /// Creates a camera at `eye` that looks at `target`, with `up` towards the top of the image.
+    /// `fov_y` is the vertical field of view in radians.
     pub fn look_at(name: &str, eye: Vec3, target: Vec3, up: Vec3, width: u32, height: u32, fov_y: f32) -> Self {
         let z = (target - eye).normalize();
         let x = z.cross(up).normalize();
@@ -96,20 +100,21 @@ impl Camera {
         }
     }
 
-    /// Checks that every number is finite and the size is not zero.
+    /// Checks that the size and focal lengths are positive, all numbers are finite, and the pose
+    /// has determinant 1 within 0.05.
     ///
     /// # Errors
-    /// A sentence that names the view and the field.
+    /// A sentence that names the view and what is wrong.
     pub fn check(&self) -> Result<(), String> {
         let name = &self.name;
         if self.width == 0 || self.height == 0 {
-            return Err(format!("camera '{name}' has size {}x{}", self.width, self.height));
+            return Err(format!("camera '{name}' has size {}x{}; both sides must be at least 1", self.width, self.height));
         }
         if ![self.fx, self.fy].iter().all(|f| f.is_finite() && *f > 0.0) || !(self.cx + self.cy).is_finite() {
-            return Err(format!("camera '{name}' has a focal length or principal point that is not a positive number"));
+            return Err(format!("camera '{name}' needs positive focal lengths and a finite principal point"));
         }
         if !self.world_to_camera.is_finite() {
-            return Err(format!("the pose of '{name}' has a NaN or infinite entry; remove or mend that pose"));
+            return Err(format!("the pose of '{name}' has a NaN or infinite entry; remove or correct that pose"));
         }
         let determinant = self.world_to_camera.determinant();
         if (determinant - 1.0).abs() > 0.05 {
@@ -118,12 +123,13 @@ impl Camera {
         Ok(())
     }
 
-    /// Reads a camera from JSON (the fields of this struct), its pose in the coordinates of the world, into the frame of a scene.
+    /// Reads a camera from a JSON file with the fields of this struct. Its pose is in world
+    /// coordinates and is converted to `frame`.
     ///
     /// # Errors
-    /// [`Error::Io`] or [`Error::Format`], also for numbers that are not finite.
+    /// [`Error::Io`] or [`Error::Format`], also for values that `check` rejects.
     pub fn load(path: &Path, frame: &WorldFrame) -> Result<Self> {
-        /// The pose with all its digits.
+        /// The pose in double precision.
         #[derive(Deserialize)]
         struct Pose {
             world_to_camera: DMat4,
@@ -138,10 +144,12 @@ impl Camera {
     }
 }
 
-/// A camera that is so many times farther from the middle of all than their median is taken to have a wrong pose.
+/// Distance from the median camera position beyond which a pose counts as an outlier, in multiples
+/// of the median distance.
 const FAR_OUTSIDE: f32 = 10.0;
 
-/// Which cameras lie far outside of the others, whose poses are wrong most often. The median camera decides, so that they do not.
+/// Marks the cameras that lie far outside the others; their poses are most often wrong. Uses
+/// medians, so that outliers do not shift the reference.
 pub fn far_outside(cameras: &[Camera]) -> Vec<bool> {
     let centres: Vec<Vec3> = cameras.iter().map(Camera::centre).collect();
     let median = |mut values: Vec<f32>| {
@@ -151,12 +159,12 @@ pub fn far_outside(cameras: &[Camera]) -> Vec<bool> {
     let middle = Vec3::from_array([0, 1, 2].map(|k| median(centres.iter().map(|c| c[k]).collect())));
     let distances: Vec<f32> = centres.iter().map(|c| c.distance(middle)).collect();
     let usual = median(distances.clone());
-    // Where most stand in one place there is no scale to compare with.
+    // If most cameras share one position, the median distance is 0 and gives no scale.
     distances.iter().map(|distance| usual > 0.0 && *distance > FAR_OUTSIDE * usual).collect()
 }
 
-/// 1.1 times the largest distance of a camera from the mean of all: the scale of learning rates ("scene extent" of 3DGS). Cameras far outside of the
-/// others do not count.
+/// Returns the "scene extent" of 3DGS, which scales learning rates: 1.1 times the largest distance
+/// of a camera from the mean position, at least 0.001. Outlier cameras do not count.
 pub fn scene_extent(cameras: &[Camera]) -> f32 {
     let outside = far_outside(cameras);
     let centres: Vec<Vec3> = cameras.iter().zip(outside).filter(|(_, outside)| !outside).map(|(c, _)| c.centre()).collect();
@@ -165,7 +173,7 @@ pub fn scene_extent(cameras: &[Camera]) -> f32 {
     (radius * 1.1).max(1e-3)
 }
 
-/// Which way is up in the world, as a unit vector: how photographers hold their cameras on average.
+/// Estimates the up direction of the scene as a unit vector: the mean up direction of the cameras.
 pub fn mean_up(cameras: &[Camera]) -> Vec3 {
     let up = |c: &Camera| -c.world_to_camera.transpose().y_axis.truncate();
     cameras.iter().map(up).sum::<Vec3>().try_normalize().unwrap_or(Vec3::NEG_Y)
@@ -205,7 +213,7 @@ mod tests {
         let extent = scene_extent(&cameras);
         cameras.push(at(Vec3::splat(1e4)));
         assert_eq!((scene_extent(&cameras), far_outside(&cameras).iter().filter(|o| **o).count()), (extent, 1));
-        // A few steps aside are no error.
+        // A moderate distance is not an outlier.
         cameras.pop();
         cameras.push(at(Vec3::splat(6.0)));
         assert!(scene_extent(&cameras) > extent && !far_outside(&cameras).contains(&true));

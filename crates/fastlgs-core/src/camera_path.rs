@@ -1,7 +1,9 @@
-//! Camera paths as nerfstudio's viewer saves and renders them (`camera_path.json`, also called `cameras.json`).
+//! Camera paths in the format of nerfstudio's viewer (`camera_path.json`, also called
+//! `cameras.json`).
 //!
-//! Its cameras are x right, y up, looking along -z, given as camera-to-world with 16 numbers row by row; `fov` is vertical, in
-//! degrees. Principal points lie in the middle: a camera whose does not is written without that offset.
+//! Its cameras have x right and y up, and look along -z (OpenGL). `camera_to_world` has 16 numbers
+//! in row-major order; `fov` is vertical, in degrees. The format has no principal point: it is
+//! written as the image centre.
 
 use crate::world_frame::{Pose, exact_decimal};
 use crate::{Camera, Error, Result, WorldFrame, fs};
@@ -36,18 +38,18 @@ fn perspective() -> String {
     "perspective".into()
 }
 
-/// OpenCV's axes in those of OpenGL: its own inverse.
+/// Converts between the camera axes of OpenCV and OpenGL. It is its own inverse.
 const FLIP: Mat4 = Mat4::from_cols(Vec4::X, Vec4::new(0.0, -1.0, 0.0, 0.0), Vec4::new(0.0, 0.0, -1.0, 0.0), Vec4::W);
 
-/// Frames a second of written paths.
+/// Frame rate of written paths, in frames per second.
 const FPS: f32 = 24.0;
 
-/// Writes the cameras of a scene as a path in the world, in the size of the first.
+/// Writes cameras as a path in world coordinates, with the image size of the first camera.
 ///
 /// # Errors
-/// No cameras; the system's refusal.
+/// [`Error::Invalid`] without cameras, [`Error::Io`] with the path.
 pub fn write(path: &Path, cameras: &[Camera], frame: &WorldFrame) -> Result<()> {
-    let first = cameras.first().ok_or_else(|| Error::Invalid(format!("{}: a path needs cameras", path.display())))?;
+    let first = cameras.first().ok_or_else(|| Error::Invalid(format!("{}: cannot write a camera path without cameras", path.display())))?;
     let pose = |camera: &Camera| match frame.is_identity() {
         true => (camera.world_to_camera.inverse() * FLIP).transpose().to_cols_array().map(exact_decimal).to_vec(),
         false => (frame.world_pose(&camera.world_to_camera) * FLIP.as_dmat4()).transpose().to_cols_array().to_vec(),
@@ -69,14 +71,16 @@ pub fn write(path: &Path, cameras: &[Camera], frame: &WorldFrame) -> Result<()> 
     fs::write_json(path, &own)
 }
 
-/// Reads a path into the frame of a scene: a camera for each of the path's frames, all of the path's size, named `frame_00000` and so on unless the file names them.
+/// Reads a path and converts its poses to the frame `world`. All cameras have the path's image
+/// size. Frames without a name are called `frame_00000` and so on.
 ///
 /// # Errors
-/// Missing or damaged files, paths that are not of perspective cameras, poses that are no rotation and translation.
+/// Missing or damaged files, cameras that are not perspective, or poses that are not a rotation and
+/// a translation.
 pub fn read(path: &Path, world: &WorldFrame) -> Result<Vec<Camera>> {
     let own: CameraPath = fs::read_json(path)?;
     if own.camera_type != "perspective" {
-        return Err(Error::format(path, format!("its cameras are '{}'; only perspective ones can be rendered", own.camera_type)));
+        return Err(Error::format(path, format!("camera_type is '{}'; only 'perspective' can be rendered", own.camera_type)));
     }
     let (width, height) = (own.render_width, own.render_height);
     let camera = |(k, frame): (usize, &Frame)| -> Result<Camera> {
@@ -122,7 +126,7 @@ mod tests {
         }
         let file: serde_json::Value = fs::read_json(&path).unwrap();
         let row = |r: usize, c: usize| file["camera_path"][0]["camera_to_world"][4 * r + c].as_f64().unwrap() as f32;
-        // The last column is the position; the third points away from what is looked at.
+        // The last column is the position. The third column points away from the target.
         assert!((Vec3::new(row(0, 3), row(1, 3), row(2, 3)) - Vec3::new(1.0, 2.0, 3.0)).length() < 1e-5);
         assert!((Vec3::new(row(0, 2), row(1, 2), row(2, 2)) - Vec3::new(1.0, 2.0, 3.0).normalize()).length() < 1e-5);
         assert!(row(1, 1) > 0.0, "y is up");

@@ -1,6 +1,6 @@
-//! Colour spaces.
+//! Conversion of colours from sRGB to CIE Lab.
 
-/// sRGB to CIE Lab (D65).
+/// Converts 8-bit sRGB to CIE Lab (white point D65).
 pub fn lab(rgb: [u8; 3]) -> [f32; 3] {
     let linear = rgb.map(|v| {
         let v = f32::from(v) / 255.0;

@@ -1,9 +1,13 @@
-//! The scene in no more bits than it needs: a safetensors file that holds each group of trained values (mean, log-scale,
-//! rotation, opacity, colour) as fixed-point numbers of one, two or three bytes between the smallest and the largest value
-//! of each channel, and the object ids. Features are not held: they are the codes of the objects.
+//! Compact scene file: a safetensors file with quantised Gaussians.
 //!
-//! Tensors, for n Gaussians: `object_id` U16 (n); for each group with c channels `GROUP` U8 (c, bytes, n), most significant
-//! byte first, and `GROUP.range` F32 (c, 2). Channels are those of [`Gaussians::to_channels`].
+//! The groups of trained values are mean, log-scale, rotation, opacity and colour. They are stored
+//! as fixed-point numbers of one, two or three bytes, between the smallest and largest value of
+//! each channel. Object ids are stored as they are. Features are left out: they follow from the
+//! codes of the objects.
+//!
+//! Tensors, for n Gaussians: `object_id` U16 (n); for each group with c channels `GROUP` U8 (c,
+//! bytes, n), most significant byte first, and `GROUP.range` F32 (c, 2). Channels are those of
+//! [`Gaussians::to_channels`].
 
 use crate::gaussians::{BASE_CHANNELS, MAX_SH_DEGREE, channels, rest_len};
 use crate::{Error, Gaussians, Result, fs};
@@ -15,10 +19,10 @@ use std::path::Path;
 
 /// Names of the groups, in the order of their channels.
 const GROUPS: [&str; 6] = ["mean", "log_scale", "rotation", "opacity", "sh_dc", "sh_rest"];
-/// Most bytes of a value.
+/// Largest number of bytes per value.
 const MAX_BYTES: u8 = 3;
 
-/// Channels of a group.
+/// Returns the channels of a group.
 fn group(index: usize, sh_degree: u32) -> Range<usize> {
     match index {
         0 => 0..3,
@@ -30,22 +34,23 @@ fn group(index: usize, sh_degree: u32) -> Range<usize> {
     }
 }
 
-/// Bytes of a value of each group.
+/// Number of bytes per value, for each group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Precision([u8; GROUPS.len()]);
 
 impl Default for Precision {
-    /// Fine enough for any scene.
+    /// Three bytes for means and two for all else: precise enough for any scene.
     fn default() -> Self {
         Self([3, 2, 2, 2, 2, 2])
     }
 }
 
 impl Precision {
-    /// The fewest bytes for each group that alone cost no more than `loss` of `quality` (PSNR in dB).
+    /// Chooses the fewest bytes for each group that reduce `quality` (PSNR in dB) by at most
+    /// `loss`. Each group is tested with all others at full precision.
     ///
     /// # Errors
-    /// What `quality` fails with.
+    /// Errors of `quality`.
     pub fn choose<E>(scene: &Gaussians, loss: f64, mut quality: impl FnMut(&Gaussians) -> Result<f64, E>) -> Result<Self, E> {
         let full = quality(scene)?;
         let mut bytes = [1; GROUPS.len()];
@@ -68,13 +73,13 @@ impl Precision {
         Ok(Self(bytes))
     }
 
-    /// Bytes of a value by group.
+    /// Returns the number of bytes per value by group name.
     pub fn by_group(&self) -> BTreeMap<&'static str, u8> {
         GROUPS.into_iter().zip(self.0).collect()
     }
 }
 
-/// Fixed-point numbers between two bounds.
+/// Fixed-point encoding of numbers between `low` and `high`.
 struct Fixed {
     low: f32,
     high: f32,
@@ -102,7 +107,7 @@ impl Fixed {
     }
 }
 
-/// Writes the scene atomically, rotations as unit quaternions with w >= 0.
+/// Writes the scene atomically. Rotations become unit quaternions with w >= 0.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
@@ -139,14 +144,14 @@ pub fn write(path: &Path, scene: &Gaussians, precision: &Precision) -> Result<()
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
-/// Reads a scene; features are zero.
+/// Reads a scene. Its features are zero.
 ///
 /// # Errors
-/// [`Error::Format`] for files that are cut off or hold something else.
+/// [`Error::Format`] for truncated files and other content.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let bad = |what: String| Error::format(path, format!("{what}; export the scene again"));
-    let file = SafeTensors::deserialize(&data).map_err(|e| bad(format!("not a whole safetensors file ({e})")))?;
+    let file = SafeTensors::deserialize(&data).map_err(|e| bad(format!("not a complete safetensors file ({e})")))?;
     let tensor = |name: &str, dtype: Dtype, rank: usize| {
         let found = file.tensor(name).ok().filter(|t| t.dtype() == dtype && t.shape().len() == rank);
         found.ok_or_else(|| bad(format!("no tensor '{name}' of type {dtype:?} with {rank} dimensions")))
@@ -156,7 +161,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let ids: Vec<u16> = ids.data().chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
     let rest = tensor("sh_rest", Dtype::U8, 3)?.shape()[0];
     let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest);
-    let sh_degree = sh_degree.ok_or_else(|| bad(format!("{rest} SH channels fit no degree")))?;
+    let sh_degree = sh_degree.ok_or_else(|| bad(format!("{rest} SH channels do not match any SH degree")))?;
     let mut values = vec![0.0f32; channels(sh_degree) * n];
     for (g, name) in GROUPS.into_iter().enumerate() {
         let (planes, bounds) = (tensor(name, Dtype::U8, 3)?, tensor(&format!("{name}.range"), Dtype::F32, 2)?);
@@ -164,7 +169,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         let bytes = planes.shape()[1];
         let fits = planes.shape() == [range.len(), bytes, n] && bounds.shape() == [range.len(), 2];
         if !fits || !(1..=usize::from(MAX_BYTES)).contains(&bytes) {
-            return Err(bad(format!("tensor '{name}' has shape {:?}", planes.shape())));
+            return Err(bad(format!("tensor '{name}' has the unexpected shape {:?}", planes.shape())));
         }
         for (k, channel) in range.enumerate() {
             let bound = |side: usize| f32::from_le_bytes(std::array::from_fn(|b| bounds.data()[8 * k + 4 * side + b]));
@@ -221,7 +226,7 @@ mod tests {
     #[test]
     fn precision_follows_what_quality_notices() {
         let scene = sample();
-        // Only the means count here, and only to about a thousandth.
+        // Quality depends only on the means, to an accuracy of 0.001.
         let quality = |g: &Gaussians| {
             let worst = g.means.iter().zip(&scene.means).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
             Ok::<_, ()>(if worst < 1e-3 { 30.0 } else { 20.0 })

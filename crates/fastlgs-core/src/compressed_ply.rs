@@ -1,5 +1,8 @@
-//! SuperSplat's compressed PLY (playcanvas.com): Gaussians in chunks of 256, whose positions, scales and colours are numbers of a few bits between the
-//! bounds of their chunk. Elements: `chunk` (floats), `vertex` (four words), and `sh` (bytes) for colour that depends on the direction.
+//! Reads SuperSplat's compressed PLY (playcanvas.com).
+//!
+//! Gaussians are stored in chunks of 256. Positions, scales and colours are quantised between the
+//! bounds of their chunk. Elements: `chunk` (floats), `vertex` (four 32-bit words), and optionally
+//! `sh` (bytes) for view-dependent colour.
 
 use crate::gaussians::{MAX_SH_DEGREE, logit, rest_len};
 use crate::{Error, Gaussians, Result};
@@ -7,22 +10,22 @@ use glam::Vec3;
 use std::collections::HashMap;
 use std::path::Path;
 
-/// Gaussians of a chunk.
+/// Number of Gaussians per chunk.
 const CHUNK: usize = 256;
 
-/// An element of the header: its count, and place and size of each property in its rows.
+/// An element of the header: row count, name and byte offset of each property, and bytes per row.
 struct Element {
     count: usize,
     columns: Vec<(String, usize)>,
     row: usize,
 }
 
-/// Whether a header's lines are those of this format.
+/// Returns whether the header lines belong to a compressed PLY.
 pub fn is_compressed(lines: &[String]) -> bool {
     lines.iter().any(|line| line.split_whitespace().eq(["property", "uint", "packed_position"]))
 }
 
-/// Columns of 32-bit or 8-bit values of one element, by name.
+/// Rows of one element, with access to its properties by name.
 struct Table<'a> {
     element: &'a Element,
     rows: &'a [u8],
@@ -44,16 +47,16 @@ impl Table<'_> {
     }
 }
 
-/// Reads the elements that a header announces.
+/// Parses the elements of a header.
 fn elements(path: &Path, lines: &[String]) -> Result<Vec<(String, Element)>> {
     let mut found: Vec<(String, Element)> = Vec::new();
     for line in lines {
         match line.split_whitespace().collect::<Vec<_>>()[..] {
             ["format", format, _] if format != "binary_little_endian" => {
-                return Err(Error::format(path, "a compressed PLY is little-endian; export it again"));
+                return Err(Error::format(path, "a compressed PLY must be binary_little_endian; export it again"));
             }
             ["element", name, count] => {
-                let count = count.parse().map_err(|_| Error::format(path, format!("bad count '{count}' of {name}")))?;
+                let count = count.parse().map_err(|_| Error::format(path, format!("bad count '{count}' of element {name}")))?;
                 found.push((name.to_owned(), Element { count, columns: Vec::new(), row: 0 }));
             }
             ["property", kind, name] => {
@@ -62,7 +65,7 @@ fn elements(path: &Path, lines: &[String]) -> Result<Vec<(String, Element)>> {
                     "uchar" | "uint8" => 1,
                     _ => return Err(Error::format(path, format!("unknown property type '{kind}' in a compressed PLY"))),
                 };
-                let (_, element) = found.last_mut().ok_or_else(|| Error::format(path, "a property before any element"))?;
+                let (_, element) = found.last_mut().ok_or_else(|| Error::format(path, "the header has a property before its first element; export it again"))?;
                 element.columns.push((name.to_owned(), element.row));
                 element.row += size;
             }
@@ -72,10 +75,11 @@ fn elements(path: &Path, lines: &[String]) -> Result<Vec<(String, Element)>> {
     Ok(found)
 }
 
-/// Reads a scene from a file whose header has these lines and is followed by `body`; features are zero and object ids 0.
+/// Parses a scene from the lines of its header and the `body` after it. Features are zero and
+/// object ids 0.
 ///
 /// # Errors
-/// [`Error::Format`] for files that are cut off or lack a property.
+/// [`Error::Format`] for truncated files and missing properties.
 pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
     let bad = |reason: String| Error::format(path, reason);
     let elements = elements(path, lines)?;
@@ -83,20 +87,20 @@ pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
     let mut tables = HashMap::new();
     for (name, element) in &elements {
         let length = element.count.checked_mul(element.row).filter(|length| *length <= body.len() - at);
-        let length = length.ok_or_else(|| bad(format!("truncated: it announces {} rows of {name}; copy it again", element.count)))?;
+        let length = length.ok_or_else(|| bad(format!("truncated: it ends before the {} announced rows of {name}; copy it again", element.count)))?;
         tables.insert(name.as_str(), Table { element, rows: &body[at..at + length] });
         at += length;
     }
     let (Some(chunks), Some(vertices)) = (tables.get("chunk"), tables.get("vertex")) else {
-        return Err(bad("a compressed PLY has the elements chunk and vertex; export it again".into()));
+        return Err(bad("a compressed PLY must have the elements chunk and vertex; export it again".into()));
     };
     let n = vertices.element.count;
     let columns = tables.get("sh").map_or(0, |table| table.element.columns.len());
     let sh_degree = (0..=MAX_SH_DEGREE).find(|degree| 3 * rest_len(*degree) == columns);
-    let sh_degree = sh_degree.ok_or_else(|| bad(format!("{columns} SH coefficients fit no degree up to {MAX_SH_DEGREE}")))?;
+    let sh_degree = sh_degree.ok_or_else(|| bad(format!("{columns} SH coefficients do not match any SH degree up to {MAX_SH_DEGREE}")))?;
     let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
     for i in 0..n {
-        let row = gaussian(chunks, vertices, i).ok_or_else(|| bad(format!("Gaussian {i} lacks a packed property or its chunk")))?;
+        let row = gaussian(chunks, vertices, i).ok_or_else(|| bad(format!("Gaussian {i} has no chunk or lacks a packed property; export it again")))?;
         scene.push_sphere(row.mean, 1.0, 0.5, row.color);
         scene.log_scales[i] = row.log_scale;
         scene.rotations[i] = row.rotation;
@@ -108,7 +112,7 @@ pub fn parse(path: &Path, lines: &[String], body: &[u8]) -> Result<Gaussians> {
             let (i, coefficient) = (k / per_color, k % per_color);
             let value = |color: usize| {
                 let byte = table.bytes(i, &format!("f_rest_{}", color * per_color + coefficient)).and_then(|bytes| bytes.first());
-                // The middle of one of 256 steps between -4 and 4.
+                // Centre of one of 256 equal steps between -4 and 4.
                 byte.map_or(0.0, |byte| (f32::from(*byte) + 0.5) / 32.0 - 4.0)
             };
             *rest = Vec3::new(value(0), value(1), value(2));
@@ -138,17 +142,18 @@ fn gaussian(chunks: &Table<'_>, vertices: &Table<'_>, i: usize) -> Option<Row> {
     let mean = between(["x", "y", "z"], eleven_ten_eleven(vertices.word(i, "packed_position")?))?;
     let log_scale = between(["scale_x", "scale_y", "scale_z"], eleven_ten_eleven(vertices.word(i, "packed_scale")?))?;
     let [r, g, b, opacity] = vertices.word(i, "packed_color")?.to_be_bytes().map(|v| f32::from(v) / 255.0);
-    // Files of earlier versions have no bounds of colours.
+    // Colour bounds are optional in the format; without them colours lie between 0 and 1.
     let color = between(["r", "g", "b"], [r, g, b]).unwrap_or(Vec3::new(r, g, b)).to_array();
     Some(Row { mean, log_scale, rotation: rotation(vertices.word(i, "packed_rotation")?), color, opacity })
 }
 
-/// Three numbers between 0 and 1 in 11, 10 and 11 bits, the first in the highest.
+/// Unpacks three numbers between 0 and 1 from 11, 10 and 11 bits, the first in the highest bits.
 fn eleven_ten_eleven(word: u32) -> [f32; 3] {
     [(word >> 21) as f32 / 2047.0, (word >> 11 & 1023) as f32 / 1023.0, (word & 2047) as f32 / 2047.0]
 }
 
-/// A rotation (w, x, y, z): the place of the largest in two bits, the others in ten each, between -1/sqrt(2) and 1/sqrt(2).
+/// Unpacks a unit quaternion (w, x, y, z). The top two bits are the index of the largest component;
+/// the others have ten bits each, between -1/sqrt(2) and 1/sqrt(2).
 fn rotation(word: u32) -> [f32; 4] {
     let part = |shift: u32| ((word >> shift & 1023) as f32 / 1023.0 - 0.5) * std::f32::consts::SQRT_2;
     let mut parts = [part(20), part(10), part(0)].into_iter();
@@ -162,7 +167,7 @@ mod tests {
     use super::*;
     use crate::ply;
 
-    /// One chunk with two Gaussians, as SuperSplat's specification has them.
+    /// Builds one chunk with two Gaussians according to SuperSplat's specification.
     fn file() -> Vec<u8> {
         let bounds = ["x", "y", "z", "scale_x", "scale_y", "scale_z", "r", "g", "b"];
         let names = |group: &[&str]| {
@@ -178,7 +183,8 @@ mod tests {
         let mut data = header.into_bytes();
         let values = [[-1.0f32, -2.0, -3.0], [1.0, 2.0, 3.0], [-5.0; 3], [-1.0; 3], [0.0; 3], [1.0, 1.0, 0.5]];
         data.extend(values.concat().into_iter().flat_map(f32::to_le_bytes));
-        // The low end, and the high one; the identity, with w left out, and a half turn about x.
+        // First Gaussian: lower bounds and the identity rotation (largest component w). Second:
+        // upper bounds and a half turn about x.
         for word in [0u32, 512 << 20 | 512 << 10 | 512, 0, 0x0000_0080, u32::MAX, 1 << 30 | 512 << 20 | 512 << 10 | 512, u32::MAX, u32::MAX]
         {
             data.extend(word.to_le_bytes());

@@ -1,27 +1,27 @@
-//! Errors of the data layer. Every message names the file and, where one is known, the mend.
+//! Errors of the data layer. Messages name the file and, where possible, how to fix the problem.
 
 use std::path::{Path, PathBuf};
 
-/// What can go wrong while reading or writing data.
+/// An error of reading or writing data.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{}: {source}", path.display())]
     Io {
-        /// The file or folder concerned.
+        /// Path of the file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The file was read but its content is not what its format promises.
+    /// The content of the file does not match its format.
     #[error("{}: {reason}", path.display())]
     Format {
-        /// The file concerned.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong and what to do.
+        /// What is wrong and how to fix it.
         reason: String,
     },
-    /// A request that does not fit the data (unknown view, empty folder, ...).
+    /// A request that does not match the data, such as an unknown view or an empty folder.
     #[error("{0}")]
     Invalid(String),
 }
@@ -30,7 +30,8 @@ pub enum Error {
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// An [`Error::Format`] for `path`. What parsers say in several lines, or repeat from the file, becomes one line.
+    /// Creates an [`Error::Format`] for `path`. Joins the lines of the reason into one and shortens
+    /// it to 300 characters.
     pub fn format(path: impl AsRef<Path>, reason: impl AsRef<str>) -> Self {
         const LONGEST: usize = 300;
         let words = reason.as_ref().split(|c: char| c.is_whitespace() || c.is_control()).filter(|w| !w.is_empty());

@@ -1,5 +1,7 @@
-//! Float images as OpenEXR with named channels, block by block: the interface of whole images takes four times as long to compile as all the rest
-//! of this crate.
+//! Reads and writes float images as OpenEXR with named channels.
+//!
+//! It uses the block interface of the `exr` crate: the whole-image interface takes four times as
+//! long to compile as the rest of this crate.
 
 use crate::{Error, Result, fs};
 use exr::block::UncompressedBlock;
@@ -12,13 +14,13 @@ use exr::meta::{BlockDescription, header::Header};
 use std::io::Cursor;
 use std::path::Path;
 
-/// A named channel with its `[h][w]` values.
+/// Name and `[h][w]` values of a channel.
 pub type Channel = (String, Vec<f32>);
 
-/// Side of the tiles of a file: what run-length encoding likes.
+/// Side of a tile in pixels, chosen for run-length encoding.
 const TILE: usize = 64;
 
-/// Writes planar float channels, atomically. `channels` pairs each name with `[h][w]` values.
+/// Writes planar float channels atomically. `channels` pairs each name with `[h][w]` values.
 ///
 /// # Errors
 /// [`Error::Io`] with the path, or [`Error::Format`] when encoding fails.
@@ -30,7 +32,7 @@ pub fn write(path: &Path, width: usize, height: usize, channels: &[(&str, &[f32]
     let header = Header::new(Text::from("fastlgs"), (width, height), list);
     let header = header.with_encoding(Compression::RLE, BlockDescription::Tiles(tiles), LineOrder::Increasing);
     let mut data = Vec::new();
-    // In parallel, blocks would land in the file in the order in which threads finish.
+    // Parallel compression would order the blocks by thread timing, so that files would differ.
     let written = exr::block::write(Cursor::new(&mut data), [header].into_iter().collect(), true, |meta, chunks| {
         let blocks = meta.collect_ordered_blocks(|index| {
             UncompressedBlock::from_lines(&meta.headers[0].channels, index, |line| {
@@ -46,10 +48,11 @@ pub fn write(path: &Path, width: usize, height: usize, channels: &[(&str, &[f32]
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
-/// Reads all channels of the first layer as (name, `[h][w]` values), with the size.
+/// Reads all channels of the first layer. Returns width, height, and each channel's name and
+/// `[h][w]` values.
 ///
 /// # Errors
-/// [`Error::Format`] when the file is no float EXR.
+/// [`Error::Format`] when the file is not a readable EXR.
 pub fn read(path: &Path) -> Result<(usize, usize, Vec<Channel>)> {
     let failed = |e: exr::error::Error| Error::format(path, format!("the EXR cannot be read: {e}"));
     let reader = exr::block::read(Cursor::new(fs::read(path)?), false).map_err(failed)?;

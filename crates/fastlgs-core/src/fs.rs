@@ -1,4 +1,4 @@
-//! Files that are either the old or the new version, never half of one.
+//! Atomic file writes, locks, user folders, and a reader for binary files.
 
 use crate::{Error, Result};
 use std::fs::File;
@@ -6,11 +6,13 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Writes `path` through a temporary neighbour that is renamed into place when `write` succeeded. A symbolic link stays one: what
-/// it points at is replaced. What is no regular file (`/dev/null`, a pipe) is written to as it is.
+/// Writes `path` atomically: writes a temporary file beside it and renames that when `write`
+/// succeeds. A symbolic link is kept and its target replaced. Devices and pipes (such as
+/// `/dev/null`) are written directly.
 ///
 /// # Errors
-/// Whatever `write` returns, or the system's refusal; the earlier file then stays as it was.
+/// Errors of `write` and of the operating system, as [`Error::Io`]. The existing file then stays
+/// unchanged.
 pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
     let path = &path.canonicalize().unwrap_or_else(|_| path.to_owned());
     if path.metadata().is_ok_and(|m| !m.is_file() && !m.is_dir()) {
@@ -38,7 +40,8 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std
     Ok(())
 }
 
-/// The temporary name beside `path`: the process id and a number of its own keep concurrent writers apart, also of one file.
+/// Returns a temporary name beside `path`. The process id and a counter keep concurrent writers
+/// apart, even of one file.
 fn partial_name(path: &Path) -> PathBuf {
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let mut name = path.file_name().unwrap_or_default().to_owned();
@@ -46,10 +49,11 @@ fn partial_name(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Waits until no other process or thread changes `path`; they stay out until what is returned is dropped. A file beside it stands for the lock.
+/// Takes an exclusive lock on `path` through a lock file beside it. Waits for other processes and
+/// threads; dropping the result releases the lock.
 ///
 /// # Errors
-/// [`Error::Io`] with the path of that file.
+/// [`Error::Io`] with the path of the lock file.
 pub fn locked(path: &Path) -> Result<File> {
     let path = path.with_added_extension("lock");
     if let Some(parent) = path.parent() {
@@ -60,7 +64,8 @@ pub fn locked(path: &Path) -> Result<File> {
     Ok(lock)
 }
 
-/// The user's cache folder of this project: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else `~/.cache/fastlgs`.
+/// Returns the cache folder: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else
+/// `~/.cache/fastlgs`.
 pub fn cache_dir() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     variable("FASTLGS_CACHE")
@@ -69,7 +74,8 @@ pub fn cache_dir() -> PathBuf {
         .unwrap_or_else(|| std::env::temp_dir().join("fastlgs"))
 }
 
-/// Where what the user has made is kept: `FASTLGS_DATA`, else `fastlgs` in the user's data folder.
+/// Returns the folder of the user's own data: `FASTLGS_DATA`, else `$XDG_DATA_HOME/fastlgs`, else
+/// `~/.local/share/fastlgs`.
 pub fn data_dir() -> PathBuf {
     let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
     variable("FASTLGS_DATA")
@@ -105,7 +111,7 @@ pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
     serde_json::from_slice(&read(path)?).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))
 }
 
-/// Little-endian reader over a byte slice that says where a file ended too early.
+/// Little-endian reader of a byte slice. Its errors name the file and the offset.
 pub struct Bytes<'a> {
     path: &'a Path,
     data: &'a [u8],
@@ -113,51 +119,52 @@ pub struct Bytes<'a> {
 }
 
 impl<'a> Bytes<'a> {
-    /// Starts at the first byte of `data`, which came from `path`.
+    /// Creates a reader at the first byte of `data`. `path` is the file that errors name.
     pub fn new(path: &'a Path, data: &'a [u8]) -> Self {
         Self { path, data, at: 0 }
     }
 
-    /// The next `n` bytes.
+    /// Reads the next `n` bytes.
     ///
     /// # Errors
-    /// [`Error::Format`] when fewer are left.
+    /// [`Error::Format`] when fewer bytes are left.
     pub fn take(&mut self, n: usize) -> Result<&'a [u8]> {
         let rest = &self.data[self.at..];
         if n > rest.len() {
             return Err(Error::format(
                 self.path,
-                format!("truncated: {n} bytes wanted at offset {}, {} left; copy the file again", self.at, rest.len()),
+                format!("truncated: {n} bytes expected at offset {}, but {} left; copy the file again", self.at, rest.len()),
             ));
         }
         self.at += n;
         Ok(&rest[..n])
     }
 
-    /// Bytes not yet read.
+    /// Returns the number of bytes that are not read yet.
     pub fn left(&self) -> usize {
         self.data.len() - self.at
     }
 
-    /// An unsigned 8-byte count that must fit what is left when each item takes at least `item` bytes.
+    /// Reads an unsigned 8-byte count. The remaining bytes must suffice for that many items of at
+    /// least `item` bytes.
     ///
     /// # Errors
-    /// [`Error::Format`] when the file cannot hold that many.
+    /// [`Error::Format`] when they do not.
     pub fn count(&mut self, item: usize) -> Result<usize> {
         let n = self.u64()?;
         if n > (self.left() / item.max(1)) as u64 {
-            return Err(Error::format(self.path, format!("truncated: it announces {n} entries but ends before them")));
+            return Err(Error::format(self.path, format!("truncated: it ends before the {n} announced entries; copy the file again")));
         }
         Ok(n as usize)
     }
 
-    /// Bytes up to the next NUL, which is consumed.
+    /// Reads the text up to the next NUL byte and consumes that byte.
     ///
     /// # Errors
-    /// [`Error::Format`] when there is none or the text is not UTF-8.
+    /// [`Error::Format`] without a NUL byte, or for text that is not UTF-8.
     pub fn c_string(&mut self) -> Result<&'a str> {
         let rest = &self.data[self.at..];
-        let end = rest.iter().position(|&b| b == 0).ok_or_else(|| Error::format(self.path, "truncated inside a name"))?;
+        let end = rest.iter().position(|&b| b == 0).ok_or_else(|| Error::format(self.path, "truncated inside a name; copy the file again"))?;
         self.at += end + 1;
         std::str::from_utf8(&rest[..end]).map_err(|_| Error::format(self.path, "a name is not UTF-8"))
     }
@@ -166,7 +173,7 @@ impl<'a> Bytes<'a> {
 macro_rules! number {
     ($($name:ident $type:ty),*) => {
         impl Bytes<'_> {$(
-            /// The next little-endian number.
+            /// Reads the next little-endian number.
             ///
             /// # Errors
             /// [`Error::Format`] when the file ends before it.
@@ -185,7 +192,7 @@ number!(u32 u32, i32 i32, u64 u64, f64 f64);
 mod tests {
     use super::*;
 
-    /// Run by root, a rename onto `/dev/null` would replace the machine's device by a file.
+    /// A plain rename onto `/dev/null` by root would replace the device with a file.
     #[test]
     fn devices_and_links_stay_what_they_are() {
         use std::os::unix::fs::FileTypeExt;

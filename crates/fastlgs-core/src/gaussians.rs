@@ -1,69 +1,74 @@
-//! The Gaussian scene as structure of arrays.
+//! The Gaussians of a scene as a structure of arrays.
 
 use glam::{Quat, Vec3};
 
 /// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
 pub const SH_C0: f32 = 0.282_094_79;
 
-/// A Gaussian is clear from this logit of opacity down: it shows nothing, but stands for a thing that photos see through. What training fades out stays
-/// well above, since pictures feel nothing of it from -5.5 on.
+/// Largest opacity logit of a transparent Gaussian, which adds no colour but marks an object that
+/// photos see through. Trained Gaussians stay far above it: their gradients vanish below -5.5,
+/// which is an opacity of 1/255.
 pub const CLEAR: f32 = -16.0;
 
-/// 3-D Gaussians with colour, semantic feature and object id. All vectors have the same length.
+/// 3-D Gaussians with colour, semantic feature and object id. All vectors have one entry per
+/// Gaussian, except `sh_rest`.
 ///
-/// Values are stored as they are optimised and as the PLY of 3DGS holds them: scales as logarithms, opacity as a
-/// logit, rotation as an unnormalised quaternion (w, x, y, z), colour as SH coefficients.
+/// Values are stored as they are optimised and as the PLY of 3DGS stores them: scales as
+/// logarithms, opacity as a logit, rotation as an unnormalised quaternion (w, x, y, z), colour as
+/// SH coefficients.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gaussians {
-    /// Centre in the world.
+    /// Mean in scene coordinates.
     pub means: Vec<Vec3>,
     /// Natural logarithm of the standard deviation along each axis of the Gaussian.
     pub log_scales: Vec<Vec3>,
     /// Rotation from the Gaussian's axes to the world, (w, x, y, z), not normalised.
     pub rotations: Vec<[f32; 4]>,
-    /// Opacity before the sigmoid.
+    /// Opacity before the sigmoid (a logit).
     pub opacity_logits: Vec<f32>,
     /// SH coefficient of degree 0; colour = 0.5 + [`SH_C0`] * dc.
     pub sh_dc: Vec<Vec3>,
     /// Highest spherical-harmonic degree of colour, 0 to [`MAX_SH_DEGREE`].
     pub sh_degree: u32,
-    /// SH coefficients of degrees 1 and up, [`rest_len`] red-green-blue triples a Gaussian.
+    /// SH coefficients of degrees 1 and up: [`rest_len`] RGB triples per Gaussian.
     pub sh_rest: Vec<Vec3>,
-    /// Low-dimensional semantic code, nominally in (0, 1)^3 (the paper's f).
+    /// Feature: three trained numbers, nominally in (0, 1) (the paper's f).
     pub features: Vec<Vec3>,
-    /// Object of the table that the Gaussian belongs to; 0 means none.
+    /// Id of the object or overlap list that the Gaussian belongs to; 0 means none.
     pub object_ids: Vec<u16>,
 }
 
-/// Trained floats of a Gaussian without view-dependent colour: mean 3, log-scale 3, rotation 4, opacity 1, colour 3,
-/// feature 3. The SH coefficients of higher degrees follow, coefficient by coefficient.
+/// Number of trained floats per Gaussian without view-dependent colour: mean 3, log-scale 3,
+/// rotation 4, opacity 1, colour 3, feature 3. SH coefficients of higher degrees follow, one RGB
+/// triple after the other.
 pub const BASE_CHANNELS: usize = 17;
 
-/// Highest degree that kernels and files know.
+/// Highest SH degree that kernels and file formats support.
 pub const MAX_SH_DEGREE: u32 = 3;
 
-/// SH coefficients of degrees 1 to `degree` for each colour.
+/// Returns the number of SH coefficients of degrees 1 to `degree` per colour.
 pub const fn rest_len(degree: u32) -> usize {
     ((degree + 1) * (degree + 1) - 1) as usize
 }
 
-/// Number of trained floats a Gaussian has at an SH degree.
+/// Returns the number of trained floats per Gaussian at an SH degree.
 pub const fn channels(degree: u32) -> usize {
     BASE_CHANNELS + 3 * rest_len(degree)
 }
 
 impl Gaussians {
-    /// How many there are.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
 
-    /// Appends an isotropic Gaussian without feature.
+    /// Appends an isotropic Gaussian with zero feature and object id 0. `radius` is its standard
+    /// deviation.
     pub fn push_sphere(&mut self, mean: Vec3, radius: f32, opacity: f32, color: [f32; 3]) {
         self.means.push(mean);
         self.log_scales.push(Vec3::splat(radius.ln()));
@@ -75,12 +80,12 @@ impl Gaussians {
         self.object_ids.push(0);
     }
 
-    /// Appends another scene.
+    /// Appends the Gaussians of another scene.
     ///
     /// # Panics
-    /// If its SH degree is another.
+    /// If the SH degrees differ.
     pub fn append(&mut self, mut other: Self) {
-        assert_eq!(self.sh_degree, other.sh_degree, "scenes of one SH degree");
+        assert_eq!(self.sh_degree, other.sh_degree, "both scenes must have the same SH degree");
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.rotations.append(&mut other.rotations);
@@ -91,13 +96,13 @@ impl Gaussians {
         self.object_ids.append(&mut other.object_ids);
     }
 
-    /// The SH coefficients of Gaussian `i` above degree 0.
+    /// Returns the SH coefficients of Gaussian `i` above degree 0.
     pub fn rest(&self, i: usize) -> &[Vec3] {
         let k = rest_len(self.sh_degree);
         &self.sh_rest[i * k..(i + 1) * k]
     }
 
-    /// The same scene with view-dependent colour up to `degree`: what is above is dropped, what is missing is zero.
+    /// Changes the SH degree of colour. Higher coefficients are dropped and missing ones are zero.
     pub fn with_sh_degree(mut self, degree: u32) -> Self {
         let (from, to) = (rest_len(self.sh_degree), rest_len(degree));
         let value = |i: usize, k: usize| if k < from { self.sh_rest[i * from + k] } else { Vec3::ZERO };
@@ -107,7 +112,7 @@ impl Gaussians {
         self
     }
 
-    /// All trained values as `[channels(sh_degree)][n]`, the layout of the kernels.
+    /// Returns all trained values as `[channels(sh_degree)][n]`, the layout of the kernels.
     pub fn to_channels(&self) -> Vec<f32> {
         let n = self.len();
         let mut out = vec![0.0; channels(self.sh_degree) * n];
@@ -127,12 +132,12 @@ impl Gaussians {
         [m.x, m.y, m.z, s.x, s.y, s.z, r[0], r[1], r[2], r[3], o, c.x, c.y, c.z, f.x, f.y, f.z]
     }
 
-    /// The inverse of [`Self::to_channels`]; object ids become 0 where `ids` does not give them.
+    /// Inverts [`Self::to_channels`]. Without `ids`, all object ids are 0.
     ///
     /// # Panics
-    /// If `values` is not a multiple of [`channels`] long.
+    /// If the length of `values` is not a multiple of [`channels`].
     pub fn from_channels(values: &[f32], sh_degree: u32, ids: Option<&[u16]>) -> Self {
-        assert_eq!(values.len() % channels(sh_degree), 0, "channels of unequal length");
+        assert_eq!(values.len() % channels(sh_degree), 0, "the number of values must be a multiple of the channels");
         let n = values.len() / channels(sh_degree);
         let v = |c: usize, i: usize| values[c * n + i];
         let at = |c: usize, i: usize| Vec3::new(v(c, i), v(c + 1, i), v(c + 2, i));
@@ -150,10 +155,11 @@ impl Gaussians {
         }
     }
 
-    /// The Gaussians at `places`, in that order; a place may occur more than once.
+    /// Returns the Gaussians at the given indices, in that order. An index may occur more than
+    /// once.
     ///
     /// # Panics
-    /// If a place is out of range.
+    /// If an index is out of range.
     pub fn select(&self, places: &[usize]) -> Self {
         fn pick<T: Copy>(items: &[T], places: &[usize]) -> Vec<T> {
             places.iter().map(|&i| items[i]).collect()
@@ -171,14 +177,16 @@ impl Gaussians {
         }
     }
 
-    /// Rotation of Gaussian `i` as a unit quaternion.
+    /// Returns the rotation of Gaussian `i` as a unit quaternion.
     pub fn rotation(&self, i: usize) -> Quat {
         let [w, x, y, z] = self.rotations[i];
         Quat::from_xyzw(x, y, z, w).normalize()
     }
 
-    /// Drops Gaussians that cannot be drawn: with NaN or infinite values, or a rotation of zeros. Infinite opacities, as files with eight bits have
-    /// them, become the nearest that is drawn. Says in one sentence how many were dropped, and for which columns of a PLY file.
+    /// Drops Gaussians that cannot be drawn: those with NaN or infinite values, or a zero
+    /// quaternion. Infinite opacity logits, from files with 8-bit opacity, are clamped instead.
+    /// Returns a warning with the number of dropped Gaussians and the PLY columns of their invalid
+    /// values.
     pub fn drop_invalid(&mut self) -> Option<String> {
         for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
             *logit = logit.signum() * SOLID;
@@ -225,12 +233,12 @@ impl Gaussians {
         *self = self.select(&kept);
         let names: Vec<&str> = columns.into_iter().collect();
         let infinite = (infinite > 0).then(|| format!("{infinite} with NaN or infinite values in {}", names.join(", ")));
-        let unrotated = (unrotated > 0).then(|| format!("{unrotated} with a rotation of zeros in rot_0 to rot_3"));
+        let unrotated = (unrotated > 0).then(|| format!("{unrotated} with a zero quaternion in rot_0 to rot_3"));
         let why: Vec<String> = infinite.into_iter().chain(unrotated).collect();
         Some(format!("{} of {all} Gaussians were dropped: {}", all - kept.len(), why.join("; ")))
     }
 
-    /// The scene with y and z of the other sign: half a turn about x, from the axes of one program to those of another.
+    /// Negates y and z: a half turn about x, which converts between OpenCV and OpenGL axes.
     pub fn with_y_and_z_flipped(mut self) -> Self {
         let flip = Vec3::new(1.0, -1.0, -1.0);
         self.means.iter_mut().for_each(|mean| *mean *= flip);
@@ -240,7 +248,8 @@ impl Gaussians {
         self
     }
 
-    /// The scene without Gaussians that lie so far outside that formats of few bits would spend their range on them; and how many these were.
+    /// Removes Gaussians far outside the scene, which would waste the range of quantised formats.
+    /// Returns the rest and the number of removed ones.
     pub fn without_far_outliers(&self) -> (Self, usize) {
         let median = |mut values: Vec<f32>| {
             values.sort_by(f32::total_cmp);
@@ -255,19 +264,20 @@ impl Gaussians {
     }
 }
 
-/// Signs of the SH coefficients above degree 0 when y and z change theirs.
+/// Signs of the SH coefficients above degree 0 after y and z are negated.
 pub(crate) const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
-/// Logit of the opacity that stands for one of exactly 1; its negative for 0.
+/// Logit that replaces an infinite one: an opacity of 0.999, or 0.001 with a negative sign.
 const SOLID: f32 = 7.0;
-/// Distance from the middle of a scene, in medians of all, beyond which a Gaussian shows nothing of it.
+/// Distance from the median mean beyond which a Gaussian is an outlier, in multiples of the median
+/// distance.
 const FAR_OUTSIDE: f32 = 1000.0;
 
-/// Inverse of [`sigmoid`].
+/// Returns ln(p / (1 - p)), the inverse of [`sigmoid`].
 pub fn logit(p: f32) -> f32 {
     (p / (1.0 - p)).ln()
 }
 
-/// 1 / (1 + e^-x).
+/// Returns 1 / (1 + e^-x).
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())
 }
@@ -281,7 +291,7 @@ mod tests {
         let mut scene = Gaussians::default();
         (0..50).for_each(|k| scene.push_sphere(Vec3::new((k as f32).sin(), (k as f32).cos(), 0.1 * k as f32), 0.1, 0.5, [0.5; 3]));
         assert_eq!(scene.without_far_outliers(), (scene.clone(), 0));
-        // A sky a hundred times as far as the rest stays.
+        // A sky at about a hundred times the usual distance is kept.
         scene.push_sphere(Vec3::new(0.0, 200.0, 0.0), 5.0, 0.5, [0.5; 3]);
         let with_sky = scene.clone();
         scene.push_sphere(Vec3::splat(1e6), 0.1, 0.5, [0.5; 3]);

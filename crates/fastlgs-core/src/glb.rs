@@ -1,8 +1,10 @@
-//! Binary glTF 2.0 with the Khronos extension `KHR_gaussian_splatting`: one mesh of points whose attributes are the Gaussians.
+//! Reads and writes binary glTF 2.0 with the Khronos extension `KHR_gaussian_splatting`: one mesh
+//! of points whose attributes are the Gaussians.
 //!
-//! Scales are written as they are (not as logarithms), opacity after the sigmoid, rotations as unit quaternions (x, y, z, w).
-//! Coordinates stay those of the scene; the node turns them so that the scene's up is glTF's +y. Programs that do not know the
-//! extension show coloured points. Features and object ids have no place in it.
+//! Scales are linear (not logarithms), opacity is after the sigmoid, and rotations are unit
+//! quaternions (x, y, z, w). Coordinates are those of the scene; the node rotates its up direction
+//! to glTF's +y. Programs without the extension show coloured points. The format has no features or
+//! object ids.
 
 use crate::gaussians::{MAX_SH_DEGREE, SH_C0, logit, rest_len, sigmoid};
 use crate::{Error, Gaussians, Result, WorldFrame, fs};
@@ -19,7 +21,7 @@ const FLOAT: u32 = 5126;
 const POINTS: u32 = 0;
 const VERTICES: u32 = 34962;
 
-/// Attribute name, glTF type, and the values of all Gaussians one after the other.
+/// Attribute name, glTF type, and the values of all Gaussians, one Gaussian after the other.
 type Attribute = (String, &'static str, Vec<f32>);
 
 fn attributes(scene: &Gaussians) -> Vec<Attribute> {
@@ -45,7 +47,7 @@ fn attributes(scene: &Gaussians) -> Vec<Attribute> {
     out
 }
 
-/// The JSON chunk for attributes that lie one after the other in the binary chunk.
+/// Builds the JSON chunk. The attributes are stored one after the other in the binary chunk.
 fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, frame: &WorldFrame, bytes: usize) -> Value {
     let (mut views, mut accessors, mut names) = (Vec::new(), Vec::new(), serde_json::Map::new());
     let mut offset = 0;
@@ -56,7 +58,7 @@ fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, frame: &World
         names.insert(name.clone(), json!(k));
         offset += length;
     }
-    // The format wants the bounds of positions.
+    // glTF requires the bounds of positions.
     let bound = |by: fn(Vec3, Vec3) -> Vec3| scene.means.iter().copied().reduce(by).unwrap_or(Vec3::ZERO).to_array();
     accessors[0]["min"] = json!(bound(Vec3::min));
     accessors[0]["max"] = json!(bound(Vec3::max));
@@ -84,10 +86,12 @@ fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, frame: &World
     })
 }
 
-/// Writes a scene whose up, a unit vector of the world, becomes +y. The node moves it to its place in the world.
+/// Writes a scene as binary glTF. The node rotates `up`, a unit vector in world coordinates, to +y
+/// and applies the scene's `frame`.
 ///
 /// # Errors
-/// [`crate::Error::Invalid`] for an empty scene and for more than 4 GiB, which the format cannot hold; the system's refusal.
+/// [`crate::Error::Invalid`] for an empty scene and above the format's limit of 4 GiB;
+/// [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Result<()> {
     let attributes = attributes(scene);
     let bytes: usize = attributes.iter().map(|a| 4 * a.2.len()).sum();
@@ -112,24 +116,26 @@ pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Re
     })
 }
 
-/// Parts of a binary glTF file: its document and its binary chunk.
+/// Returns the JSON document and the binary chunk of a binary glTF file.
 fn chunks<'a>(path: &Path, data: &'a [u8]) -> Result<(Value, &'a [u8])> {
     let bad = |reason: &str| Error::format(path, format!("{reason}; copy or export it again"));
     let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize);
-    let (Some(magic), Some(length)) = (word(0), word(12)) else { return Err(bad("not a whole glTF file")) };
+    let (Some(magic), Some(length)) = (word(0), word(12)) else { return Err(bad("not a complete glTF file")) };
     if magic != MAGIC as usize {
         return Err(bad("not a binary glTF file"));
     }
-    let text = data.get(20..20usize.saturating_add(length)).ok_or_else(|| bad("its document is cut off"))?;
-    let document = serde_json::from_slice(text).map_err(|e| bad(&format!("its document is no JSON ({e})")))?;
+    let text = data.get(20..20usize.saturating_add(length)).ok_or_else(|| bad("its JSON chunk is cut off"))?;
+    let document = serde_json::from_slice(text).map_err(|e| bad(&format!("its JSON chunk cannot be parsed ({e})")))?;
     Ok((document, data.get(20 + length + 8..).unwrap_or_default()))
 }
 
-/// Reads the first mesh of Gaussians of a binary glTF file, in its own coordinates: those of the node are left out, since this project writes
-/// scenes turned. Features are zero and object ids 0.
+/// Reads the first mesh of Gaussians in a binary glTF file. Features are zero and object ids 0.
+///
+/// Node transforms are ignored in files of FastLGS, which are in scene coordinates. Transforms in
+/// files of other programs are an error.
 ///
 /// # Errors
-/// [`Error::Format`] for other and damaged files.
+/// [`Error::Format`] for other content and damaged files.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let (document, body) = chunks(path, &data)?;
@@ -138,13 +144,13 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let moves = |node: &Value| ["matrix", "rotation", "translation", "scale"].iter().any(|part| !node[*part].is_null());
     if !is_ours && document["nodes"].as_array().into_iter().flatten().any(moves) {
         return Err(bad(
-            "a node moves or turns its Gaussians; apply the transforms in the program that made it, and export it again".to_owned()
+            "a node transforms its Gaussians; apply the transforms in the program that wrote it and export it again".to_owned()
         ));
     }
     let primitives = document["meshes"].as_array().into_iter().flatten().flat_map(|mesh| mesh["primitives"].as_array()).flatten();
     let with_gaussians = |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
     let names = primitives.into_iter().find(with_gaussians).map(|primitive| &primitive["attributes"]);
-    let names = names.ok_or_else(|| bad("it holds no Gaussians (KHR_gaussian_splatting)".to_owned()))?;
+    let names = names.ok_or_else(|| bad("it has no mesh of Gaussians (KHR_gaussian_splatting)".to_owned()))?;
     let values = |name: &str, width: usize| -> Result<Option<Vec<f32>>> {
         let Some(accessor) = names[name].as_u64() else { return Ok(None) };
         let accessor = &document["accessors"][accessor as usize];
@@ -167,7 +173,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         Ok(Some(out))
     };
     let own = |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
-    let need = |found: Option<Vec<f32>>, name: &str| found.ok_or_else(|| bad(format!("its Gaussians have no attribute {name}")));
+    let need = |found: Option<Vec<f32>>, name: &str| found.ok_or_else(|| bad(format!("its Gaussians have no attribute {name}; export it again")));
     let vec3 = |values: &[f32]| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
     let means = vec3(&need(values("POSITION", 3)?, "POSITION")?);
     let n = means.len();
@@ -192,7 +198,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     };
     let lengths = [scene.log_scales.len(), scene.rotations.len(), scene.opacity_logits.len(), scene.sh_dc.len()];
     if lengths.iter().any(|length| *length != n) {
-        return Err(bad(format!("its attributes have {lengths:?} values for {n} Gaussians")));
+        return Err(bad(format!("its attributes have {lengths:?} values, but it has {n} positions; export it again")));
     }
     Ok(scene)
 }
@@ -224,7 +230,7 @@ mod tests {
         assert_eq!(word(&data, 20 + length), body.len());
         assert_eq!(document["buffers"][0]["byteLength"], body.len());
 
-        // What the extension's schema wants, as ratified.
+        // Required by the schema of the ratified extension.
         let primitive = &document["meshes"][0]["primitives"][0];
         let extension = &primitive["extensions"]["KHR_gaussian_splatting"];
         assert_eq!((&primitive["mode"], &extension["kernel"]), (&json!(POINTS), &json!("ellipse")));
@@ -249,7 +255,7 @@ mod tests {
         assert!(close(&values("KHR_gaussian_splatting:OPACITY", 1), &[0.75, 0.5]));
         assert!(close(&values("KHR_gaussian_splatting:ROTATION", 4), &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]));
         assert!(close(&values("COLOR_0", 4), &[1.0, 0.5, 0.0, 0.75, 0.2, 0.2, 0.2, 0.5]));
-        // The last of degree 2 is the eighth coefficient; of the second Gaussian it is the sixteenth.
+        // The last coefficient of degree 2 has index 7 in the first Gaussian and 15 in the second.
         assert!(close(&values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_4", 3), &[7.0, 7.0, 7.0, 15.0, 15.0, 15.0]));
         assert!(names.get("KHR_gaussian_splatting:SH_DEGREE_3_COEF_0").is_none());
         let back = read(&path).unwrap();
@@ -258,7 +264,7 @@ mod tests {
         assert!(back.opacity_logits.iter().zip(&scene.opacity_logits).all(|(a, b)| (a - b).abs() < 1e-4));
         std::fs::write(&path, &data[..data.len() - 9]).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("cut off"));
-        // Far from the world's origin the node moves the scene there.
+        // With a frame, the node moves the scene to its world position.
         let frame = WorldFrame { origin: glam::DVec3::new(512_345.6, 5_403_210.9, 431.2), scale: 2.0 };
         write(&path, &scene, Vec3::Y, &frame).unwrap();
         let data = std::fs::read(&path).unwrap();

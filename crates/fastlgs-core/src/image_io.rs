@@ -1,4 +1,4 @@
-//! Photos and pictures on disk.
+//! Reads, resizes and writes 8-bit images.
 
 use crate::{Error, Result, fs};
 use image::metadata::Orientation;
@@ -6,7 +6,7 @@ use image::{DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, Rgb
 use std::io::Cursor;
 use std::path::Path;
 
-/// Reads a picture as 8-bit RGB, the way up that its file says.
+/// Reads an image as 8-bit RGB and applies its EXIF orientation.
 ///
 /// # Errors
 /// [`Error::Io`], or [`Error::Format`] when it cannot be decoded.
@@ -24,29 +24,32 @@ fn decode_bytes(path: &Path, data: &[u8]) -> Result<DynamicImage> {
     Ok(picture)
 }
 
-/// Pixels as they are stored, and what makes of them the picture that is meant (EXIF).
+/// Decodes the pixels as stored and the EXIF orientation that makes them upright.
 fn stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)> {
     let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
-    let failed = |e: image::ImageError| Error::format(path, format!("the picture cannot be read ({e}); export it again or remove it"));
+    let failed = |e: image::ImageError| Error::format(path, format!("the image cannot be read ({e}); export it again or remove it"));
     if reader.format() == Some(ImageFormat::Jpeg) && !is_whole_jpeg(data) {
-        return Err(Error::format(path, "the picture is cut off: its JPEG data end too early; copy it again or remove it"));
+        return Err(Error::format(path, "the image is cut off: its JPEG data have no end marker; copy it again or remove it"));
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
     let way_up = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     Ok((DynamicImage::from_decoder(decoder).map_err(failed)?, way_up))
 }
 
-/// Whether JPEG data have an end. Decoders show grey for what was cut off.
+/// Returns whether JPEG data have an end marker. Decoders fill missing data with grey instead of
+/// failing.
 ///
-/// After each marker (0xff and a code) comes a segment of a stated length; the picture itself has no length, and ends at the next marker.
+/// A marker is 0xff and a code. A segment with a stated length follows it. The scan data after its
+/// segment have no length and end at the next marker.
 fn is_whole_jpeg(data: &[u8]) -> bool {
     const END: u8 = 0xd9;
     const SCAN: u8 = 0xda;
-    // Restarts, the start of the picture, and a private marker stand alone.
+    // Restart markers, the start of the image and one private marker have no segment.
     let stands_alone = |code: u8| matches!(code, 0x01 | 0xd0..=0xd8);
     let mut at = 0;
     loop {
-        // Within a picture 0xff00 is a byte of it, and restarts do not end it; 0xff may be repeated before a code.
+        // In scan data, 0xff00 is a byte of data and restart markers do not end them. 0xff may be
+        // repeated before a code.
         let marker = (at..data.len().saturating_sub(1)).find(|k| data[*k] == 0xff && !matches!(data[k + 1], 0x00 | 0xff));
         let Some(marker) = marker else { return false };
         let code = data[marker + 1];
@@ -65,25 +68,27 @@ fn is_whole_jpeg(data: &[u8]) -> bool {
     }
 }
 
-/// A photo with what it says about itself.
+/// A decoded photo.
 pub struct Photo {
-    /// Colours, not multiplied by alpha.
+    /// Colours, not premultiplied by alpha.
     pub pixels: RgbImage,
-    /// Coverage, 0 to 255, of photos with an alpha channel that is not opaque everywhere.
+    /// Alpha channel, 0 to 255; `None` without one or if it is opaque everywhere.
     pub alpha: Option<GrayImage>,
 }
 
-/// Which way up a photo is read.
+/// How the EXIF orientation of a photo is applied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum WayUp {
-    /// As its EXIF data say: photos without poses.
+    /// Always applies it. For photos without poses.
     Upright,
-    /// As its pose counts pixels, which was found for a photo of these sides. COLMAP and nerfstudio count pixels as they are stored, so that squares
-    /// and photos that are upside down stay as they are; one whose sides are swapped was turned before its pose was found.
+    /// Matches the pixels to a pose that was computed for a photo of this width and height. COLMAP
+    /// and nerfstudio use pixels as stored, so square and upside-down photos stay as they are. If
+    /// the sides are swapped, the photo was rotated before its pose was computed, and the
+    /// orientation is applied.
     AsPosed(u32, u32),
 }
 
-/// Reads a photo as 8-bit RGB, and its alpha channel.
+/// Reads a photo as 8-bit RGB with its alpha channel.
 ///
 /// # Errors
 /// As [`load_rgb`].
@@ -110,7 +115,8 @@ pub fn load_photo(path: &Path, way_up: WayUp) -> Result<Photo> {
     Ok(Photo { pixels: decoded.into_rgb8(), alpha: alpha.filter(transparent) })
 }
 
-/// Reads a picture as brightness, 0 to 255; [`mask_image`](crate::mask_image) reads masks of other programs.
+/// Reads an image as brightness, 0 to 255. [`mask_image`](crate::mask_image) reads masks of other
+/// programs.
 ///
 /// # Errors
 /// As [`load_rgb`].
@@ -118,7 +124,7 @@ pub fn load_gray(path: &Path) -> Result<GrayImage> {
     Ok(decode(path)?.into_luma8())
 }
 
-/// Decodes a picture with all its channels and bits, the way up that its file says.
+/// Reads an image with its own channels and bit depth and applies its EXIF orientation.
 ///
 /// # Errors
 /// As [`load_rgb`].
@@ -126,26 +132,26 @@ pub fn load_any(path: &Path) -> Result<DynamicImage> {
     decode(path)
 }
 
-/// Width and height without decoding the pixels.
+/// Returns width and height without decoding the pixels. Ignores the EXIF orientation.
 ///
 /// # Errors
 /// As [`load_rgb`].
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     let reader = ImageReader::open(path).map_err(Error::io(path))?.with_guessed_format().map_err(Error::io(path))?;
-    reader.into_dimensions().map_err(|e| Error::format(path, format!("the photo cannot be read ({e})")))
+    reader.into_dimensions().map_err(|e| Error::format(path, format!("the image cannot be read ({e}); copy or export it again")))
 }
 
-/// Channels and bits of a picture, without decoding its pixels.
+/// Returns channels and bit depth without decoding the pixels.
 ///
 /// # Errors
 /// As [`load_rgb`].
 pub fn color_type(path: &Path) -> Result<image::ColorType> {
     let reader = ImageReader::open(path).map_err(Error::io(path))?.with_guessed_format().map_err(Error::io(path))?;
-    let decoder = reader.into_decoder().map_err(|e| Error::format(path, format!("the picture cannot be read ({e})")))?;
+    let decoder = reader.into_decoder().map_err(|e| Error::format(path, format!("the image cannot be read ({e}); copy or export it again")))?;
     Ok(decoder.color_type())
 }
 
-/// Area-like downscaling (triangle filter over the footprint).
+/// Resizes a photo with a triangle filter, which averages over the footprint when it shrinks.
 pub fn resize(photo: &RgbImage, width: u32, height: u32) -> RgbImage {
     if photo.dimensions() == (width, height) {
         return photo.clone();
@@ -153,34 +159,35 @@ pub fn resize(photo: &RgbImage, width: u32, height: u32) -> RgbImage {
     image::imageops::resize(photo, width, height, FilterType::Triangle)
 }
 
-/// As [`resize`], for masks.
+/// As [`resize`], for grey images.
 pub fn resize_gray(mask: &GrayImage, width: u32, height: u32) -> GrayImage {
     image::imageops::resize(mask, width, height, FilterType::Triangle)
 }
 
-/// A picture as PNG.
+/// Encodes an image as PNG.
 ///
 /// # Errors
-/// [`Error::Invalid`] for a picture without pixels.
+/// [`Error::Invalid`] when encoding fails, such as for an image without pixels.
 pub fn encode_png(picture: impl Into<DynamicImage>) -> Result<Vec<u8>> {
     let mut data = Vec::new();
     let encode = picture.into().write_to(&mut Cursor::new(&mut data), ImageFormat::Png);
-    encode.map_err(|e| Error::Invalid(format!("a picture cannot be encoded as PNG: {e}")))?;
+    encode.map_err(|e| Error::Invalid(format!("an image cannot be encoded as PNG: {e}")))?;
     Ok(data)
 }
 
-/// Most pixels of a picture that came as bytes: few of these may stand for very many.
+/// Largest image that is decoded from memory, in pixels. A few compressed bytes can expand to a
+/// huge image.
 const MOST_PIXELS: u64 = 100_000_000;
 
-/// Decodes a photo that is already in memory as 8-bit RGB; `name` is what errors call it.
+/// Decodes an image in memory as 8-bit RGB. Errors call it `name`.
 ///
 /// # Errors
-/// [`Error::Format`] when it cannot be decoded, or is larger than 100 million pixels.
+/// [`Error::Format`] when it cannot be decoded or has more than 100 million pixels.
 pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
     let path = Path::new(name);
     let sides = ImageReader::new(Cursor::new(data)).with_guessed_format().ok().and_then(|reader| reader.into_dimensions().ok());
     if let Some((width, height)) = sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MOST_PIXELS) {
-        return Err(Error::format(path, format!("{width}x{height} is too large: at most {} million pixels", MOST_PIXELS / 1_000_000)));
+        return Err(Error::format(path, format!("{width}x{height} pixels is too large; at most {} million pixels are accepted", MOST_PIXELS / 1_000_000)));
     }
     Ok(decode_bytes(path, data)?.into_rgb8())
 }
@@ -188,13 +195,13 @@ pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
 /// Writes a PNG atomically.
 ///
 /// # Errors
-/// [`Error::Io`] with the path.
+/// [`Error::Io`] with the path, or [`Error::Invalid`] when encoding fails.
 pub fn save_png(path: &Path, picture: impl Into<DynamicImage>) -> Result<()> {
     let data = encode_png(picture)?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
-/// 8-bit RGB to planar float `[3][h][w]` in [0, 1].
+/// Converts 8-bit RGB to planar floats `[3][h][w]` in [0, 1].
 pub fn to_planar(photo: &RgbImage) -> Vec<f32> {
     let n = (photo.width() * photo.height()) as usize;
     let mut planar = vec![0.0; 3 * n];
@@ -206,7 +213,7 @@ pub fn to_planar(photo: &RgbImage) -> Vec<f32> {
     planar
 }
 
-/// Planar float `[3][h][w]` in [0, 1] to 8-bit RGB, rounded and clamped.
+/// Converts planar floats `[3][h][w]` to 8-bit RGB. Values are clamped to [0, 1] and rounded.
 pub fn from_planar(planar: &[f32], width: u32, height: u32) -> RgbImage {
     let n = (width * height) as usize;
     let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
@@ -220,9 +227,10 @@ pub fn from_planar(planar: &[f32], width: u32, height: u32) -> RgbImage {
 mod tests {
     use super::*;
 
-    /// A JPEG whose EXIF states an orientation: 6 is to be turned by a quarter, clockwise, 3 by a half.
+    /// Writes a JPEG with an EXIF orientation: 6 asks for a clockwise quarter turn, 3 for a half
+    /// turn.
     fn turned(width: u32, height: u32, orientation: u8) -> (tempfile::TempDir, std::path::PathBuf) {
-        // Left half red, right half blue, as stored.
+        // As stored, the left half is red and the right half blue.
         let picture = RgbImage::from_fn(width, height, |x, _| image::Rgb(if x < width / 2 { [250, 0, 0] } else { [0, 0, 250] }));
         let mut jpeg = Vec::new();
         image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(&picture).expect("a JPEG");
@@ -243,17 +251,17 @@ mod tests {
         let upright = load_photo(&path, WayUp::Upright).unwrap().pixels;
         assert_eq!(upright.dimensions(), (32, 64));
         let (top, bottom) = (upright.get_pixel(16, 10), upright.get_pixel(16, 54));
-        assert!(top[0] > 200 && bottom[2] > 200, "what was left is above: {top:?}, {bottom:?}");
+        assert!(top[0] > 200 && bottom[2] > 200, "the stored left half must be on top: {top:?}, {bottom:?}");
         for ((w, h), sides) in [((3024, 4032), (32, 64)), ((4032, 3024), (64, 32))] {
             assert_eq!(load_photo(&path, WayUp::AsPosed(w, h)).unwrap().pixels.dimensions(), sides, "{w}x{h}");
         }
-        // Squares, and what is upside down: their sides do not change.
+        // The sides of square and upside-down photos do not change.
         for (orientation, red) in [(6, (16, 4)), (8, (16, 28)), (3, (28, 16))] {
             let (_dir, square) = turned(32, 32, orientation);
             let upright = load_photo(&square, WayUp::Upright).unwrap().pixels;
             assert!(upright.get_pixel(red.0, red.1)[0] > 200, "orientation {orientation}");
             let stored = load_photo(&square, WayUp::AsPosed(32, 32)).unwrap().pixels;
-            assert!(stored.get_pixel(4, 16)[0] > 200, "poses count stored pixels, orientation {orientation}");
+            assert!(stored.get_pixel(4, 16)[0] > 200, "poses refer to stored pixels, orientation {orientation}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! Label maps: one 16-bit label a pixel, 0 for "no mask".
+//! Label maps: images with one 16-bit label per pixel, 0 for none.
 
 use crate::undistort::Distortion;
 use crate::{Camera, Error, Result, fs, image_io};
@@ -7,37 +7,37 @@ use image::{ColorType, DynamicImage, ImageBuffer, ImageReader, Luma};
 use std::io::Cursor;
 use std::path::Path;
 
-/// Most bytes that a picture with a palette may take: a damaged header may claim any size.
+/// Largest decoded size of a palette image, in bytes. A damaged header may state any size.
 const MOST_BYTES: usize = 1 << 28;
 
-/// Non-overlapping masks of one view and level; label 0 is unlabelled.
+/// Labels of one view, such as non-overlapping masks; 0 means none.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct LabelMap {
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Row-major labels.
+    /// Labels in row-major order.
     pub labels: Vec<u16>,
 }
 
 impl LabelMap {
-    /// An unlabelled map.
+    /// Creates a map without labels.
     pub fn new(width: u32, height: u32) -> Self {
         Self { width, height, labels: vec![0; (width * height) as usize] }
     }
 
-    /// Label at a pixel.
+    /// Returns the label of a pixel.
     pub fn at(&self, x: u32, y: u32) -> u16 {
         self.labels[(y * self.width + x) as usize]
     }
 
-    /// Largest label.
+    /// Returns the largest label.
     pub fn max(&self) -> u16 {
         self.labels.iter().copied().max().unwrap_or(0)
     }
 
-    /// Pixels of each label, indexed by label.
+    /// Returns the number of pixels of each label, indexed by label.
     pub fn areas(&self) -> Vec<usize> {
         let mut areas = vec![0; usize::from(self.max()) + 1];
         for &l in &self.labels {
@@ -46,7 +46,8 @@ impl LabelMap {
         areas
     }
 
-    /// Boxes (x0, y0, x1, y1), ends excluded, indexed by label; `None` for labels that do not occur.
+    /// Returns the bounding boxes (x0, y0, x1, y1) indexed by label, with exclusive ends; `None`
+    /// for labels that do not occur.
     pub fn boxes(&self) -> Vec<Option<[u32; 4]>> {
         let mut boxes: Vec<Option<[u32; 4]>> = vec![None; usize::from(self.max()) + 1];
         for y in 0..self.height {
@@ -58,12 +59,13 @@ impl LabelMap {
         boxes
     }
 
-    /// Pixels that carry `label`.
+    /// Returns the mask of `label`.
     pub fn mask(&self, label: u16) -> Vec<bool> {
         self.labels.iter().map(|&l| l == label).collect()
     }
 
-    /// The same masks numbered 1, 2, ... without gaps, in the order of their labels; and the label of each number, 0 first.
+    /// Renumbers the labels 1, 2, ... without gaps, in ascending order. Also returns the old label
+    /// of each new one, starting with 0 for 0.
     pub fn dense(&self) -> (Self, Vec<u16>) {
         let mut number = vec![0u16; usize::from(self.max()) + 1];
         self.labels.iter().for_each(|l| number[usize::from(*l)] = 1);
@@ -76,12 +78,13 @@ impl LabelMap {
         (Self { labels: self.labels.iter().map(|l| number[usize::from(*l)]).collect(), ..*self }, names)
     }
 
-    /// The map of the pairs (own label, other's label) that occur, numbered in their order from 0; and the pair of each number.
+    /// Combines two maps. Each pair (own label, other label) that occurs gets a number, from 0 in
+    /// ascending order. Also returns the pair of each number.
     ///
     /// # Panics
     /// If the maps differ in size.
     pub fn joint(&self, other: &Self) -> (Self, Vec<(u16, u16)>) {
-        assert_eq!((self.width, self.height), (other.width, other.height), "maps of one view have one size");
+        assert_eq!((self.width, self.height), (other.width, other.height), "both maps must have the same size");
         let ((own, names), (theirs, their_names)) = (self.dense(), other.dense());
         let place = |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
         let mut number = vec![None; names.len() * their_names.len()];
@@ -95,7 +98,7 @@ impl LabelMap {
         (Self { labels, ..*self }, pairs)
     }
 
-    /// The same map at another size, nearest neighbour.
+    /// Resizes the map with nearest-neighbour sampling.
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let pick = |n: u32, from: u32, to: u32| ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32;
         let labels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
@@ -103,8 +106,8 @@ impl LabelMap {
         Self { width, height, labels }
     }
 
-    /// The map as the ideal pinhole `camera` of its size would have seen it, nearest neighbour; what the lens did not see is
-    /// unlabelled.
+    /// Resamples the map to the ideal pinhole `camera` of the same size, with nearest-neighbour
+    /// sampling. Pixels outside the distorted image get no label.
     pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
         let mut out = Self::new(self.width, self.height);
         for (i, label) in out.labels.iter_mut().enumerate() {
@@ -118,18 +121,21 @@ impl LabelMap {
         out
     }
 
-    /// Writes a 16-bit grey PNG, atomically.
+    /// Writes a 16-bit grey PNG atomically.
     ///
     /// # Errors
     /// [`Error::Io`] with the path.
     pub fn save(&self, path: &Path) -> Result<()> {
         let picture: ImageBuffer<Luma<u16>, _> =
-            ImageBuffer::from_raw(self.width, self.height, self.labels.clone()).expect("the label map has its own size");
+            ImageBuffer::from_raw(self.width, self.height, self.labels.clone()).expect("there is one label per pixel");
         image_io::save_png(path, DynamicImage::ImageLuma16(picture))
     }
 
-    /// Reads a label map of another program, in which the largest number of its bits (255, 65535) means "no label" where it is not the next after
-    /// the others: COCO's, Cityscapes' and ScanNet's tools write it so. A map of it alone is a mask.
+    /// Reads a label map that may use the largest value (255, or 65,535 with 16 bits) for "no
+    /// label". Tools of COCO, Cityscapes and ScanNet write such maps.
+    ///
+    /// The value counts as a label if it directly follows the largest other label, or if there is
+    /// no other label (a binary mask).
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -144,10 +150,11 @@ impl LabelMap {
         Ok(map)
     }
 
-    /// Reads a grey PNG of 8 or 16 bits, or the places in the palette of a PNG that has one: trackers and DAVIS's tools keep ids so.
+    /// Reads a grey PNG of 8 or 16 bits, or the palette indices of a PNG with a palette. Trackers
+    /// and the tools of DAVIS store ids as palette indices.
     ///
     /// # Errors
-    /// [`Error::Io`], or [`Error::Format`] when it is neither.
+    /// [`Error::Io`], or [`Error::Format`] for other images.
     pub fn load(path: &Path) -> Result<Self> {
         let bytes = fs::read(path)?;
         if let Some(indexed) = Self::indexed(&bytes) {
@@ -159,12 +166,13 @@ impl LabelMap {
         let labels = match decoded {
             DynamicImage::ImageLuma16(map) => map.into_raw(),
             DynamicImage::ImageLuma8(map) => map.into_raw().into_iter().map(u16::from).collect(),
-            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits, or one with a palette")),
+            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits or a PNG with a palette; convert it")),
         };
         Ok(Self { width, height, labels })
     }
 
-    /// The places in the palette of a PNG; nothing for a file without one. Other readers would give the colours.
+    /// Decodes the palette indices of a PNG; `None` for a file without a palette. The `image` crate
+    /// would return colours.
     fn indexed(bytes: &[u8]) -> Option<Result<Self, png::DecodingError>> {
         let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().ok()?;
         let (width, height, bits) = (reader.info().width, reader.info().height, reader.info().bit_depth as usize);
@@ -175,7 +183,7 @@ impl LabelMap {
         if let Err(error) = reader.next_frame(&mut packed) {
             return Some(Err(error));
         }
-        // Each row begins with a new byte, whose highest bits are the first pixel's.
+        // Each row starts with a new byte. The highest bits of a byte belong to the leftmost pixel.
         let row = reader.output_line_size(width)?;
         let label = |x: usize, y: usize| u16::from(packed[y * row + x * bits / 8] << (x * bits % 8) >> (8 - bits));
         let labels = (0..height as usize).flat_map(|y| (0..width as usize).map(move |x| (x, y))).map(|(x, y)| label(x, y)).collect();
@@ -202,11 +210,11 @@ mod tests {
             LabelMap::load_with_void(&path).unwrap().labels
         };
         assert_eq!(read(&[0, 1, 7, 255], true), [0, 1, 7, 0]);
-        assert_eq!(read(&[0, 255, 255], true), [0, 255, 255], "a mask");
-        assert_eq!(read(&[1, 254, 255], true), [1, 254, 255], "as many objects");
+        assert_eq!(read(&[0, 255, 255], true), [0, 255, 255], "a binary mask");
+        assert_eq!(read(&[1, 254, 255], true), [1, 254, 255], "255 follows the largest other label");
         assert_eq!(read(&[3, 300, 65535], false), [3, 300, 0]);
         assert_eq!(read(&[3, 255, 300], false), [3, 255, 300]);
-        assert_eq!(read(&[3, 17, 255], false), [3, 17, 255], "16 bits have another void");
+        assert_eq!(read(&[3, 17, 255], false), [3, 17, 255], "255 is an ordinary label with 16 bits");
     }
 
     #[test]

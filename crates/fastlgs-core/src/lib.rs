@@ -1,8 +1,10 @@
-//! Data of FastLGS that knows neither GPU, neural network nor text: cameras and posed photos, the Gaussian scene and
-//! its PLY, label maps, evaluation labels, metrics, and the scene folder that ties the stages together.
+//! Data layer of FastLGS, without GPU, neural networks or text: cameras and posed photos, Gaussians
+//! and their file formats, label maps, evaluation labels, metrics, and the scene folder that
+//! connects the stages.
 //!
-//! Conventions, everywhere in the project:
-//! * world units are those of the input poses (see [`world_frame`] for extreme ones); cameras look along +z with x right and y down (OpenCV);
+//! Conventions of the whole project:
+//! * world units are those of the input poses (see [`world_frame`] for extreme ones); cameras look
+//!   along +z with x right and y down (OpenCV);
 //! * pixel (0, 0) covers [0, 1) x [0, 1): its centre is at (0.5, 0.5);
 //! * images are row-major; planar float images are `[channel][row][column]`.
 

@@ -1,23 +1,26 @@
-//! Black-and-white masks as programs save them: 0 and 255, 0 and 1, a palette, 16 bits, or in the alpha channel, with hard or soft edges.
+//! Reads binary masks in the encodings of other programs: 0 and 255, 0 and 1, a palette, 16 bits,
+//! or an alpha channel, with hard or soft edges.
 
 use crate::{LabelMap, Result, image_io};
 use image::{DynamicImage, GrayImage, Luma};
 use std::path::Path;
 
-/// A mask: one truth value a pixel.
+/// A binary mask of an image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MaskImage {
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// Row by row.
+    /// Whether each pixel is inside the mask, in row-major order.
     pub inside: Vec<bool>,
 }
 
 impl MaskImage {
-    /// Reads a mask. The alpha channel carries it where that varies, else the brightness; what is brighter than the level between the two
-    /// clusters of values is inside. A picture of one value is inside everywhere, unless that value is 0.
+    /// Reads a mask from the alpha channel if that varies, else from the brightness.
+    ///
+    /// Pixels above a threshold between the two clusters of values are inside. An image with a
+    /// single value is inside everywhere, unless the value is 0.
     ///
     /// # Errors
     /// As [`image_io::load_rgb`].
@@ -25,7 +28,7 @@ impl MaskImage {
         let picture = image_io::load_any(path)?;
         let mut values = values(&picture);
         if is_flat(&values) {
-            // A palette of one colour: its places are the values.
+            // The palette has a single colour: use the palette indices instead.
             if let Some(map) = LabelMap::load(path).ok().filter(|map| map.labels.len() == values.len()) {
                 values = map.labels;
             }
@@ -34,12 +37,12 @@ impl MaskImage {
         Ok(Self { width: picture.width(), height: picture.height(), inside: values.iter().map(|v| f64::from(*v) > level).collect() })
     }
 
-    /// Pixels inside.
+    /// Returns the number of pixels inside.
     pub fn area(&self) -> usize {
         self.inside.iter().filter(|inside| **inside).count()
     }
 
-    /// White inside, black outside.
+    /// Returns an image that is white inside and black outside.
     pub fn to_gray(&self) -> GrayImage {
         let value = |inside: bool| Luma([if inside { 255 } else { 0 }]);
         GrayImage::from_fn(self.width, self.height, |x, y| value(self.inside[(y * self.width + x) as usize]))
@@ -50,7 +53,7 @@ fn is_flat(values: &[u16]) -> bool {
     values.windows(2).all(|pair| pair[0] == pair[1])
 }
 
-/// Alpha where it varies, else brightness, in 16 bits.
+/// Returns 16-bit alpha if it varies, else 16-bit brightness.
 fn values(picture: &DynamicImage) -> Vec<u16> {
     if picture.color().has_alpha() {
         let alpha: Vec<u16> = picture.to_luma_alpha16().pixels().map(|p| p[1]).collect();
@@ -61,19 +64,20 @@ fn values(picture: &DynamicImage) -> Vec<u16> {
     picture.to_luma16().into_raw()
 }
 
-/// The level between the two clusters of the values: halfway between the means of those above and below it (Ridler and Calvard, 1978). It starts in
-/// the middle of their range, so that a small cluster counts as much as a large one.
+/// Returns the threshold between two clusters of values: halfway between the means above and below
+/// it (Ridler and Calvard 1978). It starts at the middle of the range, so that a small cluster
+/// counts as much as a large one.
 fn level(values: &[u16]) -> f64 {
     let mut counts = vec![0u64; usize::from(u16::MAX) + 1];
     values.iter().for_each(|value| counts[usize::from(*value)] += 1);
     let known: Vec<(f64, f64)> = counts.iter().enumerate().filter(|(_, n)| **n > 0).map(|(v, n)| (v as f64, *n as f64)).collect();
     let (Some(least), Some(most)) = (known.first(), known.last()) else { return 0.5 };
     if known.len() == 1 {
-        // Anything but 0 lies above it.
+        // A single value is above the threshold, unless it is 0.
         return 0.5;
     }
     let mut level = (least.0 + most.0) / 2.0;
-    // It settles after a few steps; the limit guards against rounding.
+    // Converges after a few steps; the limit guards against oscillation by rounding.
     for _ in 0..100 {
         let mean = |above: bool| {
             let (sum, count) = known.iter().filter(|k| (k.0 > level) == above).fold((0.0, 0.0), |(s, n), k| (s + k.0 * k.1, n + k.1));
@@ -95,7 +99,7 @@ mod tests {
 
     const SIDE: u32 = 20;
 
-    /// A disc that covers a part of the picture.
+    /// Returns whether a pixel lies in the test disc.
     fn inside(x: u32, y: u32) -> bool {
         (x as f32 - 8.0).hypot(y as f32 - 9.0) < 5.2
     }
@@ -104,7 +108,7 @@ mod tests {
         (0..SIDE * SIDE).filter(|p| inside(p % SIDE, p / SIDE)).count()
     }
 
-    /// The area that is read of a picture.
+    /// Saves an image, reads it as a mask and returns the area.
     fn read(picture: impl Into<DynamicImage>, name: &str) -> usize {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join(name);
@@ -129,7 +133,7 @@ mod tests {
         assert_eq!(read(opaque, "a.png"), area());
         let gray: ImageBuffer<LumaA<u8>, _> = ImageBuffer::from_fn(SIDE, SIDE, |x, y| LumaA([255, if inside(x, y) { 255 } else { 0 }]));
         assert_eq!(read(gray, "a.png"), area());
-        // Through JPEG, and with soft edges: within a tenth.
+        // JPEG compression and soft edges may change a tenth of the area.
         let binary = GrayImage::from_fn(SIDE, SIDE, |x, y| Luma([if inside(x, y) { 255 } else { 0 }]));
         let soft = image::imageops::blur(&binary, 0.7);
         for found in [read(binary, "a.jpg"), read(soft, "a.png")] {

@@ -1,6 +1,6 @@
-//! Measures of masks and pictures. Rules: DESIGN of the evaluation in `docs/evaluation.md`.
+//! Metrics of masks and images. `docs/evaluation.md` states the rules of evaluation.
 
-/// Intersection over union; two empty masks agree perfectly.
+/// Returns the intersection over union; 1 for two empty masks.
 pub fn iou(a: &[bool], b: &[bool]) -> f64 {
     let (mut both, mut either) = (0usize, 0usize);
     for (&a, &b) in a.iter().zip(b) {
@@ -10,20 +10,21 @@ pub fn iou(a: &[bool], b: &[bool]) -> f64 {
     if either == 0 { 1.0 } else { both as f64 / either as f64 }
 }
 
-/// Share of the true pixels that were found; 1 where there are none.
+/// Returns the share of the true pixels that were found; 1 if there are none.
 pub fn recall(found: &[bool], truth: &[bool]) -> f64 {
     let total = truth.iter().filter(|t| **t).count();
     let hit = found.iter().zip(truth).filter(|(f, t)| **f && **t).count();
     if total == 0 { 1.0 } else { hit as f64 / total as f64 }
 }
 
-/// Pixel accuracy: share of all pixels on which two masks agree.
+/// Returns the share of all pixels on which two masks agree.
 pub fn accuracy(found: &[bool], truth: &[bool]) -> f64 {
     let same = found.iter().zip(truth).filter(|(f, t)| f == t).count();
     same as f64 / truth.len().max(1) as f64
 }
 
-/// Boundary IoU (Cheng et al. 2021): IoU of the bands within `distance` pixels inside each mask's border.
+/// Returns the boundary IoU (Cheng et al. 2021): the IoU of the bands within `distance` pixels
+/// inside each mask's border.
 pub fn boundary_iou(a: &[bool], b: &[bool], width: u32, height: u32, distance: u32) -> f64 {
     iou(&inner_band(a, width, height, distance), &inner_band(b, width, height, distance))
 }
@@ -33,18 +34,18 @@ fn inner_band(mask: &[bool], width: u32, height: u32, distance: u32) -> Vec<bool
     mask.iter().zip(inside).map(|(&m, i)| m && !i).collect()
 }
 
-/// Pixels whose whole square neighbourhood of radius `r` lies in the mask; outside the picture counts as outside.
+/// Erodes a mask with a square of radius `r` pixels. Pixels beyond the image count as outside.
 pub fn erode(mask: &[bool], width: u32, height: u32, r: u32) -> Vec<bool> {
     let outside: Vec<bool> = mask.iter().map(|m| !m).collect();
     dilated(&outside, width, height, [r, r], true).into_iter().map(|m| !m).collect()
 }
 
-/// Pixels with a mask pixel in their neighbourhood of `rx` pixels to both sides and `ry` up and down.
+/// Dilates a mask with a rectangle of `rx` pixels left and right and `ry` pixels up and down.
 pub fn dilate(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2]) -> Vec<bool> {
     dilated(mask, width, height, [rx, ry], false)
 }
 
-/// `beyond`: whether what lies beyond the picture is mask.
+/// Dilates a mask; `beyond` is the value of pixels beyond the image.
 fn dilated(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2], beyond: bool) -> Vec<bool> {
     let (w, h, rx, ry) = (width as i64, height as i64, i64::from(rx), i64::from(ry));
     let line =
@@ -64,29 +65,30 @@ fn dilated(mask: &[bool], width: u32, height: u32, [rx, ry]: [u32; 2], beyond: b
     out
 }
 
-/// What equal pictures have, and the most that there is: means stay numbers.
+/// Upper bound of the PSNR in dB, and the value of identical images. A finite bound keeps means
+/// finite.
 const PSNR_MOST: f64 = 100.0;
 
-/// Peak signal-to-noise ratio of values in [0, 1], in dB.
+/// Returns the peak signal-to-noise ratio of values in [0, 1], in dB, at most 100.
 pub fn psnr(a: &[f32], b: &[f32]) -> f64 {
     let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
     let mse = sum / a.len().max(1) as f64;
-    // `min` would take a picture with holes of NaN for a perfect one.
+    // `min` would return the bound for NaN; `clamp` keeps NaN.
     if mse == 0.0 { PSNR_MOST } else { (-10.0 * mse.log10()).clamp(f64::MIN, PSNR_MOST) }
 }
 
-/// Half width of the SSIM window.
+/// Half width of the SSIM window in pixels.
 pub const SSIM_RADIUS: usize = 5;
 
-/// The 11 weights of the Gaussian window (sigma 1.5) of SSIM.
+/// Returns the 11 normalised weights of the Gaussian SSIM window (sigma 1.5 pixels).
 pub fn ssim_window() -> [f32; 2 * SSIM_RADIUS + 1] {
     let raw: [f64; 11] = std::array::from_fn(|i| (-((i as f64 - 5.0).powi(2)) / (2.0 * 1.5 * 1.5)).exp());
     let sum: f64 = raw.iter().sum();
     raw.map(|w| (w / sum) as f32)
 }
 
-/// Mean structural similarity of planar pictures `[channels][h][w]` in [0, 1], with zeros outside, as 3DGS measures it, over the windows around
-/// the pixels that count, `[h][w]`.
+/// Returns the mean SSIM of planar images `[channels][h][w]` in [0, 1] over the windows around
+/// pixels with `counts` `[h][w]`. Pixels beyond the image are zero, as in 3DGS.
 pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, counts: &[bool]) -> f64 {
     let n = width * height;
     let counting = a.len() / n * counts.iter().filter(|c| **c).count();
@@ -106,7 +108,7 @@ pub fn ssim(a: &[f32], b: &[f32], width: usize, height: usize, counts: &[bool]) 
     total / counting.max(1) as f64
 }
 
-/// Separable blur with the SSIM window, zeros outside.
+/// Blurs `[h][w]` values with the separable SSIM window. Values beyond the image are zero.
 pub fn blur(x: &[f32], width: usize, height: usize) -> Vec<f32> {
     let window = ssim_window();
     let mut rows = vec![0.0; x.len()];
@@ -126,16 +128,17 @@ pub fn blur(x: &[f32], width: usize, height: usize) -> Vec<f32> {
     out
 }
 
-/// Localisation by LERF's rule: does the peak of the 29x29 box-filtered relevancy lie inside a box? Ties all count.
+/// Returns whether the peak of the relevancy after a 29x29 box filter lies inside a box (LERF's
+/// rule). Any of several equal peaks suffices.
 pub fn localised(relevancy: &[f32], width: u32, height: u32, boxes: &[[f64; 4]]) -> bool {
     let (w, h) = (width as usize, height as usize);
-    // Borders are mirrored without repeating the edge, as OpenCV's filter2D does by default.
+    // Mirrors at the border without repeating the edge, like OpenCV's filter2D by default.
     let mirrored = |k: isize, n: usize| {
         let period = 2 * (n as isize - 1).max(1);
         let k = k.rem_euclid(period);
         k.min(period - k) as usize
     };
-    // The window moves on by one: what enters is added, what leaves taken away.
+    // When the window moves by one, one value enters its sum and one leaves.
     let moved = |k: usize, n: usize| (mirrored(k as isize + 14, n), mirrored(k as isize - 15, n));
     let mut rows = vec![0.0f64; w * h];
     for (row, values) in rows.chunks_exact_mut(w).zip(relevancy.chunks_exact(w)) {
@@ -161,7 +164,8 @@ pub fn localised(relevancy: &[f32], width: u32, height: u32, boxes: &[[f64; 4]])
     })
 }
 
-/// Area under the ROC curve: the chance that a present score exceeds an absent one; ties count half.
+/// Returns the area under the ROC curve: the probability that a present score exceeds an absent
+/// one. Ties count half; NaN if a list is empty.
 pub fn auroc(present: &[f64], absent: &[f64]) -> f64 {
     if present.is_empty() || absent.is_empty() {
         return f64::NAN;
@@ -203,7 +207,8 @@ mod tests {
         let square = |from: usize, to: usize| -> Vec<bool> {
             (0..400).map(|p| (from..to).contains(&(p % 20)) && (from..to).contains(&(p / 20))).collect()
         };
-        // Bands one pixel wide: the ring of an 8x8 square has 28 pixels, that of a 6x6 square 20; disjoint.
+        // Bands of one pixel: the 8x8 square has 28 pixels in its ring and the 6x6 square 20. They
+        // are disjoint.
         assert_eq!(inner_band(&square(4, 12), 20, 20, 1).iter().filter(|b| **b).count(), 28);
         assert_eq!(boundary_iou(&square(4, 12), &square(4, 12), 20, 20, 1), 1.0);
         assert_eq!(boundary_iou(&square(4, 12), &square(5, 11), 20, 20, 1), 0.0);
@@ -223,7 +228,7 @@ mod tests {
         let (inverse, all): (Vec<f32>, _) = (a.iter().map(|v| 1.0 - v).collect(), vec![true; a.len()]);
         assert!((ssim(&a, &a, 32, 24, &all) - 1.0).abs() < 1e-6);
         assert!(ssim(&a, &inverse, 32, 24, &all) < 0.2);
-        // Far from the half that counts, nothing matters.
+        // Changes far from the counted pixels have no effect.
         let left = |k: usize| k % 32 < 8;
         let half: Vec<f32> = a.iter().zip(&inverse).enumerate().map(|(k, (v, other))| if k % 32 < 16 { *v } else { *other }).collect();
         assert!((ssim(&a, &half, 32, 24, &(0..32 * 24).map(left).collect::<Vec<_>>()) - 1.0).abs() < 1e-6);
@@ -236,7 +241,7 @@ mod tests {
         map[20 * 64 + 40] = 1.0;
         assert!(localised(&map, 64, 64, &[[30.0, 10.0, 50.0, 30.0]]));
         assert!(!localised(&map, 64, 64, &[[0.0, 45.0, 10.0, 60.0]]));
-        // The window summed anew for each pixel, mirrored at the borders, has the same peak.
+        // Reference: sums each mirrored window anew. The peak must be the same.
         for (seed, (w, h)) in [(40, 31), (33, 64), (9, 12)].into_iter().enumerate() {
             let mut rng = crate::rng::Rng::new(seed as u64, "localised");
             let map: Vec<f32> = (0..w * h).map(|_| rng.uniform().powi(6)).collect();

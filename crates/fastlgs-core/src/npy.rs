@@ -1,4 +1,4 @@
-//! NumPy's array files.
+//! Reads NumPy array files (`.npy`).
 
 use crate::{Error, Result};
 use npyz::{NpyFile, Order};
@@ -6,24 +6,24 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
-/// Numbers with their shape.
+/// An array of numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Npy {
-    /// Length of each dimension.
+    /// Size of each dimension.
     pub shape: Vec<usize>,
     /// Row-major values.
     pub values: Vec<f64>,
 }
 
-/// Reads a `.npy` file of numbers or truth values, in C or Fortran order.
+/// Reads a `.npy` file of numbers or booleans, in C or Fortran order.
 ///
 /// # Errors
-/// When the file is missing, cut off, or of another kind.
+/// When the file is missing, truncated, or has another type.
 pub fn read(path: &Path) -> Result<Npy> {
     let bad = |reason: String| Error::format(path, reason);
     let file = File::open(path).map_err(Error::io(path))?;
     let opened = NpyFile::new(BufReader::new(file));
-    let mut file = opened.map_err(|e| bad(format!("not a whole .npy file ({e}); save it with numpy.save")))?;
+    let mut file = opened.map_err(|e| bad(format!("not a complete .npy file ({e}); save it with numpy.save")))?;
     let by_columns = file.order() != Order::C && file.shape().len() > 1;
     let shape: Vec<usize> = file.shape().iter().map(|d| *d as usize).collect();
     let kind = file.dtype().descr();
@@ -43,10 +43,10 @@ pub fn read(path: &Path) -> Result<Npy> {
     try_kinds!(f32 => f64::from, f64 => |v| v, i32 => f64::from, i64 => |v| v as f64, u8 => f64::from, u16 => f64::from,
         i16 => f64::from, u32 => f64::from, i8 => f64::from, u64 => |v| v as f64, half::f16 => f64::from, bool => f64::from);
     let _ = file;
-    Err(bad(format!("its values are of the kind {kind}; save numbers, as with array.astype('float32')")))
+    Err(bad(format!("its values have the type {kind}; save numbers, for example with array.astype('float32')")))
 }
 
-/// Values in row-major order, of an array whose first index runs fastest (Fortran order).
+/// Reorders values from Fortran order (first index fastest) to row-major order.
 fn by_rows(values: &[f64], shape: &[usize]) -> Vec<f64> {
     let place = |row_major: usize| {
         let (mut rest, mut index) = (row_major, vec![0; shape.len()]);
@@ -73,7 +73,7 @@ mod tests {
         writer.finish().unwrap();
         std::fs::write(&path, &bytes).unwrap();
         assert_eq!(read(&path).unwrap(), Npy { shape: vec![2, 2], values: vec![-1.0, 0.0, 7.0, 300.0] });
-        // The same array by columns.
+        // The same array in Fortran order.
         let mut columns = Vec::new();
         let options = npyz::WriteOptions::new().default_dtype().order(Order::Fortran).shape(&[2, 2]);
         let mut writer = options.writer(&mut columns).begin_nd().unwrap();
@@ -82,7 +82,7 @@ mod tests {
         std::fs::write(&path, &columns).unwrap();
         assert_eq!(read(&path).unwrap(), Npy { shape: vec![2, 2], values: vec![-1.0, 0.0, 7.0, 300.0] });
         assert_eq!(by_rows(&[0.0, 3.0, 1.0, 4.0, 2.0, 5.0], &[2, 3]), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
-        // Half precision and small whole numbers.
+        // Half precision and 8-bit integers.
         let header = |kind: &str| {
             let text = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': (2,), }}");
             let text = format!("{text:<117}\n");

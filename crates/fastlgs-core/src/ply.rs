@@ -1,9 +1,12 @@
-//! The PLY that 3DGS programs exchange: binary little-endian (or ASCII on reading), one `vertex` element of floats.
+//! Reads and writes the PLY format of 3DGS: one `vertex` element of floats, binary little-endian.
+//! Reading also accepts big-endian, ASCII and SuperSplat's compressed files.
 //!
-//! Written columns: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3` (`f_rest` as in 3DGS: all of red,
-//! then green, then blue), then `feature_0..2` (float) and `object_id` (ushort), which other viewers skip. On reading,
-//! unknown columns are skipped, missing features are 0, and the SH degree is what the number of `f_rest` columns gives.
-//! Gaussians that cannot be drawn are dropped.
+//! Written columns: `x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3` (`f_rest` as
+//! in 3DGS: all of red, then green, then blue), then `feature_0..2` (float) and `object_id`
+//! (ushort), which other viewers skip.
+//!
+//! Reading skips unknown columns and sets missing features and ids to 0. The number of `f_rest`
+//! columns gives the SH degree. Gaussians that cannot be drawn are dropped.
 
 use crate::gaussians::{MAX_SH_DEGREE, rest_len};
 use crate::{Error, Gaussians, Result, WorldFrame, compressed_ply, fs};
@@ -14,7 +17,7 @@ use std::path::Path;
 /// Name of the column of object ids.
 const OBJECT_ID: &str = "object_id";
 
-/// Names of the float columns at an SH degree, in their order.
+/// Returns the names of the float columns at an SH degree, in file order.
 fn float_columns(degree: u32) -> Vec<String> {
     let numbered = |name: &str, n: usize| (0..n).map(|k| format!("{name}_{k}")).collect::<Vec<_>>();
     let fixed = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned);
@@ -23,7 +26,7 @@ fn float_columns(degree: u32) -> Vec<String> {
     fixed.into_iter().chain(groups.concat()).chain(["opacity".to_owned()]).chain(tail.concat()).collect()
 }
 
-/// Writes the scene atomically, in its own coordinates.
+/// Writes a scene atomically, in scene coordinates.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
@@ -31,7 +34,8 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     write_in(path, scene, &WorldFrame::default())
 }
 
-/// Writes the scene atomically, in the coordinates of the world. Far from its origin positions are doubles: floats would lose their digits there.
+/// Writes a scene atomically, in world coordinates. If the frame has an origin, positions are
+/// doubles, because floats lose digits far from the world's origin.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
@@ -103,7 +107,7 @@ impl Scalar {
         }
     }
 
-    /// Value of the first bytes of `b` (little-endian), which must be long enough.
+    /// Decodes a value from the first bytes of `b` (little-endian).
     fn read(self, b: &[u8]) -> f64 {
         match self {
             Self::I8 => f64::from(b[0] as i8),
@@ -123,14 +127,15 @@ struct Header {
     big_endian: bool,
     count: usize,
     columns: Vec<(String, Scalar)>,
-    /// Offset of the first row.
+    /// Byte offset of the first row.
     body: usize,
 }
 
-/// Bytes in which a header must end.
+/// Maximum length of a header in bytes.
 const LONGEST_HEADER: usize = 1 << 16;
 
-/// The lines of a header, and where the body begins. Comments may be in any encoding and hold any words.
+/// Returns the lines of a header and the offset of the body. Comments may have any encoding and
+/// contain `end_header`.
 fn header_lines(data: &[u8]) -> Option<(Vec<String>, usize)> {
     let (mut lines, mut at) = (Vec::<String>::new(), 0);
     let limit = data.len().min(LONGEST_HEADER);
@@ -163,7 +168,7 @@ fn header(path: &Path, data: &[u8]) -> Result<Header> {
                 in_vertex = true;
             }
             ["element", name, _] if header.columns.is_empty() => {
-                return Err(bad(format!("element '{name}' stands before the vertices; that layout is not supported")));
+                return Err(bad(format!("element '{name}' precedes the vertices; this layout is not supported")));
             }
             ["element", ..] => in_vertex = false,
             ["property", "list", ..] if in_vertex => return Err(bad("a list property in the vertices is not supported".into())),
@@ -177,14 +182,14 @@ fn header(path: &Path, data: &[u8]) -> Result<Header> {
     Ok(header)
 }
 
-/// The vertex rows as columns of f64.
+/// Returns the columns of the vertex element, in file order.
 fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
     let mut table = vec![Vec::new(); header.columns.len()];
     let short = |i: usize| {
-        Error::format(path, format!("truncated: it announces {} Gaussians and ends in number {}; copy it again", header.count, i + 1))
+        Error::format(path, format!("truncated: it announces {} Gaussians but ends within number {}; copy it again", header.count, i + 1))
     };
     if header.ascii {
-        let text = std::str::from_utf8(&data[header.body.min(data.len())..]).map_err(|_| Error::format(path, "not text"))?;
+        let text = std::str::from_utf8(&data[header.body.min(data.len())..]).map_err(|_| Error::format(path, "it is declared as ASCII but is not text; export it again"))?;
         let mut words = text.split_whitespace();
         for i in 0..header.count {
             for column in &mut table {
@@ -213,10 +218,10 @@ fn columns(path: &Path, data: &[u8], header: &Header) -> Result<Vec<Vec<f64>>> {
     Ok(table)
 }
 
-/// Whether a PLY file names the objects of its Gaussians: what another program saved often does not.
+/// Returns whether a PLY file has object ids. Files of other programs often have none.
 ///
 /// # Errors
-/// A missing file, or one that is no PLY.
+/// A missing file, or a header that is not a supported PLY.
 pub fn has_objects(path: &Path) -> Result<bool> {
     let mut start = Vec::new();
     let file = std::fs::File::open(path).map_err(Error::io(path))?;
@@ -224,15 +229,16 @@ pub fn has_objects(path: &Path) -> Result<bool> {
     Ok(header(path, &start)?.columns.iter().any(|column| column.0 == OBJECT_ID))
 }
 
-/// Reads a 3DGS PLY of this or another program, positions relative to the frame. What cannot be drawn is dropped; the log says so.
+/// Reads a PLY in scene coordinates. Gaussians that cannot be drawn are dropped with a warning in
+/// the log.
 ///
 /// # Errors
-/// Truncation and missing columns are [`Error::Format`].
+/// [`Error::Io`], or [`Error::Format`] for truncated files and missing columns.
 pub fn read(path: &Path) -> Result<Gaussians> {
     parse(path, &fs::read(path)?)
 }
 
-/// As [`read`], for a file that is in memory; `path` is what errors call it.
+/// As [`read`], for a file in memory. Errors name `path`.
 ///
 /// # Errors
 /// As [`read`].
@@ -244,11 +250,11 @@ pub fn parse(path: &Path, data: &[u8]) -> Result<Gaussians> {
     Ok(scene)
 }
 
-/// Says what is missing in a file that has no Gaussians as 3DGS has them.
+/// Explains why a file without the column `name` is not a 3DGS scene.
 fn missing_column(header: &Header, name: &str) -> String {
     let has = |name: &str| header.columns.iter().any(|column| column.0 == name);
     if name == "scale_2" && has("scale_1") {
-        return "its Gaussians are 2-D (scale_0 and scale_1, no scale_2), as 2DGS trains them; train the photos here or with a 3-D method"
+        return "its Gaussians are 2-D, as from 2DGS (scale_0 and scale_1, no scale_2); train the photos with FastLGS or another 3-D method"
             .into();
     }
     if name.starts_with("f_dc") && has("scale_0") && ["red", "r", "f_rgb_0"].into_iter().any(has) {
@@ -260,7 +266,8 @@ fn missing_column(header: &Header, name: &str) -> String {
     format!("no column '{name}': this is not a Gaussian scene")
 }
 
-/// Reads a PLY whose positions are those of the world into a frame; and a sentence about Gaussians that were dropped.
+/// Reads a PLY in world coordinates and converts it to `frame`. Also returns a warning if Gaussians
+/// were dropped.
 ///
 /// # Errors
 /// As [`read`].
@@ -286,7 +293,7 @@ pub fn parse_in(path: &Path, data: &[u8], frame: &WorldFrame) -> Result<(Gaussia
     let feature = |k: usize| find(&format!("feature_{k}")).unwrap_or(&zeros);
     let rest_columns = header.columns.iter().filter(|c| c.0.starts_with("f_rest_")).count();
     let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest_columns).ok_or_else(|| {
-        Error::format(path, format!("{rest_columns} columns 'f_rest_*': 0, 9, 24 or 45 are those of SH degrees 0 to {MAX_SH_DEGREE}"))
+        Error::format(path, format!("it has {rest_columns} columns 'f_rest_*'; SH degrees 0 to {MAX_SH_DEGREE} have 0, 9, 24 or 45"))
     })?;
     let per_color = rest_len(sh_degree);
     let rest = (0..rest_columns).map(|k| need(&format!("f_rest_{k}"))).collect::<Result<Vec<_>>>()?;
@@ -348,7 +355,7 @@ mod tests {
         damaged.means[0].y = f32::NAN;
         damaged.log_scales[1].x = f32::NEG_INFINITY;
         damaged.rotations[2] = [0.0; 4];
-        // Solid, as files with eight bits of opacity have it.
+        // Fully opaque, as from files with 8-bit opacity.
         damaged.opacity_logits[3] = f32::INFINITY;
         write(&path, &damaged).unwrap();
         let (scene, warning) = parse_in(&path, &std::fs::read(&path).unwrap(), &WorldFrame::default()).unwrap();
@@ -398,7 +405,7 @@ mod tests {
         assert!((world.log_scales[2] - sample().log_scales[2] - 4f32.ln()).length() < 1e-5);
     }
 
-    /// The same two Gaussians in both byte orders and in text.
+    /// Reads the same two Gaussians in both byte orders and as text.
     #[test]
     fn both_byte_orders_and_text() {
         let dir = tempfile::tempdir().unwrap();

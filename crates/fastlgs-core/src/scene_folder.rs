@@ -1,4 +1,4 @@
-//! The scene folder: one place for everything a stage leaves for the next.
+//! The scene folder: paths, manifest and files that the stages share.
 
 use crate::dataset::SfmPoint;
 use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, WorldFrame, compact, fs, image_io, ply};
@@ -8,98 +8,99 @@ use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Component, Path, PathBuf};
 
-/// What makes a folder a scene.
+/// File name of the manifest; a folder with it is a scene.
 pub const MANIFEST: &str = "scene.json";
 
-/// A model file that took part in making a scene.
+/// A model file that was used to make a scene.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ModelFile {
-    /// Where it lay.
+    /// Path at that time.
     pub path: PathBuf,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
-    /// Its SHA-256 in hexadecimal digits.
+    /// SHA-256 in hexadecimal digits.
     pub sha256: String,
 }
 
-/// What made a scene folder; `scene.json`.
+/// Manifest of a scene (`scene.json`): its inputs, options and files.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Manifest {
-    /// Version of the program that wrote it.
+    /// Version of FastLGS that wrote it.
     pub version: String,
-    /// The folder of photos.
+    /// Folder of the input photos.
     pub photos: PathBuf,
-    /// Every n-th view (by sorted name) is held out; 0 for none.
+    /// Every n-th view in sorted order is held out; 0 holds out none.
     pub holdout: usize,
-    /// Views that are held out by name, as their labels ask.
+    /// Views that are held out by name because they have evaluation labels.
     #[serde(default)]
     pub held_out_views: Vec<String>,
-    /// Segmenter that made the masks.
+    /// Name of the segmenter that made the masks.
     pub segmenter: String,
-    /// Encoder that made the embeddings; queries must use the same.
+    /// Name of the encoder that made the embeddings; queries must use the same one.
     pub encoder: String,
-    /// What stands around the masks that CLIP sees; empty where that is grey.
+    /// Background around masks in the image crops for CLIP; empty for grey.
     #[serde(default)]
     pub crops: String,
-    /// Model files by their role (`clip_image`, `clip_text`, `sam_encoder`, `sam_decoder`).
+    /// Model files by role (`clip_image`, `clip_text`, `sam_encoder`, `sam_decoder`).
     #[serde(default)]
     pub models: BTreeMap<String, ModelFile>,
-    /// Seed of all randomness.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// What was survivable but wrong in the input.
+    /// Warnings about the input that did not stop the run.
     pub warnings: Vec<String>,
-    /// Views that are not trained on because their poses contradict those of the others.
+    /// Views that are excluded from training because their poses contradict the others.
     #[serde(default)]
     pub excluded: Vec<String>,
-    /// Where the scene lies in the world of the poses' files, and its unit.
+    /// Origin and unit of scene coordinates in the world of the input poses.
     #[serde(default, skip_serializing_if = "WorldFrame::is_identity")]
     pub frame: WorldFrame,
-    /// The files of the scene, relative to its folder, with '/' between the parts. Stages move and remove only these.
+    /// Files of the scene, relative to its folder, with '/' as separator. Stages move and remove
+    /// only these.
     #[serde(default)]
     pub files: BTreeSet<String>,
-    /// Seconds a stage took, by name.
+    /// Duration of each stage in seconds, by name.
     #[serde(default)]
     pub seconds: BTreeMap<String, f64>,
-    /// Notes of later stages (training preset, adapter, figures).
+    /// Notes of later stages, such as preset, adapter and metrics.
     #[serde(default)]
     pub notes: BTreeMap<String, serde_json::Value>,
 }
 
 impl Manifest {
-    /// The views that may be trained on, in their order.
+    /// Returns the training views in order: neither held out nor excluded.
     pub fn training(&self, cameras: &[Camera]) -> Vec<Camera> {
         let usable = |(i, c): &(usize, &Camera)| !self.is_held_out(*i, &c.name) && !self.excluded.contains(&c.name);
         cameras.iter().enumerate().filter(usable).map(|(_, c)| c.clone()).collect()
     }
 
-    /// The views that are held out, in their order.
+    /// Returns the held-out views in order.
     pub fn held_out(&self, cameras: &[Camera]) -> Vec<Camera> {
         cameras.iter().enumerate().filter(|(i, c)| self.is_held_out(*i, &c.name)).map(|(_, c)| c.clone()).collect()
     }
 
-    /// Whether a view, by its index in sorted order and its name, is held out.
+    /// Returns whether a view is held out. `index` is its position in sorted order.
     pub fn is_held_out(&self, index: usize, name: &str) -> bool {
         is_held_out(index, self.holdout) || self.held_out_views.iter().any(|v| v == name)
     }
 }
 
-/// A scene folder on disk. Paths are given by the methods; nothing is cached.
+/// A scene folder on disk. Its methods return paths and read files; nothing is cached.
 #[derive(Clone, Debug)]
 pub struct SceneFolder {
-    /// Root of the folder.
+    /// Path of the folder.
     pub root: PathBuf,
 }
 
 impl SceneFolder {
-    /// A folder that may not exist yet.
+    /// Names a folder, which need not exist yet.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
 
-    /// A folder that `preprocess` has finished.
+    /// Opens a folder that `preprocess` has finished.
     ///
     /// # Errors
-    /// When there is no `scene.json`.
+    /// [`Error::Invalid`] without `scene.json`.
     pub fn open(root: &Path) -> Result<Self> {
         let folder = Self::new(root);
         if !folder.manifest_path().is_file() {
@@ -116,7 +117,7 @@ impl SceneFolder {
         self.root.join(MANIFEST)
     }
 
-    /// The trained scene.
+    /// Returns the path of the trained scene.
     pub fn ply_path(&self) -> PathBuf {
         self.root.join("scene.ply")
     }
@@ -124,37 +125,38 @@ impl SceneFolder {
     /// Reads `scene.json`.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file, or a listed file outside the scene folder.
     pub fn manifest(&self) -> Result<Manifest> {
         let manifest: Manifest = fs::read_json(&self.manifest_path())?;
         let leads_out = |file: &&String| !Path::new(file).components().all(|part| matches!(part, Component::Normal(_)));
         match manifest.files.iter().find(leads_out) {
             Some(file) => {
-                Err(Error::format(self.manifest_path(), format!("it lists the file '{file}', which is not below the scene's folder")))
+                Err(Error::format(self.manifest_path(), format!("it lists the file '{file}', which is not inside the scene folder")))
             }
             None => Ok(manifest),
         }
     }
 
-    /// Writes `scene.json`; the last act of a stage.
+    /// Writes `scene.json`. This is the last step of a stage.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// [`Error::Io`] with the path.
     pub fn save_manifest(&self, manifest: &Manifest) -> Result<()> {
         fs::write_json(&self.manifest_path(), manifest)
     }
 
-    /// The trained scene in compact form.
+    /// Returns the path of the compact scene.
     pub fn compact_path(&self) -> PathBuf {
         self.root.join("scene.safetensors")
     }
 
-    /// Whether the scene is there in compact form only: features are then those of the objects' codes.
+    /// Returns whether only the compact file exists. It has no features; they follow from the codes
+    /// of the objects.
     pub fn is_compact(&self) -> bool {
         !self.ply_path().is_file() && self.compact_path().is_file()
     }
 
-    /// The trained Gaussians.
+    /// Reads the trained Gaussians.
     ///
     /// # Errors
     /// When the scene was never trained or its file is damaged.
@@ -170,19 +172,19 @@ impl SceneFolder {
         ply::read(&path)
     }
 
-    /// Writes the cameras that training starts from, sorted by name; what an earlier training made of them goes.
+    /// Writes the initial cameras, sorted by name, and removes trained ones.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// [`Error::Io`] with the path.
     pub fn save_cameras(&self, cameras: &[Camera]) -> Result<()> {
         fs::write_json(&self.root.join("cameras/cameras.json"), &cameras)?;
         self.save_trained_cameras(None)
     }
 
-    /// All cameras as training starts from them, sorted by name.
+    /// Reads the initial cameras, sorted by name.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file.
     pub fn given_cameras(&self) -> Result<Vec<Camera>> {
         fs::read_json(&self.root.join("cameras/cameras.json"))
     }
@@ -191,10 +193,10 @@ impl SceneFolder {
         self.root.join("cameras/trained.json")
     }
 
-    /// Writes the cameras as training moved them; `None` where it left them as they were given.
+    /// Writes the cameras after training. `None` removes the file: training did not move them.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// [`Error::Io`] with the path.
     pub fn save_trained_cameras(&self, cameras: Option<&[Camera]>) -> Result<()> {
         let path = self.trained_cameras_path();
         match cameras {
@@ -204,19 +206,19 @@ impl SceneFolder {
         }
     }
 
-    /// All cameras, sorted by name: as training moved them, where it did.
+    /// Reads the cameras, sorted by name: the trained ones if they exist, else the initial ones.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file.
     pub fn cameras(&self) -> Result<Vec<Camera>> {
         let trained = self.trained_cameras_path();
         if trained.is_file() { fs::read_json(&trained) } else { self.given_cameras() }
     }
 
-    /// Index of a view by exact file name, or by name without ending where that is unique.
+    /// Finds a view by its file name, or by its name without extension if that is unique.
     ///
     /// # Errors
-    /// An unknown name; the message lists what there is.
+    /// [`Error::Invalid`] for an unknown name; the message lists the first views.
     pub fn view_index(&self, cameras: &[Camera], name: &str) -> Result<usize> {
         view_of(cameras.iter().map(|c| c.name.as_str()), name).ok_or_else(|| {
             let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
@@ -225,30 +227,30 @@ impl SceneFolder {
         })
     }
 
-    /// Undistorted, scaled photo of a view.
+    /// Returns the path of a prepared photo.
     pub fn photo_path(&self, view: &str) -> PathBuf {
         self.root.join("photos").join(format!("{view}.png"))
     }
 
-    /// Coverage of a view whose photo has an alpha channel.
+    /// Returns the path of the alpha channel of a prepared photo, if it has one.
     pub fn alpha_path(&self, view: &str) -> PathBuf {
         self.root.join("alpha").join(format!("{view}.png"))
     }
 
-    /// What does not count in a view: black there.
+    /// Returns the path of a view's ignore mask. Black pixels do not count.
     pub fn ignore_path(&self, view: &str) -> PathBuf {
         self.root.join("ignore").join(format!("{view}.png"))
     }
 
-    /// Reads a view's photo.
+    /// Reads a prepared photo.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file.
     pub fn photo(&self, view: &str) -> Result<RgbImage> {
         image_io::load_rgb(&self.photo_path(view))
     }
 
-    /// The segmenter's masks of a view.
+    /// Returns the path of the segmenter's masks of a view.
     pub fn masks_path(&self, view: &str) -> PathBuf {
         self.root.join("masks").join(format!("{view}.json"))
     }
@@ -256,7 +258,7 @@ impl SceneFolder {
     /// Reads the segmenter's masks of a view.
     ///
     /// # Errors
-    /// A missing or damaged file, or masks that do not fit the view's camera.
+    /// A missing or damaged file, or masks of another size than the view's camera.
     pub fn masks(&self, camera: &Camera) -> Result<MaskList> {
         let path = self.masks_path(&camera.name);
         let (width, height) = (camera.width, camera.height);
@@ -267,32 +269,33 @@ impl SceneFolder {
         match (list.width, list.height) {
             _ if list.masks.is_empty() => Ok(MaskList::new(width, height)),
             size if size == (width, height) => Ok(list),
-            _ => Err(Error::format(&path, "it does not fit the view's camera; run 'fastlgs preprocess' again")),
+            _ => Err(Error::format(&path, "its size differs from that of the view's camera; run 'fastlgs preprocess' again")),
         }
     }
 
-    /// Label map of a view after mapping: values are object ids.
+    /// Returns the path of a view's label map of object ids.
     pub fn objects_path(&self, view: &str) -> PathBuf {
         self.root.join(Self::objects_name(view))
     }
 
-    /// The same, relative to the scene's folder, as the manifest lists it.
+    /// Returns the same path relative to the scene folder, as in the manifest.
     pub fn objects_name(view: &str) -> String {
         format!("masks/objects/{view}.png")
     }
 
-    /// Reads the object ids of a view.
+    /// Reads the label map of object ids of a view.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file.
     pub fn objects(&self, view: &str) -> Result<LabelMap> {
         LabelMap::load(&self.objects_path(view))
     }
 
-    /// Writes the initial points: `position` (rows x y z), `color` (rows r g b), and `seen`: a row (point, training view) for each view that shows one.
+    /// Writes the initial points: `position` (rows x y z), `color` (rows r g b, 0 to 255), and
+    /// `seen` (a row point, training view for each observation).
     ///
     /// # Errors
-    /// The system's refusal.
+    /// [`Error::Io`] with the path.
     pub fn save_points(&self, points: &[SfmPoint]) -> Result<()> {
         let position: Vec<f32> = points.iter().flat_map(|p| p.position.to_array()).collect();
         let color: Vec<f32> = points.iter().flat_map(|p| p.color.map(f32::from)).collect();
@@ -307,7 +310,7 @@ impl SceneFolder {
     /// Reads the initial points.
     ///
     /// # Errors
-    /// Missing or damaged file.
+    /// A missing or damaged file.
     pub fn points(&self) -> Result<Vec<SfmPoint>> {
         let path = self.root.join("points.safetensors");
         let tensors = load_tensors(&path)?;
@@ -320,7 +323,7 @@ impl SceneFolder {
         let mut points: Vec<SfmPoint> = rows.map(point).collect();
         for pair in get("seen").chunks_exact(2) {
             let Some(point) = points.get_mut(pair[0] as usize) else {
-                return Err(Error::format(&path, "a view shows a point that is not there; run 'fastlgs preprocess' again"));
+                return Err(Error::format(&path, "a view observes a point that does not exist; run 'fastlgs preprocess' again"));
             };
             point.seen_by.push(pair[1] as u32);
         }
@@ -328,8 +331,8 @@ impl SceneFolder {
     }
 }
 
-/// Index of a view by exact file name, or by name without ending where that is unique.
-/// Folders before the file name are joined to it as the view's name has them.
+/// Finds a view by its file name, or by its name without extension if that is unique. A '/' in
+/// `name` matches the '_' that joins folders in view names.
 pub fn view_of<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> Option<usize> {
     let joined = name.replace('/', "_");
     let name = if names.clone().any(|n| n == name) { name } else { joined.as_str() };
@@ -338,7 +341,7 @@ pub fn view_of<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> 
     names.clone().position(|n| n == name).or_else(|| hits.next().filter(|_| hits.next().is_none()))
 }
 
-/// Whether every `holdout`-th view takes the one at `index` (sorted by name).
+/// Returns whether the view at `index` in sorted order is one of every `holdout` held-out views.
 pub fn is_held_out(index: usize, holdout: usize) -> bool {
     holdout > 0 && index.is_multiple_of(holdout)
 }
@@ -349,15 +352,16 @@ pub type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 /// Writes f32 tensors as safetensors, atomically.
 ///
 /// # Errors
-/// The system's refusal, or a shape that does not fit its values.
+/// [`Error::Io`] with the path, or [`Error::Format`] when a shape does not match its values.
 pub fn save_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])]) -> Result<()> {
     write_tensors(path, tensors, None)
 }
 
-/// What the metadata of a file of embeddings calls what made them.
+/// Metadata key of the encoder in files of embeddings.
 const ENCODER: &str = "encoder";
 
-/// As [`save_tensors`], of embeddings; what made them stands in the file's metadata.
+/// As [`save_tensors`], for embeddings. The name of their encoder is written to the file's
+/// metadata.
 ///
 /// # Errors
 /// As [`save_tensors`].
@@ -377,22 +381,22 @@ fn write_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], metadata: 
 /// Reads the f32 tensors of a safetensors file.
 ///
 /// # Errors
-/// Truncated or damaged files, and tensors of another type.
+/// [`Error::Io`], or [`Error::Format`] for damaged files and tensors of another type.
 pub fn load_tensors(path: &Path) -> Result<Tensors> {
     parse_tensors(path, &fs::read(path)?)
 }
 
-/// As [`load_tensors`], for a file that is in memory; `path` is what errors call it.
+/// As [`load_tensors`], for a file in memory. Errors name `path`.
 ///
 /// # Errors
 /// As [`load_tensors`].
 pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
-    let file = SafeTensors::deserialize(data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
+    let file = SafeTensors::deserialize(data).map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
     file.tensors()
         .into_iter()
         .map(|(name, view)| {
             if view.dtype() != Dtype::F32 {
-                return Err(Error::format(path, format!("tensor '{name}' is {:?}; 32-bit floats were expected", view.dtype())));
+                return Err(Error::format(path, format!("tensor '{name}' has the type {:?}, but 32-bit floats were expected", view.dtype())));
             }
             let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
             Ok((name, (view.shape().to_vec(), values)))
@@ -400,12 +404,13 @@ pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
         .collect()
 }
 
-/// What made the embeddings in a file that is in memory, as [`save_embeddings`] was told; empty where it does not say.
+/// Returns the encoder of the embeddings in a file in memory, as written by [`save_embeddings`].
+/// Empty if the metadata do not name it.
 ///
 /// # Errors
 /// As [`load_tensors`].
 pub fn embedded_by(path: &Path, data: &[u8]) -> Result<String> {
-    let (_, head) = SafeTensors::read_metadata(data).map_err(|e| Error::format(path, format!("not a whole safetensors file: {e}")))?;
+    let (_, head) = SafeTensors::read_metadata(data).map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
     Ok(head.metadata().as_ref().and_then(|metadata| metadata.get(ENCODER)).cloned().unwrap_or_default())
 }
 
@@ -424,7 +429,7 @@ mod tests {
         save_embeddings(&path, &[("a", vec![1], &[1.0])], "offline 3").unwrap();
         let noted = std::fs::read(&path).unwrap();
         assert_eq!(embedded_by(&path, &noted).unwrap(), "offline 3");
-        assert_eq!(load_tensors(&path).unwrap().len(), 1, "a note is no tensor");
+        assert_eq!(load_tensors(&path).unwrap().len(), 1, "metadata are not a tensor");
         std::fs::write(&path, &data[..data.len() - 3]).unwrap();
         assert!(load_tensors(&path).unwrap_err().to_string().contains("t.safetensors"));
     }
@@ -441,7 +446,7 @@ mod tests {
         let one = [0.0f32; 3];
         let earlier: [(&str, Vec<usize>, &[f32]); 2] = [("position", vec![1, 3], &one), ("color", vec![1, 3], &one)];
         save_tensors(&path, &earlier).unwrap();
-        assert!(folder.points().unwrap()[0].seen_by.is_empty(), "of an earlier version");
+        assert!(folder.points().unwrap()[0].seen_by.is_empty(), "`seen` is optional");
         save_tensors(&path, &[("seen", vec![1, 2], &[5.0, 0.0])]).unwrap();
         let message = folder.points().unwrap_err().to_string();
         assert!(message.contains("points.safetensors") && message.contains("preprocess"), "{message}");

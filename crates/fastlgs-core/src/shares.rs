@@ -1,42 +1,48 @@
-//! Which objects the pixels of a rendered view show, and how much of each.
+//! Id weights: which objects the pixels of a rendered view show, and with how much blending weight.
 
 use std::borrow::Cow;
 use std::cmp::Reverse;
 
-/// Ids that a pixel keeps.
+/// Number of ids that are kept per pixel.
 pub const KEPT: usize = 4;
 
-/// Blending weights alpha * transmittance of a view, summed by object id: the heaviest [`KEPT`] of each pixel.
+/// Blending weights (alpha x transmittance) of a view, summed by object id. Each pixel keeps the
+/// [`KEPT`] largest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shares {
-    /// Pixels along x.
+    /// Width in pixels.
     pub width: u32,
-    /// Pixels along y.
+    /// Height in pixels.
     pub height: u32,
-    /// Row by row, in no order within a pixel: id << 16 | weight of 0 to 1 as 0 to 65,535. Id 0 is "no object".
+    /// Row-major packed pairs: id << 16 | weight, with weights 0 to 1 as 0 to 65,535. Unordered
+    /// within a pixel. Id 0 means none.
     pub pixels: Vec<[u32; KEPT]>,
 }
 
-/// One id with its weight.
+/// Packs an id and its weight, which is clamped to [0, 1].
 pub fn pack(id: u16, weight: f32) -> u32 {
     u32::from(id) << 16 | (weight.clamp(0.0, 1.0) * 65_535.0 + 0.5) as u32
 }
 
-/// Id and weight of [`pack`].
+/// Unpacks the id and the weight (0 to 65,535) of [`pack`].
 pub fn unpack(share: u32) -> (u16, u32) {
     ((share >> 16) as u16, share & 0xffff)
 }
 
 impl Shares {
-    /// Whether the ids for which `member` holds (by id; unknown ids do not) have most of a pixel's weight.
+    /// Returns a mask of the pixels whose weight belongs mostly to the ids with `member[id]`. Ids
+    /// beyond the list are not members.
     pub fn mask(&self, member: &[bool]) -> Vec<bool> {
         let own = |share: &(u16, u32)| member.get(usize::from(share.0)) == Some(&true);
         let most = |pixel: &[u32; KEPT]| is_most(pixel.iter().map(|s| unpack(*s)).filter(own).map(|s| s.1).sum(), pixel);
         self.pixels.iter().map(most).collect()
     }
 
-    /// At each pixel the sets that have most of its weight, as each id's list in `sets` has them, which must fall; they fall too. [`Self::mask`] of
-    /// the ids in a set is where this names it.
+    /// Returns, for each pixel in row-major order, the sets that have most of its weight, in
+    /// descending order.
+    ///
+    /// `sets[id]` lists the sets that contain an id, in descending order. A pixel lists a set
+    /// exactly if [`Self::mask`] of the set's ids is true there.
     pub fn held<'a, S: Copy + Ord>(&'a self, sets: &'a [Vec<S>]) -> impl Iterator<Item = Cow<'a, [S]>> {
         let of = |id: u16| sets.get(usize::from(id)).map_or(&[][..], Vec::as_slice);
         self.pixels.iter().map(move |pixel| {
@@ -58,7 +64,7 @@ impl Shares {
     }
 }
 
-/// Whether `own` is most of a pixel's weight, and no less than what passes through.
+/// Returns whether `own` is more than half of a pixel's weight and at least its transmittance.
 fn is_most(own: u32, pixel: &[u32; KEPT]) -> bool {
     let all: u32 = pixel.iter().map(|s| unpack(*s).1).sum();
     2 * own > all && own + all.min(65_535) >= 65_535
@@ -73,7 +79,7 @@ mod tests {
         let shares = |list: &[(u16, f32)]| -> [u32; KEPT] { std::array::from_fn(|k| list.get(k).map_or(0, |s| pack(s.0, s.1))) };
         let pixels = vec![shares(&[(1, 0.3), (2, 0.3), (3, 0.4)]), shares(&[(3, 0.2)]), shares(&[(0, 0.5), (7, 0.5)])];
         let shares = Shares { width: 3, height: 1, pixels };
-        // 1 and 2 together outweigh 3, which alone is the heaviest.
+        // Ids 1 and 2 together outweigh id 3, which is the largest single one.
         assert_eq!(shares.mask(&[false, true, true]), [true, false, false]);
         assert_eq!(shares.mask(&[false, false, false, true]), [false, false, false]);
     }
@@ -81,7 +87,7 @@ mod tests {
     #[test]
     fn sets_that_overlap_are_found_where_they_have_most_of_the_weight() {
         let shares = |list: &[(u16, f32)]| -> [u32; KEPT] { std::array::from_fn(|k| list.get(k).map_or(0, |s| pack(s.0, s.1))) };
-        // Set 7 overlaps 8, and both lie in 3.
+        // Sets 7 and 8 overlap; set 3 contains both.
         let sets: [Vec<u16>; 5] = [vec![], vec![7, 3], vec![8, 3], vec![8, 7, 3], vec![3]];
         let pixels = vec![
             shares(&[(1, 0.7), (2, 0.3)]),

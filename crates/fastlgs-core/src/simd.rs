@@ -1,7 +1,11 @@
-//! One body, compiled for what the processor has: AVX-512, AVX2 with FMA, or the baseline.
+//! A macro that compiles one function for AVX-512, AVX2 with FMA, and the baseline, and selects at
+//! run time.
 
-/// `vectorised! { fn name<const ...>(args) -> T = body }`: `name` runs `body::<FMA, ...>` with the widest vectors there are.
-/// The body is an `#[inline(always)]` function whose first const parameter says whether a fused multiply-add is cheap.
+/// Defines a function that runs its body with the widest vectors of the processor:
+/// `vectorised! { fn name<const ...>(args) = body }` calls `body::<FMA, ...>(args)`.
+///
+/// The body is an `#[inline(always)]` function without result. Its first const parameter says
+/// whether a fused multiply-add is fast.
 #[macro_export]
 macro_rules! vectorised {
     ($(#[$doc:meta])* fn $name:ident $(<$(const $p:ident: bool),+>)? ($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
@@ -18,11 +22,12 @@ macro_rules! vectorised {
                     $body::<true $($(, $p)+)?>($($arg),*);
                 }
                 if is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") && is_x86_feature_detected!("avx512bw") {
-                    // SAFETY: the features were found a line above; avx512dq implies avx512f.
+                    // SAFETY: the features were detected above; avx512dq implies avx512f, which
+                    // implies avx2 and fma.
                     return unsafe { avx512 $(::<$($p),+>)? ($($arg),*) };
                 }
                 if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                    // SAFETY: the features were found a line above.
+                    // SAFETY: the features were detected above.
                     return unsafe { avx2 $(::<$($p),+>)? ($($arg),*) };
                 }
             }

@@ -1,5 +1,5 @@
-//! `.splat`, the format of antimatter15's viewer: 32 bytes a Gaussian (position and scale as floats, colour with opacity and the rotation as bytes).
-//! Colour does not depend on the direction.
+//! Reads `.splat`, the format of antimatter15's viewer: 32 bytes per Gaussian, with position and
+//! scale as floats and colour, opacity and rotation as bytes. It has no view-dependent colour.
 
 use crate::gaussians::{SH_C0, logit};
 use crate::{Error, Gaussians, Result, fs};
@@ -8,15 +8,15 @@ use std::path::Path;
 
 const ROW: usize = 32;
 
-/// Reads a scene; features are zero and object ids 0.
+/// Reads a scene. Features are zero and object ids 0.
 ///
 /// # Errors
-/// [`Error::Format`] for a file whose length is no multiple of 32 bytes.
+/// [`Error::Format`] for an empty file or a length that is not a multiple of 32 bytes.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     if data.is_empty() || !data.len().is_multiple_of(ROW) {
         let length = data.len();
-        return Err(Error::format(path, format!("{length} bytes are no whole number of Gaussians of {ROW} bytes; copy it again")));
+        return Err(Error::format(path, format!("its length of {length} bytes is not a multiple of {ROW} bytes per Gaussian; copy it again")));
     }
     let mut scene = Gaussians::default();
     for row in data.as_chunks::<ROW>().0 {

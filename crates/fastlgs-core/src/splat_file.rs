@@ -1,17 +1,18 @@
-//! Files of Gaussians in all formats that are read: PLY (also SuperSplat's compressed one), SPZ, SOG, glTF and .splat.
+//! Reads files of Gaussians in all supported formats: PLY (also SuperSplat's compressed one), SPZ,
+//! SOG, glTF and .splat.
 
 use crate::{Error, Gaussians, Result, WorldFrame, fs, glb, ply, sog, splat, spz};
 use glam::DVec3;
 use std::path::Path;
 
-/// Endings of the files that are read.
+/// File extensions of the supported formats.
 pub const ENDINGS: [&str; 5] = ["ply", "spz", "sog", "glb", "splat"];
 
-/// Reads a file as its ending says, its positions in the coordinates of the world, into the frame of a scene; and a sentence about Gaussians that
-/// cannot be drawn and were dropped.
+/// Reads a file according to its extension and converts it from world coordinates to `frame`. Also
+/// returns a warning if Gaussians that cannot be drawn were dropped.
 ///
 /// # Errors
-/// Another ending, a file without Gaussians, and those of the formats.
+/// An unknown extension, a file without Gaussians, and the errors of the formats.
 pub fn read(path: &Path, frame: &WorldFrame) -> Result<(Gaussians, Option<String>)> {
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     let (scene, warning) = match ending.as_str() {
@@ -22,17 +23,19 @@ pub fn read(path: &Path, frame: &WorldFrame) -> Result<(Gaussians, Option<String
         "splat" => in_frame(path, splat::read(path)?, frame),
         _ => {
             let known = ENDINGS.map(|ending| format!(".{ending}")).join(", ");
-            return Err(Error::format(path, format!("its ending is none of those that are read: {known}")));
+            return Err(Error::format(path, format!("its extension is not supported; supported are {known}")));
         }
     };
     if scene.is_empty() {
-        return Err(Error::format(path, "it has no Gaussians; name the file of a trained scene"));
+        return Err(Error::format(path, "it has no Gaussians; give the file of a trained scene"));
     }
     Ok((scene, warning))
 }
 
-/// Formats of few bits, and glTF with its node, hold the scene's own coordinates where this project wrote them. Another program's may be those of the
-/// world: where they lie tells.
+/// Converts a scene to `frame` if it is in world coordinates. Quantised formats and glTF are in
+/// scene coordinates if FastLGS wrote them, but other programs may write world coordinates. The
+/// scene counts as in world coordinates if its mean is nearer to the frame's origin than half the
+/// origin's distance from zero.
 fn in_frame(path: &Path, mut scene: Gaussians, frame: &WorldFrame) -> (Gaussians, Option<String>) {
     let warning = scene.drop_invalid().map(|dropped| format!("{}: {dropped}", path.display()));
     let mean = scene.means.iter().map(|mean| mean.as_dvec3()).sum::<DVec3>() / scene.len().max(1) as f64;

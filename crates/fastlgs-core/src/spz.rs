@@ -1,10 +1,13 @@
-//! SPZ, the compressed Gaussian format of Niantic (github.com/nianticlabs/spz). Version 2 is written; 2 to 4 are read: gzip of a
-//! 16-byte header and then, for all Gaussians, positions (24-bit fixed point), opacities, colours, log-scales, rotations and
-//! SH coefficients (8 bits each). Features and object ids have no place in it.
+//! Reads and writes SPZ, the compressed Gaussian format of Niantic (github.com/nianticlabs/spz).
+//! Writes version 2 and reads versions 2 to 4.
 //!
-//! Version 3 has rotations of four bytes; version 4 packs each attribute by itself with Zstandard.
+//! Version 2 is a gzip stream of a 16-byte header and six attributes. Positions are 24-bit
+//! fixed-point numbers. Opacities, colours, log-scales, rotations and SH coefficients follow with 8
+//! bits per value. Version 3 has rotations of four bytes. Version 4 compresses each attribute
+//! separately with Zstandard. The format has no features or object ids.
 //!
-//! The format's axes are right, up, back; PLY files of 3DGS are taken to be right, down, front, so y and z change sign.
+//! The format's axes are right, up, back. PLY files of 3DGS are treated as right, down, front, so y
+//! and z change sign.
 
 use crate::gaussians::{MAX_SH_DEGREE, SH_SIGNS, logit, rest_len, sigmoid};
 use crate::{Error, Gaussians, Result, fs};
@@ -17,32 +20,33 @@ use std::path::Path;
 
 const MAGIC: u32 = 0x5053_474e;
 const VERSION: u32 = 2;
-/// Versions that are read.
+/// Versions that can be read.
 const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
 const HEADER: usize = 16;
-/// Colour coefficients are stored around one half with this scale.
+/// Scale of colour coefficients, which are stored as 0.5 + 0.15 * value.
 const COLOR_SCALE: f32 = 0.15;
-/// Largest coordinate in units of the fixed point.
+/// Largest coordinate in fixed-point units (2^23 - 1).
 const POSITION_RANGE: f32 = 8_388_607.0;
 
 fn byte(value: f32) -> u8 {
     value.round().clamp(0.0, 255.0) as u8
 }
 
-/// SH coefficients are rounded to these steps: more finely in degree 1, as the specification's encoder does.
+/// Quantises an SH coefficient to 5 bits in degree 1 and 4 bits above, like the encoder of the
+/// specification.
 fn sh_byte(value: f32, coefficient: usize) -> u8 {
     let step = if coefficient < 3 { 8 } else { 16 };
     let steps = (value * 128.0 + 128.0).round() as i32;
     ((steps + step / 2).div_euclid(step) * step).clamp(0, 255) as u8
 }
 
-/// Writes the scene atomically. What the format cannot hold (features, object ids) is left out.
+/// Writes the scene atomically, without features and object ids.
 ///
 /// # Errors
 /// [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     let extent = scene.means.iter().map(|m| m.abs().max_element()).fold(1e-6f32, f32::max);
-    // As many bits behind the point as the largest coordinate leaves.
+    // Uses as many fractional bits as the largest coordinate allows.
     let fraction = (POSITION_RANGE / extent).log2().floor().clamp(0.0, 23.0) as u8;
     let unit = f32::from(fraction).exp2();
     let flip = Vec3::new(1.0, -1.0, -1.0);
@@ -76,28 +80,30 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     })
 }
 
-/// The attributes of a file, one after the other, unpacked.
+/// The decompressed attributes of a file.
 struct Packed {
     version: u32,
     count: usize,
     sh_degree: u32,
     fraction: u8,
-    /// Positions, opacities, colours, log-scales, rotations, and SH coefficients.
+    /// Positions, opacities, colours, log-scales, rotations, SH coefficients.
     streams: [Vec<u8>; 6],
 }
 
-/// Header of version 4: that of the others, the place of its table, and reserved bytes.
+/// Length of the version 4 header in bytes: the common header, the offset of the stream table, and
+/// reserved bytes.
 const HEADER_4: usize = 32;
-/// An entry of the table: packed and unpacked length of a stream.
+/// Length of a table entry in bytes: compressed and decompressed length of a stream.
 const ENTRY: usize = 16;
 
-/// Bytes of each attribute.
+/// Returns the length of each attribute in bytes.
 fn lengths(version: u32, n: usize, sh_degree: u32) -> [usize; 6] {
     let rotation = if version == 2 { 3 } else { 4 };
     [9 * n, n, 3 * n, 3 * n, rotation * n, 3 * rest_len(sh_degree) * n]
 }
 
-/// Checks the header, which all versions begin with: version, count, SH degree, bits behind the point.
+/// Checks the header that all versions begin with. Returns version, count, SH degree and fractional
+/// bits.
 fn checked_header(path: &Path, data: &[u8]) -> Result<(u32, usize, u32, u8)> {
     let bad = |reason: String| Err(Error::format(path, reason));
     let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
@@ -107,25 +113,25 @@ fn checked_header(path: &Path, data: &[u8]) -> Result<(u32, usize, u32, u8)> {
     let (version, count) = (word(4).unwrap_or(0), word(8).unwrap_or(0));
     if !VERSIONS.contains(&version) {
         let (first, last) = (VERSIONS.start(), VERSIONS.end());
-        return bad(format!("SPZ version {version}; versions {first} to {last} can be read"));
+        return bad(format!("SPZ version {version} is not supported; export it as version {first} to {last}"));
     }
     let sh_degree = u32::from(data[12]);
     if sh_degree > MAX_SH_DEGREE {
-        return bad(format!("SH degree {sh_degree}; at most {MAX_SH_DEGREE} can be read, export it with fewer"));
+        return bad(format!("SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less"));
     }
     Ok((version, count as usize, sh_degree, data[13]))
 }
 
-/// Versions 2 and 3: gzip of header and attributes.
+/// Decompresses versions 2 and 3: one gzip stream of header and attributes.
 fn unpack_gzip(path: &Path, packed: &[u8]) -> Result<Packed> {
     let bad = |reason: String| Error::format(path, reason);
     let mut data = Vec::new();
-    GzDecoder::new(packed).read_to_end(&mut data).map_err(|e| bad(format!("not a whole SPZ file ({e}); copy it again")))?;
+    GzDecoder::new(packed).read_to_end(&mut data).map_err(|e| bad(format!("not a complete SPZ file ({e}); copy it again")))?;
     let (version, count, sh_degree, fraction) = checked_header(path, &data)?;
     let lengths = lengths(version, count, sh_degree);
     let expected = HEADER + lengths.iter().sum::<usize>();
     if data.len() < expected {
-        return Err(bad(format!("truncated: {count} Gaussians need {expected} bytes, it holds {}; copy it again", data.len())));
+        return Err(bad(format!("truncated: {count} Gaussians need {expected} bytes, but it has {}; copy it again", data.len())));
     }
     let mut at = HEADER;
     let streams = lengths.map(|length| {
@@ -135,7 +141,7 @@ fn unpack_gzip(path: &Path, packed: &[u8]) -> Result<Packed> {
     Ok(Packed { version, count, sh_degree, fraction, streams })
 }
 
-/// Version 4: a plain header, a table, and a Zstandard stream for each attribute.
+/// Decompresses version 4: a plain header, a table, and a Zstandard stream for each attribute.
 fn unpack_zstd(path: &Path, data: &[u8]) -> Result<Packed> {
     let bad = |reason: String| Error::format(path, reason);
     let (version, count, sh_degree, fraction) = checked_header(path, data)?;
@@ -148,29 +154,30 @@ fn unpack_zstd(path: &Path, data: &[u8]) -> Result<Packed> {
     };
     let (used, table) = (usize::from(data[15]), number(16, 4)?);
     if used != lengths.iter().filter(|length| **length > 0).count() && count > 0 || table < HEADER_4 {
-        return Err(bad(format!("its table names {used} streams, which do not fit an SH degree of {sh_degree}")));
+        return Err(bad(format!("its table of {used} streams does not match SH degree {sh_degree}; export it again")));
     }
     let mut streams: [Vec<u8>; 6] = Default::default();
     let mut at = table + used * ENTRY;
     for (k, (stream, length)) in streams.iter_mut().zip(lengths).take(used).enumerate() {
         let (packed, unpacked) = (number(table + k * ENTRY, 8)?, number(table + k * ENTRY + 8, 8)?);
         if unpacked != length {
-            return Err(bad(format!("stream {k} has {unpacked} bytes, {count} Gaussians need {length}")));
+            return Err(bad(format!("stream {k} has {unpacked} bytes, but {count} Gaussians need {length}; export it again")));
         }
         let from = data.get(at..at.saturating_add(packed)).ok_or_else(cut_off)?;
-        let decoder = ruzstd::decoding::StreamingDecoder::new(from).map_err(|e| bad(format!("stream {k} is damaged ({e})")))?;
-        // No more than was announced is unpacked.
-        decoder.take(length as u64 + 1).read_to_end(stream).map_err(|e| bad(format!("stream {k} is damaged ({e})")))?;
+        let decoder = ruzstd::decoding::StreamingDecoder::new(from).map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
+        // Decompresses at most one byte more than announced.
+        decoder.take(length as u64 + 1).read_to_end(stream).map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
         if stream.len() != length {
-            return Err(bad(format!("stream {k} is damaged: it has {} bytes, not {length}", stream.len())));
+            return Err(bad(format!("stream {k} is damaged: it has {} bytes, not {length}; copy it again", stream.len())));
         }
         at += packed;
     }
     Ok(Packed { version, count, sh_degree, fraction, streams })
 }
 
-/// A rotation (w, x, y, z) of version 3 and up: the place of the largest of (x, y, z, w) in two bits, and of the others, last first, nine bits of size and
-/// a sign each.
+/// Decodes a quaternion of versions 3 and 4 to (w, x, y, z). The top two bits are the index of the
+/// largest of (x, y, z, w). The others follow, last first in the lowest bits: nine bits of
+/// magnitude and a sign each.
 fn smallest_three(b: &[u8]) -> [f32; 4] {
     const SIZE: u32 = (1 << 9) - 1;
     let mut bits = u32::from_le_bytes([b[0], b[1], b[2], b[3]]);
@@ -185,10 +192,10 @@ fn smallest_three(b: &[u8]) -> [f32; 4] {
     [q[3], q[0], q[1], q[2]]
 }
 
-/// Reads a scene of version 2, 3 or 4; features are zero and object ids 0.
+/// Reads a scene of version 2, 3 or 4. Features are zero and object ids 0.
 ///
 /// # Errors
-/// [`Error::Format`] for files that are no SPZ, are cut off, or of another version.
+/// [`Error::Format`] for other content, truncated files and other versions.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let packed = if data.starts_with(&MAGIC.to_le_bytes()) { unpack_zstd(path, &data)? } else { unpack_gzip(path, &data)? };
@@ -257,7 +264,7 @@ mod tests {
                 assert!((*a - *b).abs().max_element() <= 0.07);
             }
         }
-        // Writing what was read changes nothing: the format is a fixed point of itself.
+        // Values that were read are written back without change.
         let again = dir.path().join("again.spz");
         write(&again, &after).unwrap();
         let again = read(&again).unwrap();
@@ -276,7 +283,7 @@ mod tests {
         assert!(read(&path).unwrap_err().to_string().contains("SPZ"));
     }
 
-    /// A Gaussian written by hand after the specification.
+    /// Reads a Gaussian whose bytes were written according to the specification.
     #[test]
     fn bytes_are_those_of_the_specification() {
         let dir = tempfile::tempdir().unwrap();

@@ -1,6 +1,6 @@
-//! Colour maps of heat maps and object ids.
+//! Colour maps for heat maps and object ids.
 
-/// The turbo colour map (Mikhailov 2019) by the polynomial of its author; `x` in [0, 1].
+/// Returns the turbo colour (Mikhailov 2019) of `x` in [0, 1], by its author's polynomial.
 pub fn turbo(x: f32) -> [u8; 3] {
     let x = f64::from(x.clamp(0.0, 1.0));
     let poly = |c: [f64; 6]| c.iter().rev().fold(0.0, |sum, k| sum * x + k);
@@ -12,12 +12,12 @@ pub fn turbo(x: f32) -> [u8; 3] {
     ]
 }
 
-/// A stable, well-spread colour for an object id; 0 is black.
+/// Returns a distinct, constant colour for an object id; black for 0.
 pub fn id_color(id: u16) -> [u8; 3] {
     if id == 0 {
         return [0; 3];
     }
-    // Golden-ratio steps around the hue circle keep neighbouring ids apart.
+    // Golden-ratio steps around the hue circle give neighbouring ids different hues.
     let hue = (f32::from(id) * 0.618_034).fract() * 6.0;
     let value = 0.65 + 0.35 * ((f32::from(id) * 0.381_966).fract());
     let ramp = |shift: f32| ((hue + shift).rem_euclid(6.0) - 3.0).abs() - 1.0;

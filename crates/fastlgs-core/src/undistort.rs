@@ -1,52 +1,54 @@
-//! Removal of lens distortion, for COLMAP's camera models (those of `dataset/colmap.rs`): first the lens bends the ray (fisheyes), then come the
-//! rational radial, tangential and thin-prism terms of Brown and Conrady, as OpenCV and COLMAP define them.
+//! Lens distortion of COLMAP's camera models (see `dataset/colmap.rs`) and its removal.
+//!
+//! The projection of the lens (pinhole or fisheye) comes first. The rational radial, tangential and
+//! thin-prism terms of Brown and Conrady follow, as in OpenCV and COLMAP.
 
 use crate::Camera;
 use glam::Vec2;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 
-/// How far from the centre a lens images a ray at the angle theta to its axis.
+/// Projection of a lens: distance from the centre of a ray at the angle theta to the axis.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Bend {
-    /// tan(theta): a pinhole.
+    /// Pinhole: tan(theta).
     #[default]
     None,
-    /// theta: an equidistant fisheye.
+    /// Equidistant fisheye: theta.
     Fisheye,
-    /// atan(2 tan(theta) tan(omega / 2)) / omega (Devernay & Faugeras 2001).
+    /// Field-of-view model: atan(2 tan(theta) tan(omega / 2)) / omega (Devernay & Faugeras 2001).
     Fov(f32),
 }
 
-/// Distortion coefficients; all zero means an ideal pinhole.
+/// Distortion coefficients; the default is an ideal pinhole.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distortion {
-    /// What the lens does before the terms below.
+    /// Projection that is applied before the terms below.
     pub bend: Bend,
-    /// Radial, r^2.
+    /// Radial coefficient of r^2.
     pub k1: f32,
-    /// Radial, r^4.
+    /// Radial coefficient of r^4.
     pub k2: f32,
-    /// Radial, r^6.
+    /// Radial coefficient of r^6.
     pub k3: f32,
-    /// Radial, r^8.
+    /// Radial coefficient of r^8.
     pub k4: f32,
-    /// Radial, in the denominator: r^2, r^4, r^6.
+    /// Radial coefficients of r^2, r^4 and r^6 in the denominator.
     pub below: [f32; 3],
-    /// Tangential.
+    /// First tangential coefficient.
     pub p1: f32,
-    /// Tangential.
+    /// Second tangential coefficient.
     pub p2: f32,
-    /// Thin prism: what r^2 adds to x and y.
+    /// Thin-prism coefficients: multiples of r^2 that are added to x and y.
     pub prism: [f32; 2],
 }
 
 impl Distortion {
-    /// Whether there is nothing to remove.
+    /// Returns whether there is no distortion.
     pub fn is_none(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Where the ideal ray (x/z, y/z) lands on the distorted image plane.
+    /// Maps an ideal ray (x/z, y/z) to the distorted image plane.
     pub fn distort(&self, ray: Vec2) -> Vec2 {
         let r = ray.length();
         let bent = match self.bend {
@@ -65,24 +67,26 @@ impl Distortion {
         )
     }
 
-    /// The ideal ray that lands at a place on the distorted image plane: the inverse of [`Self::distort`], for lenses that bend by less than they
-    /// show.
+    /// Maps a point of the distorted image plane to its ideal ray: the inverse of
+    /// [`Self::distort`]. The fixed-point iteration converges only for moderate distortion.
     pub fn straight(&self, place: Vec2) -> Vec2 {
         let mut ray = place;
         (0..STEPS).for_each(|_| ray += place - self.distort(ray));
         ray
     }
 
-    /// Where `camera` would see without this lens what it shows at a pixel.
+    /// Maps a pixel of the distorted photo of `camera` to the undistorted photo.
     pub fn straight_pixel(&self, camera: &Camera, pixel: Vec2) -> Vec2 {
         camera.to_pixel(self.straight(camera.ray(pixel).truncate()).extend(1.0))
     }
 }
 
-/// Steps that find the ray of a place on the distorted image plane: each leaves some hundredths of the error of the one before.
+/// Iterations that invert the distortion. Each reduces the error to a few hundredths for usual
+/// lenses.
 const STEPS: usize = 20;
 
-/// Resamples a photo as the ideal pinhole `camera` of the same size would have seen it (bilinear, edges repeated).
+/// Resamples a photo to the ideal pinhole `camera` of the same size. Sampling is bilinear and
+/// repeats the edges.
 pub fn undistort(photo: &RgbImage, camera: &Camera, distortion: &Distortion) -> RgbImage {
     let (width, height) = photo.dimensions();
     RgbImage::from_fn(width, height, |i, j| {
@@ -92,7 +96,8 @@ pub fn undistort(photo: &RgbImage, camera: &Camera, distortion: &Distortion) -> 
     })
 }
 
-/// Where [`undistort`] found something to show, 255, and 0 where the lens imaged what lies there beside the photo; nothing where it always did.
+/// Returns a mask of the pixels that [`undistort`] samples inside the photo: 255 inside, 0 outside.
+/// `None` if all are inside.
 pub fn imaged(camera: &Camera, distortion: &Distortion) -> Option<GrayImage> {
     let (width, height) = (camera.width as f32, camera.height as f32);
     let mask = GrayImage::from_fn(camera.width, camera.height, |i, j| {
@@ -110,7 +115,7 @@ pub fn undistort_gray(mask: &GrayImage, camera: &Camera, distortion: &Distortion
     GrayImage::from_fn(mask.width(), mask.height(), |x, y| Luma([out.get_pixel(x, y)[0]]))
 }
 
-/// Bilinear sample with coordinates of pixel centres at whole numbers.
+/// Samples bilinearly. Pixel centres have integer coordinates here.
 fn sample(photo: &RgbImage, x: f32, y: f32) -> Rgb<u8> {
     let (w, h) = photo.dimensions();
     let (x, y) = (x.clamp(0.0, (w - 1) as f32), y.clamp(0.0, (h - 1) as f32));
@@ -137,7 +142,7 @@ mod tests {
         let camera = Camera { name, width: 160, height: 120, fx: 138.0, fy: 138.0, cx: 80.0, cy: 60.0, world_to_camera };
         let barrel = Distortion { k1: -0.1, ..Distortion::default() };
         assert!(imaged(&camera, &barrel).is_none() && imaged(&camera, &Distortion::default()).is_none());
-        // A pincushion draws the corners in from outside of the photo.
+        // Pincushion distortion: corners of the undistorted image lie outside the photo.
         let mask = imaged(&camera, &Distortion { k1: 0.05, ..Distortion::default() }).expect("corners are missing");
         assert_eq!([(0, 0), (159, 119), (80, 60), (80, 0)].map(|(x, y)| mask.get_pixel(x, y)[0]), [0, 0, 255, 0]);
         assert_eq!(mask.get_pixel(80, 3)[0], 255);
@@ -155,7 +160,7 @@ mod tests {
     fn straight_lines_become_straight() {
         let camera = Camera::look_at("a", Vec3::Z, Vec3::ZERO, Vec3::Y, 200, 200, 0.9);
         let lens = Distortion { k1: 0.2, ..Distortion::default() };
-        // A world line seen by the real lens: x = 0.3 on the ideal plane, so curved in the photo.
+        // A straight line x = 0.3 on the ideal plane, which is curved in the photo.
         let mut photo = RgbImage::new(200, 200);
         for t in 0..4000 {
             let ideal = Vec2::new(0.3, (t as f32 / 4000.0 - 0.5) * 0.9);
@@ -169,12 +174,13 @@ mod tests {
         let columns: Vec<u32> = (20..180)
             .filter_map(|j| (0..200).max_by_key(|&i| ideal.get_pixel(i, j)[0]).filter(|&i| ideal.get_pixel(i, j)[0] > 60))
             .collect();
-        assert!(columns.len() > 100, "the line is seen in most rows");
+        assert!(columns.len() > 100, "the line must be visible in most rows");
         let (low, high) = (columns.iter().min().unwrap(), columns.iter().max().unwrap());
         assert!(high - low <= 2, "columns {low} to {high}");
     }
 
-    /// By hand, for the ray (0.3, 0.4): r = 0.5, theta = atan(0.5) = 0.463648.
+    /// Expected values computed by hand for the ray (0.3, 0.4): r = 0.5, theta = atan(0.5) =
+    /// 0.463648.
     #[test]
     fn lens_models_by_hand() {
         let ray = Vec2::new(0.3, 0.4);

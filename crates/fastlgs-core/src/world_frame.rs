@@ -1,18 +1,19 @@
-//! The frame of a scene within the world of its poses' files.
+//! The frame of a scene: origin and scale of its coordinates in the world of the input poses.
 //!
-//! Scenes are stored and trained in 32-bit floats. Poses far from the origin (UTM coordinates) or in very small or large units would lose their
-//! digits there, so a scene has a frame of its own: `world = origin + scale * local`.
+//! Scenes are stored and trained in 32-bit floats. Poses far from the origin (such as UTM) or in
+//! very small or large units would lose digits. Such scenes get their own frame:
+//! `world = origin + scale * local`.
 
 use glam::{DMat4, DVec3, Mat4, Vec3};
 use serde::{Deserialize, Serialize};
 
-/// Origin and scale of a scene's own coordinates in the world; the identity for most scenes.
+/// Origin and scale of scene coordinates in the world; the identity for most scenes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct WorldFrame {
-    /// The scene's origin in the world.
+    /// Origin of the scene in world coordinates.
     pub origin: DVec3,
-    /// World units of a unit of the scene, a power of two.
+    /// World units per scene unit, a power of two.
     pub scale: f64,
 }
 
@@ -22,17 +23,17 @@ impl Default for WorldFrame {
     }
 }
 
-/// A pose in OpenCV axes (x right, y down, z forward), in the direction in which its file states it.
+/// A pose in OpenCV axes (x right, y down, z forward), in the direction that its file states.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pose {
-    /// Maps world to camera.
+    /// World-to-camera matrix.
     WorldToCamera(DMat4),
-    /// Maps camera to world.
+    /// Camera-to-world matrix.
     CameraToWorld(DMat4),
 }
 
 impl Pose {
-    /// Position of the camera in the world.
+    /// Returns the position of the camera in the world.
     pub fn centre(&self) -> DVec3 {
         match self {
             Self::WorldToCamera(pose) => pose.inverse().w_axis.truncate(),
@@ -41,15 +42,17 @@ impl Pose {
     }
 }
 
-/// The origin moves when the median camera is farther from it than so many times the cameras' spread: 32-bit floats then keep fewer than five digits
-/// of the spread.
+/// Distance of the median camera from the world's origin, in multiples of the cameras' spread,
+/// beyond which the scene gets its own origin. There, 32-bit floats keep fewer than five digits of
+/// the spread. At the world's scale, the distance must also exceed 100 world units.
 const FAR: f64 = 100.0;
-/// Spreads, in world units, within which a scene keeps the world's units.
+/// Spreads of cameras, in world units, for which a scene keeps the scale of the world.
 const USUAL_SPREAD: std::ops::Range<f64> = 0.1..100.0;
 
 impl WorldFrame {
-    /// The frame for cameras at these places: the world's own unless they are far from its origin, or its units very small or large for them.
-    /// A few cameras with wrong poses do not matter: both origin and scale stand on medians.
+    /// Chooses a frame for camera positions in the world. It is the identity unless they are far
+    /// from the origin or in very small or large units. It uses medians, so that a few wrong poses
+    /// have no effect.
     pub fn around(centres: &[DVec3]) -> Self {
         let middle = DVec3::from_array([0, 1, 2].map(|k| median(centres.iter().map(|c| c[k]).collect())));
         let spread = median(centres.iter().map(|c| c.distance(middle)).collect());
@@ -58,39 +61,39 @@ impl WorldFrame {
         Self { origin: if is_far || (scale != 1.0 && middle.length() > FAR * spread) { middle } else { DVec3::ZERO }, scale }
     }
 
-    /// Whether cameras at these places of the world keep their digits in this frame.
+    /// Returns whether this frame keeps enough digits for camera positions in the world.
     pub fn holds(&self, centres: &[DVec3]) -> bool {
         let local: Vec<DVec3> = centres.iter().map(|centre| (*centre - self.origin) / self.scale).collect();
         Self::around(&local).is_identity()
     }
 
-    /// Whether local coordinates are those of the world.
+    /// Returns whether scene coordinates are world coordinates.
     pub fn is_identity(&self) -> bool {
         *self == Self::default()
     }
 
-    /// A place of the scene in the world.
+    /// Converts a point from scene to world coordinates.
     pub fn to_world(&self, local: Vec3) -> DVec3 {
         self.origin + self.scale * local.as_dvec3()
     }
 
-    /// The coordinates of a place of the scene in the world, for reports.
+    /// Converts a point to world coordinates for reports, with as few digits as possible.
     pub fn reported(&self, local: [f32; 3]) -> [f64; 3] {
         if self.is_identity() { local.map(exact_decimal) } else { self.to_world(local.into()).to_array() }
     }
 
-    /// A place of the world in the scene.
+    /// Converts a point from world to scene coordinates.
     pub fn to_local(&self, world: DVec3) -> Vec3 {
         ((world - self.origin) / self.scale).as_vec3()
     }
 
-    /// World-to-camera matrix of a pose in the scene's coordinates. Matrices are inverted after they were rounded, as their files have most often been
-    /// made.
+    /// Converts a pose to a world-to-camera matrix in scene coordinates. Camera-to-world matrices
+    /// are rounded to 32 bits before the inversion, as most programs that write such files do.
     pub fn local_pose(&self, pose: &Pose) -> Mat4 {
         match pose {
             Pose::WorldToCamera(pose) => {
                 let mut local = *pose;
-                // The identity must not change a bit.
+                // With the identity frame, every bit of the pose must stay the same.
                 if !self.is_identity() {
                     local.w_axis = (pose.transform_point3(self.origin) / self.scale).extend(1.0);
                 }
@@ -106,7 +109,8 @@ impl WorldFrame {
         }
     }
 
-    /// Camera-to-world matrix, in the world's coordinates, of a pose in the scene's.
+    /// Converts a world-to-camera matrix in scene coordinates to a camera-to-world matrix in world
+    /// coordinates.
     pub fn world_pose(&self, world_to_camera: &Mat4) -> DMat4 {
         let mut pose = world_to_camera.as_dmat4().inverse();
         pose.w_axis = (self.origin + self.scale * pose.w_axis.truncate()).extend(1.0);
@@ -114,12 +118,13 @@ impl WorldFrame {
     }
 }
 
-/// The number with the fewest digits that a 32-bit float stands for: 0.1 and not 0.10000000149.
+/// Returns the shortest decimal number that rounds to the given 32-bit float: 0.1, not
+/// 0.10000000149.
 pub fn exact_decimal(value: f32) -> f64 {
     value.to_string().parse().unwrap_or(f64::from(value))
 }
 
-/// The middle of some values; 0 of none.
+/// Returns the (upper) median; 0 without values.
 fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     values.get(values.len() / 2).copied().unwrap_or(0.0)
@@ -139,7 +144,7 @@ mod tests {
         for (origin, unit) in [(DVec3::ZERO, 1.0), (DVec3::new(20.0, -3.0, 7.0), 1.0), (DVec3::splat(50.0), 0.5)] {
             assert!(WorldFrame::around(&ring(origin, unit)).is_identity());
         }
-        assert!(WorldFrame::around(&[DVec3::ZERO; 4]).is_identity(), "a camera that only turns");
+        assert!(WorldFrame::around(&[DVec3::ZERO; 4]).is_identity(), "cameras that only rotate");
     }
 
     #[test]
@@ -147,7 +152,7 @@ mod tests {
         let utm = DVec3::new(512_345.6, 5_403_210.9, 431.2);
         for (origin, unit) in [(utm, 1.0), (DVec3::splat(1e5), 1.0), (DVec3::ZERO, 1e-5), (DVec3::ZERO, 1e5), (utm, 1e3)] {
             let mut centres = ring(origin, unit);
-            // One wrong pose.
+            // An outlier.
             centres.push(DVec3::splat(1e9));
             let frame = WorldFrame::around(&centres);
             let plain = WorldFrame::around(&ring(DVec3::ZERO, 1.0));

@@ -1,4 +1,5 @@
-//! Maps masks of several photos to objects by Algorithm 1 of the paper: by common key points, else by embedding and colour.
+//! Maps masks of several photos to objects with Algorithm 1 of the paper: by common key points,
+//! then by embedding and colour.
 //!
 //! `cargo run --release -p fastlgs-grid --example map_masks`
 
@@ -7,7 +8,8 @@ use fastlgs_grid::grid::Grid;
 use fastlgs_grid::mapping::{Correspondences, Mask, PaperConfig, paper};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // Three photos. A mug and a book look different; the book has turned so far in the last photo that only key points tell.
+    // Three photos of a mug and a book. The book has turned so far in the last photo that only key
+    // points match it.
     let mask = |view, label, embedding: [f32; 3], red: f32| Mask {
         view,
         label,
@@ -24,7 +26,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         mask(2, 1, mug, 0.8),
         mask(2, 2, spine, 0.3),
     ];
-    // (later mask, earlier mask) -> pairs of key points.
+    // Numbers of key-point pairs, by (later mask, earlier mask).
     let pairs = Correspondences::from([((5, 2), 7)]);
 
     let mapped = paper(&masks, &pairs, &PaperConfig::default())?;
@@ -33,7 +35,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     assert_eq!(mapped.object_of, [1, 2, 2, 1, 1, 2]);
 
-    // The table that queries are put to: for each object its code and all its embeddings.
+    // The object table, which answers queries: a code and all embeddings for each object.
     let grid = Grid::build(&masks, &mapped.object_of, codes::lattice(usize::from(mapped.count), 0));
     for object in &grid.objects {
         println!("object {}: code {:.2}, {} embeddings from {} photos", object.id, object.code, object.embeddings.len(), object.views);

@@ -1,5 +1,5 @@
-//! Asks the object table of a trained scene without any model: which objects are most like a given one.
-//! A text is asked for in the same way, with its embedding as the query.
+//! Lists the objects of a trained scene that are most similar to a given one, without a model.
+//! A text query works in the same way, with the embedding of the text.
 //!
 //! `cargo run --release -p fastlgs-grid --example query -- SCENE OBJECT`
 
@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let grid = Grid::load(&SceneFolder::open(Path::new(&scene))?)?;
     let object: usize = object.parse()?;
     let asked = grid.objects.get(object.wrapping_sub(1)).ok_or_else(|| format!("{scene} has objects 1 to {}", grid.objects.len()))?;
-    let embedding = asked.embeddings.first().ok_or("this object was seen from too far to be embedded")?;
+    let embedding = asked.embeddings.first().ok_or("this object has no embedding, because its masks are too small; choose another one")?;
 
     let query = TextQuery::new(vec![embedding.clone()], Calibration::OFFLINE);
     let ranked = rank(&grid, &query);
@@ -24,6 +24,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         println!("object {:4}  score {:.3}", hit.id, hit.score);
     }
     let answer: Vec<u16> = select(&grid, &ranked, &query, &QueryConfig::default()).iter().map(|hit| hit.id).collect();
-    println!("the answer: {answer:?}");
+    println!("targets: {answer:?}");
     Ok(())
 }

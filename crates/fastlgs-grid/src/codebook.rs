@@ -1,23 +1,25 @@
-//! Which code a rendered feature is nearest to, found by the cells of a cube: a picture asks a million times, and there may be thousands of codes.
+//! Finds the code nearest to a rendered feature, with a grid of cells over the unit cube.
+//!
+//! A picture needs a million look-ups among up to thousands of codes.
 
 use crate::codes::{SCALE, distance};
 use crate::grid::Grid;
 use glam::{IVec3, Vec3};
 
-/// The codes of a grid, by the cells of a cube of side 1.
+/// The codes of an object table, sorted by cell of the unit cube.
 pub struct Codebook {
-    /// Cells along each side.
+    /// Number of cells along each axis.
     side: i32,
-    /// By cell: where its codes begin; one more at the end.
+    /// For each cell: index of its first code in `codes`, with a final end index.
     first: Vec<u32>,
-    /// Objects with their codes, cell by cell.
+    /// Object ids with their codes, sorted by cell.
     codes: Vec<(u16, Vec3)>,
 }
 
 impl Codebook {
-    /// The codes of all objects.
+    /// Sorts the codes of all objects into cells.
     pub fn of(grid: &Grid) -> Self {
-        // About a code a cell.
+        // About one code for each cell.
         let side = (grid.objects.len() as f32).cbrt().ceil().max(1.0) as i32;
         let mut codes: Vec<(u16, Vec3)> = grid.objects.iter().map(|o| (o.id, o.code)).collect();
         codes.sort_by_key(|(id, code)| (place(cell(*code, side), side), *id));
@@ -25,25 +27,29 @@ impl Codebook {
         Self { side, first: (0..=side.pow(3)).map(begin).collect(), codes }
     }
 
-    /// The object whose code is nearest to a feature, with the paper's Dis_gf; of several the first. Object 0, which is none, where the origin is
-    /// nearer: what no mask covers is trained towards it.
+    /// Returns the object whose code is nearest to `feature`, and the paper's distance Dis_gf
+    /// (0..255 scale). Ties go to the smaller id.
+    ///
+    /// Returns object 0 (none) if the origin is at least as near. Training pulls pixels outside all
+    /// masks towards the origin.
     pub fn owner(&self, feature: Vec3) -> (u16, f32) {
         let nothing = (0, distance(feature, Vec3::ZERO));
         self.nearest(feature, |_| true).filter(|found| found.1 < nothing.1).unwrap_or(nothing)
     }
 
-    /// Least distance between two codes: how far a feature may be from its own. As if there were others beyond the cube where there is but one.
+    /// Returns the smallest distance between two codes on the 0..255 scale; [`SCALE`] if there is
+    /// only one code.
     pub fn spacing(&self) -> f32 {
         let other = |&(id, code): &(u16, Vec3)| self.nearest(code, |other| other != id).map_or(SCALE, |found| found.1);
         self.codes.iter().map(other).fold(SCALE, f32::min)
     }
 
-    /// The nearest of the codes that `counts`.
+    /// Returns the nearest code among the ids that `counts` accepts, with its distance.
     fn nearest(&self, feature: Vec3, counts: impl Fn(u16) -> bool) -> Option<(u16, f32)> {
         let middle = cell(feature, self.side);
         let mut best: Option<(u16, f32)> = None;
         for ring in 0..self.side {
-            // Codes of this ring and those around it are at least so far away.
+            // Lower bound of the distance to codes in this ring and beyond.
             let least = SCALE * (ring - 1) as f32 / self.side as f32;
             if best.is_some_and(|found| found.1 <= least) {
                 break;
@@ -62,14 +68,14 @@ impl Codebook {
         best
     }
 
-    /// The cells whose largest offset from `middle` along an axis is `ring`.
+    /// Iterates over the cells whose largest offset from `middle` along an axis is `ring`.
     fn ring(&self, middle: IVec3, ring: i32) -> impl Iterator<Item = IVec3> {
         let last = self.side - 1;
         let along = move |k: i32| (k - ring).max(0)..=(k + ring).min(last);
         along(middle.z).flat_map(move |z| {
             along(middle.y).flat_map(move |y| {
                 let inner = (z - middle.z).abs() < ring && (y - middle.y).abs() < ring;
-                // Inside of the ring only the two ends of a row are on it.
+                // In the inner rows, only the two ends lie on the ring.
                 let step = if inner { (2 * ring).max(1) as usize } else { 1 };
                 (middle.x - ring..=middle.x + ring).step_by(step).filter(move |x| (0..=last).contains(x)).map(move |x| IVec3::new(x, y, z))
             })
@@ -77,7 +83,7 @@ impl Codebook {
     }
 }
 
-/// The cell of a feature; those beyond the cube have the one beside them.
+/// Returns the cell of a feature, clamped to the cube.
 fn cell(feature: Vec3, side: i32) -> IVec3 {
     (feature * side as f32).floor().as_ivec3().clamp(IVec3::ZERO, IVec3::splat(side - 1))
 }

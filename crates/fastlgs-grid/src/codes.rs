@@ -1,20 +1,25 @@
-//! Low-dimensional codes: one lattice cell of side K^(-1/d) for each object (paper, semantic feature grid).
+//! Low-dimensional codes: one lattice cell of side K^(-1/d) for each of K objects (paper, semantic
+//! feature grid).
 
 use fastlgs_core::rng::Rng;
 use glam::{IVec3, Vec3};
 
 /// Code dimension d.
 const DIMENSION: u32 = 3;
-/// Scale of the paper's distances: codes in (0, 1) are compared on (0, 255).
+/// Scale of the paper's distances: it compares codes on 0..255 instead of 0..1.
 pub const SCALE: f32 = 255.0;
 
-/// Cells along each side of the smallest cubic lattice that holds so many.
+/// Returns the number of cells along each axis of the smallest cubic lattice with at least `count`
+/// cells.
 fn side(count: usize) -> i32 {
     (1i32..).find(|s| s.pow(DIMENSION) as usize >= count).unwrap_or(1)
 }
 
-/// Codes in (0, 1)^3 of objects 1..=count: centres of the cells of the smallest cubic lattice that holds them, dealt out in seeded random order, so
-/// that objects found one after the other, which are often neighbours in the picture, do not get neighbouring codes.
+/// Returns codes in (0, 1)^3 for the objects 1..=count: cell centres of the smallest cubic lattice
+/// that holds them.
+///
+/// The order is random with `seed`. Consecutive objects are often neighbours in the picture, and so
+/// do not get neighbouring codes.
 pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     let side = side(count);
     let mut cells: Vec<IVec3> = (0..side.pow(DIMENSION)).map(|k| IVec3::new(k % side, k / side % side, k / side / side)).collect();
@@ -22,7 +27,7 @@ pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     cells.iter().take(count).map(|c| (c.as_vec3() + 0.5) / side as f32).collect()
 }
 
-/// The paper's Dis_gf: Euclidean distance on the 0..255 scale.
+/// Returns the paper's Dis_gf: the Euclidean distance on the 0..255 scale.
 pub fn distance(feature: Vec3, code: Vec3) -> f32 {
     SCALE * feature.distance(code)
 }

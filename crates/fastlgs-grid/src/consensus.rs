@@ -1,32 +1,38 @@
-//! Global mapping, first step: every mask proposes a thing, and the other views' masks say what it is.
+//! Global mapping, step 1: each mask proposes a set of Gaussians, which the masks of the other
+//! views refine.
 //!
-//! A mask holds the Gaussians that lie in it. In each other view the mask that fits these best is taken to show the same thing if each holds most
-//! of the other, so that no mask can show two things that share nothing. What most of all these masks' pixels hold is the thing as more views see
-//! it; and so on, until nothing changes. Such a set is its own consensus: whichever of its masks it starts from, a view that cuts the thing apart
-//! or glues it to another one has no voice, masks that are missing are not missed, and a thing, its parts, and what it stands on are all found,
-//! each from its own masks. (As MaskClustering, 2401.07745, has it, agreement of whole masks in all views decides, not of their borders in two;
-//! but there a mask belongs to one thing only.)
+//! A mask holds the Gaussians that lie in it. In each other view, the best fitting mask is accepted
+//! if mask and set each hold most of the other. The Gaussians that lie mostly in the accepted masks
+//! form the next set. This is repeated until the masks do not change.
+//!
+//! The result does not depend on which of its masks starts it. A view that splits or merges objects
+//! contributes no mask, and missing masks do no harm. An object, its parts and what it stands on
+//! are all found, each from its own masks.
+//!
+//! As in MaskClustering (arXiv 2401.07745), whole masks of all views decide, not the borders of
+//! two. There, however, each mask belongs to one object only.
 
 use crate::sightings::{Fit, MIN_PIXELS, MaskId, Scratch, Sightings};
 use rayon::prelude::*;
 
-/// A set of Gaussians that masks agree on.
+/// A set of Gaussians on which masks of several views agree.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Proposal {
-    /// Its Gaussians, rising.
+    /// Indices of its Gaussians in ascending order.
     pub set: Vec<u32>,
-    /// The masks that show it, at most one a view, rising.
+    /// Masks that show it, at most one for each view, in ascending order.
     pub masks: Vec<Fit>,
 }
 
-/// Most rounds; nearly all sets rest after four.
+/// Largest number of refinement rounds; nearly all sets converge within four.
 const ROUNDS: usize = 8;
-/// Masks that propose at the same time, before those that are explained fall out.
+/// Number of seeds refined in parallel before masks of found proposals are skipped as seeds.
 const BATCH: usize = 256;
 
-/// What the masks of the views propose, each once; at least `min_views` views show every one of them.
+/// Returns the distinct proposals of all masks. At least `min_views` views show each of them.
 pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
-    // What trackers hold together comes first; then single masks, scattered, so that a batch seldom holds a thing twice.
+    // Tracks come first, then single masks in scattered order, so that a batch rarely contains the
+    // same object twice.
     let mut seeds: Vec<Vec<MaskId>> = sightings.tracks();
     let mut single: Vec<MaskId> = (0..sightings.pixels.len() as MaskId).filter(|m| sightings.pixels[*m as usize] >= MIN_PIXELS).collect();
     single.sort_by_key(|mask| (mask.wrapping_mul(0x9e37_79b1), *mask));
@@ -49,7 +55,8 @@ pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
     found
 }
 
-/// What the views make of the thing that some masks show.
+/// Refines the Gaussians of the seed masks until their masks do not change, in at most [`ROUNDS`]
+/// rounds. Returns `None` if fewer than `min_views` views show the set.
 fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &mut Scratch) -> Option<Proposal> {
     let mut asked = seed.to_vec();
     let mut found = None;
@@ -73,10 +80,11 @@ mod tests {
     use fastlgs_core::mask_list::{Mask, RunLengths, Table};
     use fastlgs_core::{Level, MaskList};
 
-    /// A mask by its first Gaussian, the one after its last, and the number that a tracker gave it.
+    /// A mask: first Gaussian, end (exclusive), and track number.
     type Range = (u32, u32, Option<u32>);
 
-    /// The sets that views of a row of 12 Gaussians propose, each of 50 pixels where `shows(view, gaussian)`.
+    /// Returns the proposed sets for views of a row of 12 Gaussians. Each Gaussian has 50 pixels in
+    /// the views where `shows(view, gaussian)`.
     fn proposed(views: &[&[Range]], shows: impl Fn(usize, u32) -> bool) -> Vec<Vec<u32>> {
         let atoms = |masks: &&[Range]| {
             let runs = |from, to| RunLengths::of(12, 1, |x, _| (from..to).contains(&x));
@@ -96,27 +104,29 @@ mod tests {
 
     #[test]
     fn parts_and_wholes_are_found_and_the_views_that_show_them_decide() {
-        // A handle of 2 on a cup of 6 on a saucer of 10; one view glues all, another cuts the cup.
+        // A handle (2 Gaussians) on a cup (6) on a saucer (10). One view merges all of them,
+        // another splits the cup.
         let good: &[_] = &[(0, 10, None), (0, 6, None), (0, 2, None)];
         let (glued, cut): (&[_], &[_]) = (&[(0, 10, None)], &[(0, 10, None), (0, 3, None), (3, 6, None)]);
         let wanted = [0..2, 0..6, 0..10].map(|range| range.collect::<Vec<u32>>());
         let found = proposed(&[good, good, good, glued, cut], |_, _| true);
-        assert_eq!(found, proposed(&[cut, glued, good, good, good], |_, _| true), "the order of the views plays no part");
+        assert_eq!(found, proposed(&[cut, glued, good, good, good], |_, _| true), "the result does not depend on the order of the views");
         assert!(wanted.iter().all(|set| found.contains(set)), "{found:?}");
-        assert_eq!(proposed(&[good, good, glued, glued, glued], |_, _| true), [wanted[2].clone()], "two views of the cup are too few");
+        assert_eq!(proposed(&[good, good, glued, glued, glued], |_, _| true), [wanted[2].clone()], "two views of the cup are fewer than min_views");
     }
     #[test]
     fn masks_that_hold_most_of_each_other_show_one_thing() {
-        // Each view draws a bowl of six a little elsewhere: between the outer ones the IoU is 2 in 10, from the middle one to either 4 in 8.
+        // Each view draws a bowl of six Gaussians at another position. The outer masks have an IoU
+        // of 2/10, the middle one 4/8 with each of them.
         let drawn: [&[_]; 3] = [&[(1, 7, None)], &[(3, 9, None)], &[(5, 11, None)]];
         assert_eq!(proposed(&drawn, |_, _| true), [(3..9).collect::<Vec<u32>>()]);
-        // Half of each is too little.
+        // Masks that share only half of each other do not match.
         let drawn: [&[_]; 3] = [&[(0, 6, None)], &[(3, 9, None)], &[(6, 12, None)]];
         assert!(proposed(&drawn, |_, _| true).is_empty());
     }
     #[test]
     fn a_tracker_joins_what_no_photo_shows_together() {
-        // Each of three views shows another third of one thing.
+        // Each of three views shows a different third of one object.
         let thirds = |track| [0, 1, 2].map(|view| [(4 * view, 4 * view + 4, track)]);
         let found = |track| proposed(&thirds(track).each_ref().map(|masks| masks.as_slice()), |view, g| g as usize / 4 == view);
         assert_eq!(found(Some(7)), [(0..12).collect::<Vec<u32>>()]);

@@ -1,8 +1,8 @@
-//! Which object each pixel of blended codes shows (paper, querying features: the target mask).
+//! Assigns an object to each pixel of rendered codes (paper, querying features: the target mask).
 //!
-//! A pixel that is nearer than tau_ac to a code shows that object. At the border of two objects pixels are blends, which come near third codes
-//! and are within 5 of none: the paper's threshold alone leaves halos of both kinds. Blends show one of the objects beside them, so they are
-//! decided from there.
+//! Pixels within tau_ac of a code show its object. At borders, pixels blend two codes: they may
+//! come near a third code or be near none. The paper's threshold alone leaves halos of both kinds.
+//! Such pixels take an object of their neighbours instead.
 
 use crate::codebook::Codebook;
 use crate::codes;
@@ -11,10 +11,11 @@ use fastlgs_core::LabelMap;
 use glam::Vec3;
 use rayon::prelude::*;
 
-/// The object that each pixel shows; 0 for none. `values`: blended codes, `[3][h][w]`.
+/// Returns the object id of each pixel; 0 for none. `values`: rendered codes, `[3][h][w]`.
 ///
-/// Pixels within `tau_ac` (on the 0..255 scale; by default a quarter of the codes' spacing) of a code, or of the origin, which is no object's, are
-/// sure. Then, ring by ring, the others take that one of their decided neighbours whose code is nearest.
+/// A pixel is confident if its feature lies within `tau_ac` of a code or of the origin (no object).
+/// `tau_ac` is on the 0..255 scale and defaults to a quarter of the smallest distance between
+/// codes. All other pixels take the nearest code among their decided neighbours, ring by ring.
 pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Option<f32>) -> LabelMap {
     let pixels = (width * height) as usize;
     let feature = |p: usize| Vec3::new(values[p], values[pixels + p], values[2 * pixels + p]);
@@ -35,7 +36,7 @@ pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Opti
         };
         let found: Vec<(usize, u16)> = open.par_iter().filter_map(|p| beside(*p)).collect();
         if found.is_empty() {
-            // Nothing is sure anywhere.
+            // No pixel is confident.
             break;
         }
         found.into_iter().for_each(|(p, label)| labels[p] = Some(label));
@@ -44,7 +45,7 @@ pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Opti
     LabelMap { width, height, labels: labels.into_iter().map(Option::unwrap_or_default).collect() }
 }
 
-/// The up to eight pixels around a pixel.
+/// Iterates over the neighbours of a pixel, at most eight.
 fn neighbours(p: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> {
     let (x, y, rows) = (p % width, p / width, pixels / width);
     let columns = x.saturating_sub(1)..(x + 2).min(width);
@@ -56,18 +57,19 @@ mod tests {
     use super::*;
     use crate::query::tests::grid;
 
-    /// One row of grey features.
+    /// Decides one row of grey features.
     fn row(x: &[f32], tau_ac: Option<f32>) -> Vec<u16> {
         decide(&grid(), x.len() as u32, 1, &[x, x, x].concat(), tau_ac).labels
     }
 
     #[test]
     fn blends_belong_to_what_lies_beside_them() {
-        // Codes 0.25, 0.5 and 0.75. On the way from the first to the third lies the second, which is not there.
+        // The codes are 0.25, 0.5 and 0.75. A blend of objects 1 and 3 passes the code of object 2,
+        // which is absent here.
         assert_eq!(row(&[0.25, 0.26, 0.35, 0.48, 0.6, 0.75], Some(5.0)), [1, 1, 1, 1, 3, 3]);
-        assert_eq!(row(&[0.5, 0.5, 0.5], Some(5.0)), [2, 2, 2], "it is where it is sure");
-        assert_eq!(row(&[0.0, 0.1, 0.2, 0.25], Some(5.0)), [0, 0, 1, 1], "nothing is a neighbour, too");
-        assert_eq!(row(&[0.4, 0.4], Some(1.0)), [0, 0], "nothing is sure");
+        assert_eq!(row(&[0.5, 0.5, 0.5], Some(5.0)), [2, 2, 2], "object 2 is found where its code is confident");
+        assert_eq!(row(&[0.0, 0.1, 0.2, 0.25], Some(5.0)), [0, 0, 1, 1], "id 0 spreads to its neighbours, too");
+        assert_eq!(row(&[0.4, 0.4], Some(1.0)), [0, 0], "no pixel is confident");
     }
 
     #[test]

@@ -1,20 +1,22 @@
-//! Global mapping, second step: the masks elect which of the proposals are things.
+//! Global mapping, step 2: masks vote for proposals.
 
 use crate::consensus::Proposal;
 use crate::sightings::{Fit, MaskId};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The proposals that masks stand behind, those first that most do.
+/// Returns the proposals with at least `least` votes, sorted in descending order by the sum of
+/// their voters' IoU.
 ///
-/// Every mask has a vote for the proposal that fits it best. The one with the fewest votes goes, and its voters turn to the next that fits them,
-/// until all that are left have `least` votes: so of many that are nearly the same the best takes the others' voters, and what only borrows the
-/// masks of other things goes. The order is by the sum of the voters' IoU.
+/// Each mask votes for the proposal that fits it best. The proposal with the fewest votes is
+/// removed, and its voters move to their next best, until all remaining ones have `least` votes. So
+/// the best of several near duplicates collects their votes. Proposals that fit only masks of other
+/// objects are removed.
 pub fn elected(proposals: Vec<Proposal>, least: usize) -> Vec<Proposal> {
     let mut ballots: BTreeMap<MaskId, Vec<(f32, usize)>> = BTreeMap::new();
     for (place, proposal) in proposals.iter().enumerate() {
         proposal.masks.iter().for_each(|&Fit { mask, iou }| ballots.entry(mask).or_default().push((iou, place)));
     }
-    // The favourite last.
+    // Ascending order: the preferred proposal is the last.
     ballots.values_mut().for_each(|ballot| ballot.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))));
     let mut voters: Vec<Vec<MaskId>> = vec![Vec::new(); proposals.len()];
     ballots.iter().for_each(|(mask, ballot)| ballot.last().iter().for_each(|best| voters[best.1].push(*mask)));
@@ -51,9 +53,9 @@ mod tests {
         };
         let all = vec![
             proposal(0, &[(0, 0.9), (1, 0.7), (2, 0.7)]),
-            // Nearly the same, and a little better in one view.
+            // Nearly the same as 0, with a better fit in one view.
             proposal(1, &[(0, 0.8), (1, 0.8), (2, 0.6)]),
-            // Borrows the masks of 0, and has one of its own.
+            // Fits masks of 0, and one of its own.
             proposal(2, &[(1, 0.5), (2, 0.5), (9, 0.6)]),
             proposal(3, &[(3, 0.9), (4, 0.9), (5, 0.9)]),
         ];

@@ -1,5 +1,7 @@
-//! What Algorithm 1 goes by, kept in the scene folder: which masks share key points (`pairs.safetensors`), and what describes each mask
-//! (`embeddings.safetensors`).
+//! Input of Algorithm 1 in the scene folder.
+//!
+//! `pairs.safetensors` counts the key points that masks share; `embeddings.safetensors` describes
+//! each mask.
 
 use crate::Result;
 use crate::mapping::{Correspondences, Mask};
@@ -8,13 +10,13 @@ use fastlgs_core::{Error, SceneFolder, fs};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// A mask by its view's place among the training views, and its label there.
+/// A mask: index of its view among the training views, and its label there.
 pub type Place = (usize, u16);
 
-/// Key-point pairs between masks of a later and an earlier view.
+/// Numbers of key-point pairs, by `[mask of a later view, mask of an earlier view]`.
 pub type Pairs = BTreeMap<[Place; 2], u32>;
 
-/// Where descriptions of masks are kept.
+/// Returns the path of the mask descriptions.
 pub fn masks_path(folder: &SceneFolder) -> PathBuf {
     folder.root.join("embeddings.safetensors")
 }
@@ -23,10 +25,10 @@ fn pairs_path(folder: &SceneFolder) -> PathBuf {
     folder.root.join("pairs.safetensors")
 }
 
-/// Writes which masks share key points.
+/// Writes the numbers of key-point pairs between masks.
 ///
 /// # Errors
-/// The system's refusal.
+/// The file cannot be written.
 pub fn save_pairs(folder: &SceneFolder, pairs: &Pairs) -> Result<()> {
     let number = |(view, label): Place| [view as f32, f32::from(label)];
     let row = |(&[later, earlier], &count): (&[Place; 2], &u32)| [&number(later)[..], &number(earlier), &[count as f32]].concat();
@@ -34,10 +36,11 @@ pub fn save_pairs(folder: &SceneFolder, pairs: &Pairs) -> Result<()> {
     Ok(save_tensors(&pairs_path(folder), &[("pairs", vec![pairs.len(), 5], rows.as_slice())])?)
 }
 
-/// Reads what [`save_pairs`] wrote, as pairs of places in `masks`; key points on masks that are not among them are left out.
+/// Reads the file of [`save_pairs`]; masks become indices into `masks`. Leaves out pairs whose
+/// masks are not in `masks`.
 ///
 /// # Errors
-/// Missing or damaged file.
+/// The file is missing or damaged.
 pub fn load_pairs(folder: &SceneFolder, masks: &[Mask]) -> Result<Correspondences> {
     let path = pairs_path(folder);
     let tensors = load_tensors(&path)?;
@@ -49,10 +52,10 @@ pub fn load_pairs(folder: &SceneFolder, masks: &[Mask]) -> Result<Correspondence
     Ok(rows.1.chunks_exact(5).filter_map(pair).collect())
 }
 
-/// Writes what describes each mask: view, label, area, embedding, histogram; and what made the embeddings, as its user calls it.
+/// Writes view, label, area, embedding and histogram of each mask, and the identity of the encoder.
 ///
 /// # Errors
-/// The system's refusal.
+/// The file cannot be written.
 pub fn save_masks(folder: &SceneFolder, masks: &[Mask], encoder: &str) -> Result<()> {
     let n = masks.len();
     let width = |f: fn(&Mask) -> &Vec<f32>| masks.first().map_or(0, |m| f(m).len());
@@ -67,10 +70,11 @@ pub fn save_masks(folder: &SceneFolder, masks: &[Mask], encoder: &str) -> Result
     Ok(save_embeddings(&masks_path(folder), &tensors, encoder)?)
 }
 
-/// Reads what [`save_masks`] wrote: the masks, and what made their embeddings; empty where nobody knows.
+/// Reads the file of [`save_masks`]: the masks, and the identity of their encoder (empty if
+/// unknown).
 ///
 /// # Errors
-/// Missing or damaged file.
+/// The file is missing or damaged.
 pub fn load_masks(folder: &SceneFolder) -> Result<(Vec<Mask>, String)> {
     let path = masks_path(folder);
     let file = fs::read(&path)?;
@@ -111,7 +115,7 @@ mod tests {
         let (masks, encoder) = load_masks(&folder).unwrap();
         assert_eq!((masks.len(), masks[1].view, masks[1].label, encoder.as_str()), (2, 3, 2, "offline 3"));
         assert_eq!(masks[0].histogram, [1.0, 0.0, 0.0]);
-        // The second names a mask that is too small to be described.
+        // The second pair names a mask without a description.
         save_pairs(&folder, &Pairs::from([([(3, 2), (0, 1)], 7), ([(3, 9), (0, 1)], 2)])).unwrap();
         assert_eq!(load_pairs(&folder, &masks).unwrap(), Correspondences::from([((1, 0), 7)]));
     }

@@ -1,4 +1,4 @@
-//! From objects to a mask: what a rendered view tells about objects (paper, querying features).
+//! Masks and heat maps of objects in a rendered view (paper, querying features).
 
 use crate::decision::decide;
 use crate::grid::Grid;
@@ -7,32 +7,35 @@ use crate::query::Hit;
 use fastlgs_core::shares::{KEPT, unpack};
 use fastlgs_core::{LabelMap, Shares};
 
-/// At each pixel the id that stands for the objects which have most of it; `lists` are those of all ids.
+/// Returns for each pixel the id that represents its objects. `lists`: the objects of each id,
+/// smallest first.
 pub fn ids(shares: &Shares, lists: &[Vec<u16>]) -> LabelMap {
     let found = |pixel: &[u32; KEPT]| pixel.map(unpack).into_iter().filter(|s| s.1 > 0).map(|(id, weight)| (id, weight as f32));
     let labels = shares.held(lists).zip(&shares.pixels).map(|(objects, pixel)| standing_for(&objects, found(pixel), lists)).collect();
     LabelMap { width: shares.width, height: shares.height, labels }
 }
 
-/// What a rendered view tells about objects.
+/// The rendered object data of a view.
 pub enum Field {
-    /// Blending weights by id, of lifted scenes.
+    /// Id weights, for scenes with lifted object ids.
     Shares(Shares),
-    /// Blended codes, of scenes whose features were trained (the paper's way).
+    /// Rendered codes, for scenes with trained features (paper).
     Features {
         /// Pixels along x.
         width: u32,
         /// Pixels along y.
         height: u32,
-        /// `[3][h][w]`.
+        /// Values as `[3][h][w]`.
         values: Vec<f32>,
-        /// Largest distance of a feature to its object's code, on the 0..255 scale (paper); see [`decide`].
+        /// Largest distance between a feature and the code of its object, on the 0..255 scale
+        /// (paper); see [`decide`].
         tau_ac: Option<f32>,
     },
 }
 
 impl Field {
-    /// The objects that have most of each pixel, from small to large, row by row.
+    /// Calls `tell` for each pixel, row by row, with the objects that have most of its weight,
+    /// smallest first.
     pub fn each(&self, grid: &Grid, mut tell: impl FnMut(&[u16])) {
         let lists = grid.lists();
         match self {
@@ -43,7 +46,8 @@ impl Field {
         }
     }
 
-    /// The objects that have most of each of these pixels, from small to large.
+    /// Returns for each of these pixels (x, y) the objects that have most of its weight, smallest
+    /// first.
     pub fn at(&self, grid: &Grid, pixels: &[(u32, u32)]) -> Vec<Vec<u16>> {
         let width = self.size().0;
         let mut asked: Vec<(u32, usize)> = pixels.iter().enumerate().map(|(k, (x, y))| (y * width + x, k)).collect();
@@ -58,7 +62,7 @@ impl Field {
         found
     }
 
-    /// At each pixel the id that stands for the objects which have most of it.
+    /// Returns for each pixel the id that represents its objects; 0 for none.
     pub fn ids(&self, grid: &Grid) -> LabelMap {
         match self {
             Self::Shares(shares) => ids(shares, &grid.lists()),
@@ -66,7 +70,7 @@ impl Field {
         }
     }
 
-    /// The smallest object that has most of each pixel; 0 for none.
+    /// Returns for each pixel the smallest object that has most of its weight; 0 for none.
     pub fn owners(&self, grid: &Grid) -> LabelMap {
         let (width, height) = self.size();
         let mut labels = Vec::with_capacity((width * height) as usize);
@@ -74,7 +78,7 @@ impl Field {
         LabelMap { width, height, labels }
     }
 
-    /// Pixels along x and y.
+    /// Returns width and height in pixels.
     fn size(&self) -> (u32, u32) {
         match self {
             Self::Shares(shares) => (shares.width, shares.height),
@@ -82,7 +86,7 @@ impl Field {
         }
     }
 
-    /// The mask of some objects.
+    /// Returns whether each pixel belongs to one of the targets, row by row.
     pub fn mask(&self, grid: &Grid, targets: &[Hit]) -> Vec<bool> {
         let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
         let members = grid.members(&ids);
@@ -92,7 +96,7 @@ impl Field {
         }
     }
 
-    /// Relevancy of each pixel: the highest of the objects that it belongs to.
+    /// Returns the relevancy of each pixel: the highest score of its objects; 0 without objects.
     pub fn relevancy(&self, grid: &Grid, ranked: &[Hit]) -> Vec<f32> {
         let mut own = vec![0.0f32; grid.objects.len() + 1];
         ranked.iter().for_each(|h| own[usize::from(h.id)] = h.score);

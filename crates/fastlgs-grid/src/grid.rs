@@ -1,4 +1,4 @@
-//! The object table: for each object its code and the embeddings of all its views.
+//! The object table: codes and embeddings of all objects.
 
 use crate::Result;
 use crate::mapping::Mask;
@@ -12,32 +12,34 @@ use std::path::Path;
 /// One object.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
-    /// Number, 1..=K.
+    /// Object id, 1..=K.
     pub id: u16,
-    /// Object that contains it; 0 for none.
+    /// Smallest object that contains it; 0 for none.
     pub parent: u16,
-    /// Mean IoU with the best mask of each view; 1 where masks were taken as they are.
+    /// Mean IoU with the best mask of each view, 0 to 1; 1 if the masks themselves define the
+    /// objects.
     pub support: f32,
     /// Code in (0, 1)^3.
     pub code: Vec3,
-    /// Embeddings of its masks; of each what texts are compared with is L2-normalised.
+    /// Embeddings of its masks. The part that is compared with texts is L2-normalised.
     pub embeddings: Vec<Vec<f32>>,
-    /// Share of its photo that each of those masks covered.
+    /// For each embedding: area of its mask as a share of the photo.
     pub areas: Vec<f32>,
-    /// Photos that show it.
+    /// Number of views that show it.
     pub views: usize,
 }
 
 /// All objects of a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Grid {
-    /// In order of id.
+    /// Objects in ascending order of id.
     pub objects: Vec<Object>,
-    /// What the Gaussians' ids above those of the objects stand for.
+    /// Object lists for the ids above those of the objects.
     pub overlaps: Overlaps,
-    /// By id that Gaussians can have: the pixels that those of this id show in all views together, in pictures; empty where nobody knows.
+    /// For each id, 0 included: area of its Gaussians summed over all views, in units of a view's
+    /// area. Empty if unknown.
     pub shown: Vec<f32>,
-    /// What made the embeddings, as its user calls it; empty where nobody knows.
+    /// Identity of the encoder of the embeddings; empty if unknown.
     pub encoder: String,
 }
 
@@ -50,21 +52,22 @@ struct Row {
     support: f32,
     code: [f32; 3],
     views: usize,
-    /// Rows of the embedding table: first and number.
+    /// Index of the first of its `count` rows in the embedding table.
     first: usize,
     count: usize,
 }
 
-/// Share of an object that lies in another one of which it is a part.
+/// An object is a part of another one if more than this share of it lies there.
 pub const PART: f32 = 0.7;
 
-/// Support of objects in grids that earlier versions wrote.
+/// Support of objects in files without this field.
 fn full() -> f32 {
     1.0
 }
 
 impl Grid {
-    /// Gathers the masks of each object; there are as many objects as `codes`.
+    /// Collects the masks of each object. `object_of`: object id of each mask; `codes`: one for
+    /// each object.
     pub fn build(masks: &[Mask], object_of: &[u16], codes: Vec<Vec3>) -> Self {
         let objects = (1u16..)
             .zip(codes)
@@ -86,31 +89,34 @@ impl Grid {
         Self { objects, ..Self::default() }
     }
 
-    /// The objects that contain an object, from small to large, itself first; those that a Gaussian of this id lies in.
+    /// Iterates over the objects of an id, smallest first: an object and its ancestors, or the
+    /// members of an overlap list.
     pub fn chain(&self, id: u16) -> impl Iterator<Item = u16> {
         let known = |id: &u16| (1..=self.objects.len()).contains(&usize::from(*id));
         let list = usize::from(id).checked_sub(self.objects.len() + 1).and_then(|k| self.overlaps.0.get(k));
-        // A damaged file might go in circles: no chain is longer than there are objects.
+        // The length limit ends cycles of parents in damaged files.
         let up = move |id: &u16| Some(self.objects[usize::from(*id) - 1].parent).filter(known);
         list.into_iter().flatten().copied().chain(std::iter::successors(Some(id).filter(known), up).take(self.objects.len()))
     }
 
-    /// [`Self::chain`] of each id that Gaussians can have, 0 included.
+    /// Returns [`Self::chain`] for each id of Gaussians, 0 included.
     pub fn lists(&self) -> Vec<Vec<u16>> {
         (0..=self.highest()).map(|id| self.chain(id).collect()).collect()
     }
 
-    /// The highest id that Gaussians can have.
+    /// Returns the highest id that a Gaussian can have.
     pub fn highest(&self) -> u16 {
         (self.objects.len() + self.overlaps.0.len()) as u16
     }
 
-    /// How much of the scene's surface the Gaussians of each id show, in all views together.
+    /// Returns for each id the area of its Gaussians summed over all views, in units of a view's
+    /// area.
     pub fn surface(&self) -> Vec<f32> {
         if self.shown.len() == usize::from(self.highest()) + 1 {
             return self.shown.clone();
         }
-        // What objects show without those inside them, as far as they were measured.
+        // Without measured areas: mean mask area times number of views, minus the same of the
+        // parts.
         let seen = |object: &Object| object.areas.iter().sum::<f32>() / object.areas.len().max(1) as f32 * object.views as f32;
         let mut own: Vec<f32> = std::iter::once(0.0).chain(self.objects.iter().map(seen)).collect();
         for object in self.objects.iter().filter(|o| o.parent > 0) {
@@ -122,14 +128,15 @@ impl Grid {
         own.into_iter().map(|share| share.max(0.0)).collect()
     }
 
-    /// By object: what share of the scene's surface is its own, without regard to what else lies there.
+    /// Returns for each object its share of the scene's surface, 0 to 1. Objects overlap, so the
+    /// sum may exceed 1.
     pub fn shares(&self) -> Vec<f32> {
         let surface = self.surface();
         let total = surface.iter().skip(1).sum::<f32>().max(f32::MIN_POSITIVE);
         self.common(&[]).into_iter().map(|[shown, _]| shown / total).collect()
     }
 
-    /// By object: how much of the scene's surface it shows, and how much of that lies in one of `targets`.
+    /// Returns for each object its area, and the area that it shares with `targets`.
     fn common(&self, targets: &[u16]) -> Vec<[f32; 2]> {
         let mut sums = vec![[0.0f32; 2]; self.objects.len()];
         for (list, shown) in self.lists().iter().zip(self.surface()) {
@@ -143,7 +150,8 @@ impl Grid {
         sums
     }
 
-    /// By object: whether it is one of `targets` or a part of them: most of it lies in them.
+    /// Returns for each object whether it is one of `targets` or a part of them: more than [`PART`]
+    /// of it lies in them.
     pub fn parts(&self, targets: &[u16]) -> Vec<bool> {
         let in_chain = |id: u16| self.chain(id).any(|above| targets.contains(&above));
         let is_part = |([all, common], object): ([f32; 2], &Object)| {
@@ -152,7 +160,8 @@ impl Grid {
         self.common(targets).into_iter().zip(&self.objects).map(is_part).collect()
     }
 
-    /// By object: whether it and this one are of one place: most of the smaller lies in both.
+    /// Returns for each object whether it overlaps this one: more than half of the smaller lies in
+    /// both.
     pub fn related(&self, id: u16) -> Vec<bool> {
         let sums = self.common(&[id]);
         let own = usize::from(id).checked_sub(1).and_then(|k| sums.get(k)).map_or(0.0, |sum| sum[0]);
@@ -163,13 +172,14 @@ impl Grid {
         sums.iter().zip(&self.objects).map(is_related).collect()
     }
 
-    /// For each id that Gaussians can have whether they belong to one of `targets`.
+    /// Returns for each id of Gaussians whether it belongs to one of `targets`.
     pub fn members(&self, targets: &[u16]) -> Vec<bool> {
         let inside = |id: u16| self.chain(id).any(|above| targets.contains(&above));
         (0..=self.highest()).map(inside).collect()
     }
 
-    /// The grid without some objects and their parts, and the new number of each old id; 0 where nothing is left.
+    /// Returns the table without some objects and their parts, and the new id of each old id; 0 for
+    /// removed ones.
     pub fn without(&self, removed: &[u16]) -> (Self, Vec<u16>) {
         let mut left = 0;
         let number = |gone: bool| {
@@ -178,7 +188,7 @@ impl Grid {
         };
         let numbers: Vec<u16> = self.parts(removed).into_iter().map(number).collect();
         let new = |id: u16| usize::from(id).checked_sub(1).and_then(|k| numbers.get(k)).copied().unwrap_or(0);
-        // The next one around it that stays.
+        // The smallest remaining object that contains it.
         let parent = |o: &Object| self.chain(o.id).skip(1).map(new).find(|above| *above > 0).unwrap_or(0);
         let renumbered = |o: &Object| Object { id: new(o.id), parent: parent(o), ..o.clone() };
         let objects: Vec<Object> = self.objects.iter().filter(|o| new(o.id) > 0).map(renumbered).collect();
@@ -190,20 +200,21 @@ impl Grid {
         (Self { objects, overlaps, shown, encoder: self.encoder.clone() }, ids)
     }
 
-    /// Code of an object, or of the smallest one that a Gaussian of this id lies in; zero where there is none.
+    /// Returns the code of an object, or of the smallest object in the list of this id; zero for
+    /// none.
     pub fn code_of(&self, id: u16) -> Vec3 {
         self.chain(id).next().map_or(Vec3::ZERO, |id| self.objects[usize::from(id) - 1].code)
     }
 
-    /// Gives every Gaussian its object's code as feature.
+    /// Sets the feature of each Gaussian to the code of its object.
     pub fn set_codes(&self, scene: &mut Gaussians) {
         scene.features = scene.object_ids.iter().map(|id| self.code_of(*id)).collect();
     }
 
-    /// Writes `grid.safetensors` and then `grid.json`.
+    /// Writes `grid.safetensors`, then `grid.json`.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// A file cannot be written.
     pub fn save(&self, folder: &SceneFolder) -> Result<()> {
         let dimension = self.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next().unwrap_or(0);
         let (mut embeddings, mut areas, mut rows) = (Vec::new(), Vec::new(), Vec::new());
@@ -221,7 +232,7 @@ impl Grid {
             areas.extend(&o.areas);
         }
         let n = areas.len();
-        // Each list of objects ends with 0.
+        // A 0 ends each list.
         let overlaps: Vec<f32> = self.overlaps.0.iter().flat_map(|list| list.iter().chain(&[0])).map(|id| f32::from(*id)).collect();
         let tensors = [
             ("embeddings", vec![n, dimension], embeddings.as_slice()),
@@ -233,26 +244,27 @@ impl Grid {
         Ok(fs::write_json(&folder.root.join("grid.json"), &rows)?)
     }
 
-    /// Reads what [`Self::save`] wrote.
+    /// Reads the files of [`Self::save`].
     ///
     /// # Errors
-    /// Missing or damaged files.
+    /// A file is missing or damaged.
     pub fn load(folder: &SceneFolder) -> Result<Self> {
         let file = |name: &str| fs::read(&folder.root.join(name));
         Self::parse(&folder.root, &file("grid.json")?, &file("grid.safetensors")?)
     }
 
-    /// As [`Self::load`], for files that are in memory; `root` is what errors call their folder.
+    /// Parses the contents of `grid.json` (`rows`) and `grid.safetensors` (`tensors`). Errors name
+    /// them as files of the folder `root`.
     ///
     /// # Errors
-    /// Damaged files.
+    /// A file is damaged.
     pub fn parse(root: &Path, rows: &[u8], tensors: &[u8]) -> Result<Self> {
         let rows: Vec<Row> =
             serde_json::from_slice(rows).map_err(|e| Error::format(root.join("grid.json"), format!("not the expected JSON: {e}")))?;
         let path = root.join("grid.safetensors");
         let encoder = embedded_by(&path, tensors)?;
         let tensors = parse_tensors(&path, tensors)?;
-        let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing")));
+        let get = |name: &str| tensors.get(name).ok_or_else(|| Error::format(&path, format!("tensor '{name}' is missing; run 'fastlgs train' again")));
         let (embeddings, areas) = (get("embeddings")?, get("areas")?);
         let dimension = embeddings.0.get(1).copied().unwrap_or(0);
         let objects = rows
@@ -260,7 +272,7 @@ impl Grid {
             .map(|r| {
                 let range = r.first..r.first.saturating_add(r.count);
                 if range.end > areas.1.len() || range.end.saturating_mul(dimension) > embeddings.1.len() {
-                    return Err(Error::format(&path, "it does not fit grid.json; run 'fastlgs preprocess' again"));
+                    return Err(Error::format(&path, "it does not fit grid.json; run 'fastlgs train' again"));
                 }
                 let own = &embeddings.1[range.start * dimension..range.end * dimension];
                 Ok(Object {
@@ -274,7 +286,7 @@ impl Grid {
                 })
             })
             .collect::<Result<Vec<_>, Error>>()?;
-        // Grids that earlier versions wrote have neither.
+        // Files without the tensors `overlaps` and `shown` are valid.
         let values = |name: &str| tensors.get(name).map_or(&[][..], |t| t.1.as_slice());
         let overlaps = values("overlaps");
         let known = |id: &f32| id.fract() == 0.0 && (0.0..=objects.len() as f32).contains(id);
@@ -285,10 +297,10 @@ impl Grid {
         let grid = Self { objects, overlaps: Overlaps(lists), shown: values("shown").to_vec(), encoder };
         let are_counts = grid.shown.iter().all(|shown| *shown >= 0.0);
         if !are_lists || !are_counts || grid.objects.len() + grid.overlaps.0.len() > usize::from(u16::MAX) {
-            return Err(Error::format(&path, "its overlaps do not fit the objects in grid.json; train the scene again").into());
+            return Err(Error::format(&path, "its overlap lists do not fit the objects in grid.json; run 'fastlgs train' again").into());
         }
         if grid.objects.iter().zip(1..=u16::MAX).any(|(object, id)| object.id != id) {
-            return Err(Error::format(root.join("grid.json"), "its objects are not numbered 1, 2, ...; train the scene again").into());
+            return Err(Error::format(root.join("grid.json"), "its object ids are not 1, 2, ...; run 'fastlgs train' again").into());
         }
         Ok(grid)
     }

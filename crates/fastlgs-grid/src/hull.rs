@@ -1,5 +1,8 @@
-//! Things that photos see through. No Gaussian stands for a pane, since all light tells of what is behind it. But masks tell where it is, from many
-//! sides, and what lies in such masks wherever one looks from is their visual hull (Laurentini 1994).
+//! Visual hulls of transparent objects.
+//!
+//! Photos show what lies behind glass, so training places no Gaussians there. Masks still outline
+//! the object from many sides. The intersection of these outlines is its visual hull (Laurentini
+//! 1994).
 
 use fastlgs_core::mask_list::Atoms;
 use fastlgs_core::{Camera, LabelMap};
@@ -7,42 +10,46 @@ use glam::{Vec2, Vec3};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// What a view tells of things that no Gaussians stand for.
+/// Depth and unexplained masks of a view.
 pub struct Outline {
-    /// The view.
+    /// Camera of the view.
     pub camera: Camera,
-    /// By pixel: depth of what is seen there; infinite where nothing is, through which nothing can be seen.
+    /// For each pixel: depth of the visible surface; infinite where there is none. Such pixels
+    /// cannot lie in a hull.
     pub depth: Vec<f32>,
-    /// By pixel: whether only masks that no object explains lie there.
+    /// For each pixel: whether masks lie there and no object explains any of them.
     pub inside: Vec<bool>,
 }
 
-/// Places all over a thing.
+/// Points that cover a transparent object.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Hull {
-    /// About evenly spaced, midway between its near and its far side.
+    /// Points about evenly spaced, midway between front and back of the object.
     pub places: Vec<Vec3>,
-    /// Their spacing.
+    /// Distance between neighbouring points, in world units.
     pub spacing: f32,
 }
 
-/// Every how-manieth pixel of rows and columns looks for a hull.
+/// Distance between sampled pixels, along rows and columns.
 const STRIDE: u32 = 6;
-/// Places that are tried along a ray, evenly in 1/depth.
+/// Number of points tested along a ray, evenly spaced in 1/depth.
 const STEPS: u32 = 1024;
-/// Share of the views that may contradict: masks are missing, or a little narrow.
+/// Largest share of views that may contradict, because masks may be missing or too narrow.
 const MISSED: f32 = 0.1;
-/// Least factor between the depth of a thing that is seen through and of what is seen.
+/// Smallest ratio between the depth of the surface behind a transparent object and the object's
+/// depth. Also the tolerance of the occlusion test.
 const BEHIND: f32 = 1.05;
-/// Each how-manieth of the nearest depths of a view may be wrong, and what share of the next one is the least depth of a thing.
+/// Search depth of a view: the 1/20 quantile of its depths, which skips outliers, times 0.5.
 const NEAR: (usize, f32) = (20, 0.5);
-/// Spacings between places of one thing.
+/// Largest cell distance between neighbouring points of one hull.
 const APART: i32 = 2;
-/// Fewest places of a thing.
+/// Smallest number of points of a hull.
 const FEWEST: usize = 16;
 
-/// By pixel: whether masks lie there, but none that an object fits with an IoU of `min_support`. `shown` are the numbers of objects that are seen, which
-/// `lists` tells.
+/// Returns for each pixel whether masks lie there and no object explains any of them.
+///
+/// An object explains a mask if their IoU is at least `min_support`. `shown`: rendered id of each
+/// pixel; `lists`: the objects of each id.
 pub fn unexplained(atoms: &Atoms, shown: &LabelMap, lists: &[Vec<u16>], min_support: f32) -> Vec<bool> {
     let mut pixels: BTreeMap<(u16, u16), f32> = BTreeMap::new();
     for (atom, id) in atoms.map.labels.iter().zip(&shown.labels) {
@@ -67,7 +74,8 @@ pub fn unexplained(atoms: &Atoms, shown: &LabelMap, lists: &[Vec<u16>], min_supp
     atoms.map.labels.iter().map(|atom| of_atom[usize::from(*atom)]).collect()
 }
 
-/// The hulls of what the views outline, one for each thing that stands apart; `min_views` must see every place.
+/// Returns the hulls of the outlines, one for each connected group of points. At least `min_views`
+/// views must see each point.
 pub fn hulls(views: &[Outline], min_views: usize) -> Vec<Hull> {
     let of_view = |(view, outline): (usize, &Outline)| {
         let [width, height] = [outline.camera.width, outline.camera.height];
@@ -80,14 +88,16 @@ pub fn hulls(views: &[Outline], min_views: usize) -> Vec<Hull> {
     apart(&views.par_iter().enumerate().map(of_view).collect::<Vec<_>>().concat())
 }
 
-/// Depth from which on there may be things.
+/// Returns the smallest depth at which a view searches for hulls; infinite without a visible
+/// surface.
 fn near(view: &Outline) -> f32 {
     let mut depths: Vec<f32> = view.depth.iter().copied().filter(|depth| depth.is_finite()).collect();
     depths.sort_by(f32::total_cmp);
     depths.get(depths.len() / NEAR.0).map_or(f32::INFINITY, |depth| NEAR.1 * depth)
 }
 
-/// The middle of the hull on a pixel's ray, if what is seen there lies behind the hull, and the spacing of rays there.
+/// Returns the middle of the hull on the ray of pixel (x, y), and the distance between rays there.
+/// Returns `None` unless the visible surface lies behind the hull.
 fn on_ray(views: &[Outline], view: usize, (x, y): (u32, u32), near: f32, min_views: usize) -> Option<(Vec3, f32)> {
     let Outline { camera, depth, .. } = &views[view];
     let far = depth[(y * camera.width + x) as usize];
@@ -108,10 +118,13 @@ fn on_ray(views: &[Outline], view: usize, (x, y): (u32, u32), near: f32, min_vie
     (BEHIND * depth(last) < far).then(|| (place(middle), STRIDE as f32 * middle / camera.fx))
 }
 
-/// Whether a place, on a ray of view number `own`, lies in the outlines of nearly all other views to which nothing hides it, if these are most.
+/// Returns whether a point on a ray of view `own` lies in the hull.
+///
+/// Nearly all other views that see the point must have it in an unexplained mask. Most of the views
+/// whose picture contains it must see it without occlusion.
 fn agreed(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> bool {
     let [mut within, mut open, mut missed] = [0usize; 3];
-    // Photos follow each other: those from elsewhere say no soonest.
+    // Start with views a third of the sequence away: they reject wrong points soonest.
     for k in 0..views.len() {
         let number = (own + views.len() / 3 + k) % views.len();
         let view = &views[number];
@@ -129,7 +142,8 @@ fn agreed(views: &[Outline], own: usize, place: Vec3, min_views: usize) -> bool 
     open + 1 >= min_views && 2 * open >= within && missed as f32 <= MISSED * open as f32
 }
 
-/// Thins places out to their usual spacing, and puts those together that are near each other.
+/// Keeps one point in each cell of the median spacing, and groups cells that are at most [`APART`]
+/// cells apart.
 fn apart(found: &[(Vec3, f32)]) -> Vec<Hull> {
     let mut spacings: Vec<f32> = found.iter().map(|(_, spacing)| *spacing).collect();
     spacings.sort_by(f32::total_cmp);
@@ -153,7 +167,7 @@ fn apart(found: &[(Vec3, f32)]) -> Vec<Hull> {
     hulls
 }
 
-/// Cells up to [`APART`] beside a cell, itself included.
+/// Iterates over the cells at most [`APART`] cells from a cell, itself included.
 fn around([x, y, z]: [i32; 3]) -> impl Iterator<Item = [i32; 3]> {
     let side = 2 * APART + 1;
     (0..side.pow(3)).map(move |k| [x + k % side - APART, y + k / side % side - APART, z + k / side / side - APART])
@@ -165,8 +179,8 @@ mod tests {
     use fastlgs_core::mask_list::{Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 
-    /// Twelve cameras around a pane of 1 x 1 x 0.05 at the origin, with a wall behind it all around; it is solid, or seen through, and so many views have
-    /// no mask of it.
+    /// Twelve cameras around a pane of 1 x 1 x 0.05 at the origin, with a wall at depth 6 behind
+    /// it. The pane is solid or transparent; the first `missing` views have no mask of it.
     fn views(solid: bool, missing: usize) -> Vec<Outline> {
         let outline = |k: usize| {
             let around = 3.0 * Vec2::from_angle(std::f32::consts::TAU * k as f32 / 12.0);
@@ -193,7 +207,7 @@ mod tests {
         let [hull] = found.as_slice() else { panic!("{} hulls", found.len()) };
         let off = hull.places.iter().map(|place| (place.abs() - HALF).max_element()).fold(f32::MIN, f32::max);
         assert!(off < 0.05, "{off}");
-        // It is covered at the spacing of the rays, and once: not on both sides.
+        // One layer of points covers the pane at the spacing of the rays, not both of its sides.
         let cells = hull.spacing.powi(-2);
         assert!((0.6 * cells..2.5 * cells).contains(&(hull.places.len() as f32)), "{} of {cells}", hull.places.len());
     }
@@ -217,7 +231,8 @@ mod tests {
 
     #[test]
     fn a_mask_that_an_object_fits_is_explained_and_so_is_all_in_it() {
-        // Masks of 0..6, 0..2, 8..12 on a row of 14; shown are object 1 at 0..5, object 2 at 9..10.
+        // Masks of 0..6, 0..2 and 8..12 on a row of 14 pixels. Object 1 covers 0..5, object 2 only
+        // pixel 9.
         let mask = |from, to| Mask::new(Level::Whole, RunLengths::of(14, 1, |x, _| (from..to).contains(&x)));
         let atoms = MaskList { masks: vec![mask(0, 6), mask(0, 2), mask(8, 12)], ..MaskList::new(14, 1) }.atoms();
         let labels = (0..14).map(|x| if x < 5 { 1 } else { 2 * u16::from(x == 9) }).collect();

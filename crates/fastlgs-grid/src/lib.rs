@@ -1,6 +1,9 @@
-//! The semantic feature grid of FastLGS: masks become objects (by the paper's [`mapping`], or by [`consensus`], [`election`],
-//! [`support`] and [`objects`]), objects get low-dimensional codes ([`codes`]) and keep all their embeddings ([`grid`]), and a text
-//! finds its object ([`relevancy`], [`query`]).
+//! The object table of FastLGS, which the paper calls semantic feature grid.
+//!
+//! Masks become objects by the paper's Algorithm 1 ([`mapping`]) or by global mapping
+//! ([`consensus`], [`election`], [`support`], [`objects`]).
+//! Each object has a low-dimensional code ([`codes`]) and the embeddings of its masks ([`grid`]).
+//! A text query finds its objects by [`relevancy`] and [`query`].
 
 pub mod calibration;
 pub mod codebook;
@@ -22,14 +25,14 @@ pub mod support;
 
 pub use grid::{Grid, Object};
 
-/// Errors of the grid.
+/// Errors of the object table.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Files.
+    /// A file cannot be read or written.
     #[error(transparent)]
     Core(#[from] fastlgs_core::Error),
-    /// Ids have 16 bits.
-    #[error("there would be more than 65,535 objects: lower --theta or --tau, or use --mapping global")]
+    /// Object ids have 16 bits.
+    #[error("the masks make more than 65,535 objects; lower theta or tau, or use global mapping")]
     TooManyObjects,
 }
 

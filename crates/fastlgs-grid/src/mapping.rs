@@ -1,4 +1,4 @@
-//! Cross-view grid mapping (paper, Algorithm 1): which masks of different photos show the same object.
+//! Cross-view grid mapping (paper, Algorithm 1): matches masks of different photos to objects.
 
 use crate::{Error, Result};
 use fastlgs_core::vectorised;
@@ -6,31 +6,31 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// One mask of one photo.
+/// One mask of a photo.
 #[derive(Clone, Debug, serde::Serialize, serde::Deserialize)]
 pub struct Mask {
     /// Index of the photo in the sequence.
     pub view: usize,
-    /// Label in that photo's map.
+    /// Label in the label map of that photo.
     pub label: u16,
-    /// Share of the photo that it covers.
+    /// Area as a share of the photo.
     pub area: f32,
-    /// Embedding L, L2-normalised as masks are compared by it; zeros where there is none.
+    /// Embedding L, L2-normalised in the part that masks are compared by; zeros if there is none.
     pub embedding: Vec<f32>,
-    /// Colour distribution C, summing to 1.
+    /// Colour histogram C, with sum 1.
     pub histogram: Vec<f32>,
 }
 
 /// Constants of the paper.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PaperConfig {
-    /// Fewest key-point pairs that make two masks one object (tau).
+    /// Smallest number of key-point pairs that makes two masks one object (tau).
     pub tau: u32,
-    /// Least similarity that makes two masks one object (theta).
+    /// Smallest similarity that makes two masks one object (theta).
     pub theta: f32,
-    /// Weight of colour against the embedding (alpha); 0 leaves colour out.
+    /// Weight of colour relative to the embedding (alpha); 0 ignores colour.
     pub alpha: f32,
-    /// Whether key points count.
+    /// Whether key points are used.
     pub key_points: bool,
 }
 
@@ -40,13 +40,15 @@ impl Default for PaperConfig {
     }
 }
 
-/// Key-point pairs between masks: (later mask, earlier mask) -> number. Masks are indices into the mask list.
+/// Numbers of key-point pairs, by (later mask, earlier mask). Masks are indices into the mask list.
 pub type Correspondences = BTreeMap<(usize, usize), u32>;
 
 impl Mask {
-    /// One vector for embedding and colours, whose inner products are the paper's similarities:
-    /// sim = alpha * Bhattacharyya coefficient of C + (1 - alpha) * cosine of L. (The paper's prose swaps the two names; its formulas are meant
-    /// like this.)
+    /// Returns one vector for colours and embedding, whose inner products are the paper's
+    /// similarities.
+    ///
+    /// sim = alpha * Bhattacharyya coefficient of C + (1 - alpha) * cosine of L. The paper's prose
+    /// swaps the two names; this follows its formulas.
     fn look(&self, alpha: f32) -> Vec<f32> {
         let color = self.histogram.iter().map(|share| (alpha * share).sqrt());
         color.chain(self.embedding.iter().map(|value| (1.0 - alpha).sqrt() * value)).collect()
@@ -54,7 +56,8 @@ impl Mask {
 }
 
 vectorised! {
-    /// Inner products of a vector with others of its length.
+    /// Computes the inner products of `with` and each of `others`. All vectors have the same
+    /// length.
     fn products(with: &[f32], others: &[Vec<f32>], out: &mut [f32]) = products_body
 }
 
@@ -73,31 +76,40 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
     }
 }
 
-/// Masks that are more alike than this stand for each other. Where two objects differ by no more in how like a mask they are, looks do not tell them
-/// apart.
+/// A representative that is at least this similar to a mask of its object makes the mask
+/// superfluous.
+///
+/// Objects whose similarities to a mask differ by at most 1 minus this are treated as equally
+/// similar.
 const ALIKE: f32 = 0.98;
 
-/// What Algorithm 1 made of the masks.
+/// Result of Algorithm 1.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mapped {
-    /// Object of each mask, 1..=count.
+    /// Object id of each mask, 1..=count.
     pub object_of: Vec<u16>,
     /// Number of objects K.
     pub count: u16,
-    /// Similarities that were computed.
+    /// Number of similarities computed.
     pub comparisons: usize,
 }
 
-/// Algorithm 1. `masks` are sorted by view.
+/// Runs Algorithm 1. `masks` are sorted by view.
 ///
-/// Photos are taken in sequence; masks of the first photo are objects of their own. Key points decide first, and a photo may show several masks
-/// of an object that they find. Similarity is for what is left, and one to one, the most alike first: an object that the photo shows already is
-/// no candidate, so that two things of one look stay two; which is which, key points tell, though they be fewer than tau. A mask is compared not
-/// with every earlier one but with each object's representatives, of which none is more than 0.98 like another one. An object that is seen for the
-/// hundredth time adds none, so that the work grows with the photos, not with their square.
+/// Photos are processed in sequence; each mask of the first photo starts an object. Key points
+/// decide first: a mask joins the object of the earlier mask that shares most pairs with it, if
+/// these are at least tau. Several masks of a photo may join one object in this way.
+///
+/// All other masks are matched by similarity, one to one and in descending order. Objects that the
+/// photo already shows are no candidates, so that two objects that look the same stay separate.
+/// Among equally similar objects shared key points decide, even if there are fewer than tau.
+///
+/// A mask is compared with the representatives of each object, not with all earlier masks. A mask
+/// that is at least 0.98 similar to a representative of its object does not become one. So the work
+/// grows linearly with the number of photos.
 ///
 /// # Errors
-/// More than 65,535 objects: a Gaussian's id has 16 bits.
+/// There are more than 65,535 objects; ids have 16 bits.
 pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Result<Mapped> {
     let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
     let mut representatives: Vec<usize> = Vec::new();
@@ -123,7 +135,8 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
                     mapped.count
                 }
             };
-            // One of the same object that is as good as the mask itself makes it superfluous.
+            // A representative of the same object that is similar enough makes this mask
+            // superfluous.
             if alike[k].get(&object).is_none_or(|sim| *sim < ALIKE) {
                 representatives.push(first + k);
             }
@@ -133,21 +146,24 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
     Ok(mapped)
 }
 
-/// The object of the mask of an earlier photo, one before `first`, that shares most key points with mask `j`; none below tau.
+/// Returns the object of the mask before `first` that shares most key points with mask `j`; `None`
+/// below tau.
 fn most_corresponding(j: usize, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> Option<u16> {
     let most = pairs.range((j, 0)..(j, first)).map(|(&(_, k), &n)| (n, std::cmp::Reverse(k))).max()?;
     Some(mapped.object_of[most.1.0]).filter(|_| config.key_points && most.0 >= config.tau)
 }
 
-/// Key points that mask `j` shares with all masks of an object, in photos before that of mask `first`.
+/// Counts the key points that mask `j` shares with an object's masks before mask `first`.
 fn shared_with(j: usize, object: u16, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> u32 {
     let of_object = pairs.range((j, 0)..(j, first)).filter(|((_, k), _)| config.key_points && mapped.object_of[*k] == object);
     of_object.map(|(_, n)| n).sum()
 }
 
-/// How much each mask of a photo is like each object: like its most similar representative.
+/// Returns for each mask of a photo its similarity to each object: the largest one to a
+/// representative.
 fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usize], mapped: &Mapped) -> Vec<BTreeMap<u16, f32>> {
-    // The photo's own vectors stay at hand while each of the many representatives comes by once.
+    // Loop order for the cache: the vectors of the photo stay in it while each representative
+    // passes once.
     let with = |k: &usize| {
         let mut row = vec![0.0; photo.len()];
         products(&looks[*k], &looks[photo.clone()], &mut row);
@@ -165,8 +181,10 @@ fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usiz
     (0..photo.len()).into_par_iter().map(best).collect()
 }
 
-/// Pairs (mask, object) from theta on. Those come first that share key points, if the mask is as like that object as the one it is most like: looks
-/// do not tell such objects apart.
+/// Returns the candidates (mask, object) with a similarity of at least `theta`, best first.
+///
+/// Sorts by shared key points, then by similarity. Key points count only if the object is about as
+/// similar as the mask's most similar one.
 fn most_alike_first(alike: &[BTreeMap<u16, f32>], theta: f32, key_points: impl Fn(usize, u16) -> u32) -> Vec<(usize, u16)> {
     let mut pairs: Vec<(u32, f32, usize, u16)> = Vec::new();
     for (mask, objects) in alike.iter().enumerate() {
@@ -188,8 +206,8 @@ mod tests {
         Mask { view, label, area: 0.1, embedding: embedding.to_vec(), histogram: histogram.to_vec() }
     }
 
-    /// View 0 shows a cup and a book; view 1 the cup (by key points), a book of the same look (by similarity), and
-    /// something new; view 2 a thing with three pairs only, which is not enough.
+    /// View 0 shows a cup and a book. View 1 shows the cup (by key points), a similar book, and a
+    /// new object. View 2 shows an object with three key-point pairs, fewer than tau.
     #[test]
     fn algorithm_1_by_hand() {
         let masks = [
@@ -205,14 +223,14 @@ mod tests {
         let found = map(PaperConfig::default());
         assert_eq!((found.object_of, found.count), (vec![1, 2, 1, 2, 3, 4], 4));
         assert_eq!(map(PaperConfig { tau: 3, ..PaperConfig::default() }).object_of[5], 1, "tau is an option");
-        assert_eq!(map(PaperConfig { key_points: false, ..PaperConfig::default() }).object_of, [1, 2, 3, 2, 4, 5], "so are key points");
+        assert_eq!(map(PaperConfig { key_points: false, ..PaperConfig::default() }).object_of, [1, 2, 3, 2, 4, 5], "key points are an option");
         let mut similarity = [0.0];
         products(&masks[1].look(0.3), &[masks[3].look(0.3)], &mut similarity);
         assert!((similarity[0] - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
     }
 
-    /// Two mugs of one look, and the second photo's left one shares a key point with the first photo's right one; a third thing that
-    /// is less like it shares more, which does not count.
+    /// Two mugs look the same. Key points match the left one of the second photo to the right one
+    /// of the first. A third, less similar object shares more key points, which do not count.
     #[test]
     fn key_points_tell_twins_apart() {
         let masks = [
@@ -227,7 +245,8 @@ mod tests {
         assert_eq!([map(false), map(true)], [vec![1, 2, 3, 1, 2], vec![1, 2, 3, 2, 1]]);
     }
 
-    /// `views` photos of 40 things, of which each shows ten; how a thing looks wavers from photo to photo.
+    /// Generates `views` photos of 40 objects. Each photo shows ten; their embeddings vary between
+    /// photos.
     fn walk(views: usize) -> Vec<Mask> {
         let mut rng = fastlgs_core::rng::Rng::new(2, "walk");
         let looks: Vec<Vec<f32>> = (0..40).map(|_| unit((0..16).map(|_| rng.normal()).collect())).collect();
@@ -247,7 +266,7 @@ mod tests {
         let [few, many] = [250, 1000].map(|views| {
             let masks = walk(views);
             let mapped = paper(&masks, &Correspondences::new(), &PaperConfig { theta: 0.9, ..PaperConfig::default() }).unwrap();
-            assert_eq!(mapped.count, 40, "every thing is one object");
+            assert_eq!(mapped.count, 40, "each generated object is found once");
             assert!(
                 masks.iter().zip(&mapped.object_of).all(|(m, o)| masks
                     .iter()

@@ -1,4 +1,4 @@
-//! Global mapping, last step: the sets that the photos' masks support become the objects, which may overlap.
+//! Global mapping, step 4: the sets that masks support become objects, which may overlap.
 
 use crate::consensus::Proposal;
 use crate::grid::PART;
@@ -7,14 +7,15 @@ use crate::sightings::Sightings;
 use crate::support::Support;
 use std::collections::BTreeSet;
 
-/// When a set is an object.
+/// Conditions for a set to be an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
-    /// Fewest views that must show it, each in [`MIN_PIXELS`](crate::sightings::MIN_PIXELS) at least: so glimpses from afar make nothing smaller.
+    /// Smallest number of views that show it, each with at least
+    /// [`MIN_PIXELS`](crate::sightings::MIN_PIXELS). Distant glimpses do not count.
     pub min_views: usize,
-    /// Least support by masks: their mean IoU.
+    /// Smallest support: mean IoU with masks, 0 to 1.
     pub min_support: f32,
-    /// Of sets whose IoU is more than this only the best supported one is an object.
+    /// Largest IoU of two objects. Of more similar sets only the best supported one is an object.
     pub same: f32,
 }
 
@@ -24,30 +25,32 @@ impl Default for Config {
     }
 }
 
-/// The sets that are objects.
+/// The objects and the ids of the Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Chosen {
-    /// By Gaussian: the number of the objects that it lies in, see [`Overlaps`]; 0 for none.
+    /// For each Gaussian: id of its object or of its overlap list, see [`Overlaps`]; 0 for none.
     pub ids: Vec<u16>,
-    /// Object that object k + 1 is a part of, the smallest such; 0 for none.
+    /// For each object k + 1: the smallest object that it is a part of; 0 for none.
     pub parents: Vec<u16>,
-    /// The numbers above those of the objects.
+    /// Object lists for the ids above those of the objects.
     pub overlaps: Overlaps,
-    /// By number, 0 included: the pixels that its Gaussians show in all views together, in views.
+    /// For each id, 0 included: area of its Gaussians summed over all views, in units of a view's
+    /// area.
     pub shown: Vec<f32>,
-    /// What the views show of each object.
+    /// Support of each object by masks.
     pub support: Vec<Support>,
-    /// Sets that are no objects: too few views that show enough of them, no masks of their shape, the same as another.
+    /// Numbers of rejected sets: too few views; too little support; duplicates, or more than 16
+    /// bits can number.
     pub dropped: [usize; 3],
 }
 
 impl Chosen {
-    /// For each number the objects that it stands for, from small to large.
+    /// Returns for each id the objects that it stands for, smallest first.
     pub fn lists(&self) -> Vec<Vec<u16>> {
         self.overlaps.lists(&self.parents)
     }
 
-    /// Objects none of which shares Gaussians with another one of the same layer.
+    /// Partitions the objects into layers. Objects of a layer share no Gaussians.
     pub fn layers(&self) -> Vec<BTreeSet<u16>> {
         let mut beside: Vec<BTreeSet<u16>> = vec![BTreeSet::new(); self.parents.len() + 1];
         for list in self.lists() {
@@ -63,10 +66,13 @@ impl Chosen {
     }
 }
 
-/// Chooses the objects among the sets and numbers them, 1..=K, by falling size.
+/// Selects the objects among the sets and numbers them 1..=K in descending order of size.
 ///
-/// Masks of neighbouring things cut their common border now here, now there, and what one photo takes for one thing another joins to the next: sets
-/// overlap, and none of them has to give way. A Gaussian lies in all objects that hold it.
+/// Masks of neighbouring objects differ in their common border, and one view may merge what another
+/// separates. So the sets overlap, and all of them are kept. A Gaussian belongs to each object
+/// whose set contains it.
+///
+/// `pixels`: mean number of pixels of a view.
 pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>, pixels: usize, config: &Config) -> Chosen {
     let mut chosen = Chosen::default();
     let mut left: Vec<(Proposal, Support)> = Vec::new();
@@ -113,7 +119,7 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
     chosen
 }
 
-/// Which sets hold each Gaussian, in the order in which they were added.
+/// For each Gaussian, the sets that contain it, in order of insertion.
 struct Holders {
     of: Vec<Vec<u32>>,
     sums: Vec<f32>,
@@ -129,7 +135,7 @@ impl Holders {
         self.sums.resize(place + 1, 0.0);
     }
 
-    /// The sets that share Gaussians with this one, and the weight of these.
+    /// Returns the sets that share Gaussians with `set`, each with the weight of the shared ones.
     fn common(&mut self, set: &[u32], weights: &[f32]) -> Vec<(usize, f32)> {
         let mut met = Vec::new();
         for g in set {
@@ -152,7 +158,8 @@ mod tests {
     use super::*;
     use crate::sightings::Sighting;
 
-    /// The objects that sets of 20 Gaussians become, each of 100 pixels in four views of 10,000, with these supports.
+    /// Returns the objects of sets of 20 Gaussians with these supports. Each Gaussian covers 100
+    /// pixels in each of four views of 10,000.
     fn chosen(sets: &[(std::ops::Range<u32>, f32)], config: &Config) -> Chosen {
         let seen = (0..20).map(|g| Sighting::new(g, 0, 400.0)).collect();
         let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
@@ -164,7 +171,8 @@ mod tests {
 
     #[test]
     fn supported_sets_are_objects_by_falling_size_and_may_overlap() {
-        // A part that reaches out of its whole, another of which too little is supported, a neighbour that overlaps the whole.
+        // A part that extends beyond its object, an object, an unsupported part, and a neighbour
+        // that overlaps the object.
         let found = chosen(&[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)], &Config::default());
         assert_eq!((found.parents.as_slice(), found.dropped), (&[0, 0, 1][..], [0, 1, 0]));
         let lists = found.lists();

@@ -1,20 +1,25 @@
-//! Numbers for Gaussians that lie in several objects.
+//! Ids for Gaussians that lie in several objects.
 //!
-//! Objects are numbered 1..=K by falling size, and object k stands for itself and all above it by its parents. Where objects
-//! overlap in other ways, the numbers above K each stand for a list of them.
+//! Objects have the ids 1..=K in descending order of size. Id k stands for object k and all its
+//! ancestors. Ids above K stand for other combinations of objects, each by a list.
 
 use std::collections::BTreeMap;
 
-/// Lists of objects that no chain of parents is: number K + 1 + i stands for list i, which falls, so that small objects come first.
+/// Object lists that are no chain of parents. Id K + 1 + i stands for list i, in descending order
+/// of id: small objects come first.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overlaps(pub Vec<Vec<u16>>);
 
-/// Share of the weight whose lists are kept as they are: at borders a few Gaussians each have a list of their own.
+/// Share of the total weight whose lists get ids of their own. Many lists at borders occur in a few
+/// Gaussians only.
 pub const LISTED: f32 = 0.98;
 
 impl Overlaps {
-    /// The number of each list of objects, which fall; `parents` by object. The lists of most weight are kept, as many as make up this share of
-    /// it and 16 bits can number, and the others are taken for the one that has most in common with them.
+    /// Numbers object lists; returns the overlap lists and the id of each input list.
+    ///
+    /// `lists` are in descending order of id, with `weights`; `parents` holds the parent of each
+    /// object. The heaviest lists are kept, up to `share` of the total weight and 16-bit ids. Each
+    /// other list gets the id of the list with the largest IoU to it.
     pub fn of(lists: &[Vec<u16>], parents: &[u16], weights: &[f32], share: f32) -> (Self, Vec<u16>) {
         let mut found: BTreeMap<&[u16], f32> = BTreeMap::new();
         lists.iter().zip(weights).filter(|(list, _)| !list.is_empty()).for_each(|(list, weight)| *found.entry(list).or_default() += weight);
@@ -38,7 +43,7 @@ impl Overlaps {
         for (list, number) in &number {
             list.iter().for_each(|id| holders[usize::from(*id)].push((list, *number)));
         }
-        // Among those that hold its smallest object.
+        // The candidates are the lists that contain its smallest object.
         let nearest = |list: &[u16]| {
             let alike = |other: &[u16]| {
                 let common = list.iter().filter(|id| other.contains(id)).count();
@@ -53,22 +58,25 @@ impl Overlaps {
         (Self(kept), ids)
     }
 
-    /// By number, 0 included, the sum of the `values` of what has it; there are so many objects.
+    /// Returns for each id, 0 included, the sum of the `values` of its elements. `objects`: number
+    /// of objects.
     pub fn sums(&self, objects: usize, ids: &[u16], values: &[f32]) -> Vec<f32> {
         let mut sums = vec![0.0; 1 + objects + self.0.len()];
         ids.iter().zip(values).for_each(|(id, value)| sums[usize::from(*id)] += value);
         sums
     }
 
-    /// For each number, 0 included, the objects that it stands for, from small to large.
+    /// Returns for each id, 0 included, the objects that it stands for, smallest first.
     pub fn lists(&self, parents: &[u16]) -> Vec<Vec<u16>> {
         let objects = (0..=parents.len() as u16).map(|id| nested(id, parents));
         objects.chain(self.0.iter().cloned()).collect()
     }
 }
 
-/// The number that stands for objects of a place, which fall: of the numbers found there, with their weights, the heaviest for these very objects, else
-/// for one of which they are the smallest; else the smallest itself.
+/// Returns the id that represents the objects of a pixel, given in descending order of id.
+///
+/// `found`: the ids there with their weights. Prefers the heaviest id of exactly these objects,
+/// then the heaviest one whose smallest object is the same. Otherwise returns the smallest object.
 pub fn standing_for(objects: &[u16], found: impl Iterator<Item = (u16, f32)>, lists: &[Vec<u16>]) -> u16 {
     let Some(smallest) = objects.first() else { return 0 };
     let list = |id: u16| lists.get(usize::from(id)).map_or(&[][..], Vec::as_slice);
@@ -76,7 +84,7 @@ pub fn standing_for(objects: &[u16], found: impl Iterator<Item = (u16, f32)>, li
     fitting.max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(b.2.cmp(&a.2))).map_or(*smallest, |best| best.2)
 }
 
-/// An object and all above it; nothing for object 0.
+/// Returns an object and its ancestors, smallest first; nothing for id 0.
 fn nested(id: u16, parents: &[u16]) -> Vec<u16> {
     let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|above| (1..*id).contains(above));
     std::iter::successors(Some(id).filter(|id| *id > 0), up).collect()
@@ -88,7 +96,7 @@ mod tests {
 
     #[test]
     fn lists_are_numbered_and_found_again() {
-        // 2 and 3 lie in 1; some of 3 lies in 2 as well, and some of 2 reaches out of 1.
+        // Objects 2 and 3 lie in 1. Some Gaussians of 3 lie in 2 as well; some of 2 lie outside 1.
         let parents = [0, 1, 1];
         let lists = vec![vec![], vec![1], vec![2, 1], vec![3, 2, 1], vec![2], vec![3, 1], vec![2]];
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &[1.0; 7], 1.0);
@@ -109,7 +117,7 @@ mod tests {
     fn a_place_keeps_a_number_for_its_own_objects() {
         let lists = [vec![], vec![1], vec![2, 1], vec![3, 2], vec![3, 1]];
         let number = |objects: &[u16], found: &[(u16, f32)]| standing_for(objects, found.iter().copied(), &lists);
-        assert_eq!(number(&[2, 1], &[(3, 9.0), (2, 1.0)]), 2, "3 lies in a smaller object");
+        assert_eq!(number(&[2, 1], &[(3, 9.0), (2, 1.0)]), 2, "id 3 stands for objects 3 and 2");
         assert_eq!(number(&[3, 1], &[(3, 9.0), (4, 1.0)]), 4);
         assert_eq!(number(&[3, 2, 1], &[(3, 2.0), (4, 1.0)]), 3);
         assert_eq!((number(&[1], &[(3, 2.0), (2, 1.0)]), number(&[], &[(3, 2.0)])), (1, 0));

@@ -1,4 +1,4 @@
-//! From a text to objects (paper, querying features).
+//! Selects the objects that answer a query (paper, querying features).
 
 use crate::calibration::Best;
 use crate::grid::{Grid, Object};
@@ -6,12 +6,12 @@ use crate::relevancy::TextQuery;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 
-/// How objects are chosen.
+/// Options of object selection.
 #[derive(Clone, Copy, Debug)]
 pub struct QueryConfig {
-    /// Share of the names of absent things that may be answered all the same.
+    /// Accepted share of absent names that are answered, 0 to 1.
     pub false_alarms: f32,
-    /// At most this many objects.
+    /// Largest number of objects in an answer.
     pub top_k: usize,
 }
 
@@ -22,7 +22,7 @@ impl Default for QueryConfig {
 }
 
 impl QueryConfig {
-    /// Score from which an object counts as found.
+    /// Returns the score from which an object counts as found.
     pub fn min_score(&self) -> f32 {
         1.0 - self.false_alarms
     }
@@ -33,32 +33,39 @@ impl QueryConfig {
 pub struct Hit {
     /// Object id.
     pub id: u16,
-    /// Relevancy, 0 to 1.
+    /// Score, 0 to 1; see [`Evidence`].
     pub score: f32,
 }
 
-/// What a text says for an object.
+/// Evidence of a query for one object.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence {
-    /// Log-odds that this one is meant, up to a constant of the text: the likeness, and how much there is of it.
+    /// Log-odds that the query means this object, up to a constant: likeness plus the logarithm of
+    /// its share of the surface.
     pub rank: f32,
-    /// The same by the text alone.
+    /// Calibrated cosine: log-odds without the share of the surface.
     pub likeness: f32,
-    /// Share of absent names that no object of a scene is as like as this one is like the text.
+    /// Share of absent names whose best margin is smaller than this object's, 0 to 1.
     pub score: f32,
-    /// Standard error of rank and likeness, from view to view.
+    /// Standard error of rank and likeness over the object's views.
     pub error: f32,
 }
 
-/// What a text says for each object.
+/// Returns the evidence of a query for each object, in order of id.
 ///
-/// By Bayes: what the object's cosine is worth (see [`crate::calibration::Calibration`]), and before any text was heard names go to things
-/// by how much of the scene's surface these are, so that small fragments, of which there are many, need more likeness; or, where that is more
-/// than half, by how much they are not, because a name tells something from the rest. What has less than an equal part of the scene is not the
-/// less likely for it. Whether the text names anything at all is told by the likeness alone: by the object that exceeds
-/// "anything" most.
+/// By Bayes, rank = temperature * cosine + ln(max(min(f, 1 - f), 1 / n)). f is the object's share
+/// of the scene's surface, n the number of objects, and temperature comes from the
+/// [`crate::calibration::Calibration`].
 ///
-/// What no view shows or what is nearer to a negative is not meant; the very object that was shown as an example is meant beyond doubt.
+/// With the prior f, small fragments need a larger cosine, because there are many of them. Objects
+/// that cover more than half of the scene have the prior `1 - f`, because a name separates an
+/// object from the rest. Objects with less than an equal share get the prior `1 / n`.
+///
+/// The score depends on the margin alone: the object with the largest margin decides whether the
+/// query is answered.
+///
+/// Objects without embeddings, or at least as near to a negative as to the query, have rank -inf
+/// and score 0. The object that gave the example has rank inf and score 1.
 pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let calibration = &query.calibration;
     let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
@@ -83,43 +90,47 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     grid.objects.iter().zip(shares).map(of_object).collect()
 }
 
-/// By how much the object that is most like what is meant is more so than like anything; nothing where views show fewer than two.
+/// Returns the largest margin of the objects; `None` if fewer than two objects have one.
 pub fn best(grid: &Grid, query: &TextQuery) -> Option<Best> {
     let margins: Vec<f32> = grid.objects.iter().filter_map(|object| margin(object, query)).collect();
-    // Every second one: neighbours in number are of like size.
+    // Alternate objects form the halves, because neighbouring ids have similar sizes.
     let half = |first: usize| margins.iter().skip(first).step_by(2).copied().max_by(f32::total_cmp);
     let (even, odd) = (half(0)?, half(1)?);
     Some(Best { margin: even.max(odd), of_halves: 0.5 * (even + odd), objects: margins.len() })
 }
 
-/// The mean over an object's views, weighted by area; 0 where there are none.
+/// Returns the mean of `of` over an object's embeddings, weighted by mask area; 0 without
+/// embeddings.
 fn mean_over_views(object: &Object, of: impl Fn(&[f32]) -> f32) -> f32 {
     let total: f32 = object.areas.iter().sum();
     object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total.max(f32::MIN_POSITIVE) * of(e)).sum()
 }
 
-/// Whether any view tells what an object looks like.
+/// Returns whether an object has embeddings.
 fn is_seen(object: &Object) -> bool {
     !object.embeddings.is_empty() && object.areas.iter().sum::<f32>() > 0.0
 }
 
-/// Mean cosine over an object's views, weighted by area; nothing where no view shows it.
+/// Returns the area-weighted mean cosine of an object's embeddings with the query; `None` without
+/// embeddings.
 pub fn mean_cosine(object: &Object, query: &TextQuery) -> Option<f32> {
     is_seen(object).then(|| mean_over_views(object, |e| query.cosine(e)))
 }
 
-/// Whether an object is as near to a negative as to what is meant.
+/// Returns whether an object is at least as near to a negative as to the query.
 fn is_refuted(object: &Object, query: &TextQuery) -> bool {
     mean_over_views(object, |e| query.negative(e)) >= mean_over_views(object, |e| query.cosine(e))
 }
 
-/// By how much an object is more like what is meant than like anything: the mean over its views, weighted by area. Nothing where no view shows it,
-/// or where it is nearer to a negative.
+/// Returns an object's margin: the area-weighted mean of cosine minus canonical cosine over its
+/// embeddings.
+///
+/// Returns `None` without embeddings, or if the object is at least as near to a negative.
 pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
     (is_seen(object) && !is_refuted(object, query)).then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
 }
 
-/// All objects, the likeliest first.
+/// Returns all objects, sorted by rank in descending order.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     let hit = |(object, Evidence { rank, score, .. }): (&Object, Evidence)| (rank, Hit { id: object.id, score });
     let mut hits: Vec<(f32, Hit)> = grid.objects.iter().zip(evidence(grid, query)).map(hit).collect();
@@ -127,24 +138,30 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
     hits.into_iter().map(|h| h.1).collect()
 }
 
-/// Least support, as a share of the best one's, of an object that is taken instead of a part of it.
+/// Smallest support, relative to the best candidate, of an object that is preferred to its own
+/// part.
 pub const SUPPORT_SHARE: f32 = 0.98;
 
-/// Share of clicks that go beside what is meant.
+/// Assumed share of clicks that miss the target.
 const BESIDE: f32 = 0.1;
 
-/// The objects that some pixels of one thing show, from small to large, and the one that is meant; of each pixel, those that have most of it.
+/// Returns the objects at some pixels, smallest first, and the target. `pixels`: for each click,
+/// the objects that have most of that pixel.
 ///
-/// One pixel means the largest object there whose support comes near the best. Views agree easily on what fills them, so that support counts by how much
-/// of the scene an object is not: all of it is no thing. Further pixels tell how far the thing reaches, by Bayes: a pixel that falls on it anywhere
-/// says the more for it the smaller it is, and one beside it is a mistake.
+/// log-odds = ln(support * (1 - f)) + (1 - hits) * ln f + misses * ln 0.1
+///
+/// f is the object's share of the scene's surface. All masks agree on objects that fill the view,
+/// so the factor 1 - f penalises the whole scene. Each hit favours small objects by 1 / f; each
+/// miss costs a factor of 10.
+///
+/// The target is the largest object whose odds are at least [`SUPPORT_SHARE`] of the best ones.
 pub fn pointed(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
     let shares = grid.shares();
     let there: BTreeSet<u16> = pixels.iter().flatten().copied().collect();
     let odds = |id: u16| {
         let (object, share) = (&grid.objects[usize::from(id) - 1], shares[usize::from(id) - 1].max(1e-6));
         let on = pixels.iter().filter(|at| at.contains(&id)).count();
-        // In logarithms: many clicks say much.
+        // In logarithms, because the odds of many clicks overflow.
         (object.support * (1.0 - share)).ln() + (1.0 - on as f32) * share.ln() + (pixels.len() - on) as f32 * BESIDE.ln()
     };
     let best = there.iter().map(|id| odds(*id)).fold(f32::NEG_INFINITY, f32::max);
@@ -152,14 +169,20 @@ pub fn pointed(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
     (there.into_iter().rev().collect(), meant)
 }
 
-/// Score of the object that is most like the text: what decides whether it is found.
+/// Returns the highest score of the objects, which decides whether the query is answered; 0 without
+/// objects.
 pub fn best_score(ranked: &[Hit]) -> f32 {
     ranked.iter().map(|hit| hit.score).fold(0.0, f32::max)
 }
 
-/// The target objects; empty means "not found". Of those that are found, the likeliest one, and those elsewhere that cannot be told from it: by no more than
-/// the errors of both, and not by their size either. A large thing may be meant rather than a small one that is more like the text, but does not
-/// become another of its kind by being large.
+/// Returns the targets; empty means "not found".
+///
+/// The first target is the found object with the highest rank. Others are added if they do not
+/// overlap a target. Their rank and likeness may be lower than the first one's by at most the
+/// combined standard error.
+///
+/// Likeness must agree as well: size may make a large object the best answer, but not a second one
+/// of a kind.
 pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConfig) -> Vec<Hit> {
     let evidence = evidence(grid, query);
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
@@ -183,7 +206,8 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     chosen
 }
 
-/// The part of the `targets` that is meant, among all that lies in them; nothing where no part is found.
+/// Returns the part of the `targets` that answers the query, among all objects in them; `None` if
+/// no part is found.
 pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Option<Found> {
     let whole: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let inside = grid.parts(&whole);
@@ -193,7 +217,8 @@ pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfi
 }
 
 impl Found {
-    /// Scores for a heat map that agrees with the mask: the targets have the best score, and what is no target at most that of the least of them.
+    /// Returns scores for a heat map that agrees with the mask. Targets get the highest score;
+    /// others at most the lowest score of a target.
     pub fn heat(&self) -> Vec<Hit> {
         let least = self.targets.iter().map(|hit| hit.score).fold(f32::INFINITY, f32::min);
         let best = best_score(&self.ranked);
@@ -205,12 +230,12 @@ impl Found {
     }
 }
 
-/// The objects of an answer.
+/// Ranking and targets of a query.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Found {
-    /// What was considered, best first.
+    /// All candidates, sorted by rank in descending order.
     pub ranked: Vec<Hit>,
-    /// The answer; empty means "not found".
+    /// The targets; empty means "not found".
     pub targets: Vec<Hit>,
 }
 
@@ -221,7 +246,7 @@ pub(crate) mod tests {
     use fastlgs_core::rng::Rng;
     use glam::Vec3;
 
-    /// Object 2 lies in object 1; 3 is elsewhere.
+    /// Object 2 is a part of object 1; object 3 is elsewhere.
     pub(crate) fn grid() -> Grid {
         let object = |id: u16, parent: u16, e: [f32; 2]| Object {
             id,
@@ -254,14 +279,14 @@ pub(crate) mod tests {
         assert_eq!(find(&grid(), [1.0, 0.0], &config), [1]);
         assert_eq!(find(&grid(), [0.0, 1.0], &config), [3]);
         assert!(find(&grid(), [-1.0, 0.0], &config).is_empty());
-        assert_eq!(find(&grid(), [0.8, 0.6], &config), [2], "a part that the text fits better");
+        assert_eq!(find(&grid(), [0.8, 0.6], &config), [2], "the text fits the part better");
         let lenient = QueryConfig { false_alarms: 1.0, ..config };
         assert_eq!(find(&grid(), [-1.0, 0.0], &lenient).len(), 1);
     }
 
     #[test]
     fn the_heat_map_is_hottest_where_the_mask_is() {
-        // A small thing is more like the text, and a large one is meant.
+        // A small object has the higher score, but a large one is the target.
         let hit = |id, score| Hit { id, score };
         let found = Found { ranked: vec![hit(1, 0.95), hit(2, 0.99), hit(3, 0.2)], targets: vec![hit(1, 0.95)] };
         assert_eq!(found.heat(), [hit(1, 0.99), hit(2, 0.95), hit(3, 0.2)]);
@@ -274,14 +299,14 @@ pub(crate) mod tests {
         let mut grid = grid();
         grid.objects.iter_mut().for_each(|object| object.embeddings = vec![vec![0.999, 0.045]]);
         grid.objects.push(known(4, 0, 0.5, vec![[0.0, 1.0]]));
-        // What the objects show without what lies in them; the last is half of the scene.
+        // Surface of each object without its parts. The last object covers half of the scene.
         for (places, id) in [([0.1, 0.2, 0.1, 0.15, 0.55], 1), ([0.1, 0.1, 0.05, 0.3, 0.55], 3)] {
             grid.shown = places.to_vec();
             assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default())[0], id, "{:?}", grid.shares());
         }
     }
 
-    /// An object of which `cosine` is known, and how like a canonical phrase it is.
+    /// An object with given cosines: for each view, with the text and with a canonical phrase.
     fn known(id: u16, parent: u16, area: f32, cosines: Vec<[f32; 2]>) -> Object {
         let (code, areas, views) = (Vec3::ZERO, vec![area; cosines.len()], cosines.len());
         Object { id, parent, support: 1.0, code, embeddings: cosines.into_iter().map(|c| c.to_vec()).collect(), areas, views }
@@ -296,7 +321,8 @@ pub(crate) mod tests {
                 Grid { objects: [thing(1, 0.2, 0.6), thing(2, 0.01, fragment)].into_iter().chain(others).collect(), ..Grid::default() };
             rank(&grid, &query([1.0, 0.0]))[0].id
         };
-        // A thirteenth of the size (an equal part of the scene, if less) is worth 2.6 of log-odds, some 0.12 of cosine.
+        // A size ratio of 1/13 (limited by the equal share) costs 2.6 in log-odds, about 0.12 in
+        // cosine.
         assert_eq!((first(0.68), first(0.78)), (1, 2));
     }
 
@@ -308,13 +334,13 @@ pub(crate) mod tests {
             for id in 1..=200u16 {
                 let parent = if rng.uniform() < 0.2 { 0 } else { (rng.uniform() * f32::from(id - 1)) as u16 };
                 let around = objects.get(usize::from(parent).wrapping_sub(1)).map_or(0.4, |o| o.areas[0]);
-                // Right for text 1 only, which means any of them.
+                // Only the first object matches the text.
                 let right = if id == 1 { 0.08 } else { 0.0 };
                 let own = 0.20 + right + 0.02 * rng.normal();
                 let cosines = (0..5).map(|_| [own, 0.21 + 0.015 * rng.normal()]).collect();
                 objects.push(known(id, parent, around * rng.range(0.05, 0.6), cosines));
             }
-            // The right one is any of them.
+            // Exchanges it with a random object.
             let place = 1 + (rng.uniform() * 199.0) as usize;
             let (first, other) = (objects[0].embeddings.clone(), objects[place].embeddings.clone());
             (objects[0].embeddings, objects[place].embeddings) = (other, first);
@@ -331,21 +357,23 @@ pub(crate) mod tests {
             cosines += i32::from(best.support == 0.5);
             ours += i32::from(grid.objects[usize::from(rank(&grid, &query)[0].id) - 1].support == 0.5);
         }
-        println!("first by cosine {cosines}, by rank {ours} of {TEXTS}");
-        assert!(ours + TEXTS / 50 >= cosines, "first by cosine {cosines}, by rank {ours} of {TEXTS}");
+        println!("right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}");
+        assert!(ours + TEXTS / 50 >= cosines, "right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}");
     }
 
     #[test]
     fn a_click_means_a_thing_and_not_all_there_is() {
-        // 1 is the whole scene, on which all views agree; 2 a thing in it; 3 a part of that, on which they agree less.
+        // Object 1 is the whole scene, with full support; 2 is an object in it; 3 is a part of 2
+        // with less support.
         let object = |id: u16, parent: u16, support: f32| Object { support, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
         let objects = vec![object(1, 0, 1.0), object(2, 1, 0.9), object(3, 2, 0.7)];
         let grid = Grid { objects, shown: vec![0.0, 0.8, 0.15, 0.05], ..Grid::default() };
         let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels);
         assert_eq!(meant(&[vec![3, 2, 1]]), (vec![3, 2, 1], Some(2)));
-        assert_eq!(meant(&[vec![1]]).1, Some(1), "where there is nothing else");
+        assert_eq!(meant(&[vec![1]]).1, Some(1), "it is the only object there");
         assert_eq!(meant(&[vec![]]), (vec![], None));
-        // What all clicks hit is the part, however many they are; one beside it counts less than two.
+        // If all clicks hit the part, it is the target, however many they are. Two of five clicks
+        // beside it select the object.
         assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1]]).1, Some(3));
         assert_eq!(meant(&vec![vec![3, 2, 1]; 60]).1, Some(3));
         assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1], vec![2, 1], vec![2, 1]]).1, Some(2));
@@ -354,13 +382,13 @@ pub(crate) mod tests {
     #[test]
     fn clicks_on_two_parts_mean_what_holds_both_and_one_may_go_beside() {
         let object = |id: u16, parent: u16| Object { support: 0.8, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
-        // 2 and 3 are parts of 1, which is 0.4 of the scene; 4 is the rest.
+        // Objects 2 and 3 are parts of 1, which covers 0.4 of the scene; 4 is the rest.
         let objects = vec![object(1, 0), object(2, 1), object(3, 1), object(4, 0)];
         let grid = Grid { objects, shown: vec![0.0, 0.1, 0.2, 0.1, 0.6], ..Grid::default() };
         let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels).1;
         assert_eq!(meant(&[vec![2, 1], vec![3, 1]]), Some(1));
         assert_eq!(meant(&[vec![2, 1], vec![2, 1], vec![2, 1], vec![2, 1], vec![]]), Some(2));
-        // Four on one part outweigh one on the other; two do not.
+        // One click on the other part is outweighed by four, but not by two.
         assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![3, 1], vec![3, 1], vec![2, 1]]), Some(3));
         assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![2, 1]]), Some(1));
     }
@@ -390,7 +418,7 @@ pub(crate) mod tests {
             rank(&Grid { objects: vec![object], ..Grid::default() }, &query([1.0, 0.0]))[0].score
         };
         assert!(seen(1) < 0.05, "{}", seen(1));
-        assert!(seen(4) > 0.9, "recognised from most sides: {}", seen(4));
+        assert!(seen(4) > 0.9, "recognised in most views: {}", seen(4));
         let unseen = Object { embeddings: Vec::new(), areas: Vec::new(), ..grid().objects[0].clone() };
         assert_eq!(rank(&Grid { objects: vec![unseen], ..Grid::default() }, &query([1.0, 0.0]))[0].score, 0.0);
     }
@@ -398,7 +426,7 @@ pub(crate) mod tests {
     #[test]
     fn what_was_shown_is_meant_beyond_doubt() {
         let mut grid = grid();
-        // A larger thing that looks nearly the same.
+        // A larger object with nearly the same embedding.
         (grid.objects[2].embeddings, grid.objects[2].areas) = (vec![vec![0.81, 0.586]], vec![0.9]);
         let shown = TextQuery::of_examples(grid.objects[1].embeddings.clone(), Calibration::OFFLINE_PICTURES);
         let ranked = rank(&grid, &shown);
@@ -410,14 +438,14 @@ pub(crate) mod tests {
     fn parts_are_looked_for_inside_their_object() {
         let targets = [Hit { id: 1, score: 0.9 }];
         let ask = |text| part(&grid(), &targets, &query(text), &QueryConfig::default()).map(|found| ids(&found.targets));
-        assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "3 is nearer but lies elsewhere");
+        assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "object 3 has a higher cosine but lies elsewhere");
         assert_eq!(ask([0.0, -1.0]), None, "no such part");
     }
 
     #[test]
     fn several_of_a_kind_are_found_together() {
         let mut grid = grid();
-        // Two things that look alike, within what each varies from view to view.
+        // Two similar objects, whose difference is within the variation between views.
         let alike = |k: usize| -> Vec<Vec<f32>> {
             [0.98f32, 0.999].map(|c| vec![c, (1.0 - c * c).sqrt()]).into_iter().cycle().skip(k).take(2).collect()
         };

@@ -1,31 +1,32 @@
-//! How much an embedding says for a text: LERF's relevancy (paper eq. 4).
+//! Compares embeddings with a query: LERF's relevancy (paper, eq. 4).
 
 use crate::calibration::Calibration;
 
-/// Phrases that stand for "anything".
+/// Canonical phrases (LERF).
 pub const CANONICAL: [&str; 3] = ["object", "stuff", "texture"];
 
-/// Factor on the cosines before the softmax: LERF's code has it, its paper does not.
+/// Factor on cosines before the softmax. It is in LERF's code, not in its paper.
 const TEMPERATURE: f32 = 10.0;
 
-/// What is meant, ready to be compared: its embeddings and those of the canonical phrases.
+/// A query: positive, canonical and negative embeddings, with the calibration of their encoder.
 #[derive(Clone, Debug)]
 pub struct TextQuery {
-    /// Embeddings: one of a text, or those of examples, of which the nearest counts.
+    /// Positive embeddings: one of a text, or those of examples, of which the nearest counts.
     pub meant: Vec<Vec<f32>>,
-    /// Whether they are of things that were shown, and not of words.
+    /// Whether the positive embeddings are from examples instead of a text.
     pub shown: bool,
     /// Embeddings of [`CANONICAL`]; may be empty.
     pub canonical: Vec<Vec<f32>>,
-    /// Embeddings that an object must not be nearer to than to the text.
+    /// Negative embeddings. An object is excluded if it is at least as near to one of them as to
+    /// the query.
     pub negatives: Vec<Vec<f32>>,
-    /// Least cosine that "anything" has.
+    /// Smallest canonical cosine.
     pub anything: f32,
-    /// What the cosines are worth.
+    /// Calibration of the encoder for this kind of query.
     pub calibration: Calibration,
 }
 
-/// In sixteen sums, which the compiler may keep in vectors; one sum would have to be added up in order.
+/// Computes an inner product. Sixteen partial sums let the compiler vectorise it.
 fn dot(a: &[f32], b: &[f32]) -> f32 {
     debug_assert_eq!(a.len(), b.len(), "embeddings of one encoder");
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<16>(), b.as_chunks::<16>());
@@ -37,32 +38,34 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 }
 
 impl TextQuery {
-    /// What is meant by itself: without phrases that stand for "anything", and without negatives.
+    /// Returns a text query without canonical and negative embeddings.
     pub fn new(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
         Self { meant, shown: false, canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration }
     }
 
-    /// What was shown, in the same way.
+    /// Returns a query from examples, without canonical and negative embeddings.
     pub fn of_examples(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
         Self { shown: true, ..Self::new(meant, calibration) }
     }
 
-    /// S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)); 0.5 means as near to "anything" as to the text.
+    /// Returns the relevancy S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)), 0 to 1. At
+    /// 0.5, the text is as near as the canonical phrases.
     pub fn relevancy(&self, embedding: &[f32]) -> f32 {
         1.0 / (1.0 + (TEMPERATURE * (self.canonical(embedding) - self.cosine(embedding))).exp())
     }
 
-    /// The highest cosine of an embedding with what stands for "anything".
+    /// Returns the largest cosine of an embedding with a canonical phrase, at least `anything`.
     pub fn canonical(&self, embedding: &[f32]) -> f32 {
         self.canonical.iter().map(|c| dot(embedding, c)).fold(self.anything, f32::max)
     }
 
-    /// The highest cosine of an embedding with what is not meant.
+    /// Returns the largest cosine of an embedding with a negative; -1 if there is none.
     pub fn negative(&self, embedding: &[f32]) -> f32 {
         self.negatives.iter().map(|n| dot(embedding, n)).fold(-1.0, f32::max)
     }
 
-    /// Cosine of an embedding with what is meant; for encoders that compare examples by more than texts the sum of both cosines.
+    /// Returns the largest inner product of an embedding with a positive one. It is a cosine for
+    /// texts. Between examples, offline embeddings add a weighted cosine of appearance.
     pub fn cosine(&self, embedding: &[f32]) -> f32 {
         self.meant.iter().map(|meant| dot(embedding, meant)).fold(-1.0, f32::max)
     }

@@ -1,9 +1,11 @@
-//! What the photos' masks, which may overlap, hold of every Gaussian, looked up either way.
+//! Observations: blending weights of Gaussians in the atoms of each view's masks, indexed by
+//! Gaussian and by mask.
 
 use fastlgs_core::mask_list::Table;
 use rayon::prelude::*;
 
-/// Sum of blending weights, in pixels, to three digits: the upper half of a 32-bit float. A scene has hundreds of millions of them.
+/// Sum of blending weights in pixels, as the upper half of a 32-bit float (error below 0.4 %). A
+/// scene has hundreds of millions of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Weight(u16);
 
@@ -17,7 +19,7 @@ impl Weight {
     }
 }
 
-/// How much of a Gaussian falls on an atom of a view's masks.
+/// Blending weight of one Gaussian on one atom of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sighting {
     gaussian: u32,
@@ -26,13 +28,13 @@ pub struct Sighting {
 }
 
 impl Sighting {
-    /// `weight`: sum of blending weights, in pixels.
+    /// `weight`: sum of blending weights in pixels.
     pub fn new(gaussian: u32, atom: u16, weight: f32) -> Self {
         Self { gaussian, atom, weight: Weight::new(weight) }
     }
 }
 
-/// The same, as it is kept for the Gaussian.
+/// An observation, as stored for its Gaussian.
 #[derive(Clone, Copy)]
 struct Vote {
     view: u16,
@@ -40,20 +42,20 @@ struct Vote {
     weight: Weight,
 }
 
-/// A mask by its number among those of all views, which follow each other.
+/// Index of a mask among the masks of all views, which are concatenated.
 pub type MaskId = u32;
 
-/// Of a view: the atoms of each mask, and the Gaussians that fall on each atom.
+/// Masks of a view with their atoms, and the Gaussians on each atom.
 struct Held {
-    /// Number of the view's first mask.
+    /// Index of the view's first mask.
     first: MaskId,
-    /// By mask.
+    /// Atoms of each mask.
     atoms: Vec<Vec<u16>>,
-    /// Gaussians, atom by atom.
+    /// Gaussians, sorted by atom.
     gaussians: Vec<u32>,
-    /// Of each, how much of it falls on the atom.
+    /// Blending weight of each of these on its atom.
     weights: Vec<Weight>,
-    /// By atom: where its Gaussians begin; one more at the end.
+    /// For each atom: index of its first Gaussian, with a final end index.
     begin: Vec<usize>,
 }
 
@@ -68,61 +70,62 @@ impl Held {
         Self { first, atoms, gaussians: seen.iter().map(|s| s.gaussian).collect(), weights: seen.iter().map(|s| s.weight).collect(), begin }
     }
 
-    /// Gaussians on an atom, with their pixels there.
+    /// Iterates over the Gaussians on an atom, with their weights in pixels.
     fn of(&self, atom: u16) -> impl Iterator<Item = (u32, f32)> {
         let own = self.begin[usize::from(atom)]..self.begin[usize::from(atom) + 1];
         self.gaussians[own.clone()].iter().copied().zip(self.weights[own].iter().map(|w| w.pixels()))
     }
 }
 
-/// All sightings, by Gaussian and by mask.
+/// All observations, by Gaussian and by mask.
 pub struct Sightings<'a> {
-    /// Gaussian by Gaussian, rising by view.
+    /// Observations sorted by Gaussian, then by view.
     votes: Vec<Vote>,
-    /// By Gaussian: where its votes begin; one more at the end.
+    /// For each Gaussian: index of its first vote, with a final end index.
     begin: Vec<usize>,
     tables: &'a [Table],
     held: Vec<Held>,
-    /// By view: the number of its first atom among those of all views; one more at the end.
+    /// For each view: index of its first atom among the atoms of all views, with a final end index.
     first_atom: Vec<u32>,
-    /// By mask of all views: its pixels, as far as Gaussians show there.
+    /// For each mask of all views: total weight of Gaussians in it, in pixels.
     pub pixels: Vec<f32>,
 }
 
-/// A mask that fits a set of Gaussians.
+/// A mask with its IoU with a set of Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fit {
     /// The mask.
     pub mask: MaskId,
-    /// IoU of both, where the Gaussians show in the mask's view.
+    /// IoU of mask and set in the mask's view, 0 to 1.
     pub iou: f32,
 }
 
-/// What a view shows of a set of Gaussians.
+/// Visibility of a set of Gaussians in a view, with the best mask.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shown {
     /// The view.
     pub view: u32,
-    /// Pixels of the Gaussians there.
+    /// Total weight of the set in the view, in pixels.
     pub pixels: f32,
-    /// The mask that fits them best, if one holds any of them at all.
+    /// Mask with the largest IoU; `None` if no mask overlaps the set.
     pub best: Option<Fit>,
-    /// Whether that one holds most of them, and they most of it.
+    /// Whether mask and set each contain more than half of the other.
     pub mutual: bool,
 }
 
-/// Sums that one search after the other uses; all zero between them.
+/// Accumulators that searches reuse; all zero between searches.
 pub struct Scratch {
     gaussians: Vec<f32>,
     atoms: Vec<f32>,
     masks: Vec<f32>,
 }
 
-/// Fewest pixels with which a view shows a thing, or a mask tells of one.
+/// Smallest weight in pixels for a view to show a set, or for a mask to be used.
 pub const MIN_PIXELS: f32 = 30.0;
 
 impl<'a> Sightings<'a> {
-    /// Those of so many Gaussians, view by view; `tables` are those of all views.
+    /// Indexes the observations of each view. `gaussians`: number of Gaussians; `tables`: mask
+    /// tables of all views.
     pub fn new(gaussians: usize, views: Vec<Vec<Sighting>>, tables: &'a [Table]) -> Self {
         let mut begin = vec![0usize; gaussians + 1];
         views.iter().flatten().for_each(|seen| begin[seen.gaussian as usize + 1] += 1);
@@ -154,28 +157,28 @@ impl<'a> Sightings<'a> {
         Self { votes, begin, tables, held, first_atom, pixels }
     }
 
-    /// Room for [`Self::held_by`] and [`Self::showing`].
+    /// Allocates accumulators for [`Self::held_by`] and [`Self::showing`].
     pub fn scratch(&self) -> Scratch {
         let atoms = self.first_atom.last().map_or(0, |count| *count as usize);
         Scratch { gaussians: vec![0.0; self.gaussians()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
     }
 
-    /// How many Gaussians there are.
+    /// Returns the number of Gaussians.
     pub fn gaussians(&self) -> usize {
         self.begin.len() - 1
     }
 
-    /// Pairs of a Gaussian and an atom that it falls on.
+    /// Returns the number of observations.
     pub fn len(&self) -> usize {
         self.votes.len()
     }
 
-    /// Whether no mask sees anything.
+    /// Returns whether there are no observations.
     pub fn is_empty(&self) -> bool {
         self.votes.is_empty()
     }
 
-    /// Bytes that these pairs take.
+    /// Returns the memory of all observations in bytes.
     pub fn bytes(&self) -> usize {
         self.len() * (size_of::<Vote>() + size_of::<u32>() + size_of::<Weight>())
     }
@@ -184,7 +187,7 @@ impl<'a> Sightings<'a> {
         &self.votes[self.begin[gaussian as usize]..self.begin[gaussian as usize + 1]]
     }
 
-    /// The pixels of a Gaussian in all views.
+    /// Returns the weight of a Gaussian in all views, in pixels.
     pub fn weight(&self, gaussian: u32) -> f32 {
         self.votes_of(gaussian).iter().map(|v| v.weight.pixels()).sum()
     }
@@ -193,7 +196,7 @@ impl<'a> Sightings<'a> {
         self.held.partition_point(|view| view.first <= mask) - 1
     }
 
-    /// Masks that a tracker holds for one thing, by thing.
+    /// Returns the masks of each track, if a tracker provided them.
     pub fn tracks(&self) -> Vec<Vec<MaskId>> {
         let mut tracks = std::collections::BTreeMap::<u32, Vec<MaskId>>::new();
         for (table, held) in self.tables.iter().zip(&self.held) {
@@ -204,7 +207,8 @@ impl<'a> Sightings<'a> {
         tracks.into_values().collect()
     }
 
-    /// The Gaussians most of whose pixels lie in these masks, in the views of the masks; rising.
+    /// Returns the Gaussians with more than half of their weight in `masks`, in ascending order.
+    /// Counts only the views of these masks; expects at most one mask for each view.
     pub fn held_by(&self, masks: impl Iterator<Item = MaskId>, scratch: &mut Scratch) -> Vec<u32> {
         let (mut met, mut asked) = (Vec::new(), vec![false; self.tables.len()]);
         for mask in masks {
@@ -224,12 +228,13 @@ impl<'a> Sightings<'a> {
         met
     }
 
-    /// The masks that show these Gaussians: of each view the one that fits them best, if each holds most of the other.
+    /// Returns the best mask of each view, where mask and set each contain more than half of the
+    /// other.
     pub fn showing(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
         self.shown(set, scratch).into_iter().filter(|shown| shown.mutual).filter_map(|shown| shown.best).collect()
     }
 
-    /// What the views show of these Gaussians, rising by view.
+    /// Returns all views in which the set has at least [`MIN_PIXELS`], in ascending order.
     pub fn shown(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Shown> {
         let mut atoms = Vec::new();
         for vote in set.iter().flat_map(|g| self.votes_of(*g)) {
@@ -260,7 +265,7 @@ impl<'a> Sightings<'a> {
     }
 }
 
-/// Adds to a sum, and notes whose it is when it was none before.
+/// Adds `weight` to `sums[of]`, and appends `of` to `met` if the sum was 0.
 fn add(sums: &mut [f32], of: u32, weight: f32, met: &mut Vec<u32>) {
     let sum = &mut sums[of as usize];
     if *sum == 0.0 {
@@ -269,7 +274,7 @@ fn add(sums: &mut [f32], of: u32, weight: f32, met: &mut Vec<u32>) {
     *sum += weight;
 }
 
-/// Rising, each once: a sum that stayed 0 was noted again.
+/// Sorts and removes duplicates, which occur if a sum stays 0.
 fn listed(mut met: Vec<u32>) -> Vec<u32> {
     met.sort_unstable();
     met.dedup();
@@ -291,7 +296,8 @@ mod tests {
 
     #[test]
     fn masks_hold_gaussians_and_fit_them() {
-        // Ten Gaussians in a row, 40 pixels each in both views: masks of 0..4 and 0..2, and of 0..5.
+        // Ten Gaussians in a row, 40 pixels each in both views. View 0 has masks of 0..4 and 0..2,
+        // view 1 of 0..5.
         let atoms = |ends: &[u32], track: Option<u32>| {
             let mask = |end: &u32| Mask { track, ..Mask::new(Level::Whole, RunLengths::of(10, 1, |x, _| x < *end)) };
             MaskList { masks: ends.iter().map(mask).collect(), ..MaskList::new(10, 1) }.atoms()
@@ -306,11 +312,12 @@ mod tests {
         );
         let mut scratch = sightings.scratch();
         assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
-        assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "half of what shows of 4 is not most of it");
+        assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "exactly half of Gaussian 4 lies in the masks, not more");
         assert_eq!(sightings.showing(&[0, 1, 2, 3], &mut scratch), [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
-        // Of the mask of 0..4 the set holds half, which is not most; of 0..5 three fifths, and that mask three fifths of the set.
+        // The set contains half of mask 0..4, which is not enough. Mask 0..5 and the set share
+        // three of five Gaussians each.
         assert_eq!(sightings.showing(&[2, 3, 4, 5, 6], &mut scratch), [Fit { mask: 2, iou: 3.0 / 7.0 }]);
-        // The masks of 0..4 and 0..5 hold all of it, and it holds a little of them.
+        // Masks 0..4 and 0..5 contain the whole set, but the set contains less than half of them.
         assert_eq!(sightings.showing(&[2], &mut scratch), []);
         assert_eq!(sightings.shown(&[2], &mut scratch).iter().map(|shown| shown.best.is_some()).collect::<Vec<_>>(), [true, true]);
         assert_eq!(sightings.showing(&[8], &mut scratch), []);

@@ -1,19 +1,20 @@
-//! Global mapping, third step: how well the photos' masks fit each elected set.
+//! Global mapping, step 3: IoU of each elected set with the masks of each view.
 
 use crate::consensus::Proposal;
 use crate::sightings::Sightings;
 use rayon::prelude::*;
 
-/// What the views show of a set of Gaussians.
+/// Support of a set of Gaussians by masks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Support {
-    /// Mean IoU of the set with the best mask of each view, weighted by the set's pixels there.
+    /// Mean IoU with the best mask of each view, weighted by the set's pixels there; 0 to 1.
     pub iou: f32,
-    /// (pixels, view) of the views that show it, in [`MIN_PIXELS`](crate::sightings::MIN_PIXELS) at least.
+    /// (pixels, view) of each view that shows at least [`MIN_PIXELS`](crate::sightings::MIN_PIXELS)
+    /// of it.
     pub areas: Vec<(u32, u32)>,
 }
 
-/// Compares every set with the masks of every view.
+/// Computes the support of each set.
 pub fn support(sightings: &Sightings, sets: &[Proposal]) -> Vec<Support> {
     let of = |scratch: &mut _, set: &Proposal| {
         let shown = sightings.shown(&set.set, scratch);

@@ -1,8 +1,12 @@
-//! Lifts labels from pictures onto Gaussians: each takes the label that most of its blending weight falls on, over all views.
-//! The result, a PLY with the labels as object ids, is one that other programs can open.
+//! Lifts label maps onto Gaussians: each Gaussian gets the label with most of its blending weight.
 //!
-//! `cargo run --release -p fastlgs-raster --example lift_labels -- SCENE labelled.ply`, where SCENE is a trained scene folder.
-//! The labels are the object maps of its views; any label maps whose numbers mean the same in all views will do.
+//! The weights are summed over all views. The result is a PLY with the labels as object ids, which
+//! other programs can open.
+//!
+//! `cargo run --release -p fastlgs-raster --example lift_labels -- SCENE labelled.ply`
+//!
+//! SCENE is a trained scene folder, and the labels are the object maps of its views. Any label maps
+//! work if their numbers mean the same objects in all views.
 
 use fastlgs_core::{SceneFolder, ply};
 use fastlgs_raster::{View, lift};
@@ -18,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![BTreeMap::new(); gaussians.len()];
     for camera in &cameras {
-        // One pass over a view tells how much each Gaussian contributes to each label.
+        // The weight that each Gaussian contributes to each label of the view.
         for vote in lift::votes(&gaussians, &View::new(camera, gaussians.len(), 0), &folder.objects(&camera.name)?) {
             *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
         }

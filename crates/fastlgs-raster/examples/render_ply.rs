@@ -1,6 +1,9 @@
-//! Renders a 3DGS scene of any program to a PNG, on the first Vulkan device or, with `cpu`, without one.
+//! Renders a 3DGS scene, written by any program, to a PNG.
 //!
 //! `cargo run --release -p fastlgs-raster --example render_ply -- scene.ply picture.png [DEVICE]`
+//!
+//! DEVICE is `auto` (the default: a hardware adapter, else the CPU), `cpu`, or an adapter by name
+//! or index.
 
 use fastlgs_core::{Camera, image_io, ply};
 use fastlgs_raster::density::State;
@@ -15,7 +18,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     };
     let gaussians = ply::read(Path::new(&scene))?;
 
-    // From outside onto the middle of the scene; files of 3DGS have y pointing down.
+    // The camera looks from outside at the centre of the scene. In 3DGS files, y points down.
     let centre = gaussians.means.iter().sum::<Vec3>() / gaussians.len().max(1) as f32;
     let mut distances: Vec<f32> = gaussians.means.iter().map(|m| m.distance(centre)).collect();
     distances.sort_by(f32::total_cmp);
@@ -27,6 +30,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     engine.set_state(&State::of(&gaussians))?;
     let frame = engine.render(View::new(&camera, gaussians.len(), gaussians.sh_degree), Channels::Color)?;
     image_io::save_png(Path::new(&picture), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
-    println!("{} Gaussians, {} pairs with tiles, on {}: {picture}", gaussians.len(), frame.pairs, engine.name());
+    println!("{} Gaussians and {} (tile, Gaussian) pairs, rendered on {}: {picture}", gaussians.len(), frame.pairs, engine.name());
     Ok(())
 }

@@ -1,5 +1,8 @@
-//! Where a photo was taken, by a scene that stays as it is: Gauss-Newton on the six numbers of a camera, from coarse to fine. Slopes are
-//! differences of seven renders, so that every engine can do it, and a handful of steps is enough where descent needs dozens.
+//! Aligns a camera to a fixed scene by damped Gauss-Newton, from coarse to fine.
+//!
+//! The six parameters are a rotation and a translation. Derivatives are finite differences of seven
+//! renders, so every engine can compute them. A few steps suffice where gradient descent needs
+//! dozens.
 
 use crate::Result;
 use crate::channels::Channels;
@@ -10,16 +13,17 @@ use fastlgs_core::Camera;
 use glam::{Mat4, Quat, Vec3};
 use nalgebra::{SMatrix, SVector};
 
-/// How far the picture moves between the renders that slopes are taken from, in pixels.
+/// Image motion between the renders of a finite difference, in pixels.
 const NUDGE: f32 = 0.25;
-/// Difference of a pixel's channel from which it counts less: things that moved, highlights.
+/// Scale of the robust loss, as a residual of a colour channel (0 to 1). Moved objects and
+/// highlights exceed it and lose weight.
 const SOFT: f32 = 0.1;
-/// Steps at a quarter, half and all of the resolution.
+/// Steps at a quarter, half and full resolution.
 pub const STEPS: [usize; 3] = [4, 2, 2];
-/// Smallest side of a picture that is compared.
+/// Levels whose shorter side has fewer pixels are skipped.
 const SMALL: u32 = 24;
 
-/// A turn and a shift of camera space: q becomes exp(turn) q + shift.
+/// Rotation vector and translation in camera space: q becomes exp(rotation) q + translation.
 type Motion = [f32; 6];
 
 fn moved(camera: &Camera, motion: &Motion) -> Camera {
@@ -28,8 +32,11 @@ fn moved(camera: &Camera, motion: &Motion) -> Camera {
     Camera { world_to_camera: motion * camera.world_to_camera, ..camera.clone() }
 }
 
-/// The camera near `target`'s from which the engine's Gaussians look most like its photo. `frame` makes the frame of a camera, `steps` are
-/// those at a quarter, half and all of the resolution.
+/// Returns `target`'s camera at the nearby pose from which the engine's scene looks most like the
+/// photo.
+///
+/// `frame` makes the view of a camera. `steps` are the steps at a quarter, half and full
+/// resolution. The camera stays unchanged if its view is opaque nowhere.
 ///
 /// # Errors
 /// As [`Engine::render`].
@@ -52,7 +59,7 @@ pub fn align(
         let mut damping = 1e-3;
         let mut render = |camera: &Camera| compared(engine, frame(camera), level, exposure);
         let mut now = render(&camera)?;
-        // What fits coarsely need not fit better in detail.
+        // The pose from the coarser level may fit this level worse than the given pose.
         let given = render(&level.camera)?;
         if cost(&given) < cost(&now) {
             (camera, now) = (level.camera.clone(), given);
@@ -88,11 +95,12 @@ pub fn align(
     Ok(Camera { world_to_camera: pose, ..target.camera.clone() })
 }
 
-/// Moves all cameras alike, so that on average they stay where they were: as a whole a scene may lie anywhere.
+/// Moves all cameras by one rigid motion that restores their mean pose. Photos do not determine
+/// where the scene as a whole lies.
 pub(crate) fn keep_mean(before: &[Camera], after: &mut [Camera]) {
     let n = before.len().max(1) as f32;
     let middle = before.iter().map(Camera::centre).sum::<Vec3>() / n;
-    // What moves the world so that the camera before sees what the camera after does.
+    // Rigid motion M of the world for each camera, with after * M = before.
     let motion = |(before, after): (&Camera, &Camera)| after.world_to_camera.inverse() * before.world_to_camera;
     let (mut turn, mut shift) = (Vec3::ZERO, Vec3::ZERO);
     for motion in before.iter().zip(after.iter()).map(motion) {
@@ -111,7 +119,7 @@ fn cost(residuals: &[f32]) -> f64 {
     residuals.iter().map(|r| f64::from((r / SOFT).powi(2)).ln_1p()).sum()
 }
 
-/// Rendered minus photographed colour of every channel of every pixel; 0 where it does not count.
+/// Returns rendered minus photographed colour, `[channel][pixel]`; 0 at pixels that do not count.
 fn compared(engine: &mut dyn Engine, view: View, target: &Target, exposure: &Exposure) -> Result<Vec<f32>> {
     let frame = engine.render(view, Channels::Color)?;
     let difference = |(c, value, packed): (usize, &f32, &u32)| {
@@ -123,7 +131,8 @@ fn compared(engine: &mut dyn Engine, view: View, target: &Target, exposure: &Exp
     Ok((0..3).flat_map(|c| of_channel(c).into_iter().map(difference).collect::<Vec<_>>()).collect())
 }
 
-/// Median depth of what a view sees; none where it sees nothing.
+/// Returns the median depth of the pixels whose transmittance is below 0.5; `None` if there are
+/// none.
 fn median_depth(engine: &mut dyn Engine, view: View) -> Result<Option<f32>> {
     let frame = engine.render(View { depth_as_feature: 1, ..view }, Channels::Feature)?;
     let solid = frame.channels(3, 4).iter().zip(frame.channels(6, 7)).filter(|(_, t)| **t < 0.5);

@@ -1,62 +1,71 @@
-//! No more Gaussians than the scene needs (`--budget auto`).
+//! Automatic budget: removes Gaussians that the training views hardly need (`--budget auto`).
 //!
-//! The scene grows as far as its gradients ask and the limit allows; once it has grown, Gaussians are removed without which the photos would
-//! hardly change: each is judged by what the training views would gain or lose
-//! without it alone (as weights of a network are in Optimal Brain Damage, LeCun et al. 1990), and those that change least go, as many as together
-//! change no more than a share, `AFFORDABLE`, of the squared error that is left, or fewer where that costs more than `AT_ONCE`. So a scene that shows its photos nearly without error keeps what is faint in
-//! it, and what could only fit the noise of others goes. The rest of the run refines what is left, which takes over what went: together
-//! they cost more at once than one by one, and in the end next to nothing.
+//! The scene first grows up to the limit. Then each Gaussian is scored by how much the training
+//! views would change without it alone, as in Optimal Brain Damage (LeCun et al. 1990); see
+//! `change.rs`. Gaussians are removed in ascending order of their scores, while the sum stays below
+//! `AFFORDABLE` times the squared error of the views. Fewer are removed if the removal costs more
+//! than `AT_ONCE` dB.
+//!
+//! The limit is a share of the error. So an accurate scene keeps faint Gaussians, and an inaccurate
+//! one loses those that could only fit noise. Together, the removed Gaussians cost more than the
+//! sum of their scores. The rest of the run refines the remaining ones, and the final cost is close
+//! to zero.
 
 use serde::{Deserialize, Serialize};
 
-/// How much all that is removed at once may change the training views, one by one, as a share of their squared error.
+/// Largest sum of the scores removed at once, as a share of the squared error of the training
+/// views.
 const AFFORDABLE: f64 = 0.05;
-/// How many dB a removal may cost at once: as much as twice the squared error. Where a scene shows its photos badly nearly all of it would be
-/// affordable, and what each of many hides or holds back adds up to more than each alone.
+/// Largest loss of PSNR right after a removal, in dB: twice the squared error. Where a scene fits
+/// its photos badly, nearly all Gaussians are affordable one by one, but not together.
 const AT_ONCE: f64 = 3.01;
-/// How often the share is halved until nothing goes.
+/// Number of times that the share is halved before nothing is removed.
 const HALVINGS: usize = 9;
-/// Colour keeps the lowest SH degree that loses no more than this on the watched views, in dB.
+/// Largest loss of PSNR on the validation views when the SH degree is lowered, in dB.
 pub const DEGREE_LOSS: f64 = 0.02;
-/// Every so many training views one is watched.
+/// One of this many training views is a validation view.
 pub(crate) const WATCHED: usize = 10;
-/// Where fewer would be left to train on, none is: of 28 views, the three that wait cost the held-out ones 1.7 dB.
+/// With fewer views left to train on, there are no validation views: of 28 views, holding out three
+/// cost 1.7 dB.
 const FEW: usize = 40;
 
-/// Whether training view `index` of `count` is watched and not trained on while the scene grows.
+/// Returns whether training view `index` of `count` is a validation view while the scene grows.
 pub(crate) fn is_watched(index: usize, count: usize) -> bool {
     count >= FEW + count / WATCHED && index % WATCHED == WATCHED / 2
 }
 
-/// What a removal cost, for reports.
+/// A removal of Gaussians and its cost, for reports.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Removal {
-    /// Steps done before it.
+    /// Optimiser steps before it.
     pub iteration: u32,
     /// Gaussians before it.
     pub before: usize,
     /// Gaussians after it.
     pub after: usize,
-    /// PSNR in dB of the watched views before it, or of every tenth where none is watched; none where no pixel counts.
+    /// PSNR in dB before it, on the validation views or, if there are none, on every tenth view;
+    /// `None` if no pixel counts.
     pub psnr_before: Option<f64>,
-    /// The same right after it, before what is left was refined.
+    /// The same right after it, before the remaining Gaussians are refined.
     pub psnr_after: Option<f64>,
 }
 
 impl Removal {
-    /// Whether it cost no more than it may at once, as far as that is known.
+    /// Returns whether it costs at most `AT_ONCE` dB, or the cost is unknown.
     pub(crate) fn is_bearable(&self) -> bool {
         self.psnr_before.zip(self.psnr_after).is_none_or(|(before, after)| before - after <= AT_ONCE)
     }
 }
 
-/// Places of those that may stay where so much squared error is left: the fewest first, in the end all.
+/// Returns candidate sets of Gaussians to keep, by index, in ascending size; the last one is all.
+/// `changes` are the scores.
 pub(crate) fn candidates(changes: &[f32], squared_error: f64) -> impl Iterator<Item = Vec<usize>> {
     let shares = std::iter::successors(Some(AFFORDABLE), |share| Some(0.5 * share)).take(1 + HALVINGS);
     shares.map(move |share| needed(changes, share * squared_error)).chain(std::iter::once_with(|| (0..changes.len()).collect()))
 }
 
-/// Places of those that stay where so much squared error is affordable; all, if none were to.
+/// Returns the indices that remain when the smallest changes are removed, up to the sum
+/// `affordable`. Returns all indices if none would remain.
 fn needed(changes: &[f32], affordable: f64) -> Vec<usize> {
     let mut places: Vec<usize> = (0..changes.len()).collect();
     places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
@@ -95,7 +104,7 @@ mod tests {
         let one = changes.each.clone();
         changes.see(&other, None);
         let both = changes.each;
-        // From one side the small one is hidden; the faint one is seen from both, but hardly.
+        // The first view does not see the small Gaussian. Both views see the faint one, but hardly.
         assert!(one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3], "{one:?} {both:?}");
         let error = f64::from(both[4]);
         assert_eq!(needed(&one, 2.0 * error), [0, 1, 2]);
@@ -109,7 +118,7 @@ mod tests {
         let stay: Vec<usize> = candidates(&changes, 100.0).map(|places| places.len()).collect();
         assert_eq!(stay.len(), 2 + HALVINGS);
         assert!(stay.is_sorted() && stay[0] < stay[1], "{stay:?}");
-        assert_eq!(stay[1 + HALVINGS], 100, "in the end nothing goes");
+        assert_eq!(stay[1 + HALVINGS], 100, "the last candidate keeps all");
         let removal = |psnr_after| Removal { iteration: 1, before: 2, after: 1, psnr_before: Some(20.0), psnr_after };
         let bearable = [Some(17.5), Some(16.5), None].map(|after| removal(after).is_bearable());
         assert_eq!(bearable, [true, false, true]);
@@ -118,8 +127,8 @@ mod tests {
     #[test]
     fn what_goes_adds_up_to_what_is_affordable() {
         assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 1.0), [0, 4]);
-        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "what nobody sees goes in any case");
-        assert_eq!(needed(&[0.3; 5], 1.0), [3, 4], "of equals the first");
-        assert_eq!(needed(&[0.3; 3], 1.0), [0, 1, 2], "where all could go, it is the judgement that is wrong");
+        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "a Gaussian without effect is always removed");
+        assert_eq!(needed(&[0.3; 5], 1.0), [3, 4], "of equal changes, the first are removed");
+        assert_eq!(needed(&[0.3; 3], 1.0), [0, 1, 2], "if all could be removed, all are kept");
     }
 }

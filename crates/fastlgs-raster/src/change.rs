@@ -1,8 +1,9 @@
-//! What photos would miss: how much the pixels of views would change without a Gaussian.
+//! Scores of Gaussians: how much the pixels of views change when one Gaussian is removed.
 //!
-//! Without it alone, a pixel loses the Gaussian's own colour, weighted, and sees more of what lies behind, of which it held back alpha:
-//! d = alpha / (1 - alpha) x (colour behind) - weight x (own colour). The sum of the squares of d is the diagonal of what Optimal Brain Damage
-//! (LeCun et al. 1990) asks of a network's weights.
+//! Without a Gaussian, a pixel loses its weighted colour and shows more of what lies behind it:
+//! d = alpha / (1 - alpha) x (colour behind) - weight x (own colour).
+//! The sum of d^2 corresponds to the diagonal of the Hessian in Optimal Brain Damage
+//! (LeCun et al. 1990).
 
 use crate::engine::{Exposure, TargetImage};
 use crate::native::blend::{self, Blended, Job, Tile};
@@ -11,29 +12,30 @@ use crate::view::View;
 use fastlgs_core::Gaussians;
 use rayon::prelude::*;
 
-/// What views tell of the Gaussians of a scene.
+/// Scores of the Gaussians of a scene, accumulated over views.
 pub struct Changes {
-    /// Values, `[Gaussian][channel]`.
+    /// Trained values, `[Gaussian][channel]`.
     rows: Vec<f32>,
-    /// For each Gaussian the sum of squares of what colour pixels would gain or lose without it.
+    /// For each Gaussian, the sum of squared changes of colour (0 to 1) without it.
     pub each: Vec<f32>,
-    /// Sum of squares of what is between photos and pictures, as they are.
+    /// Sum of squared differences between photos and rendered colours.
     pub error: f64,
 }
 
 impl Changes {
-    /// Of a scene, before any view was seen.
+    /// Starts the scores of a scene, before any view is added.
     pub fn of(scene: &Gaussians) -> Self {
         let rows = native::transposed(&scene.to_channels(), scene.len());
         Self { rows, each: vec![0.0; scene.len()], error: 0.0 }
     }
 
-    /// Sees a view. Of a photo, those pixels are asked that count, as bright as its exposure makes them; without one, all as they are.
+    /// Adds a view. With a photo, only the pixels that count are used, and changes are scaled by
+    /// the gain of the exposure. Without one, all pixels are used as rendered.
     ///
     /// # Panics
     /// If photo and view differ in size.
     pub fn see(&mut self, view: &View, photo: Option<(&TargetImage, Exposure)>) {
-        assert!(photo.is_none_or(|(image, _)| image.size == view.size), "the photo has the view's size");
+        assert!(photo.is_none_or(|(image, _)| image.size == view.size), "the photo must have the view's size");
         let lists = Lists::new(view, &self.rows);
         let of_tile = |changes: &mut Vec<f32>, tile: usize| {
             let job = Job::new(view, tile, &lists);
@@ -54,7 +56,8 @@ impl Changes {
     }
 }
 
-/// How bright each pixel and colour of a tile is in the photo for what is rendered, 0 where it does not count, and the squared error there.
+/// Returns the factor on the changes of each pixel and colour of a tile, and the squared error of
+/// the tile. The factor is the gain of the exposure, or 0 for pixels that do not count.
 fn asked(job: &Job, shown: &Tile, colours: &[Tile; 3], photo: Option<(&TargetImage, Exposure)>) -> ([Tile; 3], f64) {
     let mut brightness = [*shown; 3];
     let Some((image, exposure)) = photo else { return (brightness, 0.0) };
@@ -96,7 +99,7 @@ mod tests {
             let mut changes = Changes::of(&scene);
             changes.see(&view(scene.len()), photo);
             assert!(changes.each.iter().filter(|c| **c > 0.1).count() > 20, "{:?}", changes.each);
-            // [colour][pixel], as frames are.
+            // [colour][pixel], the layout of frames.
             let sum = |of: &dyn Fn(usize, f32, f32) -> f32| -> f32 {
                 let counts = |k: usize| photo.is_none_or(|(image, _)| image.color[k % pixels].to_le_bytes()[3] == 255);
                 let gain = |k: usize| photo.map_or(1.0, |(_, exposure)| exposure.gain[k / pixels]);
@@ -106,13 +109,13 @@ mod tests {
                 let others: Vec<usize> = (0..scene.len()).filter(|k| *k != i).collect();
                 let without = rendered(&scene.select(&others));
                 let square = sum(&|k, gain, with| gain * (with - without[k]));
-                assert!((told - square).abs() <= 1e-3 * square + 1e-4, "Gaussian {i}: {told} told, {square} measured");
+                assert!((told - square).abs() <= 1e-3 * square + 1e-4, "Gaussian {i}: score {told}, measured {square}");
             }
             let error = photo.map_or(0.0, |(image, exposure)| {
                 let wanted = |k: usize| f32::from(image.color[k % pixels].to_le_bytes()[k / pixels]) / 255.0;
                 sum(&|k, gain, with| gain * with + exposure.offset[k / pixels] - wanted(k))
             });
-            assert!((changes.error as f32 - error).abs() <= 1e-4 * error, "{} told, {error} measured", changes.error);
+            assert!((changes.error as f32 - error).abs() <= 1e-4 * error, "error {}, measured {error}", changes.error);
         }
     }
 }

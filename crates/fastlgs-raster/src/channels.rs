@@ -1,35 +1,35 @@
-//! What a step renders and trains.
+//! The channels that a step renders and trains.
 
 /// What a step renders and trains.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
 pub enum Channels {
     /// Geometry and colour.
     Color,
-    /// The feature alone, geometry being frozen.
+    /// The feature only; geometry is frozen.
     Feature,
-    /// Both; the feature does not move geometry.
+    /// Geometry, colour and feature. The feature loss does not move geometry.
     Both,
-    /// Both, and the feature moves geometry too.
+    /// Geometry, colour and feature. The feature loss moves geometry too.
     Coupled,
 }
 
 impl Channels {
-    /// Whether geometry and colour are among them.
+    /// Returns whether geometry and colour are included.
     pub fn color(self) -> bool {
         self != Self::Feature
     }
 
-    /// Whether the feature is among them.
+    /// Returns whether the feature is included.
     pub fn feature(self) -> bool {
         self != Self::Color
     }
 
-    /// Groups of four floats in a gradient slot.
+    /// Returns the number of four-float groups in a gradient slot.
     pub(crate) fn slot(self) -> usize {
         if self.color() { 3 } else { 1 }
     }
 
-    /// Flags of the shaders' permutations.
+    /// Returns the flags of the shader permutation.
     pub(crate) fn flags(self) -> &'static [&'static str] {
         match self {
             Self::Color => &["WITH_COLOR"],

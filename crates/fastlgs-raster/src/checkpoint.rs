@@ -1,4 +1,7 @@
-//! Checkpoints: a JSON header that names a file of tensors, so that either the old or the new one is whole.
+//! Checkpoints: a JSON header that names a file of tensors.
+//!
+//! The header is replaced after the new tensors are written, so a complete checkpoint exists at any
+//! time.
 
 use crate::Result;
 use crate::budget::Removal;
@@ -13,7 +16,7 @@ use glam::Mat4;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Everything of a run that is not a tensor.
+/// The state of a training run, except its tensors.
 #[derive(Clone, Serialize, Deserialize)]
 pub(crate) struct Course {
     pub config: TrainConfig,
@@ -24,17 +27,17 @@ pub(crate) struct Course {
     pub removals: Vec<Removal>,
     pub exposures: Vec<LearnedExposure>,
     pub background: Learned<6>,
-    /// Names and sizes of the training views.
+    /// Names and sizes in pixels of the training views.
     #[serde(default)]
     pub views: Vec<(String, [u32; 2])>,
-    /// Fingerprint of what these views show and of the first Gaussians; 0 in checkpoints of versions that kept none.
+    /// Fingerprint of the target images and the first Gaussians; 0 if unknown.
     #[serde(default)]
     pub shown: u64,
     /// Poses of the training views, world to camera.
     pub poses: Vec<Mat4>,
-    /// What the watched views gained by alignment, in dB, once that was looked at.
+    /// PSNR gain of the validation views by alignment, in dB; `None` until it is measured.
     pub alignment_gain: Option<f64>,
-    /// Whether masks shape the Gaussians by now.
+    /// Whether the feature loss already moves geometry.
     #[serde(default)]
     pub coupled: bool,
 }
@@ -43,7 +46,7 @@ fn tensors_path(path: &Path, iteration: u32) -> PathBuf {
     path.with_extension(format!("{iteration}.safetensors"))
 }
 
-/// Writes `path.json` and the tensors it names; older tensors are then removed.
+/// Writes `path.json` and the tensor file that it names, then removes older tensor files.
 pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -> Result<()> {
     let n = state.len();
     let shape = vec![channels(state.sh_degree), n];
@@ -60,7 +63,7 @@ pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -
     Ok(())
 }
 
-/// The tensor files of a checkpoint: `NAME.ITERATION.safetensors` beside `path`.
+/// Returns the tensor files of a checkpoint: `NAME.ITERATION.safetensors` beside `path`.
 fn tensors_of(path: &Path) -> impl Iterator<Item = PathBuf> {
     let entries = std::fs::read_dir(path.parent().unwrap_or(Path::new("."))).into_iter().flatten().flatten();
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -71,13 +74,13 @@ fn tensors_of(path: &Path) -> impl Iterator<Item = PathBuf> {
     })
 }
 
-/// Removes a checkpoint and nothing else.
+/// Removes the files of a checkpoint and no others.
 pub fn remove(path: &Path) {
     let _ = std::fs::remove_file(path.with_extension("json"));
     tensors_of(path).for_each(|file| drop(std::fs::remove_file(file)));
 }
 
-/// Reads a checkpoint; nothing where there is none.
+/// Reads a checkpoint. Returns `None` if there is none.
 pub(crate) fn load(path: &Path) -> Result<Option<(Course, State, Vec<f32>)>> {
     let header = path.with_extension("json");
     if !header.is_file() {
@@ -88,7 +91,7 @@ pub(crate) fn load(path: &Path) -> Result<Option<(Course, State, Vec<f32>)>> {
     let mut tensors = load_tensors(&tensors_path)?;
     let mut take = |name: &str, rows: usize| {
         let found = tensors.remove(name).filter(|t| t.0 == [rows, course.gaussians]).map(|t| t.1);
-        found.ok_or_else(|| fastlgs_core::Error::format(&tensors_path, format!("tensor '{name}' is missing or misshapen")))
+        found.ok_or_else(|| fastlgs_core::Error::format(&tensors_path, format!("tensor '{name}' is missing or has the wrong shape; delete the checkpoint")))
     };
     let sh_degree = course.config.sh_degree;
     let rows = channels(sh_degree);

@@ -1,5 +1,5 @@
-//! Density control as small named operations on the training state: clone, split, prune and opacity reset of 3DGS
-//! (section 5).
+//! Density control as named operations on the training state: clone, split, prune and opacity reset
+//! (3DGS, section 5).
 
 use fastlgs_core::Gaussians;
 use fastlgs_core::curve::along_curve;
@@ -24,15 +24,17 @@ pub struct State {
 /// Thresholds of 3DGS.
 #[derive(Clone, Copy, Debug)]
 pub struct Config {
-    /// Mean gradient of the projected centre (half-image units) from which a Gaussian is too coarse.
+    /// Mean gradient of the projected centre (in half-image units) above which a Gaussian is cloned
+    /// or split.
     pub gradient: f32,
-    /// Share of the scene extent that separates cloning from splitting.
+    /// Largest scale, as a share of the scene extent, up to which a Gaussian is cloned instead of
+    /// split.
     pub split_scale: f32,
     /// Opacity below which a Gaussian is removed.
     pub min_opacity: f32,
     /// Largest scale, as a share of the scene extent, beyond which a Gaussian is removed.
     pub largest: f32,
-    /// No more Gaussians than this.
+    /// Largest number of Gaussians.
     pub budget: usize,
 }
 
@@ -42,7 +44,7 @@ impl Default for Config {
     }
 }
 
-/// What one round did.
+/// Numbers of Gaussians that one round changed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Copied in place.
@@ -54,19 +56,19 @@ pub struct Counts {
 }
 
 impl State {
-    /// The state of a scene that no optimiser has touched.
+    /// Returns the initial state of a scene, with zero moments.
     pub fn of(scene: &Gaussians) -> Self {
         let params = scene.to_channels();
         let zeros = vec![0.0; params.len()];
         Self { sh_degree: scene.sh_degree, params, moment1: zeros.clone(), moment2: zeros }
     }
 
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     pub fn len(&self) -> usize {
         self.params.len() / channels(self.sh_degree)
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.params.is_empty()
     }
@@ -84,7 +86,8 @@ impl State {
         self.vec3(3, i).max_element().exp()
     }
 
-    /// The state whose Gaussian k is a copy of `sources[k]`; moments of those marked fresh start at zero.
+    /// Returns the state whose Gaussian k is a copy of `sources[k].0`, with zero moments if
+    /// `sources[k].1`.
     fn gathered(&self, sources: &[(usize, bool)]) -> Self {
         let n = self.len();
         let pick = |values: &[f32], keep_fresh: bool| {
@@ -100,20 +103,20 @@ impl State {
         Self { sh_degree: self.sh_degree, params, moment1, moment2 }
     }
 
-    /// Leaves only the Gaussians at `places`.
+    /// Keeps only the Gaussians with the indices `places`, in this order.
     pub fn keep(&mut self, places: &[usize]) {
         let sources: Vec<(usize, bool)> = places.iter().map(|&i| (i, false)).collect();
         *self = self.gathered(&sources);
     }
 
-    /// Puts the Gaussians along a curve through space: neighbours on the device are then neighbours in pictures as well, and what a step asks for
-    /// lies together.
+    /// Sorts the Gaussians along a Morton curve. Neighbours in memory are then mostly neighbours in
+    /// images, so a step reads contiguous memory.
     pub(crate) fn sort_along_curve(&mut self) {
         let means: Vec<Vec3> = (0..self.len()).map(|i| self.vec3(0, i)).collect();
         self.keep(&along_curve(&means));
     }
 
-    /// Removes Gaussians whose mean lies where nothing is; returns how many.
+    /// Removes Gaussians whose mean lies in free space. Returns how many.
     pub(crate) fn remove_in(&mut self, free: impl Fn(Vec3) -> bool + Sync) -> usize {
         let n = self.len();
         let places: Vec<usize> = (0..n).into_par_iter().filter(|&i| !free(self.vec3(0, i))).collect();
@@ -127,7 +130,7 @@ impl State {
         (0..channels(self.sh_degree)).all(|c| self.params[c * self.len() + i].is_finite())
     }
 
-    /// Removes Gaussians with a value that is no finite number; returns how many.
+    /// Removes Gaussians with a value that is not finite. Returns how many.
     pub fn keep_finite(&mut self) -> usize {
         let n = self.len();
         let places: Vec<usize> = (0..n).filter(|&i| self.is_finite(i)).collect();
@@ -137,7 +140,7 @@ impl State {
         n - places.len()
     }
 
-    /// Moves Gaussian `i` to a sample of its own distribution and shrinks it by 1.6.
+    /// Moves Gaussian `i` to a sample of its own distribution and divides its scales by 1.6 (3DGS).
     fn resample(&mut self, i: usize, rng: &mut Rng) {
         let n = self.len();
         let scale = self.vec3(3, i).map(f32::exp);
@@ -151,7 +154,8 @@ impl State {
     }
 }
 
-/// Gaussians whose mean gradient exceeds the threshold, steepest first, at most `room` of them.
+/// Returns the Gaussians whose mean gradient exceeds the threshold, in descending order, at most
+/// `room`. `stats` is `[2][n]`: sums of gradients, then how often each Gaussian was drawn.
 fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
     let n = stats.len() / 2;
     let mean = |i: usize| stats[i] / stats[n + i].max(1.0);
@@ -161,7 +165,8 @@ fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
     found
 }
 
-/// One round: prune the faint, clone small and split large coarse Gaussians within the budget.
+/// Runs one round: prunes faint, too large and non-finite Gaussians, clones small coarse ones and
+/// splits large coarse ones, within the budget.
 pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rng: &mut Rng) -> Counts {
     let n = state.len();
     let keeps =
@@ -193,7 +198,8 @@ pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rn
     counts
 }
 
-/// Lowers every opacity to at most `ceiling` and forgets its momentum (3DGS: floaters must earn their place again).
+/// Lowers every opacity to at most `ceiling` and clears its moments (3DGS). Floaters then stay
+/// faint, because no photo needs them.
 pub fn reset_opacity(state: &mut State, ceiling: f32) {
     let n = state.len();
     for k in 10 * n..11 * n {
@@ -221,7 +227,7 @@ mod tests {
         scene.push_sphere(Vec3::Y, 0.1, 0.001, [0.5; 3]);
         scene.push_sphere(Vec3::Z, 0.1, 0.5, [0.5; 3]);
         let mut s = state(&scene);
-        // Gradient sums, then how often each was drawn.
+        // Gradient sums, then how often each Gaussian was drawn.
         let stats = [1.0, 1.0, 1.0, 0.0, 10.0, 10.0, 10.0, 10.0];
         let counts = refine(&mut s, &stats, 1.0, &Config::default(), &mut Rng::new(1, "test"));
         assert_eq!(counts, Counts { cloned: 1, split: 1, pruned: 1 });

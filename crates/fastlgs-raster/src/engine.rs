@@ -1,4 +1,4 @@
-//! One interface for the GPU and the fast CPU backend.
+//! The interface of both engines: GPU and CPU.
 
 use crate::channels::Channels;
 use crate::cpu::RUN;
@@ -9,20 +9,21 @@ use fastlgs_core::Shares;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// A rendered frame, planar.
+/// A rendered frame in planar layout.
 #[derive(Clone, Debug)]
 pub struct Frame {
     /// Pixels along x.
     pub width: u32,
     /// Pixels along y.
     pub height: u32,
-    /// `[8][h][w]`: r, g, b, f0, f1, f2, transmittance left, pairs walked. Channels that were not asked for are zero.
+    /// `[8][h][w]`: r, g, b, f0, f1, f2, remaining transmittance, number of pairs that the tile
+    /// processed. Channels that were not requested are zero.
     pub data: Vec<f32>,
-    /// (tile, Gaussian) pairs of the frame.
+    /// Number of (tile, Gaussian) pairs of the frame.
     pub pairs: u32,
 }
 
-/// Whether a channel of [`Frame`] is rendered.
+/// Returns whether a channel of [`Frame`] is rendered.
 pub(crate) fn rendered(channels: Channels, channel: usize) -> bool {
     match channel {
         0..3 => channels.color(),
@@ -32,12 +33,13 @@ pub(crate) fn rendered(channels: Channels, channel: usize) -> bool {
 }
 
 impl Frame {
-    /// The frame of a view, all 0.
+    /// Returns a frame of the view's size, filled with 0.
     pub(crate) fn new(view: &View) -> Self {
         Self { width: view.size[0], height: view.size[1], data: vec![0.0; 8 * view.pixels()], pairs: view.pairs }
     }
 
-    /// The frame of a view from rows (of a channel and y) that begin at its left border; only what was rendered is copied.
+    /// Copies the rendered channels of a view into a frame. `row(channel, y)` returns a row from
+    /// the left border on, which may be padded.
     pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32] + Sync) -> Self {
         let (mut frame, w) = (Self::new(view), view.size[0] as usize);
         let planes = frame.data.par_chunks_exact_mut(view.pixels()).enumerate();
@@ -49,36 +51,38 @@ impl Frame {
         frame
     }
 
-    /// Channels `from..to` as one planar slice.
+    /// Returns the channels `from..to` as one planar slice.
     pub fn channels(&self, from: usize, to: usize) -> &[f32] {
         let n = (self.width * self.height) as usize;
         &self.data[from * n..to * n]
     }
 }
 
-/// What a view should look like, in 8 bits a channel.
+/// The image that a view is trained towards, with 8 bits a channel.
 #[derive(Clone, Debug, Default)]
 pub struct TargetImage {
-    /// Pixels along x and y.
+    /// Width and height in pixels.
     pub size: [u32; 2],
     /// [`pack`]ed colours, row by row.
     pub color: Vec<u32>,
-    /// [`pack`]ed features (0 to 1 as 0 to 255), row by row; may be empty where features are not trained.
+    /// [`pack`]ed features (0 to 255 for 0 to 1), row by row; may be empty if features are not
+    /// trained.
     pub feature: Vec<u32>,
 }
 
-/// A pixel of a target; one that does not count is left out of the loss.
+/// Packs a pixel of a target image. The loss ignores pixels that do not count.
 pub fn pack(values: [u8; 3], counts: bool) -> u32 {
     u32::from_le_bytes([values[0], values[1], values[2], if counts { 255 } else { 0 }])
 }
 
 impl TargetImage {
-    /// Bytes of its planes.
+    /// Returns the size of the planes in bytes.
     pub(crate) fn bytes(&self) -> usize {
         4 * (self.color.len() + self.feature.len())
     }
 
-    /// `[2][padded rows][padded columns]`, as it lies on the device; pixels without feature do not count.
+    /// Returns `[2][padded rows][padded columns]`, the layout on the device. Pixels without a
+    /// feature do not count.
     pub(crate) fn padded(&self, view: &View) -> Vec<u32> {
         let mut planes = self.color.clone();
         planes.extend(&self.feature);
@@ -87,12 +91,13 @@ impl TargetImage {
     }
 }
 
-/// Affine exposure of a view for each colour: the photo is compared with gain * rendered + offset.
+/// Affine exposure of a view for each colour channel. The photo is compared with
+/// gain * rendered + offset.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Exposure {
     /// Factors of red, green and blue.
     pub gain: [f32; 3],
-    /// Summands of red, green and blue.
+    /// Offsets of red, green and blue.
     pub offset: [f32; 3],
 }
 
@@ -102,12 +107,12 @@ impl Default for Exposure {
     }
 }
 
-/// What a training step does.
+/// Options of a training step.
 #[derive(Clone, Copy, Debug)]
 pub struct StepOptions {
-    /// What is trained.
+    /// Channels that are rendered and trained.
     pub channels: Channels,
-    /// Share of D-SSIM (the paper's lambda).
+    /// Weight of D-SSIM against L1, 0 to 1 (the paper's lambda).
     pub lambda: f32,
     /// Weight of the feature loss.
     pub feature_weight: f32,
@@ -115,7 +120,7 @@ pub struct StepOptions {
     pub exposure: Exposure,
 }
 
-/// Loss of the last step, and its gradients by what is not stored with the Gaussians.
+/// Losses of a step, and the gradients of parameters that are not stored with the Gaussians.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Losses {
     /// Mean absolute error of colour.
@@ -124,35 +129,36 @@ pub struct Losses {
     pub color_ssim: f64,
     /// Mean absolute error of the feature.
     pub feature_l1: f64,
-    /// By the exposure's gains.
+    /// Gradient with respect to the gains of the exposure.
     pub by_gain: [f64; 3],
-    /// By the exposure's offsets.
+    /// Gradient with respect to the offsets of the exposure.
     pub by_offset: [f64; 3],
-    /// By the background's colour and feature.
+    /// Gradient with respect to the background's colour and feature.
     pub by_background: [f64; 6],
 }
 
-/// Runs the passes.
+/// Renders and trains Gaussians on a device by running all passes.
 pub trait Engine: Send {
-    /// The adapter, for reports.
+    /// Returns the name of the device, for reports.
     fn name(&self) -> String;
-    /// Number of Gaussians.
+    /// Returns the number of Gaussians.
     fn len(&self) -> usize;
-    /// Whether there are no Gaussians.
+    /// Returns whether there are no Gaussians.
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// Replaces trained values and moments; clears the statistics.
+    /// Replaces the trained values and moments, and clears the statistics.
     ///
     /// # Errors
-    /// When they do not fit the device.
+    /// When the state does not fit the device.
     fn set_state(&mut self, state: &State) -> Result<()>;
-    /// Trained values and moments.
+    /// Returns the trained values and moments.
     ///
     /// # Errors
     /// When the device failed.
     fn state(&self) -> Result<State>;
-    /// Statistics `[2][n]` since the last [`Self::set_state`]; `shaders/project_backward.wgsl`.
+    /// Returns the statistics `[2][n]` since the last [`Self::set_state`]: sum of gradient norms,
+    /// and how often each Gaussian was drawn (`shaders/project_backward.wgsl`).
     ///
     /// # Errors
     /// When the device failed.
@@ -162,75 +168,79 @@ pub trait Engine: Send {
     /// # Errors
     /// When the device failed.
     fn set_stats(&mut self, stats: &[f32]) -> Result<()>;
-    /// Gradient of the last step, laid out like the state's values; zero where nothing was trained.
+    /// Returns the gradient of the last step, in the layout of the state's values; zero for
+    /// channels that are not trained.
     ///
     /// # Errors
     /// When the device failed.
     fn gradients(&self) -> Result<Vec<f32>>;
-    /// Keeps a target on the device.
+    /// Stores the target image of view `id` on the device.
     ///
     /// # Errors
-    /// When it does not fit.
+    /// When the image does not fit the device.
     fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()>;
-    /// Keeps it no longer.
+    /// Removes the target image of view `id` from the device.
     fn forget_target(&mut self, id: usize);
     /// Renders a frame; `view.gaussians` must equal [`Self::len`].
     ///
     /// # Errors
-    /// When it does not fit or the device failed.
+    /// When the frame does not fit the device, or the device failed.
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame>;
-    /// Blending weights of a frame summed by the Gaussians' object ids; `view.gaussians` must equal [`Self::len`].
+    /// Sums the blending weights of a frame by object id. `ids` has one id for each Gaussian, and
+    /// `view.gaussians` must equal [`Self::len`].
     ///
     /// # Errors
-    /// As [`Self::render`], and when there is not one id a Gaussian.
+    /// As [`Self::render`], and when the number of ids is wrong.
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares>;
-    /// One training step towards target `id`: forward, loss, backward, Adam. With [`Channels::Feature`] geometry must
-    /// stay as it was since the last [`Self::set_state`].
+    /// Runs one training step towards target `id`: forward, loss, backward, Adam. With
+    /// [`Channels::Feature`], geometry must not have changed since the last [`Self::set_state`].
     ///
     /// # Errors
     /// As [`Self::render`].
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()>;
-    /// Losses of the last step.
+    /// Returns the losses of the last step.
     ///
     /// # Errors
     /// When the device failed.
     fn losses(&self) -> Result<Losses>;
-    /// Bytes that the engine holds for itself now, and of these what Gaussians, moments and key lists take.
+    /// Returns the bytes that the engine holds, by purpose.
     fn memory(&self) -> Memory;
-    /// Starts or stops taking the time of each pass; false where the device cannot.
+    /// Starts or stops measuring the time of each pass. Returns false if the device cannot measure
+    /// it.
     fn set_profiling(&mut self, on: bool) -> bool;
-    /// Seconds of each pass since the last call, while profiling.
+    /// Returns the seconds of each pass since the last call, while profiling.
     ///
     /// # Errors
     /// When the device failed.
     fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>>;
 }
 
-/// Refuses ids that do not belong to the Gaussians of the view.
+/// Checks that view, engine and `ids` have the same number of Gaussians, and more than 0.
 pub(crate) fn check_ids(view: &View, ids: &[u16], n: usize) -> Result<()> {
     if view.gaussians as usize != n || ids.len() != n || n == 0 {
-        let reason = format!("the view was made for {} Gaussians, there are {} ids, the device holds {n}", view.gaussians, ids.len());
+        let reason = format!("the view has {} Gaussians, there are {} object ids, and the engine holds {n} Gaussians; all three must be equal", view.gaussians, ids.len());
         return Err(Error::Invalid(reason));
     }
     Ok(())
 }
 
-/// Bytes that an engine holds.
+/// Bytes that an engine holds, by purpose.
 #[derive(Clone, Copy, Debug, Default, serde::Serialize)]
 pub struct Memory {
     /// Trained values and both moments.
     pub state: u64,
-    /// Key lists: what sorting needs, and the gradient slots of the (tile, Gaussian) pairs.
+    /// Buffers of the sorts, and gradient slots of the (tile, Gaussian) pairs.
     pub lists: u64,
-    /// Everything else for Gaussians: gradients, splats, footprints, counts.
+    /// Other buffers with one item for each Gaussian: gradients, splats, footprints, counts.
     pub gaussians: u64,
-    /// Frames and what the loss needs.
+    /// Frames and buffers of the loss.
     pub frame: u64,
-    /// Targets and cached lists of views.
+    /// Target images and cached tile lists of views.
     pub views: u64,
 }
 
-/// Loss planes of a step: colour channels 0..3 and feature channels 3..6, as far as they are trained.
+/// Returns the planes of a step's loss: the trained channels among colour (0..3) and feature
+/// (3..6).
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
     let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
     let trained = |c: &usize| if *c < 3 { options.channels.color() } else { options.channels.feature() };
@@ -250,7 +260,8 @@ pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
         .collect()
 }
 
-/// Losses from the sums of `shaders/ssim_columns.wgsl` and `shaders/loss_gradient.wgsl`.
+/// Computes the losses from the sums of `shaders/ssim_columns.wgsl` and
+/// `shaders/loss_gradient.wgsl`.
 pub(crate) fn losses_of(view: &View, channels: Channels, ssim: &[f32], sums: &[f32]) -> Losses {
     let per_channel = (view.tiles[1] * view.tiles[0] * RUN as u32) as usize;
     let sum = |sums: &[f32], plane: usize| -> f64 {
@@ -271,7 +282,8 @@ pub(crate) fn losses_of(view: &View, channels: Channels, ssim: &[f32], sums: &[f
     }
 }
 
-/// Bits of the largest tile number and of the one after it, which marks padding.
+/// Returns the number of bits of tile numbers. They include the number of tiles itself, which marks
+/// unused pairs.
 pub(crate) fn tile_bits(view: &View) -> u32 {
     32 - view.tile_count().leading_zeros()
 }

@@ -1,10 +1,10 @@
-//! What is learned beside the Gaussians: exposures of the training views, and the background. A handful of numbers, so the
-//! host does their Adam.
+//! Parameters learned beside the Gaussians: exposures of the training views, and the background.
+//! They are few numbers, so the host runs Adam on them.
 
 use crate::engine::{Exposure, Losses};
 use serde::{Deserialize, Serialize};
 
-/// Some values with both moments of Adam.
+/// Values with both moments of Adam.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Learned<const N: usize> {
     #[serde(with = "array")]
@@ -16,7 +16,7 @@ pub(crate) struct Learned<const N: usize> {
     steps: i32,
 }
 
-/// serde knows arrays only up to fixed lengths, and not by a parameter.
+/// Needed because serde does not implement arrays whose length is a parameter.
 mod array {
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -26,7 +26,7 @@ mod array {
 
     pub fn deserialize<'de, D: Deserializer<'de>, const N: usize>(deserializer: D) -> Result<[f32; N], D::Error> {
         let values = Vec::<f32>::deserialize(deserializer)?;
-        values.try_into().map_err(|v: Vec<f32>| serde::de::Error::invalid_length(v.len(), &"another number of values"))
+        values.try_into().map_err(|v: Vec<f32>| serde::de::Error::invalid_length(v.len(), &"as many values as the array has"))
     }
 }
 
@@ -49,18 +49,18 @@ impl<const N: usize> Learned<N> {
 
 /// Learning rate of the background.
 pub(crate) const BACKGROUND_RATE: f32 = 1e-3;
-/// Learning rates of exposures at the run's begin and end.
+/// Learning rates of exposures at the start and the end of a run.
 const RATES: [f32; 2] = [1e-2, 1e-3];
-/// Gain from which a photo's nearly white pixels are taken for cut off.
+/// Gain above which nearly white pixels of a photo are treated as clipped.
 const BRIGHT: f32 = 1.05;
-/// Values that may have been cut off at white.
+/// 8-bit value from which a pixel may be clipped at white.
 const CLIPPED: u8 = 250;
 
 /// Exposure of one view: logarithms of three gains, and three offsets.
 pub(crate) type LearnedExposure = Learned<6>;
 
 impl LearnedExposure {
-    /// What is known of a photo before training.
+    /// Starts from the brightness of a photo that was measured before training.
     pub fn from_gain(gain: [f32; 3]) -> Self {
         let [a, b, c] = gain.map(f32::ln);
         Self::new([a, b, c, 0.0, 0.0, 0.0])
@@ -71,7 +71,7 @@ impl LearnedExposure {
         Exposure { gain: [a, b, c].map(f32::exp), offset: [d, e, f] }
     }
 
-    /// A step at some share of the run.
+    /// Runs one Adam step; `progress` is the share of the run that is done.
     pub fn learn(&mut self, losses: &Losses, progress: f32) {
         let gain = self.exposure().gain;
         let [a, b, c]: [f64; 3] = std::array::from_fn(|k| losses.by_gain[k] * f64::from(gain[k]));
@@ -80,7 +80,8 @@ impl LearnedExposure {
     }
 }
 
-/// Shifts all exposures so that their mean does nothing: else the scene's brightness and theirs could drift against each other.
+/// Shifts all exposures so that their mean is the identity. Otherwise the brightness of the scene
+/// and of the exposures could drift against each other.
 pub(crate) fn pin_mean(exposures: &mut [LearnedExposure]) {
     for k in 0..6 {
         let mean = exposures.iter().map(|e| e.values[k]).sum::<f32>() / exposures.len().max(1) as f32;
@@ -88,7 +89,8 @@ pub(crate) fn pin_mean(exposures: &mut [LearnedExposure]) {
     }
 }
 
-/// Whether a pixel of a photo that is so many times brighter than the mean was cut off at white: it tells no brightness.
+/// Returns whether a pixel may be clipped at white, in a photo whose channels are `gain` times
+/// brighter than the mean. The true brightness of such a pixel is unknown.
 pub(crate) fn is_clipped(pixel: u32, gain: [f32; 3]) -> bool {
     pixel.to_le_bytes().iter().zip(gain).any(|(value, gain)| gain > BRIGHT && *value >= CLIPPED)
 }

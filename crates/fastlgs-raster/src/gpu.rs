@@ -1,13 +1,14 @@
-//! Adapters, the device, and buffers.
+//! wgpu adapters, the opened device, and its buffers.
 
 use crate::profile::Profile;
 use crate::shape::Shape;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex};
 
-/// Bytes between two uniforms: room for each of them, and a multiple of what every adapter can bind at.
+/// Bytes between two uniforms: enough for each of them, and a multiple of every adapter's offset
+/// alignment.
 pub(crate) const UNIFORM_SLOT: u64 = 512;
-/// Uniforms of one submission.
+/// Largest number of uniforms in one submission.
 pub(crate) const UNIFORM_SLOTS: u64 = 256;
 
 /// An opened device.
@@ -20,17 +21,17 @@ pub struct Gpu {
     pub name: String,
     /// How the kernels divide their work.
     pub shape: Shape,
-    /// Whether it is a software rasteriser.
+    /// Whether it is a software adapter.
     pub software: bool,
     /// Largest storage binding in bytes.
     pub max_binding: u64,
-    /// Times of the passes, where asked for.
+    /// Timestamps of the passes, while profiling.
     pub(crate) profile: Option<Profile>,
     /// Uniforms of the passes of one submission, in slots.
     pub(crate) uniforms: wgpu::Buffer,
-    /// Where the last reading went through.
+    /// Buffer of the last read, kept for the next one.
     staging: Mutex<Option<wgpu::Buffer>>,
-    /// First error that no one caught (out of memory, lost device).
+    /// First uncaught error (out of memory, lost device).
     failure: Arc<Mutex<Option<String>>>,
 }
 
@@ -41,17 +42,18 @@ fn instance() -> wgpu::Instance {
     })
 }
 
-/// Names of the adapters, in the order of their indices.
+/// Returns the names of the adapters, in the order of their indices.
 pub fn adapters() -> Vec<String> {
     let list = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()));
     list.iter().map(|a| a.get_info().name).collect()
 }
 
 impl Gpu {
-    /// Opens `auto` (the first hardware adapter, else any), an adapter by index, or by a part of its name.
+    /// Opens an adapter: `auto` (the first hardware adapter, else the first of all), an index, or a
+    /// part of its name.
     ///
     /// # Errors
-    /// When there is no such adapter; the message lists those there are.
+    /// When there is no such adapter; the message lists the available ones.
     pub fn open(which: &str) -> Result<Self> {
         let mut list = pollster::block_on(instance().enumerate_adapters(wgpu::Backends::all()));
         let names: Vec<String> = list.iter().map(|a| a.get_info().name).collect();
@@ -61,17 +63,17 @@ impl Gpu {
             list.iter().position(hardware).or(if list.is_empty() { None } else { Some(0) })
         } else {
             match which.parse::<usize>() {
-                // "4090" is part of a name, and "1" of too many.
+                // A short number is an index. A long one, such as "4090", is a part of a name.
                 Ok(index) if which.len() < 3 => Some(index).filter(|index| *index < list.len()),
                 _ => names.iter().position(|n| n.to_lowercase().contains(&wanted)),
             }
         };
         let index = found.ok_or_else(|| {
             Error::Adapter(if names.is_empty() {
-                "no Vulkan device found; install a driver (on Debian: mesa-vulkan-drivers) or use --device cpu".to_owned()
+                "no Vulkan, Metal or DirectX device found; install a driver (on Debian: mesa-vulkan-drivers) or select the device 'cpu'".to_owned()
             } else {
                 let listed = names.iter().enumerate().map(|(index, name)| format!("{index} ({name})")).collect::<Vec<_>>();
-                format!("no device '{which}'; there are: {}, and cpu", listed.join(", "))
+                format!("no device '{which}'; available devices: {}, and cpu", listed.join(", "))
             })
         })?;
         Self::from_adapter(&list.swap_remove(index))
@@ -89,7 +91,7 @@ impl Gpu {
             required_limits: wgpu::Limits {
                 max_storage_buffer_binding_size: limits.max_storage_buffer_binding_size,
                 max_buffer_size: limits.max_buffer_size,
-                // What every adapter of WebGPU grants; blend_backward uses them all.
+                // The limit that every WebGPU adapter grants; blend_backward needs all eight.
                 max_storage_buffers_per_shader_stage: 8,
                 ..wgpu::Limits::default()
             },
@@ -107,7 +109,7 @@ impl Gpu {
         let slot = failure.clone();
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
             let reason = match e {
-                wgpu::Error::OutOfMemory { .. } => "it is out of memory; lower --budget, --size or --sh-degree".to_owned(),
+                wgpu::Error::OutOfMemory { .. } => "out of memory; lower the option budget, size or sh_degree".to_owned(),
                 other => other.to_string(),
             };
             slot.lock().expect("no panic while holding the lock").get_or_insert(reason);
@@ -126,16 +128,16 @@ impl Gpu {
         })
     }
 
-    /// An uninitialised storage buffer of `bytes` (at least 16).
+    /// Creates an uninitialised storage buffer of `bytes` (at least 16).
     ///
     /// # Errors
-    /// When it exceeds the adapter's binding limit; `what` names it.
+    /// When it exceeds the adapter's binding limit; `what` names the buffer in the message.
     pub fn storage(&self, what: &str, bytes: u64) -> Result<wgpu::Buffer> {
         let size = bytes.max(16).next_multiple_of(16);
         if size > self.max_binding {
             let mib = |b: u64| b.div_ceil(1 << 20);
             return Err(Error::TooLarge(format!(
-                "{what} needs {} MiB, but '{}' binds at most {} MiB at once; lower --size or --budget",
+                "the buffer for {what} needs {} MiB, but '{}' binds at most {} MiB; lower the option size or budget",
                 mib(size),
                 self.name,
                 mib(self.max_binding)
@@ -149,7 +151,7 @@ impl Gpu {
         }))
     }
 
-    /// A storage buffer with the given content.
+    /// Creates a storage buffer with the given content.
     ///
     /// # Errors
     /// As [`Self::storage`].
@@ -160,12 +162,12 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Starts recording.
+    /// Returns a new command encoder.
     pub fn encoder(&self) -> wgpu::CommandEncoder {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
-    /// Submits what was recorded.
+    /// Submits the recorded commands.
     pub fn submit(&self, encoder: wgpu::CommandEncoder) {
         self.queue.submit([encoder.finish()]);
     }
@@ -178,13 +180,13 @@ impl Gpu {
         self.read_with(buffer, count, <[T]>::to_vec)
     }
 
-    /// The same, handing the values to `take` where the device left them.
+    /// Like `read`, but passes the mapped values to `take` without copying them.
     ///
     /// # Errors
     /// When the device failed since the last call.
     pub fn read_with<T: bytemuck::Pod, R>(&self, buffer: &wgpu::Buffer, count: usize, take: impl FnOnce(&[T]) -> R) -> Result<R> {
         let bytes = ((count * size_of::<T>()) as u64).next_multiple_of(8).min(buffer.size());
-        // Kept between calls: fresh memory costs more than the copy.
+        // Keep the buffer for the next call: allocation costs more than the copy.
         let mut kept = self.staging.lock().expect("no panic while holding the lock");
         let staging = kept.take().filter(|b| b.size() >= bytes).unwrap_or_else(|| {
             self.device.create_buffer(&wgpu::BufferDescriptor {

@@ -1,4 +1,4 @@
-//! First Gaussians: from points, or at worst at random in what the cameras see together, and a backdrop.
+//! The first Gaussians: from points, from random points as a last resort, and as a backdrop.
 
 use crate::Result;
 use crate::floaters::around;
@@ -10,7 +10,8 @@ use glam::{Mat3, Vec2, Vec3};
 use kiddo::{KdTree, SquaredEuclidean};
 use std::collections::BTreeSet;
 
-/// One isotropic Gaussian a point, as wide as the mean distance to its three nearest neighbours (3DGS); of points in one place the first.
+/// Returns one isotropic Gaussian for each point. Its scale is the root mean square distance to the
+/// three nearest neighbours (3DGS). Of points at the same position only the first is used.
 pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     let mut known = BTreeSet::new();
     let points: Vec<&SfmPoint> = points.iter().filter(|p| known.insert(p.position.to_array().map(f32::to_bits))).collect();
@@ -29,14 +30,16 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     scene
 }
 
-/// Pixels that are tried for a random point before one is taken that does not count.
+/// Random pixels that are tried before one is used that does not count.
 const TRIES: usize = 32;
 
-/// `count` points in front of the views, as many of each, coloured as their photos are there, at depths around their distance to the cameras' common
-/// focus: the last resort where nothing else is known.
+/// Returns `count` random points in front of the views, the same number for each view.
+///
+/// They have the colours of the photos. Their depths are 0.3 to 2 times the distance between the
+/// camera and the common focus of all cameras. This is the last resort if no points are known.
 ///
 /// # Errors
-/// When a picture cannot be read.
+/// When a photo cannot be read.
 pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec<SfmPoint>> {
     let focus = common_focus(&views.cameras);
     let mut out = Vec::with_capacity(count);
@@ -66,23 +69,27 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
     Ok(out)
 }
 
-/// Cells of a backdrop along the longer side of a photo.
+/// Cells of the backdrop along the longer side of a photo.
 const CELLS: u32 = 30;
-/// Share of the points that may lie beyond a backdrop.
+/// Share of the points that may lie outside the backdrop.
 const BEYOND: f32 = 0.02;
-/// How many times as far from the focus as the farthest camera it is at least: no camera that looks outwards has it before its lens.
+/// Smallest radius of the backdrop, in multiples of the largest distance between a camera and the
+/// focus. It keeps the backdrop away from cameras that look outwards.
 const ROOM: f32 = 2.0;
-/// Opacity of a backdrop: what is solid leaves training nothing to explain.
+/// Opacity of the backdrop: nearly opaque, so that training adds nothing to explain the same
+/// pixels.
 const SOLID: f32 = 0.9;
 
-/// A backdrop for few photos: at most `most` solid Gaussians on a sphere around the cameras' common focus that holds all cameras and all but a few of
-/// `points`, coloured as photos are wherever these show no point nearby.
+/// Returns a backdrop for few photos: at most `most` nearly opaque Gaussians on a sphere.
 ///
-/// What few photos show can stand anywhere along their rays, and training makes a haze in mid-air of what it finds nothing for, which hides the scene from
-/// other places. Behind everything it hides nothing.
+/// The sphere surrounds the common focus, all cameras, and all but a few of `points`. Its Gaussians
+/// have the colours of the photos. They cover the parts of the photos that show no point nearby.
+///
+/// Few photos do not determine the depth of these parts. Without a backdrop, training explains them
+/// by a haze that hides the scene from other views.
 ///
 /// # Errors
-/// When a picture cannot be read.
+/// When a photo cannot be read.
 pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gaussians> {
     let focus = common_focus(&views.cameras);
     let mut distances: Vec<f32> = points.iter().map(|point| point.position.distance(focus)).collect();
@@ -95,7 +102,7 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
         let cells = camera.shrunk_to(CELLS);
         let [width, height] = [cells.width, cells.height].map(|side| side as usize);
         let mut known = vec![false; width * height];
-        // What earlier photos added counts, too.
+        // Include the Gaussians that earlier photos added.
         let shown = points.iter().map(|point| point.position).chain(scene.means.iter().copied());
         for (cell, _) in shown.filter_map(|place| cells.see(place)) {
             around(&cells, cell, 1).for_each(|at| known[at] = true);
@@ -105,12 +112,12 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
         for cell in (0..width * height).filter(|cell| !known[*cell]) {
             let middle = Vec2::new((cell % width) as f32 + 0.5, (cell / width) as f32 + 0.5);
             let ray = turn * cells.ray(middle).normalize();
-            // Where the ray leaves the sphere.
+            // Distance to the point where the ray leaves the sphere.
             let towards = from.dot(ray);
             let way = (towards * towards + radius * radius - from.length_squared()).max(0.0).sqrt() - towards;
             let [x, y] = [middle.x * camera.width as f32 / cells.width as f32, middle.y * camera.height as f32 / cells.height as f32];
             let [r, g, b, counts] = image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
-            // Where all cameras stand in one place and no points are known there is no sphere.
+            // The radius is 0 if all cameras stand in one place and no points are known.
             if counts == 255 && way > 0.0 {
                 scene.push_sphere(camera.centre() + way * ray, way / cells.fx, SOLID, [r, g, b].map(|c| f32::from(c) / 255.0));
             }
@@ -120,7 +127,8 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
     Ok(scene.select(&kept))
 }
 
-/// The point nearest to all viewing axes (least squares).
+/// Returns the point nearest to all optical axes (least squares). For parallel axes, returns a
+/// point in front of the mean position.
 pub fn common_focus(cameras: &[Camera]) -> Vec3 {
     let (mut a, mut b) = (Mat3::ZERO, Vec3::ZERO);
     for camera in cameras {
@@ -158,7 +166,7 @@ mod tests {
         assert!((common_focus(&cameras) - target).length() < 1e-3);
     }
 
-    /// Four photos of what lies around the origin, of nearly one colour, but for their blackened right third.
+    /// Four photos from around the origin, each of one colour. Their right third does not count.
     fn photos() -> Targets {
         let eyes = [Vec3::X, Vec3::Z, -Vec3::X, -Vec3::Z].map(|eye| 4.0 * eye);
         let target = |(k, eye): (usize, &Vec3)| {
@@ -172,7 +180,7 @@ mod tests {
     #[test]
     fn a_backdrop_stands_behind_all_where_photos_show_no_points() {
         let views = photos();
-        // A ball of radius 1, and one point that is far away and wrong.
+        // A ball of radius 1, and one wrong point far away.
         let mut points: Vec<SfmPoint> = (0..200)
             .map(|k| {
                 let (up, around) = (k as f32 / 100.0 - 1.0, 2.4 * k as f32);
@@ -184,15 +192,15 @@ mod tests {
         let scene = backdrop(&views, &points, usize::MAX).unwrap();
         assert!(scene.len() > 500, "{} Gaussians", scene.len());
         for (mean, color) in scene.means.iter().zip(&scene.sh_dc) {
-            assert!((mean.length() - 8.0).abs() < 1e-3, "on the sphere that holds cameras, with room, and points: {mean}");
+            assert!((mean.length() - 8.0).abs() < 1e-3, "on the sphere around cameras and points: {mean}");
             let shown = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
             assert!((50.0..54.0).contains(&shown[0]) && shown[1..] == [100.0, 200.0], "{shown:?}");
         }
         let first = &views.cameras[0].shrunk_to(CELLS);
         let shown: Vec<usize> = scene.means.iter().filter_map(|mean| first.see(*mean)).map(|(cell, _)| cell).collect();
-        assert!(shown.iter().all(|cell| cell % first.width as usize != 15 || cell / first.width as usize != 10), "the ball is known");
+        assert!(shown.iter().all(|cell| cell % first.width as usize != 15 || cell / first.width as usize != 10), "no Gaussian covers the ball");
         let own = 20 * 20 - shown.iter().filter(|cell| *cell % 30 < 20).count();
-        assert!(own < 200, "all else that counts is covered: {own} cells are not");
+        assert!(own < 200, "all other cells that count are covered, except {own}");
         assert!(backdrop(&views, &points, 40).unwrap().len() == 40);
         assert!(backdrop(&views, &[], usize::MAX).unwrap().len() > scene.len(), "no points are needed");
         assert_eq!(backdrop(&views, &points, 0).unwrap().len(), 0);

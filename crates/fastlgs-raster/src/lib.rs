@@ -1,11 +1,15 @@
-//! Gaussian splatting on wgpu: one WGSL file a pass in `shaders/`, one CPU twin of the same name in [`cpu`], and the
-//! trainer on top. The way of a frame:
+//! Rendering and training of Gaussians on wgpu, with a CPU twin of every pass.
 //!
-//! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles -> `tile_ranges` ->
-//! `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`, `ssim_columns`, `ssim_backward_rows`,
-//! `loss_gradient` -> `blend_backward` -> `project_backward` -> `adam`.
+//! Each pass is one WGSL file in `shaders/` and has a twin of the same name in [`cpu`]. The passes
+//! of a frame run in this order:
 //!
-//! [`Engine`] hides whether the passes run on a GPU ([`GpuEngine`]) or as vectorised Rust ([`CpuEngine`]).
+//! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles ->
+//! `tile_ranges` -> `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`,
+//! `ssim_columns`, `ssim_backward_rows`, `loss_gradient` -> `blend_backward` -> `fold_slots` ->
+//! `project_backward` -> `adam`.
+//!
+//! [`Engine`] is the common interface of [`GpuEngine`] and of [`CpuEngine`], which runs vectorised
+//! Rust.
 
 pub mod align;
 pub mod budget;
@@ -52,24 +56,24 @@ pub use view::{Rates, Step, View};
 /// Errors of the rasteriser.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// No adapter, or none of that name.
+    /// There is no adapter, or none with this name.
     #[error("{0}")]
     Adapter(String),
-    /// The scene or picture does not fit the adapter.
+    /// The scene or the image does not fit the adapter.
     #[error("{0}")]
     TooLarge(String),
-    /// The device failed in the middle of the work.
+    /// The device failed during the work.
     #[error("the device '{device}' failed: {reason}")]
     Device {
         /// Adapter name.
         device: String,
-        /// What wgpu said.
+        /// Message of wgpu.
         reason: String,
     },
     /// Input that cannot be trained or rendered.
     #[error("{0}")]
     Invalid(String),
-    /// A picture that is trained towards cannot be read.
+    /// A photo or another training image cannot be read.
     #[error(transparent)]
     Picture(Box<dyn std::error::Error + Send + Sync>),
     /// Reading or writing a checkpoint failed.

@@ -1,4 +1,6 @@
-//! Lifting: what the Gaussians see of label maps, in one pass over the views instead of thousands of gradient steps.
+//! Lifting: sums the blending weights of Gaussians by the labels of label maps.
+//!
+//! This takes one pass over the views instead of thousands of gradient steps.
 
 use crate::native::blend::{self, Job, Tile};
 use crate::native::{self, Lists};
@@ -6,27 +8,27 @@ use crate::view::{TILE, View};
 use fastlgs_core::{Gaussians, LabelMap};
 use rayon::prelude::*;
 
-/// How much one Gaussian contributes to the pixels of one label of one view: the sum of its blending weights
-/// w = alpha * transmittance, in pixels.
+/// Contribution of one Gaussian to one label of one view: the sum of its blending weights
+/// w = alpha * transmittance over the pixels of the label.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Vote {
     /// Index of the Gaussian.
     pub gaussian: u32,
-    /// Label; 0 is what no mask covers.
+    /// Label; 0 means pixels that no mask covers.
     pub label: u16,
     /// Sum of blending weights.
     pub weight: f32,
 }
 
-/// Votes below this are dust that only costs memory.
+/// Votes with less weight are dropped to save memory.
 const MIN_WEIGHT: f32 = 0.02;
 
-/// Votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
+/// Returns the votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
 ///
 /// # Panics
 /// If map and view differ in size.
 pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
-    assert_eq!(view.size, [labels.width, labels.height], "the label map has the view's size");
+    assert_eq!(view.size, [labels.width, labels.height], "the label map must have the view's size");
     let view = View { sh_degree: 0, ..*view };
     let lists = lists_of(scene, &view);
     let of_tile = |sums: &mut Vec<f32>, tile: usize| {
@@ -40,7 +42,7 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
     };
     let tiles: Vec<Vec<Vote>> = (0..view.tile_count() as usize).into_par_iter().map_init(Vec::new, of_tile).collect();
     let mut all = tiles.concat();
-    // A stable sort keeps the tiles' order, so that sums are the same in every run.
+    // A stable sort keeps the order of the tiles, so the sums are the same in every run.
     all.par_sort_by_key(|v| (v.gaussian, v.label));
     all.dedup_by(|next, kept| {
         let same = (next.gaussian, next.label) == (kept.gaussian, kept.label);
@@ -51,7 +53,8 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
     all
 }
 
-/// The labels that a tile's pixels have, and where each of them lies. Pixels of the padding repeat the border.
+/// Returns the labels of a tile's pixels, and a mask of each (1 inside). Padding pixels repeat the
+/// border.
 fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
     let (mut names, mut masks): (Vec<u16>, Vec<Tile>) = Default::default();
     for p in 0..blend::EMPTY.len() {
@@ -67,7 +70,7 @@ fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
     (names, masks)
 }
 
-/// Tile lists of a view; what depends on the viewing direction is left out.
+/// Returns the tile lists of a view.
 fn lists_of(scene: &Gaussians, view: &View) -> Lists {
     Lists::new(view, &native::transposed(&scene.to_channels(), scene.len()))
 }
@@ -89,6 +92,6 @@ mod tests {
         let votes = votes(&scene, &View::new(&camera, 2, 0), &labels);
         let of = |g: u32, l: u16| votes.iter().find(|v| (v.gaussian, v.label) == (g, l)).map_or(0.0, |v| v.weight);
         assert!((of(0, 1) - of(0, 2)).abs() < 0.01 * of(0, 1), "the border cuts it in halves");
-        assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden one has little to say");
+        assert!(of(0, 1) > 4.0 * of(1, 1), "the hidden Gaussian has little weight");
     }
 }

@@ -1,4 +1,4 @@
-//! A compute pass made from an assembled shader, and the recording of passes one after the other.
+//! Compute passes made from assembled shaders, and a recorder that runs them in order.
 
 use crate::channels::Channels;
 use crate::gpu::{Gpu, UNIFORM_SLOT, UNIFORM_SLOTS};
@@ -6,7 +6,8 @@ use crate::shader::{Binding, Kernel, Shader};
 use crate::{Result, cpu};
 use std::marker::PhantomData;
 
-/// A pipeline with an explicit layout (an automatic one drops bindings that a permutation does not use).
+/// A compute pipeline with an explicit layout. An automatic layout would drop bindings that a
+/// permutation does not use.
 pub struct Pass {
     shader: &'static Shader,
     channels: Channels,
@@ -14,20 +15,20 @@ pub struct Pass {
     layout: wgpu::BindGroupLayout,
 }
 
-/// A [`Pass`] that knows what it must be given.
+/// A [`Pass`] with typed uniform and buffers.
 pub struct Typed<K: Kernel> {
     pass: Pass,
     kernel: PhantomData<K>,
 }
 
 impl<K: Kernel> Typed<K> {
-    /// As [`Pass::new`].
+    /// Compiles the pass as [`Pass::new`] does.
     pub fn new(gpu: &Gpu, channels: Channels, harmonics: bool) -> Self {
         Self { pass: Pass::new(gpu, K::SHADER, channels, harmonics), kernel: PhantomData }
     }
 }
 
-/// Workgroups of a dispatch: any number of them in one line, for each z.
+/// Workgroups of a dispatch: any number in one dimension, for each z.
 #[derive(Clone, Copy)]
 pub(crate) struct Groups {
     pub flat: u32,
@@ -40,13 +41,15 @@ impl From<u32> for Groups {
     }
 }
 
-/// Records passes one after the other. The first `on_cpu` of them run as their twins instead, which finds a wrong one.
+/// Records passes in order. The first `on_cpu` of them run as their CPU twins instead, to find a
+/// faulty pass.
 pub(crate) struct Recorder<'a> {
     gpu: &'a Gpu,
     encoder: wgpu::CommandEncoder,
-    /// The compute pass that goes on: beginning one for each of our passes costs more than recording it.
+    /// The current compute pass. All passes share it, because beginning a compute pass costs more
+    /// than recording one of ours.
     open: Option<wgpu::ComputePass<'static>>,
-    /// What the recorded passes find in [`Gpu::uniforms`]: written at once, when they are submitted.
+    /// Content of [`Gpu::uniforms`], written once when the passes are submitted.
     uniforms: Vec<u8>,
     on_cpu: usize,
 }
@@ -56,7 +59,7 @@ impl<'a> Recorder<'a> {
         Self { gpu, encoder: gpu.encoder(), open: None, uniforms: Vec::new(), on_cpu }
     }
 
-    /// One pass over its uniform and storage buffers.
+    /// Runs one pass with its uniform and storage buffers.
     pub fn run<K: Kernel>(
         &mut self,
         pass: &Typed<K>,
@@ -74,7 +77,7 @@ impl<'a> Recorder<'a> {
         Ok(())
     }
 
-    /// The same for a pass that does not know its buffers.
+    /// Records a pass whose storage buffers are untyped and in the order of their bindings.
     pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: Groups) {
         if groups.flat == 0 {
             return;
@@ -87,7 +90,7 @@ impl<'a> Recorder<'a> {
         self.uniforms.resize(place + UNIFORM_SLOT as usize, 0);
         let size = std::num::NonZeroU64::new(uniform.len() as u64);
         let uniform = wgpu::BufferBinding { buffer: &self.gpu.uniforms, offset: place as u64, size };
-        // Times are taken at the ends of compute passes, so that each needs its own.
+        // Timestamps are written at the ends of compute passes, so each pass needs its own.
         let timestamp_writes = self.gpu.profile.as_ref().and_then(|p| p.next(pass.shader.name));
         if self.gpu.profile.is_some() {
             self.open = None;
@@ -118,7 +121,7 @@ impl<'a> Recorder<'a> {
         self.encoder.clear_buffer(buffer, 0, None);
     }
 
-    /// Copies the start of one buffer.
+    /// Copies the start of one buffer to another, up to the smaller size.
     pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
         self.open = None;
         self.encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size().min(from.size()));
@@ -126,27 +129,29 @@ impl<'a> Recorder<'a> {
 
     fn flush(&mut self) {
         self.open = None;
-        // The queue writes before what is submitted next, and after what was submitted before.
+        // This write takes effect before the submission below and after all earlier ones.
         self.gpu.queue.write_buffer(&self.gpu.uniforms, 0, &self.uniforms);
         self.uniforms.clear();
         self.gpu.submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
     }
 
-    /// Submits what was recorded; returns how many passes may still run on the CPU.
+    /// Submits the recorded passes. Returns how many further passes may run on the CPU.
     pub fn submit(mut self) -> usize {
         self.flush();
         self.on_cpu
     }
 }
 
-/// Largest number of workgroups along one dimension that every adapter grants.
+/// Largest number of workgroups in one dimension that every adapter grants.
 const MAX_GROUPS: u32 = 65_535;
 
 impl Pass {
-    /// Compiles the permutation for the device's shape and for `channels`, with colour that depends on the view or not.
+    /// Compiles the permutation for the device's shape and for `channels`, with view-dependent
+    /// colour if `harmonics`.
     pub fn new(gpu: &Gpu, shader: &'static Shader, channels: Channels, harmonics: bool) -> Self {
         let wanted = |flag: &&str| gpu.shape.flag() == Some(*flag) || channels.flags().contains(flag) || (harmonics && *flag == "WITH_SH");
-        // Of the permutations all of whose flags are wanted, the one with most: it leaves out only what the pass ignores.
+        // Of the permutations with only wanted flags, take the one with most flags. It lacks only
+        // flags that the pass does not use.
         let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(&wanted));
         let source = fitting.max_by_key(|(flags, _)| flags.len()).expect("a permutation for every choice").1;
         let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -190,7 +195,7 @@ impl Pass {
         Self { shader, channels, pipeline, layout }
     }
 
-    /// Records one dispatch of `groups` workgroups, split over y above the limit.
+    /// Records one dispatch of `groups` workgroups. Above the limit, they are split over y.
     fn record(
         &self,
         gpu: &Gpu,

@@ -1,10 +1,10 @@
-//! Time of each pass on the device, by timestamp queries.
+//! Measures the time of each pass on the device with timestamp queries.
 
 use crate::{Gpu, Result};
 use std::collections::BTreeMap;
 use std::sync::Mutex;
 
-/// Dispatches between two readings; wgpu allows 4,096 queries a set.
+/// Largest number of dispatches between two readings; wgpu allows 4,096 queries in a set.
 const CAPACITY: usize = 2048;
 
 /// Two timestamps for each dispatch since the last reading.
@@ -15,7 +15,7 @@ pub(crate) struct Profile {
 }
 
 impl Profile {
-    /// Nothing where the device has no timestamps.
+    /// Returns `None` if the device has no timestamps.
     pub fn new(gpu: &Gpu) -> Option<Self> {
         if !gpu.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
             return None;
@@ -34,7 +34,7 @@ impl Profile {
         Some(Self { queries, resolved, names: Mutex::default() })
     }
 
-    /// Where the next dispatch writes its times; nothing once the set is full.
+    /// Returns where the next dispatch writes its times; `None` if the set is full.
     pub fn next(&self, name: &'static str) -> Option<wgpu::ComputePassTimestampWrites<'_>> {
         let mut names = self.names.lock().expect("no panic while holding the lock");
         if names.len() == CAPACITY {
@@ -49,7 +49,7 @@ impl Profile {
         })
     }
 
-    /// Seconds of each pass since the last call.
+    /// Returns the seconds of each pass since the last call.
     pub fn take(&self, gpu: &Gpu) -> Result<BTreeMap<&'static str, f64>> {
         let names = std::mem::take(&mut *self.names.lock().expect("no panic while holding the lock"));
         let mut seconds = BTreeMap::new();

@@ -1,21 +1,21 @@
-//! What changes in the course of a training run: learning rates, colour degree, resolution, density control.
+//! The schedule of a training run: learning rates, SH degree, resolution and density control.
 
 use crate::floaters::FEW_VIEWS;
 use crate::view::Rates;
 use fastlgs_core::gaussians::BASE_CHANNELS;
 use serde::{Deserialize, Serialize};
 
-/// How many Gaussians there may be.
+/// Largest number of Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Budget {
-    /// Growth up to this number, and then as many as the training views would miss; see `budget.rs`.
+    /// Growth up to this number, then removal of unimportant Gaussians; see `budget.rs`.
     Auto(usize),
-    /// Growth up to this number; nothing is removed for being unimportant.
+    /// Growth up to this number, without later removal.
     Fixed(usize),
 }
 
 impl Budget {
-    /// The most Gaussians there may be.
+    /// Returns the largest number of Gaussians.
     pub fn most(self) -> usize {
         match self {
             Self::Auto(n) | Self::Fixed(n) => n,
@@ -23,51 +23,52 @@ impl Budget {
     }
 }
 
-/// Whether cameras are moved to where the scene says that they were.
+/// Whether training aligns the cameras to the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Alignment {
-    /// No.
+    /// The cameras stay as they are.
     Off,
-    /// Where views that are not trained on show that it pays.
+    /// The cameras are aligned if the validation views gain from it.
     Auto,
-    /// Yes.
+    /// The cameras are aligned.
     On,
 }
 
-/// What a training run needs to know; part of every checkpoint.
+/// Configuration of a training run; part of every checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TrainConfig {
     /// Optimiser steps.
     pub iterations: u32,
     /// Seed of view order, splitting and left-out Gaussians.
     pub seed: u64,
-    /// How many Gaussians there may be.
+    /// Largest number of Gaussians, and whether unimportant ones are removed.
     pub budget: Budget,
-    /// What is trained.
+    /// Channels that are trained.
     pub channels: crate::Channels,
-    /// Highest SH degree of colour; it grows step by step.
+    /// Highest SH degree of colour; the degree rises during training.
     pub sh_degree: u32,
-    /// SH degree at the start: that of a scene that was trained before, else 0.
+    /// SH degree at the start: that of the first Gaussians if they were already trained, else 0.
     pub first_degree: u32,
-    /// Share of D-SSIM in both losses (the paper's lambda).
+    /// Weight of D-SSIM against L1 in both losses, 0 to 1 (the paper's lambda).
     pub lambda: f32,
     /// Weight of the feature loss.
     pub feature_weight: f32,
-    /// Share of the iterations after which the scene no longer grows.
+    /// Share of the iterations after which growth ends.
     pub refine_until: f32,
-    /// Share of the iterations done at half the resolution.
+    /// Share of the iterations, from the start, that run at half the resolution.
     pub coarse_until: f32,
-    /// 2-D Mip filter: opacity is lowered by what the dilation of small Gaussians adds.
+    /// 2-D Mip filter: lowers opacity to compensate for the dilation of small Gaussians.
     pub antialias: bool,
-    /// Colour behind everything.
+    /// Background colour.
     pub background: [f32; 3],
-    /// Learn that colour.
+    /// Whether the background colour is learned.
     pub learn_background: bool,
-    /// Learn an affine exposure for each training view.
+    /// Whether an affine exposure is learned for each training view.
     pub exposure: bool,
-    /// Move the cameras of the training views.
+    /// Whether the cameras of the training views are aligned.
     pub alignment: Alignment,
-    /// Steps after which the caller has masks shape the Gaussians ([`Trainer::couple`](crate::Trainer::couple)).
+    /// Step after which the caller lets masks shape the Gaussians
+    /// ([`Trainer::couple`](crate::Trainer::couple)).
     #[serde(default)]
     pub couples_at: Option<u32>,
 }
@@ -97,25 +98,31 @@ impl Default for TrainConfig {
 
 /// Share of the iterations after which density control begins.
 const REFINE_FROM: f32 = 0.05;
-/// Rounds of density control that a run has room for, as far as the steps between two of them allow.
+/// Target number of rounds of density control in a run, within the limits of `BETWEEN_ROUNDS`.
 const ROUNDS: u32 = 16;
-/// Fewest and most steps between two rounds: fewer tell little about gradients, more waste a long run.
+/// Fewest and most steps between two rounds. Fewer steps measure gradients badly, more waste a long
+/// run.
 const BETWEEN_ROUNDS: [u32; 2] = [25, 100];
 /// Steps between opacity resets (3DGS).
 const RESET_EVERY: u32 = 3000;
-/// Shares of the iterations after the end of growth at which unimportant Gaussians are removed under an automatic budget.
+/// Shares of the iterations, from the end of growth on, at which an automatic budget removes
+/// unimportant Gaussians.
 const PRUNE_AFTER: [f32; 2] = [0.05, 0.25];
-/// Shares of the iterations after which cameras are aligned: once shapes stand, and so that what is left can follow.
+/// Shares of the iterations at which cameras are aligned: after shapes have formed, and early
+/// enough for the scene to adapt.
 const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
-/// What a mean opacity of 1 costs in standard deviations of the photos' brightness: the loss is a difference of brightness, and
-/// a fixed price that suits bright photos takes from dark ones what they show. It stands for opacity resets, from which runs of a few thousand steps
-/// would not recover, and ends with the first removal: what no photo asks for fades, and goes.
+/// Weight of the mean opacity in the loss, in standard deviations of the photos' brightness.
+///
+/// The loss is a difference of brightness, so a fixed weight that suits bright photos would remove
+/// what dark photos show. The weight replaces opacity resets, from which runs of a few thousand
+/// steps would not recover. It applies until the first removal, so that Gaussians that no photo
+/// needs fade before.
 const OPACITY_PRICE: f32 = 0.04;
-/// Share of the Gaussians that the last step leaves out where photos are few (DropGaussian).
+/// Share of the Gaussians that the last step drops if photos are few (DropGaussian).
 const LEFT_OUT: f32 = 0.2;
 
 impl TrainConfig {
-    /// Share of the run that is done at a step.
+    /// Returns the share of the run that is done at a step.
     pub(crate) fn progress(&self, iteration: u32) -> f32 {
         iteration as f32 / self.iterations.max(1) as f32
     }
@@ -124,8 +131,11 @@ impl TrainConfig {
         (self.iterations as f32 * share) as u32
     }
 
-    /// Learning rates of 3DGS; those of means decay exponentially to a hundredth, and so do those of features: at a constant 1e-2, two steps
-    /// lead out of what the paper's tau_ac accepts, and where views disagree a feature never comes to rest. `extent`: size of the scene.
+    /// Returns the learning rates of 3DGS for a scene of size `extent`.
+    ///
+    /// The rates of means and features decay exponentially to a hundredth. At a constant 1e-2, two
+    /// steps would move a feature farther than the paper's tau_ac. It would also oscillate where
+    /// views disagree.
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
         let decay = 0.01f32.powf(self.progress(iteration));
@@ -139,64 +149,67 @@ impl TrainConfig {
         rates
     }
 
-    /// SH degree in use: one more every 1,000 steps as in 3DGS, sooner in short runs.
+    /// Returns the SH degree in use: one more every 1,000 steps as in 3DGS, sooner in short runs.
     pub(crate) fn degree(&self, iteration: u32) -> u32 {
         let every = (self.iterations / 8).clamp(1, 1000);
         (iteration / every).max(self.first_degree).min(self.sh_degree)
     }
 
-    /// Whether a step is done at half the resolution.
+    /// Returns whether a step runs at half the resolution.
     pub(crate) fn coarse(&self, iteration: u32) -> bool {
         iteration < self.step_at(self.coarse_until)
     }
 
-    /// Share of the Gaussians that a step leaves out: with few photos, more and more of them, so that what only hides behind others for a photo
-    /// gets its light as well, and none learns its photos by heart (DropGaussian, Park et al. 2025).
+    /// Returns the share of the Gaussians that a step drops (DropGaussian, Park et al. 2025). With
+    /// few photos it rises linearly. Occluded Gaussians then get gradients too, and the scene
+    /// overfits less.
     pub(crate) fn left_out(&self, iteration: u32, views: usize) -> f32 {
         if views < FEW_VIEWS && self.channels.color() { LEFT_OUT * self.progress(iteration) } else { 0.0 }
     }
 
-    /// Number of a step's draw.
+    /// Returns the seed of a step's random choices.
     pub(crate) fn draw(&self, iteration: u32) -> u32 {
         iteration ^ (self.seed as u32).wrapping_mul(0x9e37_79b9)
     }
 
-    /// Steps between two rounds of density control.
+    /// Returns the number of steps between two rounds of density control.
     fn between_rounds(&self) -> u32 {
         let growing = self.step_at(self.refine_until).saturating_sub(self.step_at(REFINE_FROM));
         (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
-    /// Whether the scene may still grow.
+    /// Returns whether the scene may still grow.
     pub(crate) fn grows(&self, iteration: u32) -> bool {
         iteration <= self.step_at(self.refine_until)
     }
 
-    /// Whether a round of density control follows the step that made it `iteration` steps.
+    /// Returns whether a round of density control follows when `iteration` steps are done.
     pub(crate) fn refines(&self, iteration: u32) -> bool {
         let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.refine_until));
         let due = iteration.checked_sub(from).is_some_and(|since| since.is_multiple_of(self.between_rounds()));
         self.channels.color() && due && iteration > 0 && iteration <= until
     }
 
-    /// Whether opacities are reset then: not so late that they could not recover before growth ends.
+    /// Returns whether opacities are reset when `iteration` steps are done. The last reset leaves
+    /// time to recover before growth ends.
     pub(crate) fn resets_opacity(&self, iteration: u32) -> bool {
         iteration.is_multiple_of(RESET_EVERY) && iteration + RESET_EVERY / 2 <= self.step_at(self.refine_until)
     }
 
-    /// Whether unimportant Gaussians are removed then.
+    /// Returns whether unimportant Gaussians are removed when `iteration` steps are done.
     pub(crate) fn prunes(&self, iteration: u32) -> bool {
         let automatic = matches!(self.budget, Budget::Auto(_)) && self.channels.color();
         automatic && PRUNE_AFTER.iter().any(|share| iteration == self.step_at(self.refine_until + share).max(1))
     }
 
-    /// Whether the cameras of the training views are aligned to the scene then.
+    /// Returns whether the cameras are aligned to the scene when `iteration` steps are done.
     pub(crate) fn aligns(&self, iteration: u32) -> bool {
         let asked = self.alignment != Alignment::Off && self.channels.color();
         asked && ALIGN_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
     }
 
-    /// Weight of each Gaussian's opacity in the loss of a step. `contrast`: standard deviation of the photos' brightness.
+    /// Returns the weight of each Gaussian's opacity in the loss of a step. `contrast` is the
+    /// standard deviation of the photos' brightness.
     pub(crate) fn opacity_weight(&self, iteration: u32, gaussians: usize, contrast: f32) -> f32 {
         let fades = self.channels.color() && iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]);
         let each = 1.0 / gaussians as f32;
@@ -222,7 +235,7 @@ mod tests {
         let few = |views: usize, iteration: u32| config.left_out(iteration, views);
         assert_eq!([few(24, 0), few(24, 4000), few(24, 8000), few(25, 8000)], [0.0, 0.1, 0.2, 0.0]);
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config.clone() };
-        assert_eq!(frozen.left_out(8000, 24), 0.0, "lists that are kept hold all");
+        assert_eq!(frozen.left_out(8000, 24), 0.0, "cached lists contain all Gaussians");
         assert_ne!(config.draw(5), TrainConfig { seed: 1, ..config.clone() }.draw(5));
         assert!(!config.resets_opacity(3000), "too late to recover");
         let long = TrainConfig { iterations: 30_000, ..config.clone() };
@@ -232,7 +245,7 @@ mod tests {
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
         assert_eq!([3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)), [0.5 * OPACITY_PRICE, 0.0]);
         let continued = TrainConfig { first_degree: 2, ..config.clone() };
-        assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "colour that is there already stays");
+        assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "training continues at the degree of the scene");
         let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
         assert!(!frozen.refines(400) && !frozen.prunes(3600));
     }

@@ -1,4 +1,6 @@
-//! Shaders as the build found them: sources, and what each binds, by the names that it gives its buffers.
+//! Types of the assembled shaders: sources and bindings.
+//!
+//! `build.rs` generates a type for each pass, and one for its buffers with the names in the shader.
 
 /// How a shader uses a binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -13,28 +15,28 @@ pub enum Binding {
 
 /// An assembled, validated shader; all permutations have the same bindings 0, 1, 2, ...
 pub struct Shader {
-    /// File name without ending: also that of the CPU twin.
+    /// File name without extension; also the name of the CPU twin.
     pub name: &'static str,
-    /// Sources by the flags that they were assembled for.
+    /// Flags and source of each permutation.
     pub sources: &'static [(&'static [&'static str], &'static str)],
     /// Kind of each binding.
     pub bindings: &'static [Binding],
 }
 
-/// A shader as a type: what its passes must be given.
+/// A shader as a type that fixes its uniform and its buffers.
 pub trait Kernel {
     /// The shader.
     const SHADER: &'static Shader;
-    /// The value of binding 0.
+    /// Type of the uniform at binding 0.
     type Uniform: bytemuck::Pod;
-    /// Its storage buffers, by the names in the shader.
+    /// Its storage buffers, with the names in the shader.
     type Buffers<'a>;
-    /// These in the order of their bindings.
+    /// Returns the buffers in the order of their bindings.
     fn in_order<'a>(buffers: &Self::Buffers<'a>) -> Vec<&'a wgpu::Buffer>;
 }
 
-/// One type a file of `shaders/`, and one for its buffers. A buffer that a shader does not have, one that is missing, a uniform of another
-/// type or size: each is a build error.
+/// Two types for each file of `shaders/`: the pass and its buffers. An unknown or missing buffer,
+/// or a uniform of another type or size, is a build error.
 #[allow(missing_docs, reason = "generated: each item names its file")]
 pub mod shaders {
     use super::{Binding, Kernel, Shader};

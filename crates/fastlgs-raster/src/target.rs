@@ -1,4 +1,4 @@
-//! What training is towards: a camera and what it should see.
+//! Training views: cameras and the images that they are trained towards.
 
 use crate::engine::{TargetImage, pack};
 use crate::{Error, Result, exposure};
@@ -11,22 +11,24 @@ use std::sync::Arc;
 pub struct Target {
     /// Camera at the training resolution.
     pub camera: Camera,
-    /// What it should see.
+    /// Image that the view is trained towards.
     pub image: TargetImage,
-    /// How many times brighter than the mean its photo shows things, by channel, as far as that is known before training.
+    /// Brightness of its photo relative to the mean of all, by channel, as measured before
+    /// training.
     pub gain: [f32; 3],
 }
 
 impl Target {
-    /// The view at half the resolution.
+    /// Returns the view at half the resolution.
     pub(crate) fn halved(&self) -> Self {
         Self { camera: self.camera.halved(), image: self.image.halved(), gain: self.gain }
     }
 }
 
 impl TargetImage {
-    /// The picture at half the resolution, over 2x2 pixels of those that count: the mean of their colours, and the code that most of them have. The mean
-    /// of two codes is near a third object's.
+    /// Returns the image at half the resolution, from the pixels of each 2x2 block that count.
+    /// Colours are averaged. Of codes the most frequent is taken, because the mean of two codes may
+    /// be near that of a third object.
     pub(crate) fn halved(&self) -> Self {
         let [w, h] = self.size;
         let size = [w.div_ceil(2), h.div_ceil(2)];
@@ -47,7 +49,8 @@ impl TargetImage {
         Self { size, color: halve(&self.color, mean), feature: halve(&self.feature, mode) }
     }
 
-    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over colours.
+    /// Returns the standard deviation of the brightness of the pixels that count (0 to 1), averaged
+    /// over the colours.
     fn contrast(&self) -> f64 {
         let deviation = |c: usize| {
             let counting = self.color.iter().map(|p| p.to_le_bytes()).filter(|p| p[3] == 255);
@@ -62,7 +65,8 @@ impl TargetImage {
     }
 }
 
-/// Training views whose pictures are read when they are needed: 300 photos of 1600x1066 would take two gigabytes.
+/// Training views whose images are read on demand: 300 photos of 1600x1066 would take two
+/// gigabytes.
 #[derive(Clone)]
 pub struct Targets {
     /// Cameras at the training resolution.
@@ -73,55 +77,56 @@ pub struct Targets {
 }
 
 impl Targets {
-    /// Views of which `read` tells the pictures, the same whenever it is asked.
+    /// Creates views whose images `read` returns. It must return the same image on every call.
     pub fn new(cameras: Vec<Camera>, gains: Vec<[f32; 3]>, read: impl Fn(usize) -> Result<TargetImage> + Send + Sync + 'static) -> Self {
         Self { cameras, gains, read: Arc::new(read) }
     }
 
-    /// Number of views.
+    /// Returns the number of views.
     pub fn len(&self) -> usize {
         self.cameras.len()
     }
 
-    /// Whether there are none.
+    /// Returns whether there are no views.
     pub fn is_empty(&self) -> bool {
         self.cameras.is_empty()
     }
 
-    /// Pixels of all views.
+    /// Returns the number of pixels of all views.
     pub fn pixels(&self) -> usize {
         self.cameras.iter().map(|c| (c.width * c.height) as usize).sum()
     }
 
-    /// How bright each photo is against the mean, as far as that is known before training.
+    /// Returns the brightness of each photo relative to the mean, by channel, as measured before
+    /// training.
     pub(crate) fn gains(&self) -> &[[f32; 3]] {
         &self.gains
     }
 
-    /// A view with its picture.
+    /// Reads a view with its image.
     ///
     /// # Errors
-    /// When the picture cannot be read.
+    /// When the image cannot be read.
     pub fn get(&self, id: usize) -> Result<Target> {
         Ok(Target { camera: self.cameras[id].clone(), image: (self.read)(id)?, gain: self.gains[id] })
     }
 
-    /// Reads all pictures once, so that what is wrong with them is known before the work.
+    /// Reads all images once, to detect errors before training.
     ///
     /// # Errors
-    /// When a picture cannot be read.
+    /// When an image cannot be read.
     pub fn check(&self) -> Result<()> {
         (0..self.len()).into_par_iter().try_for_each(|id| (self.read)(id).map(drop))
     }
 
-    /// Some of the views.
+    /// Returns a subset of the views.
     pub(crate) fn some(&self, ids: Vec<usize>) -> Self {
         let (cameras, gains) = ids.iter().map(|&id| (self.cameras[id].clone(), self.gains[id])).unzip();
         let read = self.read.clone();
         Self::new(cameras, gains, move |k| read(ids[k]))
     }
 
-    /// The views without the pixels that their photos may have cut off; `exposure.rs`.
+    /// Returns the views without pixels that may be clipped at white; see `exposure.rs`.
     pub(crate) fn without_clipped(self) -> Self {
         let (read, gains) = (self.read, self.gains.clone());
         let unclipped = move |id: usize| {
@@ -132,16 +137,17 @@ impl Targets {
         Self::new(self.cameras, self.gains, unclipped)
     }
 
-    /// The views with these features.
+    /// Returns the views with these feature images.
     pub(crate) fn with_features(self, features: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) -> Self {
         let read = self.read;
         Self::new(self.cameras, self.gains, move |id| Ok(TargetImage { feature: features(id)?, ..read(id)? }))
     }
 
-    /// Standard deviation of the brightness of the pixels that count, 0 to 1: the mean over views and colours. And a fingerprint of all pictures.
+    /// Returns the mean contrast of all images and their fingerprint. The contrast is the standard
+    /// deviation of the brightness of the pixels that count, 0 to 1, averaged over colours.
     ///
     /// # Errors
-    /// When a picture cannot be read.
+    /// When an image cannot be read, or no pixel counts.
     pub(crate) fn survey(&self) -> Result<(f32, u64)> {
         let of_picture = |image: TargetImage| {
             let counts = image.color.iter().chain(&image.feature).any(|pixel| pixel.to_le_bytes()[3] == 255);
@@ -149,7 +155,7 @@ impl Targets {
         };
         let each = (0..self.len()).into_par_iter().map(|id| Ok(of_picture((self.read)(id)?))).collect::<Result<Vec<(f64, u64, bool)>>>()?;
         if !each.iter().any(|(.., counts)| *counts) {
-            return Err(Error::Invalid("no pixel of any training photo counts: their masks leave nothing to train on".to_owned()));
+            return Err(Error::Invalid("the masks leave nothing to train on: they exclude every pixel of all training photos; check whether they are inverted".to_owned()));
         }
         let contrast = each.iter().map(|(contrast, ..)| contrast).sum::<f64>() / each.len().max(1) as f64;
         Ok((contrast as f32, fingerprint(each.iter().flat_map(|(_, print, _)| [*print as u32, (print >> 32) as u32]))))
@@ -163,7 +169,7 @@ impl From<Vec<Target>> for Targets {
     }
 }
 
-/// A number that tells words from others, in their order (FNV-1a over words instead of bytes).
+/// Returns an FNV-1a hash of words (instead of bytes); it depends on their order.
 pub(crate) fn fingerprint(words: impl Iterator<Item = u32>) -> u64 {
     words.fold(0xcbf2_9ce4_8422_2325, |print, word| (print ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3))
 }
@@ -173,7 +179,7 @@ fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
     std::array::from_fn(|c| ((pixels.iter().map(|p| u32::from(p[c])).sum::<u32>() + n / 2) / n) as u8)
 }
 
-/// What most of the pixels are; of several the one that comes first.
+/// Returns the most frequent pixel; of several, the first.
 fn mode(pixels: &[[u8; 4]]) -> [u8; 3] {
     let count = |pixel: &[u8; 4]| pixels.iter().filter(|p| *p == pixel).count();
     let [x, y, z, _] = pixels.iter().rev().copied().max_by_key(count).unwrap_or_default();
@@ -189,7 +195,7 @@ mod tests {
         let camera = Camera::look_at("v", glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::Y, 2, 2, 1.0);
         let color = vec![pack([0, 50, 255], true), pack([102, 50, 0], true), pack([255; 3], false), pack([51, 50, 0], true)];
         let target = Target { camera, image: TargetImage { size: [2, 2], color, feature: Vec::new() }, gain: [1.0; 3] };
-        // Deviations of 0, 0.2, 0.4 and of 1, 0, 0.
+        // Values of red: 0, 0.4, 0.2; of green: constant; of blue: 1, 0, 0.
         let expected = ((0.08f32 / 3.0).sqrt() + (2.0f32 / 9.0).sqrt()) / 3.0;
         let mut other = target.clone();
         let (contrast, print) = Targets::from(vec![target.clone()]).survey().unwrap();

@@ -1,4 +1,4 @@
-//! Uniforms shared by kernels and twins; the same bytes as `shaders/shared/view.wgsl` and `shaders/adam.wgsl`.
+//! Uniforms of the passes and their twins, with the layouts of the structures in `shaders/`.
 
 use bytemuck::{Pod, Zeroable};
 use fastlgs_core::Camera;
@@ -7,7 +7,7 @@ use fastlgs_core::gaussians::BASE_CHANNELS;
 /// Tile edge in pixels.
 pub const TILE: u32 = 8;
 
-/// Transmittance below which a picture needs nothing of what lies behind.
+/// Transmittance below which a rendered pixel ignores what lies behind.
 const TRANSMITTANCE_MIN: f32 = 0.0001;
 /// The same for a training step: half a grey level of a white background.
 const TRANSMITTANCE_TRAINED: f32 = 1.0 / 512.0;
@@ -22,50 +22,53 @@ pub struct View {
     pub focal: [f32; 2],
     /// Principal point in pixels.
     pub centre: [f32; 2],
-    /// Pixels.
+    /// Image size in pixels.
     pub size: [u32; 2],
-    /// Tiles.
+    /// Image size in tiles.
     pub tiles: [u32; 2],
-    /// Colour behind everything.
+    /// Background colour; the last entry is unused.
     pub background_color: [f32; 4],
-    /// Feature behind everything.
+    /// Background feature; the last entry is unused.
     pub background_feature: [f32; 4],
-    /// Position in the world; the last entry is unused.
+    /// Position of the camera in the world; the last entry is unused.
     pub camera: [f32; 4],
     /// Number of Gaussians.
     pub gaussians: u32,
-    /// Number of (tile, Gaussian) pairs, once known.
+    /// Number of (tile, Gaussian) pairs, once they are counted.
     pub pairs: u32,
-    /// First Gaussian of the page that is bound.
+    /// First Gaussian of the bound page.
     pub first: u32,
-    /// Gaussians of that page.
+    /// Number of Gaussians of the bound page.
     pub page: u32,
-    /// First pair of the window of gradient slots that is bound.
+    /// First pair of the bound window of gradient slots.
     pub slot_first: u32,
     /// Number of pairs whose Gaussians start in that window.
     pub slot_count: u32,
-    /// Degree up to which colour depends on the view now.
+    /// SH degree of the colour in use.
     pub sh_degree: u32,
-    /// 1: opacity is lowered by what dilation adds (2-D Mip filter).
+    /// 1: opacity compensates for dilation (2-D Mip filter).
     pub antialias: u32,
     /// 1: the first feature channel carries the depth.
     pub depth_as_feature: u32,
-    /// Transmittance below which a pixel needs no more Gaussians.
+    /// Transmittance below which a pixel ignores further Gaussians.
     pub finished: f32,
-    /// A step leaves out each Gaussian with the probability `dropped` / 2^32.
+    /// A step drops each Gaussian with the probability `dropped` / 2^32.
     pub dropped: u32,
-    /// Number of the draw that says which.
+    /// Seed that selects the dropped Gaussians.
     pub draw: u32,
-    /// Pairs of a run, within which `fold_slots` adds up a Gaussian's slots; 1 where it does not run.
+    /// Length of the runs of pairs in which `fold_slots` sums a Gaussian's slots; 1 if it does not
+    /// run.
     pub fold: u32,
-    /// 1: Gaussians that are clear ([`fastlgs_core::gaussians::CLEAR`]) are drawn as solid ones, to see what objects are where.
+    /// 1: Gaussians of transparent objects ([`fastlgs_core::gaussians::CLEAR`]) are drawn as opaque
+    /// ones, to show which objects are where.
     pub solid: u32,
     /// Padding to 16 bytes.
     pub unused: [u32; 2],
 }
 
 impl View {
-    /// The frame of `camera` for `gaussians` Gaussians with colour up to `sh_degree`, before a black background.
+    /// Returns the view of `camera` for `gaussians` Gaussians with SH degree `sh_degree`, on a
+    /// black background.
     pub fn new(camera: &Camera, gaussians: usize, sh_degree: u32) -> Self {
         Self {
             world_to_camera: camera.world_to_camera.to_cols_array(),
@@ -94,39 +97,40 @@ impl View {
         }
     }
 
-    /// The same for a step of training, which need not see the last half of a grey level.
+    /// Returns the view for a training step, which ignores the last half of a grey level.
     #[must_use]
     pub fn trained(self) -> Self {
         Self { finished: TRANSMITTANCE_TRAINED, ..self }
     }
 
-    /// The same without a share of the Gaussians, at most 0.9, by draw number `draw`.
+    /// Returns the view with a share of the Gaussians dropped, at most 0.9; `draw` is the seed.
     #[must_use]
     pub fn without(self, share: f32, draw: u32) -> Self {
         Self { dropped: (f64::from(share.clamp(0.0, 0.9)) * 4_294_967_296.0) as u32, draw, ..self }
     }
 
-    /// Factor on the opacities of those that are not left out, which makes up for the others as far as the largest alpha allows.
+    /// Returns the factor on the remaining opacities that compensates for dropped Gaussians, up to
+    /// the largest alpha.
     pub(crate) fn kept_gain(&self) -> f32 {
         1.0 / (1.0 - self.dropped as f32 / 4_294_967_296.0)
     }
 
-    /// Pixels of the frame.
+    /// Returns the number of pixels of the frame.
     pub fn pixels(&self) -> usize {
         (self.size[0] * self.size[1]) as usize
     }
 
-    /// Pixels of the frame padded to whole tiles, as it lies on the device.
+    /// Returns the number of pixels of the frame padded to whole tiles, as on the device.
     pub fn padded_pixels(&self) -> usize {
         (self.tile_count() * TILE * TILE) as usize
     }
 
-    /// Place of a pixel in a padded plane.
+    /// Returns the index of a pixel in a padded plane.
     pub(crate) fn at(&self, x: u32, y: u32) -> usize {
         (y * self.tiles[0] * TILE + x) as usize
     }
 
-    /// Planes as they lie on the device; the padding is zero.
+    /// Returns the planes in the padded layout of the device; the padding is zero.
     pub(crate) fn padded<T: Copy + Default>(&self, planes: &[T]) -> Vec<T> {
         let [w, h] = self.size.map(|s| s as usize);
         let mut out = vec![T::default(); planes.len() / (w * h) * self.padded_pixels()];
@@ -139,7 +143,7 @@ impl View {
         out
     }
 
-    /// Tiles of the frame.
+    /// Returns the number of tiles of the frame.
     pub fn tile_count(&self) -> u32 {
         self.tiles[0] * self.tiles[1]
     }
@@ -149,11 +153,11 @@ impl View {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Step {
-    /// Stride of the page's channels, in fours.
+    /// Stride of the page's channels, in groups of four floats.
     pub quads: u32,
-    /// 1 - 0.9^t.
+    /// Bias correction of the first moment: 1 - 0.9^t.
     pub correction1: f32,
-    /// 1 - 0.999^t.
+    /// Bias correction of the second moment: 1 - 0.999^t.
     pub correction2: f32,
     /// Added to the root of the second moment.
     pub epsilon: f32,
@@ -172,7 +176,7 @@ pub struct Step {
 pub type Rates = [f32; BASE_CHANNELS + 1];
 
 impl Step {
-    /// Step number `t` (from 1) over the channels of `range` with the given learning rates.
+    /// Returns step number `t` (from 1) over the channels of `range` with the given learning rates.
     pub fn new(t: u32, range: std::ops::Range<usize>, rates: &Rates) -> Self {
         let mut all = [0.0; 20];
         all[..rates.len()].copy_from_slice(rates);
@@ -195,40 +199,40 @@ impl Step {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Plane {
-    /// Pixels of the picture.
+    /// Image size in pixels.
     pub size: [u32; 2],
     /// Quads of four pixels in a padded row.
     pub quads: u32,
-    /// Padded rows.
+    /// Number of padded rows.
     pub rows: u32,
     /// Channel of the frame.
     pub channel: u32,
     /// Loss weight of one pixel of this channel.
     pub scale: f32,
-    /// Share of D-SSIM.
+    /// Weight of D-SSIM against L1, 0 to 1.
     pub lambda: f32,
-    /// Exposure of the view: factor.
+    /// Gain of the view's exposure.
     pub gain: f32,
-    /// Exposure of the view: summand.
+    /// Offset of the view's exposure.
     pub offset: f32,
     /// Padding to 16 bytes.
     pub unused: [u32; 3],
 }
 
-/// Planes that the passes of the loss take at once; `shaders/shared/window.wgsl`.
+/// Planes that the loss passes process at once; `shaders/shared/window.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct Planes {
-    /// One for each z of the workgroups.
+    /// One plane for each z of the workgroups.
     pub each: [Plane; 6],
-    /// How many there are.
+    /// Number of planes.
     pub count: u32,
     /// Padding to 16 bytes.
     pub unused: [u32; 3],
 }
 
 impl Planes {
-    /// At most six.
+    /// Returns the uniform of at most six planes.
     pub(crate) fn new(planes: &[Plane]) -> Self {
         let mut all: Self = Zeroable::zeroed();
         all.each[..planes.len()].copy_from_slice(planes);
@@ -242,15 +246,16 @@ impl Planes {
 pub struct Job {
     /// Number of items.
     pub n: u32,
-    /// Shift of the radix digit.
+    /// Shift of the radix digit in bits.
     pub shift: u32,
-    /// 1: values are 0, 1, 2, ... instead of read.
+    /// 1: values are 0, 1, 2, ... and not read.
     pub first: u32,
-    /// Number of chunks that the items are divided into.
+    /// Number of chunks of items.
     pub chunks: u32,
 }
 
-/// Distance between the channels of a page of `n` Gaussians; `shaders/shared/channels.wgsl`.
+/// Returns the distance between the channels of a page of `n` Gaussians;
+/// `shaders/shared/channels.wgsl`.
 pub fn stride(n: usize) -> usize {
     n.next_multiple_of(4)
 }

@@ -1,4 +1,6 @@
-//! Cuts a photo into regions and tells which of some words fits each best. Needs `fastlgs models install-offline`.
+//! Cuts a photo into regions and prints the word that fits each region best.
+//!
+//! Needs the models of `fastlgs models install-offline`.
 //!
 //! `cargo run --release -p fastlgs-vision --example name_photo -- photo.jpg cat coffee bicycle`
 

@@ -1,40 +1,41 @@
-//! What masks look like to the classifier, beyond the names of its classes: by this, too, objects are compared with examples and pictures.
+//! Appearance of masks: the classifier's logits in fewer dimensions, to compare objects with
+//! examples and pictures.
 //!
-//! ConSE keeps of the classifier's logits what the ten likeliest names mean, so that two things of one kind are the same to it. All logits together tell
-//! single things apart. Both together do both: by one view of an object of three photographed scenes, its other views are told from all objects of
-//! the other scenes in 90 % of all cases instead of 43 % (where 7 % of these are taken for it), and a lamp of one generated scene is still known by
-//! that of another.
-//! Embeddings of the offline encoder end with what logits look like, in fewer dimensions; for texts that is zero.
+//! ConSE keeps only the names of the ten likeliest classes, so objects of one kind have equal
+//! embeddings. All logits together also distinguish objects of one kind.
+//! Embeddings of the offline encoder end with the appearance; for texts it is zero.
 
 use crate::encoder::normalise;
 use fastlgs_core::rng::Rng;
 
-/// Numbers at the end of an embedding. A random projection keeps inner products: by these numbers alone it is 91 %, by 32 86, by 128 93, by all logits 96.
+/// Number of appearance values at the end of an embedding. A random projection preserves inner
+/// products: 64 values recognise 91 % of an object's other views, all logits 96 %.
 pub const COUNT: usize = 64;
 
-/// What 3,086 masks of a fox, an office and a bonsai project to in the mean: a cut-out is rather like this than like nothing. By all logits it is 79 %
-/// without it and 96 with that of two scenes for the third.
+/// Mean projection of 3,086 masks of three scenes. Subtracting it removes what all cut-outs share.
+/// It belongs to the axes of `Appearance::new`.
 const MEAN: [f32; COUNT] = [
     -2.2, 24.2, -18.5, -5.7, -3.5, 28.2, 37.6, -2.6, 18.4, 14.4, 6.7, -39.7, -7.8, 3.9, 35.8, 34.5, -6.3, -49.0, -14.6, 9.1, -3.4, -19.4,
     -16.1, -17.6, -11.8, 32.5, -31.7, 0.3, 3.4, -13.7, -27.3, -3.5, -9.6, -38.9, 13.2, 11.0, -4.6, -15.1, -26.1, -32.9, 34.4, -10.0, -13.6,
     -24.8, 22.6, 19.0, 14.1, 2.9, -32.0, -27.3, 34.8, -5.2, -26.5, 21.7, -38.6, 10.3, 12.2, 39.5, 0.1, 13.7, -4.1, 1.2, -0.4, -12.4,
 ];
 
-/// What the cosine of appearances counts against that of meanings. With 1 it is 88 % instead of 90. With nothing but appearance it is 91, but the mug of
-/// one generated table is not known by that of another.
+/// Weight of the cosine of appearances, relative to that of ConSE embeddings. Appearance alone does
+/// not recognise an object of the same kind in another scene.
 pub const WEIGHT: f32 = 2.0;
 
-/// Where each class of a classifier lies.
+/// Random projection axes of each class of a classifier.
 pub struct Appearance(Vec<[f32; COUNT]>);
 
 impl Appearance {
-    /// For so many classes.
+    /// Makes the axes of `classes` classes, with a fixed seed.
     pub fn new(classes: usize) -> Self {
         let mut rng = Rng::new(0, "likeness");
         Self((0..classes).map(|_| std::array::from_fn(|_| rng.normal())).collect())
     }
 
-    /// What logits look like; the inner product with that of others is [`WEIGHT`] times their cosine.
+    /// Returns the appearance of class logits. The inner product of two appearances is [`WEIGHT`]
+    /// times their cosine.
     pub fn of(&self, logits: &[f32]) -> [f32; COUNT] {
         let mean = logits.iter().sum::<f32>() / logits.len().max(1) as f32;
         let mut sum = MEAN.map(|m| -m);
@@ -46,13 +47,14 @@ impl Appearance {
     }
 }
 
-/// The numbers of an offline embedding that texts are compared by.
+/// Returns the values of an offline embedding that are compared with texts: all but the appearance.
 pub fn words(embedding: &mut [f32]) -> &mut [f32] {
     let count = embedding.len().saturating_sub(COUNT);
     &mut embedding[..count]
 }
 
-/// An offline embedding for what knows nothing but words: without the numbers that count only between examples.
+/// Returns an offline embedding with its appearance set to zero, so that only the values shared
+/// with texts count.
 pub fn for_words(mut embedding: Vec<f32>) -> Vec<f32> {
     let count = words(&mut embedding).len();
     embedding[count..].fill(0.0);
@@ -79,7 +81,7 @@ mod tests {
     fn the_mean_is_of_these_axes() {
         let axes = Appearance::new(1000).0;
         let sum: f32 = axes.iter().flatten().sum();
-        assert!((axes[0][0] - -1.09525).abs() < 1e-5 && (sum - 311.36).abs() < 0.05, "{} {sum}: MEAN must be measured anew", axes[0][0]);
+        assert!((axes[0][0] - -1.09525).abs() < 1e-5 && (sum - 311.36).abs() < 0.05, "{} {sum}: the axes have changed, so MEAN must be measured again", axes[0][0]);
     }
 
     #[test]

@@ -1,19 +1,22 @@
-//! Colours and materials by name: what a classifier of things does not tell, a mask's own pixels do.
+//! Colours and materials by name, measured from a mask's pixels because the classifier does not
+//! report them.
 //!
-//! Embeddings of the offline encoder have one number an attribute: for a mask how much of it has that colour, for a text
-//! whether it names it. Their product adds to the cosine of what the rest of the text means.
+//! Embeddings of the offline encoder have one value for each attribute. For a mask, it measures how
+//! much of the mask has that colour; for a text, whether the text names it. Their product is added
+//! to the cosine of the rest of the text.
 
 use fastlgs_core::LabelMap;
 use fastlgs_core::color::lab;
 use image::RgbImage;
 
-/// An attribute: the words that name it, and the CIE Lab colours that have it.
+/// An attribute: the words that name it, and its colours in CIE Lab.
 struct Attribute {
     words: &'static [&'static str],
     colors: &'static [[f32; 3]],
 }
 
-/// Basic colour terms (Berlin & Kay 1969) with focal colours, and wood, which is known by its colours too.
+/// Basic colour terms (Berlin & Kay 1969) with their focal colours, and wood, which is also
+/// recognised by its colours.
 const ATTRIBUTES: [Attribute; 12] = [
     Attribute { words: &["red", "crimson", "scarlet"], colors: &[[45.0, 65.0, 45.0], [35.0, 50.0, 30.0], [25.0, 38.0, 20.0]] },
     Attribute { words: &["orange"], colors: &[[65.0, 42.0, 65.0]] },
@@ -29,22 +32,23 @@ const ATTRIBUTES: [Attribute; 12] = [
     Attribute { words: &["wooden", "wood"], colors: &[[35.0, 15.0, 22.0], [48.0, 17.0, 28.0], [62.0, 12.0, 30.0], [25.0, 10.0, 14.0]] },
 ];
 
-/// Attributes, each a number of an embedding.
+/// Number of attributes; each is one value of an embedding.
 pub const COUNT: usize = ATTRIBUTES.len();
-/// Share of a mask that makes a colour neither its own nor foreign to it.
+/// Share of a mask at which a colour counts neither for nor against the mask.
 const NEUTRAL: f32 = 0.25;
-/// Weight of the attributes in embeddings of masks: small, so that they hardly count between masks.
+/// Weight of attributes in embeddings of masks. It is small, so that attributes hardly affect
+/// comparisons between masks.
 const MASK_WEIGHT: f32 = 0.1;
-/// Weight of a mask's attribute against the cosine of meanings, when a text names it.
+/// Weight of an attribute that a text names, relative to the cosine of the rest of the text.
 const WEIGHT: f32 = 0.25;
-/// What things of the named colour gain by it although they are something else: with it, absent things with a colour ("purple umbrella") score like
-/// those without.
+/// Cosine that unrelated masks gain because they have the named colour. Adding it to the baseline
+/// makes absent names with a colour score like those without.
 const ADVANTAGE: f32 = 0.08;
 
-/// For each basic colour, whether a Lab colour is nearest to one of its focal colours.
+/// Returns the index of the basic colour whose focal colours are nearest to a Lab colour.
 fn nearest(color: [f32; 3]) -> usize {
     let distance = |focal: &[f32; 3]| {
-        // Hue tells colours apart more than lightness does.
+        // Hue distinguishes colours better than lightness does.
         let [l, a, b] = [0, 1, 2].map(|k| color[k] - focal[k]);
         0.5 * l * l + a * a + b * b
     };
@@ -53,13 +57,13 @@ fn nearest(color: [f32; 3]) -> usize {
     best.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |b| b.1)
 }
 
-/// Whether a colour may be that of wood.
+/// Returns whether a Lab colour may be that of wood.
 fn wooden(color: [f32; 3]) -> bool {
     let near = |focal: &[f32; 3]| (0..3).map(|k| (color[k] - focal[k]).powi(2)).sum::<f32>() < 18.0 * 18.0;
     ATTRIBUTES[COUNT - 1].colors.iter().any(near)
 }
 
-/// Attributes of each label 1..=max, by the photo's pixels.
+/// Returns the attributes of each label 1..=max, measured from the photo's pixels.
 pub fn of_masks(photo: &RgbImage, masks: &LabelMap) -> Vec<[f32; COUNT]> {
     let mut counts = vec![[0.0f32; COUNT]; usize::from(masks.max())];
     let mut areas = vec![0.0f32; usize::from(masks.max())];
@@ -77,13 +81,14 @@ pub fn of_masks(photo: &RgbImage, masks: &LabelMap) -> Vec<[f32; COUNT]> {
     counts.into_iter().zip(areas).map(share).collect()
 }
 
-/// By how much the cosine that unrelated masks reach is higher for a text that names an attribute.
+/// Returns by how much a text raises the cosine of unrelated masks: 0 if it names no attribute.
 pub fn advantage(text: &str) -> f32 {
     let named = of_text(text).0.iter().any(|n| *n > 0.0);
     if named { ADVANTAGE } else { 0.0 }
 }
 
-/// Attributes that a text names, and the text without them; the whole text where nothing else is left.
+/// Returns the attributes that a text names, and the text without them. If nothing else is left,
+/// returns the whole text.
 pub fn of_text(text: &str) -> ([f32; COUNT], String) {
     let mut named = [0.0; COUNT];
     let mut rest = Vec::new();

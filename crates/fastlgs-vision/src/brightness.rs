@@ -1,18 +1,20 @@
-//! How much the brightness of a set of photos varies, by what the same points look like in two of them.
+//! Brightness of photos relative to each other, measured from the colours of matched key points.
 
 use crate::tracks::PairMatches;
 use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeSet;
 
-/// Fewest matches that tell how bright one photo is against another.
+/// Smallest number of matches from which the brightness of two photos is compared.
 const FEW: usize = 8;
-/// Values near black say nothing about ratios.
+/// Values up to this one (of 255) do not count: ratios of nearly black values are unreliable.
 const DARK: f32 = 8.0;
-/// Nor do values that may have been cut off at white.
+/// Values from this one on (of 255) do not count: they may be clipped at white.
 const CLIPPED: f32 = 250.0;
-/// Matches' worth of belief that a photo is as bright as it looks: what holds photos, and groups of them, that no match ties to the others.
+/// Weight, in matches, of the prior that a photo is as bright as it looks. It decides for photos
+/// and groups that no match connects to the others.
 const HOLD: f32 = 1e-2;
-/// Matches' worth of belief that what brightens a channel of a photo brightens them all: where one is cut off at white, the others tell.
+/// Weight, in matches, of the prior that all channels of a photo change alike. It decides for a
+/// channel that is clipped at white.
 const TOGETHER: f32 = 1.0;
 
 fn median(values: &mut [f32]) -> Option<f32> {
@@ -20,20 +22,21 @@ fn median(values: &mut [f32]) -> Option<f32> {
     values.get(values.len() / 2).copied()
 }
 
-/// How bright photos are against each other.
+/// Brightness of photos relative to each other.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Brightness {
-    /// The typical difference between two photos of the same thing in stops (factors of two), in the colour channel that differs most: the
-    /// median over pairs of photos. 0 where nothing matches.
+    /// Typical difference between two photos of the same surface, in stops (factors of two). It is
+    /// the median over pairs of photos, in the channel where it is largest; 0 without matches.
     pub spread_stops: f32,
-    /// How many times brighter than the mean of all each photo shows things, by channel.
+    /// Factor by which each photo is brighter than the geometric mean of all photos, by channel.
     pub gains: Vec<[f32; 3]>,
 }
 
-/// A pair of photos: how many stops brighter the first is, and how many matches say so.
+/// First photo, second photo, by how many stops the first is brighter, and the number of matches.
 type Difference = (usize, usize, f32, f32);
 
-/// Compares photos by what the same points look like in them; `colors` are those of each photo's key points.
+/// Compares photos by the colours of matched key points. `colors` holds the colours of each photo's
+/// key points.
 pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let of_channel = |c: usize| -> Vec<Difference> {
         let difference = |m: &PairMatches| {
@@ -48,7 +51,8 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let channels: [Vec<Difference>; 3] = std::array::from_fn(of_channel);
     let spread = |differences: &Vec<Difference>| median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0);
     let looks = looks(colors);
-    // Photos of one exposure look brighter and darker, too, by what they show: how far looks tell of light is measured where matches tell of it.
+    // A photo may look bright only because it shows bright surfaces. Apparent brightness is
+    // therefore scaled by the least-squares slope of measured against apparent brightness.
     let known = consistent(&channels, &DVector::zeros(looks.len()));
     let told = channels.iter().enumerate().flat_map(|(c, all)| all.iter().flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c)));
     let told: BTreeSet<usize> = told.collect();
@@ -60,7 +64,8 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     }
 }
 
-/// How many stops brighter than the mean of all photos the key points of each one look, channel by channel; `[photo][3]`.
+/// Returns by how many stops the key points of each photo look brighter than the mean of all
+/// photos, for each channel: `[photo][3]`.
 fn looks(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
     let of =
         |photo: &Vec<[u8; 3]>, c: usize| median(&mut photo.iter().map(|color| f32::from(color[c]).max(1.0).log2()).collect::<Vec<_>>());
@@ -73,8 +78,8 @@ fn looks(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
     looks
 }
 
-/// Stops of each photo's channels, `[photo][3]`, with a mean of 0 in each, that fit all differences best (least squares); `looks` is what holds
-/// where no difference does.
+/// Returns the stops of each photo's channels, `[photo][3]`, that fit all differences best (least
+/// squares). Each channel has a mean of 0. Without differences, `looks` decides.
 fn consistent(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
     let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * HOLD;
     let mut right = looks * HOLD;
@@ -113,7 +118,8 @@ mod tests {
         assert!((gains[0][1] - 2.0f32.sqrt()).abs() < 0.02 && (gains[1][1] - 0.5f32.sqrt()).abs() < 0.02, "{gains:?}");
     }
 
-    /// Gains of photos of the same twenty points; each is matched with the next, but the last with none.
+    /// Gains of photos of the same twenty points. Each photo matches the next one, but the last one
+    /// matches none.
     fn gains_of(light: &[[f32; 3]]) -> Vec<[f32; 3]> {
         let point = |k: u8, gain: &[f32; 3]| [0, 1, 2].map(|c| ([60 + k, 50 + 2 * k, 70].map(f32::from)[c] * gain[c]) as u8);
         let colors: Vec<Vec<[u8; 3]>> = light.iter().map(|gain| (0..20).map(|k| point(k, gain)).collect()).collect();
@@ -123,7 +129,7 @@ mod tests {
 
     #[test]
     fn a_channel_that_is_cut_off_follows_the_others() {
-        // Red is at white in the second photo, so that green and blue alone tell how bright it is.
+        // Red is clipped in the second photo, so only green and blue measure its brightness.
         let gains = gains_of(&[[1.0; 3], [9.0, 2.0, 2.0], [1.0; 3], [1.0; 3]]);
         let stops = [0, 1, 2].map(|c| (gains[1][c] / gains[0][c]).log2());
         assert!(stops.iter().all(|s| (s - 1.0).abs() < 0.1), "{stops:?}");

@@ -10,20 +10,22 @@ use image::RgbImage;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Mean and standard deviation of CLIP's training pictures, RGB in [0, 1]; a configuration beside the model overrides them.
+/// Mean and standard deviation of CLIP's training pictures, RGB in [0, 1]. A
+/// `preprocessor_config.json` of the model overrides them.
 const MEAN: [f32; 3] = [0.481_454_66, 0.457_827_5, 0.408_210_73];
 const DEVIATION: [f32; 3] = [0.268_629_54, 0.261_302_6, 0.275_777_1];
-/// Side of the input where neither the model nor a configuration tells.
+/// Input size in pixels if neither the model nor a configuration file gives one.
 const SIZE: usize = 224;
-/// Crops or texts in one inference.
+/// Number of crops or texts in one inference.
 const BATCH: usize = 8;
-/// A text is embedded in each of these sentences, and the embeddings are averaged.
+/// Prompts of a text; the embeddings of all of them are averaged.
 const TEMPLATES: [&str; 4] = ["{}", "a photo of a {}.", "a photo of the {}.", "a close-up photo of a {}."];
 
-/// Names under which exporters give the embedding, best first.
+/// Output names that exporters use for the embedding, in order of preference.
 const IMAGE_OUTPUTS: [&str; 4] = ["image_embeds", "image_features", "image_embedding", "embeddings"];
 const TEXT_OUTPUTS: [&str; 4] = ["text_embeds", "text_features", "text_embedding", "embeddings"];
-/// Where SigLIP's towers have it. CLIP's is not in the space that texts and pictures share: a projection follows.
+/// Output with SigLIP's embedding. CLIP's output of this name is not yet projected into the joint
+/// space of texts and pictures.
 const POOLED: &str = "pooler_output";
 
 /// The image tower.
@@ -48,18 +50,19 @@ pub struct ClipText {
     context: usize,
 }
 
-/// A file of settings in the model's folder or the one above; null where there is none.
+/// Reads the JSON file `name` in the model's folder or its parent folder; null if there is none.
 fn settings(model: &Path, name: &str) -> Result<serde_json::Value> {
     let found = model.ancestors().skip(1).take(2).map(|folder| folder.join(name)).find(|file| file.is_file());
     Ok(found.map(|file| fs::read_json(&file)).transpose()?.unwrap_or_default())
 }
 
-/// Whether the configuration of a model is that of a SigLIP.
+/// Returns whether the configuration describes a SigLIP model.
 fn is_siglip(configuration: &serde_json::Value) -> bool {
     configuration["model_type"].as_str().is_some_and(|kind| kind.starts_with("siglip"))
 }
 
-/// The output of one of these names, else the only one.
+/// Returns the embedding output: the first of `names` that exists, SigLIP's pooled output, or the
+/// only output.
 fn embedding_output(model: &Model, names: &[&str], configuration: &serde_json::Value) -> Result<String> {
     let pooled = || model.output(&[POOLED]).filter(|_| is_siglip(configuration));
     let only = || model.outputs.first().filter(|_| model.outputs.len() == 1).map(String::as_str);
@@ -68,19 +71,22 @@ fn embedding_output(model: &Model, names: &[&str], configuration: &serde_json::V
 }
 
 impl ClipImage {
-    /// Loads the tower. Size and normalisation are those of `preprocessor_config.json` in its folder or the one above, as
-    /// far as there is one; a size that the model fixes goes first. `config.json` there tells whether it is SigLIP's.
+    /// Loads the tower.
+    ///
+    /// Size and normalisation come from `preprocessor_config.json` in the model's folder or its
+    /// parent folder, if there is one. A size that the model fixes has priority. `config.json`
+    /// there identifies SigLIP.
     ///
     /// # Errors
-    /// When the file is missing or no image tower.
+    /// When the file is missing or is not an image tower.
     pub fn load(path: &Path) -> Result<Self> {
         let model = Model::load(path)?;
         let [slot] = &model.inputs[..] else {
             let names: Vec<&str> = model.inputs.iter().map(|i| i.name.as_str()).collect();
-            return Err(model.refuse(format!("no image tower alone: its inputs are {}", names.join(", "))));
+            return Err(model.refuse(format!("it is not an image tower, which has one input; its inputs are {}", names.join(", "))));
         };
         if slot.shape.len() != 4 {
-            return Err(model.refuse(format!("its input '{}' takes no pictures", slot.name)));
+            return Err(model.refuse(format!("its input '{}' does not take pictures, which have four dimensions", slot.name)));
         }
         let (fixed, input) = (slot.shape[2], slot.name.clone());
         let configuration = settings(path, "preprocessor_config.json")?;
@@ -96,7 +102,7 @@ impl ClipImage {
         Ok(Self { model: Arc::new(model), input, output, size, mean, deviation, background })
     }
 
-    /// The same tower with this around the masks that it sees.
+    /// Sets the background of masks in their crops.
     #[must_use]
     pub fn with_background(self, background: Background) -> Self {
         Self { background, ..self }
@@ -114,7 +120,7 @@ impl Encoder for ClipImage {
         let plane = self.size * self.size;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         let mut dimension = 0;
-        // A model that fixes its batch takes crops one by one.
+        // A model with a fixed batch size takes one crop at a time.
         let fixed = self.model.input(&[&self.input]).and_then(|s| s.shape[0]);
         for batch in present.chunks(fixed.map_or(BATCH, |_| 1)) {
             let mut values = Vec::with_capacity(batch.len() * 3 * plane);
@@ -126,7 +132,7 @@ impl Encoder for ClipImage {
             let input = Array::new([batch.len(), 3, self.size, self.size], values);
             let embeddings = self.model.run(vec![(&self.input, input)], &[&self.output])?.remove(0);
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
-                return Err(self.model.refuse(format!("{} crops gave embeddings of shape {:?}", batch.len(), embeddings.shape)));
+                return Err(self.model.refuse(format!("for {} crops it returned embeddings of shape {:?}; expected one row for each crop", batch.len(), embeddings.shape)));
             }
             dimension = embeddings.shape[1];
             for (label, row) in batch.iter().zip(embeddings.values.chunks_exact(dimension)) {
@@ -144,11 +150,11 @@ impl ClipText {
     /// Loads the tower and its tokenizer.
     ///
     /// # Errors
-    /// When a file is missing or no text tower.
+    /// When a file is missing or is not a text tower.
     pub fn load(path: &Path) -> Result<Self> {
         let model = Model::load(path)?;
         let ids = model.input(&["input_ids", "text", "tokens", "input"]).map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
-        let (ids, context) = ids.ok_or_else(|| model.refuse("no text tower: it takes no token ids"))?;
+        let (ids, context) = ids.ok_or_else(|| model.refuse("it is no text tower: it has no input for token ids"))?;
         let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
         let configuration = settings(path, "config.json")?;
         let output = embedding_output(&model, &TEXT_OUTPUTS, &configuration)?;
@@ -157,7 +163,7 @@ impl ClipText {
         Ok(Self { context: context.or(told).unwrap_or(tokens.context()), tokens, ids, mask, output, model })
     }
 
-    /// L2-normalised embeddings of whole sentences.
+    /// Returns the L2-normalised embeddings of complete sentences.
     pub(crate) fn sentences(&self, sentences: &[String]) -> Result<Vec<Vec<f32>>> {
         let mut out = Vec::with_capacity(sentences.len());
         let fixed = self.model.input(&[&self.ids]).and_then(|s| s.shape[0]);
@@ -176,7 +182,7 @@ impl ClipText {
             }
             let embeddings = self.model.run(inputs, &[&self.output])?.remove(0);
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
-                return Err(self.model.refuse(format!("{} texts gave embeddings of shape {:?}", batch.len(), embeddings.shape)));
+                return Err(self.model.refuse(format!("for {} texts it returned embeddings of shape {:?}; expected one row for each text", batch.len(), embeddings.shape)));
             }
             out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(|row| {
                 let mut row = row.to_vec();
@@ -202,10 +208,10 @@ impl TextEncoder for ClipText {
     }
 }
 
-/// That the two towers belong together: their embeddings are of one length.
+/// Checks that the embeddings of both towers have the same length.
 ///
 /// # Errors
-/// When they are not, naming both lengths.
+/// When the lengths differ; the error gives both.
 pub fn check_pair(image: &ClipImage, text: &ClipText) -> Result<()> {
     let gray = RgbImage::from_pixel(8, 8, image::Rgb([127; 3]));
     let pixel = LabelMap { width: 8, height: 8, labels: vec![1; 64] };
@@ -213,7 +219,7 @@ pub fn check_pair(image: &ClipImage, text: &ClipText) -> Result<()> {
     if a == b {
         return Ok(());
     }
-    Err(Error::Invalid(format!("the CLIP towers do not belong together: the image tower gives {a} numbers, the text tower {b}")))
+    Err(Error::Invalid(format!("the CLIP towers do not belong together: embeddings of the image tower have length {a}, those of the text tower {b}; use two towers of one model")))
 }
 
 #[cfg(test)]
@@ -224,7 +230,7 @@ mod tests {
 
     fn has_runtime() -> bool {
         let found = crate::places::runtime_library().inspect_err(|e| eprintln!("SKIPPED: {e}"));
-        assert!(found.is_ok() || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "the runtime is required");
+        assert!(found.is_ok() || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "FASTLGS_REQUIRE_MODELS is set, but ONNX Runtime is missing");
         found.is_ok()
     }
 
@@ -239,7 +245,7 @@ mod tests {
         let (image, text) = (ClipImage::load(&image).unwrap(), ClipText::load(&text).unwrap());
         assert_eq!(image.size, 32);
         check_pair(&image, &text).unwrap();
-        // Label 1 red, 2 absent, 3 blue with green around it, which the mask hides.
+        // Label 1 is red, label 2 is absent, label 3 is blue. The green between them is in no mask.
         let photo = RgbImage::from_fn(60, 40, |x, _| {
             Rgb(if x < 20 {
                 [220, 30, 30]

@@ -1,5 +1,7 @@
-//! The offline joint space: ConSE (Norouzi et al. 2014). What an image means is the probability-weighted mean of the
-//! text embeddings of its ten most likely ImageNet class names. A zero-shot encoder with the limits of 1,000 concepts.
+//! The offline encoder, a joint space of photos and texts: ConSE (Norouzi et al. 2014).
+//!
+//! The embedding of an image is the probability-weighted mean of the text embeddings of its ten
+//! most likely ImageNet class names. It is zero-shot, but limited to 1,000 concepts.
 
 use crate::appearance::{self, Appearance};
 use crate::attributes;
@@ -13,35 +15,36 @@ use fastlgs_core::rng::Rng;
 use image::RgbImage;
 use rayon::prelude::*;
 
-/// Changes when the same mask gets another embedding: those of different versions cannot be compared.
+/// Version of the embeddings; those of different versions cannot be compared. Raise it when a mask
+/// gets another embedding.
 pub const VERSION: u32 = 3;
 
-/// Numbers of an embedding: what MiniLM makes of words, [`attributes`], and [`appearance`].
+/// Length of an embedding: 384 values of MiniLM, then [`attributes`] and [`appearance`].
 pub const LENGTH: usize = 384 + attributes::COUNT + appearance::COUNT;
 
-/// Classes that take part in what an embedding means.
+/// Number of classes that contribute to an embedding.
 const TOP: usize = 10;
-/// Input size of EfficientNet-Lite2.
+/// Input size of EfficientNet-Lite2 in pixels.
 const SIZE: usize = 260;
-/// Dimensions of the dense embedding.
+/// Number of dimensions of a projected dense map.
 pub const DENSE: usize = 32;
-/// Masks in one inference.
+/// Number of masks in one inference.
 const BATCH: usize = 4;
 
-/// Features of the cells of a photo.
+/// Features of a grid of cells that covers a photo.
 #[derive(Clone, Debug)]
 pub struct DenseMap {
-    /// Cells in a row.
+    /// Number of cells in a row.
     pub columns: usize,
-    /// Cells in a column.
+    /// Number of cells in a column.
     pub rows: usize,
-    /// Values of a cell.
+    /// Number of values of a cell.
     pub channels: usize,
     /// `[rows][columns][channels]`.
     pub values: Vec<f32>,
 }
 
-/// EfficientNet-Lite2 + MiniLM.
+/// The offline encoder: EfficientNet-Lite2 and MiniLM.
 pub struct Conse {
     classifier: Model,
     /// `[1000][384]`, L2-normalised.
@@ -52,7 +55,7 @@ pub struct Conse {
 }
 
 impl Conse {
-    /// Loads both towers from the cache folder.
+    /// Loads the classifier and the embeddings of its class names from the cache folder.
     ///
     /// # Errors
     /// When they are not installed.
@@ -66,13 +69,13 @@ impl Conse {
         Ok(Self { classifier, class_embeddings, projection, appearance })
     }
 
-    /// Class logits of each crop.
+    /// Returns the class logits of each crop, `[crops][1000]`.
     fn logits(&self, crops: &[crops::Crop]) -> Result<Array> {
         let data = crops.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
         Ok(self.classifier.run(vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0))
     }
 
-    /// The ConSE embedding of class probabilities.
+    /// Returns the L2-normalised ConSE embedding of class probabilities.
     fn embedding(&self, probabilities: &[f32]) -> Vec<f32> {
         let mut order: Vec<usize> = (0..probabilities.len()).collect();
         order.sort_by(|&a, &b| probabilities[b].total_cmp(&probabilities[a]).then(a.cmp(&b)));
@@ -86,7 +89,7 @@ impl Conse {
         sum
     }
 
-    /// What every part of a photo looks like: the class logits of cells of 32 pixels, without their mean over the photo.
+    /// Returns the class logits of cells of 32 pixels, minus the mean of each class over the photo.
     ///
     /// # Errors
     /// When inference fails.
@@ -107,7 +110,8 @@ impl Conse {
         Ok(DenseMap { columns, rows, channels: classes, values })
     }
 
-    /// A dense map in [`DENSE`] dimensions: a seeded random projection keeps distances.
+    /// Projects a dense map to [`DENSE`] dimensions by a seeded random projection, which preserves
+    /// distances approximately.
     pub fn project(&self, map: &DenseMap) -> DenseMap {
         let mut values = vec![0.0; map.columns * map.rows * DENSE];
         for (cell, out) in map.values.chunks_exact(map.channels).zip(values.chunks_exact_mut(DENSE)) {
@@ -118,8 +122,9 @@ impl Conse {
         DenseMap { channels: DENSE, values, ..*map }
     }
 
-    /// Class logits of each label 1..=max; empty for labels that do not occur. A mask is looked at twice, by itself and with what
-    /// surrounds it; the mean of both logits is what both views of it allow for.
+    /// Returns the class logits of each label 1..=max; empty for labels that do not occur.
+    ///
+    /// Each mask is classified alone and with its surroundings; the result is the mean of both.
     fn mask_logits(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let photo = &exposure::lifted(photo);
         let boxes = masks.boxes();

@@ -11,16 +11,17 @@ pub struct Crop {
     pub planar: Vec<f32>,
 }
 
-/// How a crop treats what is not the mask.
+/// Treatment of the pixels outside of the mask in a crop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Surround {
     /// Painted with mid grey.
     Neutral,
-    /// Left as it is, with some context around the box.
+    /// Unchanged, with a wider margin around the box.
     Context,
 }
 
-/// Cuts the box of `label`, widened to a square, and scales it (bilinear, area-averaged by sampling).
+/// Cuts the box of `label`, widened to a square with a margin. Scales it to `size` pixels: each
+/// pixel is the mean of up to 4 x 4 samples.
 pub fn crop(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], size: usize, surround: Surround) -> Crop {
     let [x0, y0, x1, y1] = bounds.map(|v| v as f32);
     // Masks may be coarser than the photo.
@@ -55,31 +56,33 @@ pub fn crop(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], si
     Crop { planar }
 }
 
-/// Side of a crop's box over that of the mask's.
+/// Side of a crop, relative to the longer side of the mask's box.
 const MARGIN: f32 = 1.05;
 
-/// What stands around the mask in a crop for CLIP; which tells most depends on the model.
+/// Background of the mask in a crop for CLIP. The best choice depends on the model.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Background {
     /// Mid grey.
     #[default]
     Grey,
-    /// Black, as LangSplat has it.
+    /// Black, as in LangSplat.
     Black,
-    /// The photo, out of focus.
+    /// The photo, blurred.
     Blurred,
 }
 
 impl Background {
-    /// All of them.
+    /// All backgrounds.
     pub const ALL: [Self; 3] = [Self::Grey, Self::Black, Self::Blurred];
 }
 
-/// Side of the picture that a blurred background is reduced to: what is left tells of a place, and not of things.
+/// Side in pixels to which a blurred background is reduced: it still shows the kind of place, but
+/// no objects.
 const OUT_OF_FOCUS: u32 = 12;
 
-/// The same with a background of choice, scaled as CLIP's own preprocessing does: bicubic, antialiased.
+/// Cuts the box of `label` with the given background, and scales it as CLIP's preprocessing does:
+/// bicubic, antialiased.
 pub fn bicubic(photo: &RgbImage, masks: &LabelMap, label: u16, bounds: [u32; 4], size: usize, background: Background) -> Crop {
     let [x0, y0, x1, y1] = bounds.map(|v| v as f32);
     let (sx, sy) = (photo.width() as f32 / masks.width as f32, photo.height() as f32 / masks.height as f32);
@@ -134,7 +137,7 @@ mod tests {
         assert_eq!([at(&black, 16, 16), at(&black, 1, 16)], [[255.0, 0.0, 0.0], [0.0; 3]]);
         let [red, green, blue] = at(&blurred, 4, 16);
         assert_eq!((at(&blurred, 16, 16), blue), ([255.0, 0.0, 0.0], 0.0));
-        assert!(red > 20.0 && green > 20.0, "some of the thing is around it: {red}, {green}");
+        assert!(red > 20.0 && green > 20.0, "the blurred background contains both colours: {red}, {green}");
         let context = crop(&photo, &masks, 1, bounds, 32, Surround::Context);
         assert_eq!(at(&context, 1, 16), [0.0, 255.0, 0.0]);
     }

@@ -4,14 +4,14 @@ use crate::runtime::{Array, Model};
 use crate::{Result, places};
 use image::RgbImage;
 
-/// Mean of the training pictures, BGR.
+/// Mean of the training pictures, BGR in [0, 255].
 const MEAN_BGR: [f32; 3] = [103.939, 116.779, 123.68];
 
 /// The edge detector.
 pub struct Hed(Model);
 
 impl Hed {
-    /// Loads it from the cache folder.
+    /// Loads the model from the cache folder.
     ///
     /// # Errors
     /// When it is not installed.
@@ -19,7 +19,7 @@ impl Hed {
         Ok(Self(Model::load_for_each_core(&places::offline_dir().join("edges.onnx"))?))
     }
 
-    /// Edge probability of each pixel, row-major.
+    /// Returns the edge probability of each pixel, row-major.
     ///
     /// # Errors
     /// When inference fails.

@@ -1,4 +1,4 @@
-//! What embeds masks and texts into one space.
+//! Traits of encoders, which embed masks and texts in one space.
 
 use crate::Result;
 use fastlgs_core::LabelMap;
@@ -8,29 +8,32 @@ use image::RgbImage;
 pub trait Encoder: Sync {
     /// Name recorded in the scene; a query must use the text tower of the same encoder.
     fn name(&self) -> &'static str;
-    /// One embedding for each label 1..=max of the map of a view, in order; zeros for labels that do not occur. What texts are compared with has length 1;
-    /// between examples further numbers may count ([`crate::appearance`]).
+    /// Returns one embedding for each label 1..=max of a view's label map, in order; zeros for
+    /// labels that do not occur. The values that are compared with texts have length 1. Further
+    /// values may count between examples ([`crate::appearance`]).
     ///
     /// # Errors
-    /// When inference fails, or embeddings that were made elsewhere are missing.
+    /// When inference fails, or imported embeddings are missing.
     fn embed_masks(&self, view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>>;
 }
 
 /// Embeds texts.
 pub trait TextEncoder: Send {
-    /// One embedding a text, to be multiplied with those of masks.
+    /// Returns one embedding for each text. Its inner product with that of a mask is their
+    /// similarity.
     ///
     /// # Errors
     /// When inference fails.
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>>;
 
-    /// By how much the cosine that unrelated masks reach with this text exceeds what they reach with others.
+    /// Returns by how much this text raises the cosine of unrelated masks, compared with other
+    /// texts.
     fn advantage(&self, _text: &str) -> f32 {
         0.0
     }
 }
 
-/// Scales a vector to length 1; a zero vector stays.
+/// Scales a vector to length 1; a zero vector stays zero.
 pub fn normalise(vector: &mut [f32]) {
     let length = vector.iter().map(|v| v * v).sum::<f32>().sqrt();
     if length > 0.0 {

@@ -1,13 +1,13 @@
-//! Photos as bright as those that the networks were trained on.
+//! Brightens dark photos to the level that the networks were trained on.
 
 use image::RgbImage;
 
-/// Mean luminance that a dark photo is lifted to, as a share of white: about that of ImageNet.
+/// Target of the mean luminance of dark photos, as a share of white: about that of ImageNet.
 const TARGET: f32 = 0.45;
-/// Strongest lift: beyond, sensor noise is all that comes up.
+/// Smallest gamma, which brightens most. Below it, mostly sensor noise becomes visible.
 const LEAST_GAMMA: f32 = 0.45;
 
-/// The photo, if it is dark with its mid-tones lifted by a gamma curve. Bright photos come back as they are.
+/// Returns the photo; if it is dark, its mid-tones are brightened by a gamma curve.
 pub fn lifted(photo: &RgbImage) -> RgbImage {
     let pixels = (photo.width() * photo.height()).max(1) as f32;
     let luminance = |p: &image::Rgb<u8>| 0.2126 * f32::from(p[0]) + 0.7152 * f32::from(p[1]) + 0.0722 * f32::from(p[2]);

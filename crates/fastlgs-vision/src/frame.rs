@@ -1,4 +1,6 @@
-//! Poses that were found anew, brought into the frame of those that were given: what else is known of the scene, and other photos of it, lie there.
+//! Aligns newly computed poses with the given ones.
+//!
+//! The result stays in the given world frame, because other data and photos of the scene use it.
 
 use crate::similarity::Similarity;
 use fastlgs_core::Camera;
@@ -6,18 +8,22 @@ use fastlgs_core::rng::Rng;
 use glam::{Mat4, Quat, Vec3};
 use std::collections::BTreeSet;
 
-/// Trials of three cameras each.
+/// Number of random samples of three cameras each (RANSAC).
 const TRIALS: usize = 2000;
-/// Distance, as a share of that of half of the cameras from their middle, and angle in radians, up to which two poses of a camera are the same.
+/// Largest distance of equal positions, as a share of the cameras' `spread`.
 const SAME: f32 = 0.02;
+/// Largest angle of equal rotations, in radians.
 const SAME_TURN: f32 = 0.05;
-/// Times that the frame is fitted again to all that agree with it.
+/// Number of times that the frame is fitted again to all cameras that agree with it.
 const FITS: usize = 3;
-/// Fewest cameras that have to agree on a frame.
+/// Smallest number of cameras that must agree on a frame.
 const FEW: usize = 4;
 
-/// The cameras of `given` with the poses that were `found` for them, in the frame on which most of both agree, and the photos whose cameras are elsewhere
-/// than they were. Those without a new pose stay. None where there is no such frame.
+/// Returns the cameras of `given` with the poses `found` for them, and the photos whose pose
+/// changed.
+///
+/// New poses are moved into the given frame by the similarity on which most cameras agree. Cameras
+/// without a new pose stay unchanged. Returns `None` if no such similarity exists.
 pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<Camera>, BTreeSet<usize>)> {
     let placed: Vec<(usize, Camera)> = found
         .iter()
@@ -71,7 +77,8 @@ pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<
     Some((cameras, moved))
 }
 
-/// How far half of the cameras are from the middle of all; some may be anywhere.
+/// Returns the median distance of the cameras from their median position, which is robust to
+/// outliers.
 fn spread(cameras: &[Camera]) -> f32 {
     let median = |mut values: Vec<f32>| {
         values.sort_by(f32::total_cmp);
@@ -93,7 +100,8 @@ mod tests {
             Camera::look_at(&k.to_string(), Vec3::new(4.0 * sin, 0.1 * (k % 5) as f32, 4.0 * cos), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
         };
         let truth: Vec<Camera> = (0..20).map(|k| eye(k, 0.0)).collect();
-        // The last seven were given on a wrong arc, consistent among themselves; one was given far away, and one turned aside.
+        // The last seven given poses lie on a wrong arc that is consistent in itself. One camera is
+        // far away, and one is rotated.
         let mut given: Vec<Camera> = (0..20).map(|k| eye(k, if k < 13 { 0.0 } else { 1.0 })).collect();
         given[1].world_to_camera.w_axis.x += 1000.0;
         given[2].world_to_camera = Mat4::from_rotation_z(0.3) * given[2].world_to_camera;
@@ -111,7 +119,7 @@ mod tests {
         let (cameras, moved) = kept(&given, &found, 1).unwrap();
         assert_eq!(moved, [1, 2].into_iter().chain(13..20).collect());
         assert!(cameras.iter().zip(&truth).all(|(c, t)| c.world_to_camera.abs_diff_eq(t.world_to_camera, 1e-3)));
-        assert_eq!(cameras[4], given[4], "what was not placed stays");
+        assert_eq!(cameras[4], given[4], "a camera without a new pose stays unchanged");
         assert!(kept(&given, &vec![None; 20], 1).is_none());
     }
 }

@@ -1,15 +1,18 @@
-//! Colour distributions C of masks and their similarity (paper, feature similarity comparison).
+//! Colour histograms of masks (C in the paper's feature similarity comparison).
 
 use fastlgs_core::LabelMap;
 use image::{RgbImage, imageops::FilterType};
 
-/// Bins along each of R, G and B.
+/// Number of bins for each of R, G and B.
 const SIDE: usize = 8;
 /// Length of a histogram.
 pub const BINS: usize = SIDE * SIDE * SIDE;
 
-/// Normalised joint RGB histogram of each label 1..=max. A pixel counts in the two bins around it along each channel, as it lies between their
-/// middles: with hard bins, two photos of a thing of which one is a little brighter share few bins, and Algorithm 1 would ask for a cosine above 1.
+/// Returns the normalised joint RGB histogram of each label 1..=max.
+///
+/// Each pixel is shared linearly between the two nearest bins of each channel. With hard bins, a
+/// small change of brightness would move most pixels to other bins. Algorithm 1 would then require
+/// a cosine above 1.
 pub fn histograms(photo: &RgbImage, masks: &LabelMap) -> Vec<Vec<f32>> {
     let photo = image::imageops::resize(photo, masks.width, masks.height, FilterType::Triangle);
     let mut out = vec![vec![0.0f32; BINS]; usize::from(masks.max())];
@@ -30,7 +33,7 @@ pub fn histograms(photo: &RgbImage, masks: &LabelMap) -> Vec<Vec<f32>> {
     out
 }
 
-/// The two bins around a value, with its shares in them.
+/// Returns the two bins nearest to a value, each with its weight.
 fn around(value: u8) -> [(usize, f32); 2] {
     let at = ((f32::from(value) + 0.5) * SIDE as f32 / 256.0 - 0.5).clamp(0.0, (SIDE - 1) as f32);
     let below = (at as usize).min(SIDE - 2);
@@ -50,7 +53,7 @@ mod tests {
         for v in [0, 31, 32, 100, 255] {
             assert!((of(v).iter().sum::<f32>() - 1.0).abs() < 1e-5 && (alike(v, v) - 1.0).abs() < 1e-5);
         }
-        assert!(alike(30, 33) > 0.97, "over the border of two bins: {}", alike(30, 33));
+        assert!(alike(30, 33) > 0.97, "values on both sides of a bin border: {}", alike(30, 33));
         assert!(alike(20, 120) < 0.01);
     }
 }

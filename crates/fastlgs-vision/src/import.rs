@@ -1,4 +1,4 @@
-//! Masks and embeddings that other programs made, in the layouts that they leave beside the photos.
+//! Imports masks and embeddings of other programs, in the layouts that these programs write.
 
 use crate::runtime::Array;
 use crate::segmenter::Segmenter;
@@ -14,28 +14,32 @@ use image::RgbImage;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// How masks lie beside the photos.
+/// Layout of the masks beside the photos.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
-    /// `masks/NAME.png`: 16-bit labels, 0 for none; finer levels in `masks/part/` and `masks/subpart/`.
+    /// `masks/NAME.png`: 16-bit labels, 0 means none. Finer levels are in `masks/part/` and
+    /// `masks/subpart/`.
     Labels,
-    /// JSON in `masks/`, `annotations/` or `images/`, for each photo (`NAME.json` or `STEM.json`) or for all: COCO's annotations, labelme's and Label
-    /// Studio's; masks may overlap, and `track_id` is the same in all photos.
+    /// JSON of COCO, labelme or Label Studio in `masks/`, `annotations/` or `images/`: one file for
+    /// each photo (`NAME.json` or `STEM.json`) or one for all. Masks may overlap; a `track_id` is
+    /// the same object in all photos.
     Annotations,
-    /// `masks/STEM/*.png`: one black-and-white picture a mask, which may overlap.
+    /// `masks/STEM/*.png`: one black-and-white picture for each mask. Masks may overlap.
     MaskFolders,
-    /// LangSplat's `language_features/STEM_s.npy` (levels default, small, medium, large) and `STEM_f.npy`.
+    /// LangSplat's `language_features/STEM_s.npy` (levels default, small, medium, large) and
+    /// `STEM_f.npy`.
     LangSplat,
-    /// Gaussian Grouping's `object_mask/STEM.png`: ids that are the same in all photos.
+    /// Gaussian Grouping's `object_mask/STEM.png`: an id is the same object in all photos.
     GaussianGrouping,
     /// SPIn-NeRF's `label/STEM.png` or `images_N/label/STEM.png`: one object, black and white.
     SpinNerf,
 }
 
-/// The camera of a photo, at any size, and the distortion of its lens: imported masks were drawn on the distorted photo.
+/// Camera of a photo, at any size, and the distortion of its lens. Imported masks were drawn on the
+/// distorted photo.
 pub type Lens = (Camera, Distortion);
 
-/// The lens of each photo, by name.
+/// Returns the lens of each photo, by name.
 pub fn lenses(dataset: &Dataset) -> BTreeMap<String, Lens> {
     dataset.photos.iter().map(|p| (p.camera.name.clone(), (p.camera.clone(), p.distortion))).collect()
 }
@@ -47,45 +51,47 @@ pub struct Import {
     lenses: BTreeMap<String, Lens>,
 }
 
-/// Proportions of a label map may differ from the photo's by this share.
+/// Largest relative difference between the aspect ratios of masks and photo.
 const PROPORTIONS: f64 = 0.02;
-/// IoU from which the embedding of an imported mask describes another mask.
+/// Smallest IoU at which the embedding of an imported mask is used for another mask.
 const SAME: f32 = 0.3;
 
 fn stem(view: &str) -> &str {
     Path::new(view).file_stem().and_then(|s| s.to_str()).unwrap_or(view)
 }
 
-/// Masks as they are on disk, and the row of each one's embedding among those of its photo: those of finer levels have none.
+/// Masks as they are on disk, with the row of each mask's embedding. Masks of finer levels have no
+/// row.
 struct Found {
     list: MaskList,
     rows: Vec<Option<usize>>,
 }
 
 impl Found {
-    /// From label maps, coarse to fine: embeddings are in the order of the coarsest map's labels, from 1 on.
+    /// Collects the masks of label maps, from coarse to fine. Embeddings follow the labels of the
+    /// coarsest map, from 1 on.
     fn of_maps(maps: &[LabelMap]) -> Self {
         let mut found = Self { list: MaskList::new(maps[0].width, maps[0].height), rows: Vec::new() };
         for (level, map) in Level::ALL.into_iter().zip(maps) {
             let row = |label: u16| (level == Level::Whole).then(|| usize::from(label) - 1);
-            // Finer levels may be drawn at another size.
+            // Finer levels may have another size.
             let map = map.resized(found.list.width, found.list.height);
             found.rows.extend(found.list.add(level, &map).into_iter().map(row));
         }
         found
     }
 
-    /// From masks in the order of their embeddings.
+    /// Takes masks whose embeddings are in the same order.
     fn in_order(list: MaskList) -> Self {
         Self { rows: (0..list.masks.len()).map(Some).collect(), list }
     }
 }
 
 impl Import {
-    /// Finds out which layout PHOTOS has.
+    /// Detects the layout of the folder `photos`.
     ///
     /// # Errors
-    /// When there is none; the message lists those that are known.
+    /// When it has no known layout; the message lists all of them.
     pub fn open(photos: &Path, lenses: BTreeMap<String, Lens>) -> Result<Self> {
         let masks = photos.join("masks");
         let some = |folder: &Path, want: &dyn Fn(&Path) -> bool| folder.read_dir().is_ok_and(|d| d.flatten().any(|e| want(&e.path())));
@@ -115,20 +121,20 @@ impl Import {
         Ok(Self { photos: photos.to_owned(), layout, lenses })
     }
 
-    /// The layout that was found.
+    /// Returns the detected layout.
     pub fn layout(&self) -> Layout {
         self.layout
     }
 
-    /// The first of some files of a view that is there.
+    /// Returns the first of `candidates` that exists.
     fn find(&self, view: &str, candidates: &[PathBuf]) -> Result<PathBuf> {
         candidates.iter().find(|p| p.exists()).cloned().ok_or_else(|| {
             let first = candidates.first().map(|p| p.display().to_string()).unwrap_or_default();
-            Error::Missing(format!("{first}: the photo '{view}' has no masks; add them, or take the photo out of images/"))
+            Error::Missing(format!("{first}: not found, so the photo '{view}' has no masks; add them, or remove the photo from images/"))
         })
     }
 
-    /// The masks of a view in its own file of annotations, or in one of several photos.
+    /// Loads the masks of a view from its own annotation file, or from one of several photos.
     fn annotated(&self, view: &str) -> Result<MaskList> {
         let sides = self.lenses.get(view).map(|(camera, _)| (camera.width, camera.height));
         let folders = annotation_folders(&self.photos);
@@ -145,12 +151,12 @@ impl Import {
         }
         let looked_at: Vec<String> = own.iter().chain(&shared).take(5).map(|path| path.display().to_string()).collect();
         Err(Error::Missing(format!(
-            "the photo '{view}' has no masks in {}; add them, or take the photo out of images/",
+            "the photo '{view}' has no masks in {}; add them, or remove the photo from images/",
             looked_at.join(", ")
         )))
     }
 
-    /// The masks of a view as they are on disk.
+    /// Loads the masks of a view as they are on disk.
     fn found(&self, view: &str) -> Result<Found> {
         let stem = stem(view);
         let named = |folder: PathBuf, ending: &str| [view, stem].map(|n| folder.join(format!("{n}.{ending}")));
@@ -172,7 +178,7 @@ impl Import {
                 let Npy { shape, values } = npy::read(&path)?;
                 let [levels @ (1 | 4), rows, columns] = shape[..] else {
                     return Err(Error::Invalid(format!(
-                        "{}: shape {shape:?}; LangSplat's segmentations are (4, rows, columns)",
+                        "{}: the array has shape {shape:?}; LangSplat's segmentations have (4, rows, columns)",
                         path.display()
                     )));
                 };
@@ -185,7 +191,8 @@ impl Import {
             Layout::GaussianGrouping => {
                 let map = LabelMap::load_with_void(&self.find(view, &named(self.photos.join("object_mask"), "png"))?)?;
                 let mut found = Found::of_maps(&[map]);
-                // Rows follow the labels, and these are the things' numbers in all photos.
+                // Rows of embeddings follow the labels, and a label is the same object in all
+                // photos.
                 found.list.masks.iter_mut().zip(&found.rows).for_each(|(mask, row)| mask.track = row.map(|r| r as u32 + 1));
                 Ok(found)
             }
@@ -199,7 +206,8 @@ impl Import {
         }
     }
 
-    /// The masks of a view at the size of the working photo, without the lens's distortion; those of which nothing is left are gone.
+    /// Returns the masks of a view at the size of the prepared photo, without lens distortion.
+    /// Masks that become empty are removed.
     fn fitted(&self, view: &str, width: u32, height: u32) -> Result<Found> {
         let Found { list, rows } = self.found(view)?;
         if list.masks.is_empty() {
@@ -210,7 +218,7 @@ impl Import {
         if (proportions(list.width, list.height) / proportions(width, height) - 1.0).abs() > PROPORTIONS {
             let (w, h) = (list.width, list.height);
             return Err(Error::Invalid(format!(
-                "{}: the masks of '{view}' are {w}x{h}, which does not fit a photo of {width}x{height}; were they cropped or rotated?",
+                "{}: the masks of '{view}' are {w}x{h}, which does not fit a photo of {width}x{height}; use masks that are neither cropped nor rotated",
                 self.photos.display()
             )));
         }
@@ -229,7 +237,7 @@ impl Import {
         Ok(Found { list: MaskList { masks, ..MaskList::new(width, height) }, rows })
     }
 
-    /// Embeddings of a view's *whole* masks, label 1 first; none where the layout has none.
+    /// Loads the embeddings of a view's *whole* masks, label 1 first; `None` if there are none.
     fn rows(&self, view: &str) -> Result<Option<Array>> {
         let stem = stem(view);
         let rows = if self.layout == Layout::LangSplat {
@@ -242,7 +250,7 @@ impl Import {
             } else if let Some(path) = at("safetensors") {
                 let mut tensors = load_tensors(&path)?;
                 let (shape, values) =
-                    tensors.remove("embeddings").ok_or_else(|| Error::Invalid(format!("{}: no tensor 'embeddings'", path.display())))?;
+                    tensors.remove("embeddings").ok_or_else(|| Error::Invalid(format!("{}: it has no tensor 'embeddings'; write one with a row for each mask", path.display())))?;
                 Array::new(shape, values)
             } else {
                 return Ok(None);
@@ -250,7 +258,7 @@ impl Import {
         };
         if rows.shape.len() != 2 || rows.values.iter().any(|v| !v.is_finite()) {
             return Err(Error::Invalid(format!(
-                "{}: the embeddings of '{view}' have shape {:?}; one finite row a mask is needed",
+                "{}: the embeddings of '{view}' have shape {:?}; write one row of finite numbers for each mask",
                 self.photos.display(),
                 rows.shape
             )));
@@ -263,7 +271,7 @@ fn array(npy: Npy) -> Array {
     Array::new(npy.shape, npy.values.into_iter().map(|v| v as f32).collect())
 }
 
-/// The folder of SPIn-NeRF's labels: the finest of `label`, `images_N/label`.
+/// Returns SPIn-NeRF's label folder of the highest resolution: `label` or `images_N/label`.
 fn spin_nerf_folder(photos: &Path) -> Option<PathBuf> {
     let folders = ["label", "images/label", "images_2/label", "images_4/label", "images_8/label"];
     folders.iter().map(|f| photos.join(f)).find(|f| f.is_dir())
@@ -273,7 +281,7 @@ fn is_json(path: &Path) -> bool {
     path.extension().is_some_and(|ending| ending == "json")
 }
 
-/// Where annotation programs leave their files.
+/// Returns the folders in which annotation programs save their files.
 fn annotation_folders(photos: &Path) -> Vec<PathBuf> {
     let mut folders = vec![photos.join("masks"), photos.join("annotations")];
     folders.extend(images_folder(photos));
@@ -281,7 +289,7 @@ fn annotation_folders(photos: &Path) -> Vec<PathBuf> {
     folders
 }
 
-/// All black-and-white pictures of a folder as masks, in the order of their names.
+/// Loads all black-and-white pictures of a folder as masks, in the order of their names.
 fn pictures(folder: &Path) -> Result<MaskList> {
     let entries = folder.read_dir().map_err(fastlgs_core::Error::io(folder))?;
     let mut paths: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
@@ -292,11 +300,11 @@ fn pictures(folder: &Path) -> Result<MaskList> {
         let (width, height) = (picture.width, picture.height);
         let list = list.get_or_insert_with(|| MaskList::new(width, height));
         if (list.width, list.height) != (width, height) {
-            return Err(Error::Invalid(format!("{}: it differs in size from the other masks of its folder", path.display())));
+            return Err(Error::Invalid(format!("{}: its size differs from that of the other masks in its folder; use one size", path.display())));
         }
         list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| picture.inside[(y * width + x) as usize])));
     }
-    list.ok_or_else(|| Error::Missing(format!("{}: no masks (*.png) in it", folder.display())))
+    list.ok_or_else(|| Error::Missing(format!("{}: the folder contains no masks; add *.png files", folder.display())))
 }
 
 impl Segmenter for Import {
@@ -314,19 +322,19 @@ impl Encoder for Import {
         "import"
     }
 
-    /// The imported embedding of the mask that fits each label best; zeros where none does.
+    /// Returns the imported embedding of the mask that fits each label best; zeros if none fits.
     fn embed_masks(&self, view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
         let missing = || {
             let folder = self.photos.display();
-            Error::Missing(format!("{folder}/embeddings: no embeddings of '{view}' (.npy or .safetensors, one row a mask)"))
+            Error::Missing(format!("{folder}/embeddings: no embeddings of '{view}'; add a .npy or .safetensors file with one row for each mask"))
         };
         let embeddings = self.rows(view)?.ok_or_else(missing)?;
         let dimension = embeddings.shape[1];
         let Found { list, rows } = self.fitted(view, photo.width(), photo.height())?;
-        // Of the masks on disk: undistorting may have lost some.
+        // Count the masks on disk: undistorting may have removed some.
         let needed = self.found(view)?.rows.iter().flatten().max().map_or(0, |r| r + 1);
         let given = embeddings.shape[0];
-        // LangSplat's rows are those of all levels.
+        // LangSplat's rows cover all levels.
         if needed > given || (needed < given && self.layout != Layout::LangSplat) {
             let of = match self.layout {
                 Layout::Labels | Layout::GaussianGrouping | Layout::SpinNerf => "labels (row 0 is label 1; the background has no row)",
@@ -351,7 +359,8 @@ impl Encoder for Import {
     }
 }
 
-/// For each label 1..=max of `masks` the place of the mask in `others`, which has the same size, that fits best, if it fits.
+/// Returns for each label 1..=max of `masks` the index of the mask in `others` with the largest
+/// IoU; `None` if that is too small. Both have the same size.
 pub fn fitting(masks: &LabelMap, others: &MaskList) -> Vec<Option<usize>> {
     let areas = masks.areas();
     let mut best: Vec<(f32, Option<usize>)> = vec![(SAME, None); areas.len()];
@@ -383,7 +392,7 @@ mod tests {
         RgbImage::new(PHOTO.0, PHOTO.1)
     }
 
-    /// Left half 1, right half 2.
+    /// Label map with 1 in the left half and 2 in the right half.
     fn halves(width: u32, height: u32) -> LabelMap {
         LabelMap { width, height, labels: (0..width * height).map(|i| if i % width < width / 2 { 1 } else { 2 }).collect() }
     }
@@ -433,7 +442,7 @@ mod tests {
         halves(8, 4).save(&dir.path().join("masks/a.png")).unwrap();
         npy(&dir.path().join("embeddings/a.npy"), &[2, 2], &[3.0f32, 0.0, 0.0, 2.0]);
         let import = open(dir.path());
-        // Other labels, and one mask that fits nothing.
+        // Swapped labels, and one mask that fits no imported mask.
         let mut other = halves(8, 4);
         other.labels.iter_mut().for_each(|l| *l = 3 - *l);
         other.labels[0] = 3;
@@ -443,7 +452,7 @@ mod tests {
         npy(&dir.path().join("embeddings/a.npy"), &[3, 2], &[9.0f32, 9.0, 3.0, 0.0, 0.0, 2.0]);
         let background = import.embed_masks("a.jpg", &photo(), &other).unwrap_err().to_string();
         assert!(background.contains("3 embeddings for 2 labels") && background.contains("background"), "{background}");
-        // Of two that overlap, each answers for itself.
+        // Each of two overlapping masks is matched on its own.
         let both = |x: u32| if x < 2 { 1 } else { 2 };
         let map = LabelMap { width: 8, height: 4, labels: (0..32).map(|p| both(p % 8)).collect() };
         let list = |ends: [u32; 2]| MaskList {
@@ -465,7 +474,7 @@ mod tests {
         assert_eq!(levels.each_ref().map(|m| m.at(0, 0)), [1; 3], "large, medium, small");
         assert_eq!(levels[0].at(7, 0), 0);
         let embeddings = import.embed_masks("a.jpg", &photo(), &levels[0]).unwrap();
-        assert_eq!(embeddings, [[0.0, -1.0]], "the large one's");
+        assert_eq!(embeddings, [[0.0, -1.0]], "embedding of the large mask");
     }
 
     #[test]
@@ -488,9 +497,9 @@ mod tests {
         assert_eq!(import.layout(), Layout::MaskFolders);
         assert_eq!((whole(&import).at(0, 0), whole(&import).at(5, 0)), (2, 1));
         let areas: Vec<usize> = import.segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.runs.area()).collect();
-        assert_eq!(areas, [32, 8], "what lies below is whole");
+        assert_eq!(areas, [32, 8], "the mask below is complete");
 
-        // Masks of 0 and 1.
+        // Masks with the values 0 and 1.
         gray(&dir.path().join("masks/a/0.png"), |_, _| 1);
         gray(&dir.path().join("masks/a/1.png"), |x, _| u8::from(x < 2));
         let areas: Vec<usize> = import.segment("a.jpg", &photo()).unwrap().masks.iter().map(|m| m.runs.area()).collect();
@@ -515,7 +524,7 @@ mod tests {
         let lens = (camera, Distortion { k1: 1.0, ..Distortion::default() });
         let import = Import::open(dir.path(), BTreeMap::from([("a.jpg".to_owned(), lens)])).unwrap();
         let [whole, ..] = levels(&import);
-        // The corner's ray lies outside what the distorted photo shows.
+        // The ray of the corner lies outside of the distorted photo.
         assert_eq!((whole.at(0, 0), whole.at(3, 2), whole.at(4, 2)), (0, 1, 2));
     }
 

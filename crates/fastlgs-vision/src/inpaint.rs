@@ -1,4 +1,4 @@
-//! Colours for what no photo shows.
+//! Inpainters: fill parts of pictures that no photo shows with colours.
 
 use crate::runtime::{Array, Model};
 use crate::{Error, Result};
@@ -8,18 +8,20 @@ use std::path::Path;
 
 /// Fills holes of pictures.
 pub trait Inpainter {
-    /// Gives the pixels of `hole` colours that continue those around them. `colors`: `[3][height][width]`, 0 to 1.
+    /// Fills the pixels of `hole` with colours that continue their surroundings. `colors`:
+    /// `[3][height][width]`, 0 to 1; `hole`: `[height][width]`.
     ///
     /// # Errors
-    /// When what does the work refuses the picture.
+    /// When the inpainter rejects the picture.
     fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> Result<()>;
 }
 
-/// OpenCV's inpainting (Telea 2004): colours and their slopes march in from the rim.
+/// OpenCV's inpainting (Telea 2004): colours and their gradients are continued from the border of
+/// the hole inwards.
 #[cfg(feature = "opencv")]
 pub struct Telea;
 
-/// Pixels around a pixel that decide its colour.
+/// Radius in pixels of the neighbourhood that determines the colour of a pixel.
 #[cfg(feature = "opencv")]
 const REACH: f32 = 5.0;
 
@@ -33,22 +35,25 @@ impl Inpainter for Telea {
     }
 }
 
-/// A network that was trained to inpaint, as ONNX file: `image` `[1][3][h][w]` from 0 to 1 and `mask` `[1][1][h][w]`, 1 in the hole, give one
-/// picture `[1][3][h][w]` from 0 to 1 or to 255 (LaMa as it is exported). Pictures get the size that it wants; where any will do, whole eights.
+/// An inpainting network in an ONNX file, such as LaMa.
+///
+/// Inputs are `image` `[1][3][h][w]`, from 0 to 1, and `mask` `[1][1][h][w]`, 1 in the hole. The
+/// output is one picture `[1][3][h][w]`, from 0 to 1 or from 0 to 255. Pictures are resized to the
+/// input size of the model, or to multiples of 8 pixels if it accepts any size.
 pub struct Learned(Model);
 
-/// LaMa halves its pictures three times.
+/// LaMa halves its pictures three times, so sides must be multiples of 8 pixels.
 const BLOCK: u32 = 8;
 
 impl Learned {
     /// Loads the model.
     ///
     /// # Errors
-    /// When it cannot be loaded, or has other inputs.
+    /// When the model cannot be loaded, or has other inputs.
     pub fn load(path: &Path) -> Result<Self> {
         let model = Model::load(path)?;
         if model.input(&["image"]).is_none_or(|slot| slot.shape.len() != 4) || model.input(&["mask"]).is_none() || model.inputs.len() != 2 {
-            return Err(model.refuse("an inpainter has the inputs 'image' [1][3][h][w] and 'mask' [1][1][h][w], like LaMa's exports"));
+            return Err(model.refuse("it is not an inpainter: its inputs must be 'image' [1][3][h][w] and 'mask' [1][1][h][w], as in LaMa's exports"));
         }
         Ok(Self(model))
     }
@@ -57,7 +62,7 @@ impl Learned {
 impl Inpainter for Learned {
     fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> Result<()> {
         let height = hole.len() as u32 / width;
-        let wanted = &self.0.input(&["image"]).expect("it has one: it was loaded").shape;
+        let wanted = &self.0.input(&["image"]).expect("`load` checks that it exists").shape;
         let side = |wanted: Option<usize>, own: u32| wanted.map_or(own.next_multiple_of(BLOCK), |n| n as u32);
         let (w, h) = (side(wanted[3], width), side(wanted[2], height));
         let picture = image_io::resize(&image_io::from_planar(colors, width, height), w, h);
@@ -68,7 +73,7 @@ impl Inpainter for Learned {
         let output = self.0.outputs[0].clone();
         let found = self.0.run(vec![("image", image), ("mask", mask)], &[&output])?.remove(0);
         if found.shape != shape(3) {
-            return Err(self.0.refuse(format!("it gave a picture of shape {:?} instead of {:?}", found.shape, shape(3))));
+            return Err(self.0.refuse(format!("it returned a picture of shape {:?} instead of {:?}", found.shape, shape(3))));
         }
         let white = if found.values.iter().any(|v| *v > 2.0) { 255.0 } else { 1.0 };
         let values: Vec<f32> = found.values.iter().map(|v| v / white).collect();
@@ -78,12 +83,12 @@ impl Inpainter for Learned {
     }
 }
 
-/// A hole as a picture: 255 within.
+/// Returns a hole as a picture: 255 inside, 0 outside.
 fn mask(hole: &[bool], width: u32) -> GrayImage {
     GrayImage::from_fn(width, hole.len() as u32 / width, |x, y| Luma([if hole[(y * width + x) as usize] { 255 } else { 0 }]))
 }
 
-/// Takes the hole's pixels from `filled`.
+/// Copies the pixels of the hole from `filled`.
 fn replace(colors: &mut [f32], filled: &[f32], hole: &[bool]) {
     for (p, (color, filled)) in colors.iter_mut().zip(filled).enumerate() {
         if hole[p % hole.len()] {
@@ -92,20 +97,20 @@ fn replace(colors: &mut [f32], filled: &[f32], hole: &[bool]) {
     }
 }
 
-/// What its name stands for: `opencv`, or an ONNX file.
+/// Returns the inpainter of a name: `opencv`, or the path of an ONNX file.
 ///
 /// # Errors
-/// A build without OpenCV, or a file that is no inpainter.
+/// When this build has no OpenCV, or the file is not an inpainter.
 pub fn named(name: &str) -> Result<Box<dyn Inpainter>> {
     match name {
         #[cfg(feature = "opencv")]
         "opencv" => Ok(Box::new(Telea)),
         #[cfg(not(feature = "opencv"))]
-        "opencv" => Err(Error::Invalid("this build has no OpenCV; build with --features opencv, or leave --inpainter out".to_owned())),
+        "opencv" => Err(Error::Invalid("this build has no OpenCV; build with --features opencv, or use the inpainter 'membrane'".to_owned())),
         path if Path::new(path).extension().is_some_and(|e| e.eq_ignore_ascii_case("onnx")) => {
             Ok(Box::new(Learned::load(Path::new(path))?))
         }
-        other => Err(Error::Invalid(format!("'{other}' is no inpainter: membrane, opencv, or an ONNX file like LaMa's"))),
+        other => Err(Error::Invalid(format!("'{other}' is not an inpainter; use membrane, opencv, or an ONNX file like LaMa's"))),
     }
 }
 
@@ -114,7 +119,8 @@ mod tests {
     use super::*;
     use crate::onnx::{Graph, Kind};
 
-    /// Colours that grow to the right, with a hole that holds something else.
+    /// Returns colours that increase to the right, the same with other colours in a hole, and the
+    /// hole.
     fn picture(width: u32, height: u32) -> (Vec<f32>, Vec<f32>, Vec<bool>) {
         let n = (width * height) as usize;
         let at = |p: usize| ((p % width as usize) as f32, (p / width as usize) as f32);
@@ -134,7 +140,7 @@ mod tests {
         assert!(worst < 0.06, "{worst}");
     }
 
-    /// A model that paints holes black: image x (1 - mask), in 255ths.
+    /// A model that paints holes black: image x (1 - mask), from 0 to 255.
     #[test]
     fn a_network_fills_only_the_hole() {
         if let Err(e) = crate::places::runtime_library() {

@@ -8,14 +8,14 @@ use image::GrayImage;
 /// Key points of one photo.
 #[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
 pub struct Keypoints {
-    /// Positions in pixels.
+    /// Positions in pixels; (0, 0) is the corner of the first pixel.
     pub positions: Vec<Vec2>,
     /// 128-byte descriptors.
     #[serde(with = "descriptors")]
     pub descriptors: Vec<[u8; 128]>,
 }
 
-/// Serde has no arrays of 128: descriptors one after the other.
+/// Stores descriptors as one byte string, because Serde does not support arrays of length 128.
 mod descriptors {
     use serde::{Deserialize, Deserializer, Serializer};
 
@@ -28,13 +28,13 @@ mod descriptors {
     }
 }
 
-/// Most key points kept a photo, strongest first.
+/// Largest number of key points of a photo; the strongest are kept.
 pub const MAX_KEYPOINTS: usize = 2500;
 
-/// Detects and describes key points: with OpenCV where this build has it, else in pure Rust.
+/// Detects and describes key points, with OpenCV if this build has it, otherwise in pure Rust.
 ///
 /// # Errors
-/// When the picture is refused.
+/// When the detector rejects the picture.
 pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
     #[cfg(feature = "opencv")]
     return detect_with_opencv(photo);
@@ -48,8 +48,10 @@ fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
     Ok(Keypoints { positions, descriptors })
 }
 
-/// How pictures are smoothed and scaled by the SIFT in Rust: of two pixels the first stays where a picture is halved, so that all octaves have their
-/// first pixel at one place. Its own way takes the second, and each octave lies farther off.
+/// Smoothing and scaling of pictures for the SIFT in Rust.
+///
+/// Halving keeps the first of two pixels, so that the first pixels of all octaves coincide. The
+/// default of the library keeps the second, which shifts each octave further.
 #[cfg(feature = "rust-sift")]
 struct Scaling;
 
@@ -78,9 +80,10 @@ fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
     let found = sift_features::sift_with_processing::<Scaling>(photo, Some(MAX_KEYPOINTS));
     let descriptors = found.descriptors.rows().into_iter().map(|row| std::array::from_fn(|k| row[k])).collect::<Vec<[u8; 128]>>();
     if descriptors.len() != found.keypoints.len() {
-        return Err(crate::Error::Invalid("SIFT gave unequal numbers of key points and descriptors".to_owned()));
+        return Err(crate::Error::Invalid("SIFT returned different numbers of key points and descriptors".to_owned()));
     }
-    // It counts from the first pixel of a picture of twice the size, which lies a quarter of a pixel from the corner.
+    // SIFT counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels
+    // from the photo's corner.
     let positions = found.keypoints.iter().map(|p| Vec2::new(p.x + 0.25, p.y + 0.25)).collect();
     Ok(Keypoints { positions, descriptors })
 }
@@ -88,17 +91,18 @@ fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
 #[cfg(not(any(feature = "rust-sift", feature = "opencv")))]
 compile_error!("key points need the feature 'rust-sift' or the feature 'opencv'");
 
-/// Which SIFT this build uses.
+/// Returns the name of this build's SIFT.
 pub fn backend() -> &'static str {
     if cfg!(feature = "opencv") { "OpenCV" } else { "pure Rust" }
 }
 
-/// What kept key points depend on besides their photo: which SIFT found them, and a number that goes up when it finds other positions.
+/// Returns the version of this build's key points, for caches. The number is raised when the
+/// detector finds other positions.
 pub fn version() -> &'static str {
     if cfg!(feature = "opencv") { "OpenCV 2" } else { "pure Rust 3" }
 }
 
-/// Fundamental matrix: x_b^T F x_a = 0 for pixels of the same point.
+/// Returns the fundamental matrix F: x_b^T F x_a = 0 for pixels of the same point.
 pub fn fundamental(a: &Camera, b: &Camera) -> Mat3 {
     let relative = b.world_to_camera * a.world_to_camera.inverse();
     let t = relative.w_axis.truncate();
@@ -107,7 +111,7 @@ pub fn fundamental(a: &Camera, b: &Camera) -> Mat3 {
     k(b).inverse().transpose() * cross * Mat3::from_mat4(relative) * k(a).inverse()
 }
 
-/// Distance in pixels of each point to the other's epipolar line, the larger of the two.
+/// Returns the larger distance in pixels of two points from each other's epipolar line.
 pub fn epipolar_error(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
     let (pa, pb) = (a.extend(1.0), b.extend(1.0));
     let (line_b, line_a) = (*f * pa, f.transpose() * pb);
@@ -115,7 +119,8 @@ pub fn epipolar_error(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
     (residual / line_b.truncate().length().max(1e-12)).max(residual / line_a.truncate().length().max(1e-12))
 }
 
-/// Signed first-order distance in pixels of a match to the epipolar geometry (Sampson).
+/// Returns the signed first-order distance in pixels of a match from the epipolar geometry
+/// (Sampson).
 pub fn epipolar_residual(f: &Mat3, a: Vec2, b: Vec2) -> f32 {
     let (pa, pb) = (a.extend(1.0), b.extend(1.0));
     let (line_b, line_a) = (*f * pa, f.transpose() * pb);
@@ -129,7 +134,7 @@ mod tests {
 
     #[test]
     fn a_shifted_picture_matches_itself() {
-        // Bright and dark blobs of several sizes at seeded places.
+        // Bright and dark blobs of several sizes at seeded positions.
         let mut rng = fastlgs_core::rng::Rng::new(1, "blobs");
         let blobs: Vec<[f32; 4]> =
             (0..150).map(|_| [rng.range(0.0, 280.0), rng.range(0.0, 220.0), rng.range(2.0, 9.0), rng.range(-90.0, 90.0)]).collect();
@@ -146,10 +151,10 @@ mod tests {
         assert!(right * 10 >= pairs.len() * 8, "{right} of {}", pairs.len());
     }
 
-    /// A blob lies where its key point says, on average: half a pixel of one's own would turn every camera.
+    /// Key points lie on their blobs on average: a bias of half a pixel would rotate every camera.
     #[test]
     fn key_points_lie_where_blobs_are() {
-        // An octave each: their first pixels lie at one place, or not.
+        // Each range of radii belongs to one octave, so that a shifted octave shows as a bias.
         const RADII: [f32; 3] = [1.5, 3.0, 6.0];
         const BLOBS: usize = 40;
         let check = |detect: fn(&GrayImage) -> Result<Keypoints>| {
@@ -179,7 +184,7 @@ mod tests {
         check(detect_in_rust);
     }
 
-    /// Both implementations tell the same of two neighbouring photos of fox.
+    /// Both implementations find mostly the same matches in two neighbouring photos of fox.
     #[cfg(all(feature = "opencv", feature = "rust-sift"))]
     #[test]
     fn opencv_and_rust_find_the_same_correspondences() {
@@ -189,7 +194,7 @@ mod tests {
             image::imageops::grayscale(&fastlgs_core::image_io::resize(&photo, 270, 480))
         };
         if !images.is_dir() {
-            eprintln!("SKIPPED: {} is not there", images.display());
+            eprintln!("SKIPPED: {} does not exist", images.display());
             return;
         }
         let (a, b) = (photo("0001.jpg"), photo("0002.jpg"));

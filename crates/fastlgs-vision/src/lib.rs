@@ -1,6 +1,7 @@
-//! Eyes of FastLGS: segmenters, image and text encoders (ONNX Runtime), and key points (SIFT).
+//! Vision of FastLGS: segmenters, encoders (ONNX Runtime), key points (SIFT) and poses.
 //!
-//! A new segmenter is one file behind [`Segmenter`], a new encoder one file behind [`Encoder`].
+//! To add a segmenter, implement [`Segmenter`] in a new file; to add an encoder, implement
+//! [`Encoder`].
 
 pub mod appearance;
 pub mod attributes;
@@ -65,21 +66,21 @@ pub use text::{MiniLm, OfflineText};
 /// Errors of the vision crate.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Weights or the ONNX Runtime library are not installed.
+    /// A file, model, library or program is missing.
     #[error("{0}")]
     Missing(String),
-    /// ONNX Runtime refused a model or an input.
+    /// A model or its input is not valid, or inference failed.
     #[error("{model}: {reason}")]
     Inference {
         /// File of the model.
         model: String,
-        /// What ONNX Runtime said.
+        /// Reason of the failure.
         reason: String,
     },
-    /// Data that does not fit.
+    /// Data with a wrong size, shape or content.
     #[error("{0}")]
     Invalid(String),
-    /// Files.
+    /// An error of `fastlgs-core`, such as a file that cannot be read.
     #[error(transparent)]
     Core(#[from] fastlgs_core::Error),
 }

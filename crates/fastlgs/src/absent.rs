@@ -1,6 +1,6 @@
-//! Names of things that are not there: what must not be found.
+//! Names of absent objects, which measure false alarms.
 
-/// Things that are in neither of the project's scenes; those that a label names are left out.
+/// Absent names for scenes of the project. Callers skip a name that occurs in a label.
 pub(crate) const ABSENT: [&str; 40] = [
     "elephant",
     "airplane",
@@ -44,5 +44,6 @@ pub(crate) const ABSENT: [&str; 40] = [
     "umbrella",
 ];
 
-/// Each of these goes before each absent thing as well: a colour that is there makes nothing else be there.
+/// Words that are put before absent names. The colour of a present object must not make an absent
+/// name match.
 pub(crate) const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "brown", "wooden"];

@@ -1,5 +1,6 @@
-//! Results of preprocessing by what they were made from: a second run does again only what changed, and one that was killed
-//! goes on where it was.
+//! Cache of preprocessing results, with fingerprints of their inputs as keys.
+//!
+//! A second run computes only what changed, and an interrupted run continues.
 
 use crate::Result;
 use fastlgs_core::{SceneFolder, fs};
@@ -10,10 +11,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-/// A fingerprint of inputs.
+/// SHA-256 fingerprint of inputs.
 pub type Key = [u8; 32];
 
-/// Fingerprint of some inputs; where one ends and the next begins counts.
+/// Returns the fingerprint of inputs. The length of each input is part of it.
 pub fn key(parts: &[&[u8]]) -> Key {
     let mut hash = Sha256::new();
     for part in parts {
@@ -23,31 +24,35 @@ pub fn key(parts: &[&[u8]]) -> Key {
     hash.finalize().into()
 }
 
-/// Length of the name of a result: sixteen bytes of its fingerprint in hexadecimal digits.
+/// Length of the file name of a result: 16 bytes of its fingerprint in hexadecimal digits.
 const NAME_LENGTH: usize = 32;
-/// Bytes that may lie idle in any case.
+/// Bytes of unused results that are kept in any case.
 const IDLE: u64 = 256 << 20;
 
-/// `SCENE/cache/STAGE/FINGERPRINT`.
+/// The cache of a scene, with files `SCENE/cache/STAGE/FINGERPRINT`.
 pub struct Cache {
     root: PathBuf,
     used: Mutex<BTreeSet<PathBuf>>,
-    /// By stage: results that were there, and all.
+    /// By stage: number of results found, and number of results requested.
     counts: Mutex<BTreeMap<&'static str, [usize; 2]>>,
 }
 
 impl Cache {
-    /// The cache of a scene folder.
+    /// Returns the cache of a scene folder.
     pub fn new(folder: &SceneFolder) -> Self {
         Self { root: folder.root.join("cache"), used: Mutex::default(), counts: Mutex::default() }
     }
 
-    /// What `make` once made from inputs of this fingerprint, by this version of the program; else makes and keeps it.
+    /// Returns the cached result of these inputs and this version of the program. If there is none,
+    /// calls `make` and stores its result.
+    ///
+    /// # Errors
+    /// Errors of `make`, or a file that cannot be written.
     pub fn get<T: Serialize + DeserializeOwned>(&self, stage: &'static str, inputs: &Key, make: impl FnOnce() -> Result<T>) -> Result<T> {
         let key = key(&[env!("CARGO_PKG_VERSION").as_bytes(), inputs]);
         let name: String = key[..NAME_LENGTH / 2].iter().map(|b| format!("{b:02x}")).collect();
         let path = self.root.join(stage).join(name);
-        // A file that cannot be read is as good as none.
+        // An unreadable file counts as missing.
         let known = std::fs::read(&path).ok().and_then(|bytes| postcard::from_bytes(&bytes).ok());
         self.used.lock().expect("no panic while holding the lock").insert(path.clone());
         let mut counts = self.counts.lock().expect("no panic while holding the lock");
@@ -64,13 +69,14 @@ impl Cache {
         Ok(made)
     }
 
-    /// By stage, how many results were there already and how many were asked for.
+    /// Returns by stage the number of results found, and the number of results requested.
     pub fn counts(&self) -> BTreeMap<&'static str, [usize; 2]> {
         self.counts.lock().expect("no panic while holding the lock").clone()
     }
 
-    /// Removes what this run had no use for, oldest first, until the rest takes no more room than what it used, or than [`IDLE`]: a trial with
-    /// another segmenter, or with masks of another program, leaves the first one's results.
+    /// Removes results that this run did not use, oldest first. The rest takes no more bytes than
+    /// the used results, or than [`IDLE`] if that is more. So a trial with another segmenter keeps
+    /// the earlier results.
     pub fn tidy(&self) {
         self.tidy_to(IDLE);
     }
@@ -79,7 +85,7 @@ impl Cache {
         let used = self.used.lock().expect("no panic while holding the lock");
         let stages = std::fs::read_dir(&self.root).into_iter().flatten().flatten();
         let files = stages.flat_map(|stage| std::fs::read_dir(stage.path()).into_iter().flatten().flatten());
-        // Other files in these folders are not ours.
+        // Other files in these folders are not results.
         let ours = |file: &std::fs::DirEntry| {
             let name = file.file_name();
             name.len() == NAME_LENGTH && name.as_encoded_bytes().iter().all(u8::is_ascii_hexdigit)
@@ -117,14 +123,15 @@ mod tests {
         let cache = Cache::new(&SceneFolder::new(dir.path()));
         assert_eq!((ask(&cache, "one"), ask(&cache, "three"), ask(&cache, "one")), (vec![3], vec![5], vec![3]));
         assert_eq!((*made.borrow(), cache.counts()["stage"]), (2, [1, 3]));
-        // A run that uses one of two leaves the other, one that uses one of many does not leave all.
+        // A run that uses one of two results keeps the other. A run that uses one of many does not
+        // keep all.
         let rest = |input: &str| {
             let cache = Cache::new(&SceneFolder::new(dir.path()));
             ask(&cache, input);
             cache.tidy_to(0);
             std::fs::read_dir(dir.path().join("cache/stage")).unwrap().count()
         };
-        assert_eq!(rest("one"), 2, "as much as is in use may lie idle");
+        assert_eq!(rest("one"), 2, "unused results may take as many bytes as used ones");
         let cache = Cache::new(&SceneFolder::new(dir.path()));
         (0..8).for_each(|k| drop(ask(&cache, &"x".repeat(10 + k))));
         assert_eq!((rest("one"), *made.borrow()), (2, 10));

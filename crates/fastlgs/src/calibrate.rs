@@ -1,4 +1,4 @@
-//! Measures what the cosines of an encoder are worth: on generated scenes whose things are known, and on labelled ones.
+//! Measures the calibration of an encoder on generated scenes and on labelled scenes.
 
 use crate::absent::{ABSENT, COLORS};
 use crate::calibrations::{self, Calibrations, Kept, beside};
@@ -22,51 +22,53 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// What was measured.
+/// Report of a calibration.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// What should stand around masks.
+    /// Best background around the masks in crops.
     pub background: Background,
-    /// With each background, by how many standard deviations of other things' cosines with a name the thing that has it exceeds them.
+    /// By background: how far the cosine of an object with its name exceeds the mean of the other
+    /// objects, in standard deviations of the latter.
     pub separation: BTreeMap<Background, f32>,
-    /// What texts are worth.
+    /// Calibration of texts.
     pub texts: Calibration,
-    /// What pictures are worth.
+    /// Calibration of pictures.
     pub pictures: Calibration,
-    /// Things that were looked at.
+    /// Number of objects in the generated scenes.
     pub things: usize,
-    /// Names of absent things that were asked for.
+    /// Number of absent names.
     pub absent: usize,
-    /// The file that keeps it.
+    /// File that stores the calibration.
     pub kept: PathBuf,
-    /// Seconds that it took.
+    /// Duration in seconds.
     pub seconds: f64,
 }
 
 /// Seeds of the generated tables.
 const TABLES: [u64; 3] = [1, 2, 3];
-/// Photos of each scene.
+/// Number of photos of each generated scene.
 const VIEWS: usize = 12;
-/// Their size.
+/// Width and height of these photos in pixels.
 const SIZE: (u32, u32) = (480, 360);
-/// Smallest share of a photo in which a thing is looked at.
+/// Least share of a photo that a mask must cover to be embedded.
 const LEAST_AREA: f32 = 0.0005;
 
-/// A generated scene: its things, and what the encoder makes of them.
+/// A generated scene: its true objects, and their embeddings.
 struct Known {
     things: Vec<Thing>,
     grid: Grid,
 }
 
-/// Measures what the cosines of CLIP's towers are worth, on generated scenes whose things are known, and keeps it beside the image tower.
+/// Measures the calibration of CLIP's towers on generated scenes, and writes it beside the image
+/// tower.
 ///
 /// # Errors
-/// Towers that cannot be loaded or that tell nothing apart, and a folder that cannot be written.
+/// Towers that cannot be loaded or that distinguish no objects, or a folder that cannot be written.
 pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     let clock = Instant::now();
     if eyes.encoder != EncoderKind::Clip {
         bail!(
-            "the offline encoder comes calibrated, imported embeddings cannot be: name CLIP's towers, with --clip or --clip-image and --clip-text"
+            "only CLIP can be calibrated: the offline encoder is calibrated already, and imported embeddings cannot be; choose the towers with --clip, or with --clip-image and --clip-text"
         );
     }
     let image_tower = eyes.clip_files()?[0].clone();
@@ -75,7 +77,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     let texts = eyes.text_encoder()?;
     let pictures = models::pictures_dir();
     let mut worlds = TABLES.iter().map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed)).collect::<Result<Vec<_>, _>>()?;
-    // The room shows pictures that may not be installed; the tables do without.
+    // The room needs pictures that may not be installed; the tables do not.
     worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
     let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
     let mut known: Vec<Vec<Known>> = Background::ALL.map(|_| Vec::new()).into();
@@ -90,7 +92,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     };
     let there = |name: &str| known[0].iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
     let absent = absent_where(there);
-    let blind = || format!("{}: the encoder tells the generated things not apart by their names; is it CLIP?", image_tower.display());
+    let blind = || format!("{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP", image_tower.display());
     let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
     for (background, known) in Background::ALL.into_iter().zip(&known) {
         let named = by_names(known, &absent, query)?;
@@ -101,7 +103,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
             separation.insert(background, named.separation());
         }
     }
-    // Of equals grey, which comes first.
+    // `max_by` returns the last of equal values; in reverse order that is grey.
     let (background, _) = separation.iter().rev().max_by(|a, b| a.1.total_cmp(b.1)).with_context(blind)?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
     let kept = beside(&image_tower);
@@ -118,7 +120,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     })
 }
 
-/// Renders a generated scene and embeds all its things with their exact masks, by each encoder.
+/// Renders a generated scene and embeds its objects by their exact masks, once for each encoder.
 fn seen(world: &World, encoders: &[ClipImage], advance: impl Fn() -> Result<()>) -> Result<Vec<Known>> {
     let things = world.things.clone();
     let chain =
@@ -148,23 +150,24 @@ fn seen(world: &World, encoders: &[ClipImage], advance: impl Fn() -> Result<()>)
 }
 
 impl Known {
-    /// Things that were seen, with their names.
+    /// Returns the objects that have embeddings, with their names.
     fn objects(&self) -> impl Iterator<Item = (&Object, &str)> {
         let named = self.grid.objects.iter().zip(self.things.iter().map(|t| t.name.as_str()));
         named.filter(|(object, _)| !object.embeddings.is_empty())
     }
 
-    /// Things that neither contain another one nor lie in it.
+    /// Returns the objects that neither contain object `of` nor are part of it.
     fn others(&self, of: u16) -> impl Iterator<Item = &Object> {
         let related = self.grid.related(of);
         self.objects().map(|o| o.0).filter(move |o| !related[usize::from(o.id) - 1])
     }
 }
 
-/// Samples of a trained scene whose labels say what is in it: what `bench names` measures from other scenes.
+/// Returns samples of a labelled scene. `bench names` calibrates each scene by samples of the
+/// others.
 ///
 /// # Errors
-/// Labels of views that the scene lacks, and a device that fails.
+/// Labels of views that the scene lacks, or a failing device.
 pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples> {
     scene.forget_taught();
     let grid = scene.grid()?;
@@ -188,23 +191,25 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
     Ok(samples)
 }
 
-/// Names of absent things, by themselves and with a colour: a colour that is there makes nothing else be there.
+/// Returns the absent names for which `there` is false, each by itself and with a colour. The
+/// colour of a present object must not make an absent name match.
 fn absent_where(there: impl Fn(&str) -> bool) -> Vec<String> {
     let absent = ABSENT.into_iter().filter(|name| !there(name)).zip(COLORS.into_iter().cycle());
     absent.flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")]).collect()
 }
 
-/// IoU with a label from which an object is what it names.
+/// Least IoU of an object with a label to count as the labelled object.
 const SAME: f64 = 0.5;
 
-/// Adds what is asked for, as it is like the thing that is meant and like others.
+/// Adds a sample: the mean cosines of a query with its target and with other objects.
 fn tell<'a>(samples: &mut Samples, query: &TextQuery, own: &Object, others: impl Iterator<Item = &'a Object>) {
     if let Some(cosine) = query::mean_cosine(own, query) {
         samples.tell(cosine, &others.filter_map(|other| query::mean_cosine(other, query)).collect::<Vec<_>>());
     }
 }
 
-/// Samples of things with their own names, with those of others, and of scenes with names of absent things.
+/// Returns samples of texts: names of objects, compared with all objects; and absent names,
+/// compared with all scenes.
 fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<TextQuery>) -> Result<Samples> {
     let mut samples = Samples::default();
     for scene in known {
@@ -219,11 +224,12 @@ fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<T
     Ok(samples)
 }
 
-/// Samples of things with one view of their own, with one of others, and of scenes with views of things that they lack.
+/// Returns samples of pictures: one view of each object, compared with its other views and with
+/// other objects. Absent samples are all views of an object, compared with scenes that lack it.
 fn by_examples<'a>(known: &'a [Known]) -> Samples {
     let mut samples = Samples::default();
     let shown = |object: &Object| TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
-    // As a lesson keeps it: all that was embedded.
+    // A taught name also keeps all embeddings of its object.
     let whole = |object: &Object| TextQuery::of_examples(object.embeddings.clone(), Calibration::CLIP);
     let several = |scene: &'a Known| scene.objects().filter(|(object, _)| object.embeddings.len() > 1);
     for scene in known {

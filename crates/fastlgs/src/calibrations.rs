@@ -1,4 +1,4 @@
-//! What the cosines of a scene's encoder are worth: known for the offline encoder, kept beside the model for others.
+//! Calibrations of encoders: constants for the offline encoder, a file beside the model for others.
 
 use crate::Result;
 use crate::error::Context;
@@ -10,57 +10,60 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The manifest's name of the encoder that comes with the program.
+/// Name of the offline encoder in the manifest.
 pub(crate) const OFFLINE: &str = "offline";
 
-/// What cosines with texts, and cosines with other pictures, are worth.
+/// Calibrations of an encoder for texts and for pictures.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Calibrations {
-    /// Of masks with texts.
+    /// For cosines of masks with texts.
     pub texts: Calibration,
-    /// Of masks with pictures and with things that were shown.
+    /// For cosines of masks with pictures and with examples.
     pub pictures: Calibration,
 }
 
-/// A measurement as it is kept beside the model, with the files that it holds for.
+/// Calibration file beside a model, with the hashes of the towers for which it is valid.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct Kept {
-    /// Of image and text tower.
+    /// SHA-256 of image and text tower.
     pub sha256: [String; 2],
-    /// What should stand around masks: that with which names tell things apart best.
+    /// Background around masks with which names separate objects best.
     pub background: Background,
-    /// With each of them.
+    /// Calibrations by background.
     pub calibrations: BTreeMap<Background, Calibrations>,
 }
 
-/// SHA-256 of the towers among some model files.
+/// Returns the SHA-256 of image and text tower among model files; empty if one is missing.
 pub(crate) fn sums(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
     ["clip_image", "clip_text"].map(|role| files.get(role).map(|file| file.sha256.clone()).unwrap_or_default())
 }
 
-/// What was measured with these towers, if it was.
+/// Reads the calibration file of these towers; `None` if there is none, or none for these hashes.
 fn kept(files: &BTreeMap<String, ModelFile>) -> Option<Kept> {
     let path = beside(&files.get("clip_image")?.path);
     let kept = path.is_file().then(|| fs::read_json::<Kept>(&path))?;
-    // What another version measured was measured for other rules.
+    // A file that cannot be parsed comes from another version, whose values are not comparable.
     if kept.is_err() {
-        tracing::warn!("{}: it is of another version and does not count; run 'fastlgs models calibrate' again", path.display());
+        tracing::warn!("{}: another version wrote this calibration, so it is ignored; run 'fastlgs models calibrate' again", path.display());
     }
     kept.ok().filter(|kept| kept.sha256 == sums(files))
 }
 
-/// What stands around the masks that a scene's encoder saw; a word that this program does not know is refused.
+/// Returns the background around masks in the crops of a scene.
+///
+/// # Errors
+/// A background that this version does not know.
 pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
     if manifest.crops.is_empty() {
         return Ok(Background::default());
     }
     let known = serde_json::from_value(manifest.crops.clone().into()).ok();
     known.with_context(|| {
-        format!("scene.json: 'crops' is '{}', which this program does not know; preprocess the photos again", manifest.crops)
+        format!("scene.json: this version does not know the value '{}' of 'crops'; run 'fastlgs preprocess' again", manifest.crops)
     })
 }
 
-/// The word that a scene remembers for it.
+/// Returns the word for a background in the manifest; empty for grey.
 pub(crate) fn word_of(background: Background) -> String {
     match background {
         Background::Grey => String::new(),
@@ -68,29 +71,29 @@ pub(crate) fn word_of(background: Background) -> String {
     }
 }
 
-/// Whether a measurement of this version lies beside an image tower.
+/// Returns whether a readable calibration file lies beside an image tower.
 pub fn is_measured(image_tower: &Path) -> bool {
     fs::read_json::<Kept>(&beside(image_tower)).is_ok()
 }
 
-/// What should stand around the masks that these towers see.
+/// Returns the best measured background for these towers; the default without calibration file.
 pub(crate) fn best_background(files: &BTreeMap<String, ModelFile>) -> Background {
     kept(files).map(|kept| kept.background).unwrap_or_default()
 }
 
-/// Where the measurement of a CLIP is kept.
+/// Returns the path of the calibration file of a CLIP image tower.
 pub fn beside(image_tower: &Path) -> PathBuf {
     image_tower.with_extension("calibration.json")
 }
 
 impl Calibrations {
-    /// The offline encoder's.
+    /// Calibrations of the offline encoder.
     pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
 
-    /// What is assumed of a CLIP that was not measured.
+    /// Assumed calibrations of a CLIP without calibration file.
     pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration::CLIP_PICTURES };
 
-    /// Those of the encoder that made a scene's embeddings.
+    /// Returns the calibrations of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {
         if manifest.encoder == OFFLINE {
             return Self::OFFLINE;

@@ -1,23 +1,24 @@
-//! Steps of a training that was broken off, in the scene's folder.
+//! Checkpoints of an interrupted training in the scene folder.
 
 use fastlgs_core::SceneFolder;
 use std::path::PathBuf;
 
-/// Where they are kept: a header of this name with the ending json, and what it names.
+/// Returns the path of the checkpoint without extension. With `.json` it is the header, which names
+/// the other files.
 pub(crate) fn path(folder: &SceneFolder) -> PathBuf {
     folder.root.join("checkpoints/train")
 }
 
-/// Whether a run was broken off that can go on.
+/// Returns whether there is a checkpoint to resume from.
 pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
     path(folder).with_extension("json").is_file()
 }
 
-/// Forgets a run that was broken off.
+/// Removes all checkpoints.
 pub(crate) fn forget(folder: &SceneFolder) {
     fastlgs_raster::checkpoint::remove(&path(folder));
-    // What views were trained towards.
+    // Mask targets of the views (see `train/borders.rs`).
     let _ = std::fs::remove_dir_all(folder.root.join("checkpoints/borders"));
-    // It stays where anything else lies in it.
+    // This fails if other files are in the folder, which then stays.
     let _ = std::fs::remove_dir(folder.root.join("checkpoints"));
 }

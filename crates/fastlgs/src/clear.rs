@@ -1,4 +1,4 @@
-//! Things that photos see through become objects as well: clear Gaussians, which show nothing, stand where masks say that such things are.
+//! Finds transparent objects. Masks show where they are, and invisible Gaussians represent them.
 
 use crate::objects::{self, Config, Mapped};
 use crate::{Result, Run};
@@ -10,26 +10,26 @@ use fastlgs_raster::{Channels, Engine, View};
 use std::collections::BTreeMap;
 use std::ops::Range;
 
-/// Longer side of the pictures in which things are looked for.
+/// Longer side of the images in which transparent objects are searched, in pixels.
 const SIDE: u32 = 480;
-/// Most views that are asked, spread over all.
+/// Largest number of views in the search; they are spread evenly over all views.
 const ASKED: usize = 200;
-/// A clear Gaussian's logit of opacity.
+/// Opacity of a transparent Gaussian, as a logit.
 const LOGIT: f32 = 1.25 * CLEAR;
-/// Share of what passes through a pixel from which on nothing is seen there.
+/// Transmittance from which a pixel counts as empty.
 const NOTHING: f32 = 0.5;
 
-/// Whether a Gaussian is clear.
+/// Returns whether a Gaussian is transparent.
 pub fn is_clear(scene: &Gaussians, gaussian: usize) -> bool {
     scene.opacity_logits[gaussian] <= CLEAR
 }
 
-/// How many clear Gaussians a scene has.
+/// Returns the number of transparent Gaussians.
 pub fn count(scene: &Gaussians) -> usize {
     (0..scene.len()).filter(|i| is_clear(scene, *i)).count()
 }
 
-/// Leaves out what does not stay.
+/// Removes the Gaussians for which `stays` is false.
 fn retain(scene: &mut Gaussians, stays: impl Fn(&Gaussians, usize) -> bool) {
     let kept: Vec<usize> = (0..scene.len()).filter(|i| stays(scene, *i)).collect();
     if kept.len() < scene.len() {
@@ -37,7 +37,7 @@ fn retain(scene: &mut Gaussians, stays: impl Fn(&Gaussians, usize) -> bool) {
     }
 }
 
-/// Takes the clear ones out of a scene.
+/// Removes the transparent Gaussians from a scene and returns them.
 pub fn take(scene: &mut Gaussians) -> Gaussians {
     let clear: Vec<usize> = (0..scene.len()).filter(|i| is_clear(scene, *i)).collect();
     let taken = scene.select(&clear);
@@ -45,12 +45,13 @@ pub fn take(scene: &mut Gaussians) -> Gaussians {
     taken
 }
 
-/// Leaves out clear ones that stand for nothing.
+/// Removes transparent Gaussians that belong to no object.
 pub fn keep_owned(scene: &mut Gaussians) {
     retain(scene, |scene, i| !is_clear(scene, i) || scene.object_ids[i] > 0);
 }
 
-/// [`objects::map`] with the things that photos see through; writes the object maps.
+/// Maps masks to objects as [`objects::map`] does, transparent objects included. Writes the object
+/// maps.
 pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
     forget(scene);
     let mapped = objects::map(scene, folder, training, config, run)?;
@@ -64,12 +65,13 @@ pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], con
     Ok(with_clear)
 }
 
-/// Leaves out what shows nothing: earlier clear ones, and what faded.
+/// Removes Gaussians with an alpha below 1/255: transparent ones of an earlier run, and faded ones.
 fn forget(scene: &mut Gaussians) {
     retain(scene, |scene, i| 255.0 * sigmoid(scene.opacity_logits[i]) >= 1.0);
 }
 
-/// Puts clear Gaussians where `unexplained` masks of the views agree; the objects as they are found with these, and nothing where there are none.
+/// Adds transparent Gaussians where `unexplained` masks of the views agree, and maps the objects
+/// again. Returns `None` if no transparent object is found.
 fn add(
     scene: &mut Gaussians,
     folder: &SceneFolder,
@@ -90,7 +92,7 @@ fn add(
         let lists: Vec<&[u16]> = scene.object_ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
         let kept: Vec<Vec<usize>> = places.iter().map(|places| own(&lists, places.clone())).collect();
         let all: Vec<usize> = (0..shown).chain(kept.iter().flatten().copied()).collect();
-        tracing::debug!(hulls = places.len(), put = scene.len() - shown, kept = all.len() - shown, "clear Gaussians");
+        tracing::debug!(hulls = places.len(), put = scene.len() - shown, kept = all.len() - shown, "transparent Gaussians");
         if all.len() == scene.len() {
             return Ok(Some(mapped));
         }
@@ -99,7 +101,7 @@ fn add(
             scene.object_ids = before;
             return Ok(None);
         }
-        // Without those, what is behind them may belong to something else.
+        // Without the removed Gaussians, those behind them may belong to other objects.
         let following = |end: &mut usize, kept: &Vec<usize>| {
             *end += kept.len();
             Some(*end - kept.len()..*end)
@@ -108,7 +110,9 @@ fn add(
     }
 }
 
-/// The pixels of a view, in a picture of at most [`SIDE`] pixels, where only masks lie that none of the objects fits which `shown` shows.
+/// Returns the pixels of a view that have masks, but none that an object fits. The result is scaled
+/// to at most [`SIDE`] pixels. `shown` is the object map of the view, and `lists` holds the objects
+/// of each id.
 fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &[Vec<u16>], config: &Config) -> Result<Vec<bool>> {
     let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, config.objects.min_support);
     let small = camera.shrunk_to(SIDE);
@@ -118,7 +122,7 @@ fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &
     Ok(rows.flat_map(|row| (0..small.width).map(move |x| row + columns(x))).map(|pixel| pixels[pixel]).collect())
 }
 
-/// The hulls of what masks tell of and objects do not.
+/// Returns the visual hulls of unexplained masks; none if fewer than `min_views` views have any.
 fn hulls(scene: &Gaussians, training: &[Camera], unexplained: Vec<Vec<bool>>, config: &Config, run: &Run) -> Result<Vec<Hull>> {
     if unexplained.iter().filter(|view| view.contains(&true)).count() < config.objects.min_views {
         return Ok(Vec::new());
@@ -135,7 +139,7 @@ fn hulls(scene: &Gaussians, training: &[Camera], unexplained: Vec<Vec<bool>>, co
     Ok(hull::hulls(&views, config.objects.min_views))
 }
 
-/// Depth of what is seen at each pixel.
+/// Renders the depth of each pixel; infinite where the pixel is empty.
 fn depth(engine: &mut dyn Engine, scene: &Gaussians, camera: &Camera, antialias: bool) -> Result<Vec<f32>> {
     let view = View { depth_as_feature: 1, antialias: u32::from(antialias), ..View::new(camera, scene.len(), 0) };
     let frame = engine.render(view, Channels::Feature)?;
@@ -143,7 +147,7 @@ fn depth(engine: &mut dyn Engine, scene: &Gaussians, camera: &Camera, antialias:
     Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(of_pixel).collect())
 }
 
-/// Adds the clear Gaussians of a thing; returns which they are.
+/// Adds the transparent Gaussians of a hull to a scene, and returns their indices.
 fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
     let first = scene.len();
     for place in &hull.places {
@@ -153,11 +157,13 @@ fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
     first..scene.len()
 }
 
-/// Those of a thing's places that lie in its object, if there is one: each holds most of the other. `lists` tells of each Gaussian's objects.
+/// Returns the Gaussians of a hull (`places`) that belong to its object; none if it has no object.
+/// Hull and object must each contain more than half of the other. `lists` holds the objects of each
+/// Gaussian.
 fn own(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
     let mut held: BTreeMap<u16, usize> = BTreeMap::new();
     places.clone().flat_map(|place| lists[place]).for_each(|object| *held.entry(*object).or_default() += 1);
-    // More than half of the places can lie in many objects around each other: the smallest of them is meant.
+    // Nested objects can each contain more than half of the hull: take the smallest.
     let all = |object: u16| lists.iter().filter(|list| list.contains(&object)).count();
     let most = held.into_iter().filter(|(_, common)| 2 * common > places.len()).map(|(object, common)| (all(object), common, object));
     let object = most.min().filter(|(all, common, _)| 2 * common > *all).map(|found| found.2);
@@ -172,7 +178,8 @@ mod tests {
     use fastlgs_core::{Level, MaskList};
     use glam::{Vec2, Vec3};
 
-    /// Twelve cameras around a pane that is not there, on a sphere of solid Gaussians; masks have it.
+    /// Returns twelve cameras around an invisible pane, inside a sphere of solid Gaussians. Only
+    /// the masks show the pane.
     fn scene(folder: &SceneFolder) -> (Gaussians, Vec<Camera>) {
         let mut scene = Gaussians::default();
         for k in 0..4000 {
@@ -208,7 +215,7 @@ mod tests {
         let (wall, config) = (scene.clone(), Config { objects: fastlgs_grid::objects::Config::default(), antialias: false });
         let run = Run { seed: 0, device: "cpu", progress: &Silent };
         let mapped = objects::map(&mut scene, &folder, &cameras, &config, &run).unwrap();
-        assert!(mapped.chosen.support.is_empty(), "the wall is seen in each mask, and none of it in most");
+        assert!(mapped.chosen.support.is_empty(), "no part of the wall is in most of the masks");
         let left = |camera: &Camera| unexplained(&folder, camera, &LabelMap::new(160, 120), &mapped.chosen.lists(), &config).unwrap();
         let left = cameras.iter().map(left).collect();
         let mapped = add(&mut scene, &folder, &cameras, left, &config, &run).unwrap().expect("a pane");
@@ -216,7 +223,7 @@ mod tests {
         assert!(supports.len() == 1 && supports[0] > 0.7, "{supports:?}");
         assert_eq!(scene.means[..wall.len()], wall.means);
         assert!(scene.len() > wall.len() && count(&scene) == scene.len() - wall.len());
-        assert!(scene.object_ids[wall.len()..].iter().all(|id| *id > 0), "what belongs to nothing is left out");
+        assert!(scene.object_ids[wall.len()..].iter().all(|id| *id > 0), "Gaussians without an object are removed");
         let mut rest = scene.clone();
         let taken = take(&mut rest);
         assert_eq!((rest.means, taken.means.as_slice()), (wall.means.clone(), &scene.means[wall.len()..]));

@@ -1,9 +1,10 @@
-//! What was rendered beside the photo that it should show.
+//! Compares a rendered view with its photo.
 
 use fastlgs_core::metrics;
 use fastlgs_raster::Target;
 
-/// Planar pictures; where the photo does not count, it shows what was rendered.
+/// A render and its photo, both `[3][h][w]`. Pixels of the photo that do not count are copied from
+/// the render.
 pub(crate) struct Compared {
     pub rendered: Vec<f32>,
     pub photo: Vec<f32>,
@@ -12,7 +13,8 @@ pub(crate) struct Compared {
 }
 
 impl Compared {
-    /// `rendered` `[3][h][w]` beside a photo; nothing where no pixel of that counts.
+    /// Pairs `rendered`, `[3][h][w]`, with the photo of `target`; `None` if no pixel of the photo
+    /// counts.
     pub fn of(target: &Target, rendered: &[f32]) -> Option<Self> {
         let counts: Vec<bool> = target.image.color.iter().map(|p| p.to_le_bytes()[3] == 255).collect();
         let rendered: Vec<f32> = rendered.iter().map(|v| v.clamp(0.0, 1.0)).collect();
@@ -23,14 +25,14 @@ impl Compared {
         counts.contains(&true).then_some(Self { rendered, photo, counts })
     }
 
-    /// PSNR in dB over the pixels that count.
+    /// Returns the PSNR over the pixels that count, in dB.
     pub fn psnr(&self) -> f64 {
         let counting =
             |plane: &[f32]| plane.iter().zip(self.counts.iter().cycle()).filter(|(_, c)| **c).map(|(v, _)| *v).collect::<Vec<_>>();
         metrics::psnr(&counting(&self.rendered), &counting(&self.photo))
     }
 
-    /// Scales and shifts each channel of the render to where it is nearest to the photo.
+    /// Fits gain and offset of each channel of the render to the photo, by least squares.
     pub fn fit_exposure(&mut self) {
         let pixels = self.counts.len();
         for (rendered, photo) in self.rendered.chunks_exact_mut(pixels).zip(self.photo.chunks_exact(pixels)) {

@@ -1,44 +1,44 @@
-//! Errors of the pipeline: one sentence that names the file and the mend, with the chain of causes behind it.
+//! Errors of the pipeline: each message names the file and the remedy, and has a chain of causes.
 
 use std::fmt::Display;
 
-/// Why a stage did not finish.
+/// Reason why a stage fails.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// Files, datasets, images.
+    /// Error of files, data sets or images.
     #[error(transparent)]
     Core(#[from] fastlgs_core::Error),
-    /// Devices and training.
+    /// Error of devices or training.
     #[error(transparent)]
     Raster(#[from] fastlgs_raster::Error),
-    /// Objects and queries.
+    /// Error of objects or queries.
     #[error(transparent)]
     Grid(#[from] fastlgs_grid::Error),
-    /// Segmenters, encoders, key points.
+    /// Error of segmenters, encoders or key points.
     #[error(transparent)]
     Vision(#[from] fastlgs_vision::Error),
-    /// The system's refusal.
+    /// Error of the operating system.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A value that has no JSON.
+    /// Value that cannot be converted from or to JSON.
     #[error(transparent)]
     Json(#[from] serde_json::Error),
-    /// An intermediate result that cannot be kept.
+    /// Intermediate result that cannot be stored in the cache.
     #[error(transparent)]
     Cache(#[from] postcard::Error),
-    /// Input or options that do not fit.
+    /// Invalid input or options.
     #[error("{0}")]
     Invalid(String),
-    /// What was being done when the cause arose.
+    /// Step that failed, with its cause.
     #[error("{what}")]
     While {
-        /// The work, in words.
+        /// Description of the step.
         what: String,
         /// The cause.
         source: Box<Error>,
     },
-    /// Whoever watches the run asked for its end.
+    /// The progress sink cancelled the run.
     #[error("cancelled")]
     Cancelled,
 }
@@ -46,7 +46,8 @@ pub enum Error {
 /// Result of the pipeline.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// The chain of causes in one line; a cause that its parent already quotes is not repeated.
+/// Returns an error with its causes in one line. A cause that the text already contains is not
+/// repeated.
 pub fn one_sentence(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
@@ -60,11 +61,11 @@ pub fn one_sentence(error: &dyn std::error::Error) -> String {
     text
 }
 
-/// Says what was being done where something fails.
+/// Adds a description of the failed step to an error.
 pub(crate) trait Context<T> {
-    /// Adds `what` to the cause.
+    /// Adds `what` to the error.
     fn context(self, what: impl Display) -> Result<T>;
-    /// Adds `what()` to the cause.
+    /// Adds the result of `what` to the error.
     fn with_context<S: Display>(self, what: impl FnOnce() -> S) -> Result<T>;
 }
 

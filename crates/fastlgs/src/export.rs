@@ -1,4 +1,4 @@
-//! A trained scene for other programs, or a small folder with just what a query needs.
+//! Exports a trained scene as a file for other programs, or as a small folder for queries.
 
 use crate::compared::Compared;
 use crate::error::{Context, bail};
@@ -14,89 +14,90 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What is exported, and to where.
+/// Options of `export`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// FILE.ply (3DGS columns), FILE.spz or FILE.sog (compressed, without objects), FILE.glb (glTF with KHR_gaussian_splatting), FILE.json (the
-    /// views as a camera path of nerfstudio's form), or a folder for everything that queries need.
+    /// Output file or folder. FILE.ply has 3DGS columns; FILE.spz and FILE.sog are compressed and
+    /// have no objects; FILE.glb is glTF with KHR_gaussian_splatting; FILE.json has the views as a
+    /// camera path of nerfstudio. A folder has all that queries need.
     pub output: PathBuf,
-    /// Drop colour's SH coefficients above this degree.
+    /// Drop SH coefficients of colour above this degree.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
     pub sh_degree: Option<u32>,
 }
 
-/// What was written.
+/// Report of `export`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Report {
-    /// A scene.
+    /// Exported scene.
     Scene(Box<SceneReport>),
-    /// The views as a camera path.
+    /// Exported camera path.
     Path {
-        /// The scene.
+        /// Scene folder.
         scene: PathBuf,
-        /// The file.
+        /// Written file.
         output: PathBuf,
-        /// Its frames.
+        /// Number of frames.
         frames: usize,
     },
 }
 
-/// A scene that was written, and what that cost.
+/// Report of an exported scene.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SceneReport {
-    /// The scene.
+    /// Scene folder.
     pub scene: PathBuf,
-    /// File or folder.
+    /// Written file or folder.
     pub output: PathBuf,
-    /// Bytes of what was written.
+    /// Size of the output in bytes.
     pub bytes: u64,
-    /// Bytes of everything that queries of the scene need.
+    /// Size of all files of the scene that queries need, in bytes.
     pub bytes_before: u64,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
     /// SH degree of colour.
     pub sh_degree: u32,
-    /// Bytes of each value, by group, of a small folder.
+    /// Bytes per value of each group in a small folder; `None` for a file.
     pub bytes_a_value: Option<BTreeMap<String, u8>>,
-    /// Mean PSNR of the held-out views against their photos in dB, where these are there.
+    /// Mean PSNR of the held-out views in dB; `None` if their photos are missing.
     pub psnr_held_out: Loss,
-    /// Mean PSNR of what was written against the scene in dB.
+    /// Mean PSNR of renders of the output against renders of the scene, in dB.
     pub psnr_against_original: f64,
-    /// The device's name.
+    /// Name of the device.
     pub adapter: String,
 }
 
-/// A figure before and after.
+/// PSNR before and after the export, in dB.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Loss {
-    /// Of the scene.
+    /// PSNR of the scene.
     pub before: Option<f64>,
-    /// Of what was written.
+    /// PSNR of the output.
     pub after: Option<f64>,
 }
 
-/// Training views that the precision of the small folder is tried on.
+/// Number of training views that decide the precision of a small folder.
 const PRECISION_VIEWS: usize = 4;
-/// What each group of values may lose there, in dB.
+/// PSNR that each group of values may lose in these views, in dB.
 const PRECISION_LOSS: f64 = 0.01;
 
-/// All that a small folder has, beside the manifest.
+/// Files and folders of a small folder, besides the manifest.
 const LEFT: [&str; 4] = ["scene.safetensors", "grid.json", "grid.safetensors", "cameras"];
 
-/// Whether a folder is meant, whatever the ending of its name.
+/// Returns whether a path denotes a folder: one exists there, or the path ends with a separator.
 pub fn names_folder(path: &Path) -> bool {
     path.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || path.is_dir()
 }
 
-/// Writes a trained scene for other programs.
+/// Exports a trained scene to `config.output`.
 ///
 /// # Errors
-/// A scene that was never trained, a place that cannot be written, or a device that fails.
+/// A scene that was never trained, an output that cannot be written, or a failing device.
 pub fn export(config: &Config, run: &Run) -> Result<Report> {
     if config.output.extension().is_some_and(|e| e == "json") {
         let folder = SceneFolder::open(&config.scene)?;
@@ -110,12 +111,12 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     if !folder && !file && !ending.is_empty() {
         let path = config.output.display();
         bail!(
-            "{path}: nothing is written as .{ending}; there are .ply, .spz, .sog, .glb and .json, and folders, whose names have no ending or end with /"
+            "{path}: the format .{ending} is unknown; use .ply, .spz, .sog, .glb or .json, or name a folder (without extension, or with / at the end)"
         );
     }
     let mut scene = Session::open(&config.scene, run.device)?;
     let held_out = scene.manifest.held_out(&scene.cameras);
-    // Also where none is held out, a picture tells what writing has cost.
+    // Without held-out views, one training view measures the loss.
     let shown = if held_out.is_empty() { scene.cameras.iter().take(1).cloned().collect() } else { held_out.clone() };
     let before = pictures(&mut scene, &shown)?;
     let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
@@ -126,7 +127,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         let world = selection::World::of(&scene.manifest, &scene.cameras);
         selection::write(&config.output, &scene.gaussians, &world)?;
         let written = match ending {
-            // It holds the same floats as before.
+            // glTF stores the floats unchanged.
             "glb" => scene.gaussians.clone(),
             _ => splat_file::read(&config.output, &world.frame)?.0,
         };
@@ -137,7 +138,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     };
     scene.show(written)?;
     let after = pictures(&mut scene, &shown)?;
-    // Both against each other, not against photos: an exported scene may have none.
+    // Compare renders with renders: an exported scene may have no photos.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
     Ok(Report::Scene(Box::new(SceneReport {
         scene: config.scene.clone(),
@@ -153,17 +154,18 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     })))
 }
 
-/// Colours of these views.
+/// Renders the colours of views, `[3][h][w]` each.
 fn pictures(scene: &mut Session, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
     views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
 }
 
-/// Whether the photos of all these views are there: an exported scene has none.
+/// Returns whether the photos of all views exist. An exported scene has none.
 fn have_photos(scene: &Session, views: &[Camera]) -> bool {
     views.iter().all(|view| scene.folder.photo_path(&view.name).is_file())
 }
 
-/// Mean PSNR against the photos, as far as these count; nothing where the scene has them no more.
+/// Returns the mean PSNR of renders against photos in dB, over the pixels that count; `None` if
+/// photos are missing.
 fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> Result<Option<f64>> {
     if !have_photos(scene, views) {
         return Ok(None);
@@ -177,7 +179,8 @@ fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> R
     Ok((!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64))
 }
 
-/// The precision that some training views show to be enough; the default where they have no photos.
+/// Returns the least precision that suffices for some training views; the default if their photos
+/// are missing.
 fn precision(scene: &mut Session) -> Result<Precision> {
     let training = scene.manifest.training(&scene.cameras);
     let views: Vec<Camera> = training.iter().step_by(training.len().div_ceil(PRECISION_VIEWS).max(1)).cloned().collect();
@@ -189,39 +192,43 @@ fn precision(scene: &mut Session) -> Result<Precision> {
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
         scene.show(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
-        against_photos(scene, &views, &pictures)?.context("the scene's photos are there no more; run 'fastlgs preprocess' again")
+        against_photos(scene, &views, &pictures)?.context("the photos of the scene are missing now; run 'fastlgs preprocess' again")
     })?;
     scene.show(original)?;
     Ok(chosen)
 }
 
-/// Writes what queries need: the compact scene, grid, cameras and manifest. Returns the scene as it reads.
+/// Writes a folder with all that queries need: compact scene, object table, cameras and manifest.
+/// Returns the scene as it reads back, and its precision.
+///
+/// # Errors
+/// The folder is a trained scene, or the features of the scene are not the codes of its objects.
 fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precision)> {
     if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
-        bail!("{}: this is the scene itself; name another folder", root.display());
+        bail!("{}: this folder is the scene itself; choose another folder", root.display());
     }
     let folder = SceneFolder::new(root);
     let _lock = SceneLock::take(root, "export")?;
     if folder.manifest().is_ok() && !folder.is_compact() {
-        bail!("{}: this is a scene that was trained, not an export; name a new folder", root.display());
+        bail!("{}: this folder is a trained scene, not an export; choose a new folder", root.display());
     }
     let grid = scene.grid()?;
     if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
-        bail!("the scene's features were trained by descent, which a small folder cannot hold; export FILE.ply instead");
+        bail!("the features of the scene were trained by gradient descent, and a small folder cannot store them; export FILE.ply instead");
     }
     let precision = precision(scene)?;
     let staged = StagedOutput::new(&folder, "export")?;
     let (kept, dropped) = scene.gaussians.without_far_outliers();
     if dropped > 0 {
         tracing::warn!(
-            "{}: {dropped} Gaussians far outside of the scene were left out, as the precision of all would suffer",
+            "{}: {dropped} Gaussians far outside of the scene were left out, because they would reduce the precision of all others",
             root.display()
         );
     }
     compact::write(&staged.folder.compact_path(), &kept, &precision)?;
     grid.save(&staged.folder)?;
     staged.folder.save_cameras(&scene.cameras)?;
-    // The export has none of the scene's other files.
+    // The export contains no other files of the scene.
     let manifest = Manifest { files: Default::default(), ..scene.manifest.clone() };
     staged.publish(&folder, &LEFT, [], &manifest)?;
     let mut written = folder.gaussians()?;

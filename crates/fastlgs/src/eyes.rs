@@ -1,4 +1,4 @@
-//! Which segmenter and encoders a command works with: chosen by options in `preprocess`, remembered in `scene.json`.
+//! Choice of segmenter and encoders: options of `preprocess`, afterwards read from `scene.json`.
 
 use crate::error::{Context, bail};
 use crate::{Result, calibrations};
@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What finds masks.
+/// Segmenter, which finds masks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
@@ -26,14 +26,14 @@ pub enum SegmenterKind {
     /// Learned edges, merged into regions.
     #[default]
     Offline,
-    /// ONNX exports of SAM.
+    /// SAM, from ONNX files.
     Sam,
-    /// Masks beside the photos, made by other programs; docs/formats.md lists the layouts.
+    /// Masks of other programs beside the photos; docs/formats.md lists the layouts.
     Import,
 }
 
 impl SegmenterKind {
-    /// What `scene.json` calls it.
+    /// Returns the name in `scene.json`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Offline => "offline",
@@ -43,36 +43,36 @@ impl SegmenterKind {
     }
 }
 
-/// How SAM is asked for all masks of a photo.
+/// Settings with which SAM segments a photo.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum SamPreset {
-    /// As its authors' generator does: predicted IoU 0.88, stability 0.95, no crops.
+    /// As in the generator of its authors: predicted IoU 0.88, stability 0.95, no crops.
     #[default]
     Meta,
-    /// As LangSplat does, whose masks the paper takes: 0.7, 0.85, one layer of crops, and masks of one level that do not repeat or hold each
-    /// other.
+    /// As in LangSplat, whose masks the paper uses: predicted IoU 0.7, stability 0.85, one layer of
+    /// crops. Masks of one level neither repeat nor contain each other.
     #[cfg_attr(feature = "clap", value(name = "langsplat"))]
     LangSplat,
 }
 
-/// What embeds masks.
+/// Encoder, which embeds masks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum EncoderKind {
-    /// A classifier of 1,000 things.
+    /// A classifier of 1,000 classes, and a sentence encoder.
     #[default]
     Offline,
-    /// ONNX exports of CLIP.
+    /// CLIP, from ONNX files.
     Clip,
-    /// Embeddings beside the photos.
+    /// Embeddings of other programs beside the photos.
     Import,
 }
 
 impl EncoderKind {
-    /// What `scene.json` calls it.
+    /// Returns the name in `scene.json`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Offline => "offline",
@@ -82,48 +82,51 @@ impl EncoderKind {
     }
 }
 
-/// Which segmenter and encoder `preprocess` works with.
+/// Segmenter and encoder of `preprocess`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Eyes {
-    /// What finds masks.
+    /// Segmenter, which finds masks.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub segmenter: SegmenterKind,
-    /// What embeds masks.
+    /// Encoder, which embeds masks.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub encoder: EncoderKind,
-    /// Levels of masks that are kept, separated by commas; Algorithm 1 makes objects of the whole ones alone.
+    /// Levels of masks to keep, separated by commas. Whole masks are always kept; Algorithm 1 uses
+    /// only those.
     #[cfg_attr(feature = "clap", arg(long, value_delimiter = ',', default_value = "whole,part,subpart", value_parser = ["whole", "part", "subpart"]))]
     pub levels: Vec<String>,
-    /// SAM by the name that `models pull` knows it by.
+    /// SAM model, by its name in `models pull`.
     #[cfg_attr(feature = "clap", arg(long, default_value = "slimsam", value_name = "NAME"))]
     pub sam: String,
-    /// SAM's image encoder, instead of --sam.
+    /// ONNX file of SAM's image encoder, instead of --sam.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_decoder"))]
     pub sam_encoder: Option<PathBuf>,
-    /// SAM's prompt decoder, instead of --sam.
+    /// ONNX file of SAM's prompt decoder, instead of --sam.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_encoder"))]
     pub sam_decoder: Option<PathBuf>,
-    /// How SAM is asked for all masks of a photo; by default as its authors do, and as LangSplat does where all is made as the paper has it.
+    /// Settings with which SAM segments a photo. Default: meta, but langsplat with `make --effort
+    /// like-paper`.
     #[cfg_attr(feature = "clap", arg(long, value_enum))]
     pub sam_preset: Option<SamPreset>,
-    /// Point prompts along each side of a photo, instead of the preset's 32.
+    /// Number of point prompts along each side of a photo, instead of the preset's 32.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(1..=128)))]
     pub sam_points: Option<u32>,
-    /// Least IoU that SAM predicts for its own mask, instead of the preset's.
+    /// Least predicted IoU of SAM's masks, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub sam_iou: Option<f32>,
     /// Least stability of SAM's masks, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub sam_stability: Option<f32>,
-    /// CLIP by the name that `models pull` knows it by.
+    /// CLIP model, by its name in `models pull`.
     #[cfg_attr(feature = "clap", arg(long, default_value = "clip-vit-b16", value_name = "NAME"))]
     pub clip: String,
-    /// CLIP's image tower, instead of --clip.
+    /// ONNX file of CLIP's image tower, instead of --clip.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "clip_text"))]
     pub clip_image: Option<PathBuf>,
-    /// CLIP's text tower, instead of --clip; with imported embeddings the tower that belongs to them.
+    /// ONNX file of CLIP's text tower, instead of --clip. With imported embeddings: the tower that
+    /// belongs to them.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub clip_text: Option<PathBuf>,
 }
@@ -149,7 +152,7 @@ impl Default for Eyes {
 }
 
 impl Eyes {
-    /// Refuses files and settings that the chosen segmenter and encoder would not look at.
+    /// Checks that no option is set that the chosen segmenter and encoder ignore.
     pub(crate) fn check(&self) -> Result<()> {
         let of_sam = [
             ("--sam-encoder", self.sam_encoder.is_some()),
@@ -177,7 +180,7 @@ impl Eyes {
         })
     }
 
-    /// CLIP's towers.
+    /// Returns the files of CLIP's image and text tower.
     pub(crate) fn clip_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.clip_image, &self.clip_text) {
             (Some(image), Some(text)) => [image.clone(), text.clone()],
@@ -200,7 +203,7 @@ impl Eyes {
         }
     }
 
-    /// The segmenter.
+    /// Loads the segmenter. Imported masks are read beside `photos` and undistorted by `lenses`.
     pub fn segmenter(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Segmenter>> {
         Ok(match self.segmenter {
             SegmenterKind::Sam => {
@@ -212,7 +215,7 @@ impl Eyes {
         })
     }
 
-    /// The image encoder.
+    /// Loads the image encoder. Imported embeddings are read beside `photos`.
     pub fn encoder(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Encoder>> {
         Ok(match self.encoder {
             EncoderKind::Clip => Box::new(self.clip_image()?.with_background(calibrations::best_background(&self.files()?))),
@@ -221,7 +224,8 @@ impl Eyes {
         })
     }
 
-    /// CLIP's image tower, once the text tower is known to belong to it: a wrong pair would only show in the first query.
+    /// Loads CLIP's image tower, after checking that the text tower belongs to it. Otherwise a
+    /// wrong pair is noticed only at the first query.
     pub(crate) fn clip_image(&self) -> Result<ClipImage> {
         let [image, text] = self.clip_files()?;
         let image = ClipImage::load(&image)?;
@@ -229,7 +233,7 @@ impl Eyes {
         Ok(image)
     }
 
-    /// The text tower that belongs to the image encoder.
+    /// Loads the text tower that belongs to the image encoder.
     pub fn text_encoder(&self) -> Result<Box<dyn TextEncoder>> {
         Ok(match (self.encoder, &self.clip_text) {
             (EncoderKind::Clip, _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
@@ -239,11 +243,11 @@ impl Eyes {
         })
     }
 
-    /// The files of the models, for the record.
+    /// Returns the model files by role, as the manifest records them.
     pub fn files(&self) -> Result<BTreeMap<String, ModelFile>> {
         let mut files = BTreeMap::new();
         let mut add = |role: &str, path: PathBuf| -> Result<()> {
-            // Not what it links to: other files of the model lie beside the link.
+            // Do not resolve links: other files of the model lie beside the link.
             let path = std::path::absolute(&path).unwrap_or(path);
             let (bytes, sha256) = places::digest(&path)?;
             files.insert(role.to_owned(), ModelFile { path, bytes, sha256 });
@@ -266,12 +270,13 @@ impl Eyes {
         Ok(files)
     }
 
-    /// What masks depend on beside the photo; nothing where they come from files that may change unseen.
+    /// Returns what masks depend on besides the photo, for cache keys; `None` for imported masks,
+    /// whose files can change at any time.
     pub fn segmenter_identity(&self) -> Result<Option<String>> {
         Ok(match self.segmenter {
             SegmenterKind::Import => None,
             SegmenterKind::Sam => {
-                // SAM's own files alone: another encoder leaves the masks as they are.
+                // Only the files of SAM: masks do not depend on the encoder.
                 let files = self.files()?;
                 let sums: Vec<&str> = files.iter().filter(|(role, _)| role.starts_with("sam")).map(|(_, f)| f.sha256.as_str()).collect();
                 Some(format!("sam {} {:?} {}", sam::VERSION, self.sam_config(), sums.join(" ")))
@@ -280,13 +285,14 @@ impl Eyes {
         })
     }
 
-    /// Whether masks of a level are kept.
+    /// Returns whether masks of a level are kept.
     pub fn keeps(&self, level: Level) -> bool {
         level == Level::Whole || self.levels.iter().any(|l| l == level.name())
     }
 }
 
-/// What embeddings of a scene can be compared with: those that the same files made, with the same around the masks.
+/// Returns the identity of the encoder of a scene. Embeddings are comparable if they have the same
+/// identity: same model files, same background around masks.
 pub(crate) fn identity_of(manifest: &Manifest) -> String {
     let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {} {}", file.sha256, manifest.crops).trim_end().to_owned());
     match manifest.encoder.as_str() {
@@ -295,19 +301,22 @@ pub(crate) fn identity_of(manifest: &Manifest) -> String {
     }
 }
 
-/// An embedding of a scene's encoder for what knows nothing but words: without the numbers that count only between examples.
+/// Returns an embedding for comparisons with texts: components that count only between pictures are
+/// set to 0.
 pub fn for_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
     if manifest.encoder == calibrations::OFFLINE { appearance::for_words(embedding) } else { embedding }
 }
 
-/// The numbers of an embedding that texts are compared by.
+/// Returns the components of an embedding that are compared with texts.
 pub fn words<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32] {
     if manifest.encoder == calibrations::OFFLINE { appearance::words(embedding) } else { embedding }
 }
 
-/// Whether `embeddings` that `encoder` made, if anybody knows, can be compared with those of a scene's encoder.
+/// Returns whether `embeddings` are comparable with those of a scene's encoder. `encoder` is the
+/// identity of what made them; empty if unknown.
 pub(crate) fn is_current<'a>(manifest: &Manifest, encoder: &str, mut embeddings: impl Iterator<Item = &'a Vec<f32>>) -> bool {
-    // Earlier versions did not say; of the offline encoder's the length tells.
+    // The encoder is unknown: only embeddings of the offline encoder can be checked, by their
+    // length.
     if encoder.is_empty() {
         manifest.encoder != calibrations::OFFLINE || embeddings.all(|e| e.len() == conse::LENGTH)
     } else {
@@ -315,45 +324,48 @@ pub(crate) fn is_current<'a>(manifest: &Manifest, encoder: &str, mut embeddings:
     }
 }
 
-/// Fails where the objects of a scene were embedded by another encoder than its own or an earlier version of it, with which nothing of this one can be
-/// compared.
+/// Checks that the encoder of a scene made the embeddings of its objects.
 ///
 /// # Errors
-/// One sentence with the mend.
+/// Another encoder, or another version of it, made them, so that they are not comparable.
 pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
     if !is_current(manifest, &grid.encoder, grid.objects.iter().flat_map(|o| &o.embeddings)) {
         let root = folder.root.display();
         bail!(
-            "{root}: its objects were embedded by another encoder than the scene's, or by an earlier version of it; \
-             'fastlgs train {root} --init {root}/scene.ply --iterations 0' embeds them again and keeps the Gaussians"
+            "{root}: another encoder than the scene's, or another version of it, embedded its objects; \
+             run 'fastlgs train {root} --init {root}/scene.ply --iterations 0' to embed them again and keep the Gaussians"
         );
     }
     Ok(())
 }
 
-/// The model file of a role, as the manifest remembers it.
+/// Returns the model file of a role in the manifest.
+///
+/// # Errors
+/// The manifest names none, or size or SHA-256 of the file differ.
 fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
     let what = role.replace('_', " ");
-    let file = manifest.models.get(role).with_context(|| format!("the scene does not say which {what} it was made with"))?;
-    let bytes = std::fs::metadata(&file.path).with_context(|| format!("the {what} of the scene, {}", file.path.display()))?.len();
-    // The length first: it costs nothing.
+    let file = manifest.models.get(role).with_context(|| format!("scene.json does not name the {what} that the scene was made with; run 'fastlgs preprocess' again"))?;
+    let bytes = std::fs::metadata(&file.path).with_context(|| format!("the {what} of the scene cannot be opened, {}", file.path.display()))?.len();
+    // Compare the size first, because hashing is slow.
     if bytes != file.bytes || places::digest(&file.path)?.1 != file.sha256 {
-        bail!("{}: not the {what} that the scene was made with; its content is another, name the right file", file.path.display());
+        bail!("{}: this is not the {what} that the scene was made with, because its content differs; restore the original file", file.path.display());
     }
     Ok(&file.path)
 }
 
-/// The encoder that made a scene's embeddings, for masks that come later.
+/// Loads the encoder that made a scene's embeddings, to embed more masks.
 pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn Encoder>> {
     Ok(match manifest.encoder.as_str() {
         "offline" => Box::new(Conse::load()?),
         "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?.with_background(calibrations::background_of(manifest)?)),
         "import" => Box::new(Recorded::load(folder, manifest)?),
-        other => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
+        other => bail!("the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"),
     })
 }
 
-/// The text tower of the encoder that made a scene's embeddings; `clip_text` stands in for a CLIP tower.
+/// Loads the text tower of the encoder that made a scene's embeddings. `clip_text` replaces the
+/// CLIP tower that the manifest names.
 pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<Box<dyn TextEncoder>> {
     Ok(match (manifest.encoder.as_str(), clip_text) {
         ("offline", _) => Box::new(OfflineText::load()?),
@@ -361,11 +373,12 @@ pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<
         ("clip", None) => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
         ("import", None) if manifest.models.contains_key("clip_text") => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
         ("import", None) => bail!("the scene's embeddings were imported: name the text tower that belongs to them with --clip-text FILE"),
-        (other, None) => bail!("the scene's embeddings were made by the encoder '{other}', which this program does not know"),
+        (other, None) => bail!("the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"),
     })
 }
 
-/// Imported embeddings as `preprocess` left them in the scene folder: those of the masks that fit.
+/// Encoder that returns the imported embeddings in the scene folder: each mask gets that of the
+/// imported mask that fits it.
 struct Recorded {
     folder: SceneFolder,
     views: Vec<Camera>,
@@ -387,7 +400,7 @@ impl Encoder for Recorded {
     fn embed_masks(&self, view: &str, _photo: &RgbImage, masks: &LabelMap) -> fastlgs_vision::Result<Vec<Vec<f32>>> {
         let index = self.views.iter().position(|camera| camera.name == view);
         let Some(camera) = index.map(|i| &self.views[i]) else {
-            return Err(fastlgs_vision::Error::Missing(format!("the view '{view}' is none of the training")));
+            return Err(fastlgs_vision::Error::Missing(format!("the view '{view}' is not a training view")));
         };
         let mut whole = MaskList::new(camera.width, camera.height);
         let labels = whole.add(Level::Whole, &self.folder.masks(camera)?.painted(Level::Whole));

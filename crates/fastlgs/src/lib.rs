@@ -1,16 +1,19 @@
-//! The pipeline of FastLGS: from photos to a scene that answers text.
+//! The pipeline of FastLGS: from photos to a scene that answers text queries.
 //!
-//! Each stage is a function of a configuration and a [`Run`], and returns a report; both are plain data (`serde`):
+//! Each stage is a function that takes a configuration and a [`Run`], and returns a report.
+//! Configurations and reports are plain data (`serde`):
 //!
-//! * [`preprocess`](preprocess()): photos (with poses) to masks, embeddings, key points and points;
-//! * [`train`](train()): Gaussians with colour, then [`objects`] on them;
-//! * [`make`](make()): both, where they were not done before;
-//! * [`Session`]: an opened scene that renders and answers;
-//! * [`eval`](eval()), [`export`](export()), [`synth`](synth()): accuracy, other formats, generated scenes;
-//! * [`render`](render()), [`library`]: pictures of views, and which of many scenes hold a thing.
+//! * [`preprocess`](preprocess()): photos to masks, poses, key point matches and points;
+//! * [`train`](train()): Gaussians with colour, then [`objects`];
+//! * [`make`](make()): both, without repeating finished work;
+//! * [`Session`]: an opened scene that renders and answers queries;
+//! * [`eval`](eval()), [`export`](export()), [`synth`](synth()): accuracy, other formats, generated
+//!   scenes;
+//! * [`render`](render()), [`library`]: images of views, and search in many scenes.
 //!
-//! Nothing here prints or ends the process. Who calls hears of progress and warnings through [`progress::Sink`], which also cancels.
-//! Files are read and written in a scene folder ([`fastlgs_core::SceneFolder`]); a stage that fails leaves earlier results whole.
+//! No function prints or ends the process. The caller receives progress and warnings through
+//! [`progress::Sink`], and can cancel there. Stages read and write a scene folder
+//! ([`fastlgs_core::SceneFolder`]). A stage that fails keeps earlier results.
 
 mod absent;
 mod cache;

@@ -1,4 +1,4 @@
-//! Which scenes of a folder hold what a text names.
+//! Searches many scenes for the object that a text names.
 
 use crate::error::{Context, bail};
 use crate::session::Texts;
@@ -13,23 +13,23 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// How deep below the library's folder scenes are looked for.
+/// Depth of folders below the library in which scenes are searched.
 const DEPTH: usize = 3;
 
-/// What is asked of a library, beside the text.
+/// Options of a library query, besides the text.
 #[derive(Clone, Debug)]
 pub struct Config {
-    /// Most scenes that are named.
+    /// Largest number of scenes in an answer.
     pub scenes: usize,
-    /// Share of the names of absent things that a scene may answer all the same.
+    /// Accepted share of absent names that a scene answers.
     pub false_alarms: f32,
-    /// Texts that the object must not be nearer to.
+    /// Texts that must not fit an object better than the query.
     pub negatives: Vec<String>,
-    /// A CLIP text tower in place of the one that the scenes remember.
+    /// CLIP text tower to use instead of the one that the scenes record.
     pub clip_text: Option<PathBuf>,
 }
 
-/// An opened library with the encoder of its texts.
+/// An opened library and its text encoder.
 pub struct Search {
     config: Config,
     texts: Texts,
@@ -45,64 +45,64 @@ struct Opened {
     grid: Grid,
 }
 
-/// What a library answers.
+/// Answer of a library.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// The text.
+    /// Text of the query.
     pub text: String,
-    /// Whether any scene holds it.
+    /// Whether any scene contains the object.
     pub found: bool,
-    /// The best scenes, those first that hold it best.
+    /// Best scenes, sorted by score in descending order.
     pub scenes: Vec<Row>,
-    /// How much was searched.
+    /// Number of scenes and objects that were searched.
     pub searched: Searched,
-    /// Scenes that were passed over.
+    /// Scenes that were left out.
     pub skipped: Vec<Skipped>,
-    /// Where the time went.
+    /// Duration of each step.
     pub ms: Milliseconds,
 }
 
-/// A scene of an answer.
+/// A scene in an answer.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Row {
-    /// Its path below the library.
+    /// Path below the folder of the library.
     pub scene: String,
-    /// Its best object.
+    /// Id of its best object.
     pub object: u16,
-    /// Score of the object that is most like what is asked for, by which the scene has it or not.
+    /// Largest score of its objects, which decides whether the scene contains the target.
     pub score: f32,
-    /// How well the views' masks fit it.
+    /// Support of the best object, 0 to 1.
     pub support: f32,
-    /// Whether it counts as found.
+    /// Whether the scene contains the target.
     pub found: bool,
 }
 
-/// How much was searched.
+/// Number of scenes and objects that were searched.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Searched {
-    /// Scenes.
+    /// Number of scenes.
     pub scenes: usize,
-    /// Their objects.
+    /// Number of their objects.
     pub objects: usize,
 }
 
-/// A scene that was passed over.
+/// A scene that was left out.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Skipped {
-    /// Its path below the library.
+    /// Path below the folder of the library.
     pub scene: String,
     /// The reason.
     pub why: String,
 }
 
-/// Milliseconds of an answer.
+/// Duration of the steps of an answer, in milliseconds.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Milliseconds {
     /// Loading the object tables of all scenes.
     pub load: f64,
     /// Embedding the text.
     pub encode: f64,
-    /// Comparing it.
+    /// Comparing it with all objects.
     pub search: f64,
 }
 
@@ -117,7 +117,7 @@ impl Search {
         for row in &skipped {
             run.warn(&format!("{}: left out: {}", row.scene, row.why));
         }
-        let Some((first, manifest)) = trained.first() else { bail!("{}: no trained scenes are in it", root.display()) };
+        let Some((first, manifest)) = trained.first() else { bail!("{}: this folder contains no trained scenes; train one first", root.display()) };
         let work = run.work("library", trained.len() as u64);
         let load = |(path, manifest): &(String, Manifest)| -> Result<Opened> {
             work.advance()?;
@@ -170,7 +170,8 @@ impl Search {
 /// The path of a scene below the library's folder, and its manifest.
 type Scene = (String, Manifest);
 
-/// Trained scenes of one encoder below a folder, sorted by path; and those that were left out, with the reason.
+/// Returns the trained scenes of one encoder below a folder, sorted by path, and the scenes that
+/// were left out with the reasons.
 fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
     let mut folders = Vec::new();
     collect(root, DEPTH, &mut folders)?;
@@ -188,7 +189,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
                     scenes.first().map(|s| &s.1).filter(|first| eyes::identity_of(first) != eyes::identity_of(own)).map(|first| {
                         let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
                         format!(
-                            "its encoder is another ('{own}') than that of the library ('{first}'); preprocess and train it again with that"
+                            "its encoder ('{own}') is not that of the library ('{first}'); preprocess and train it again with that of the library"
                         )
                     })
                 }
@@ -207,7 +208,7 @@ fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
     for entry in entries {
         let entry = entry?;
         let path = entry.path();
-        // Scenes may be linked; names with a dot are of what is not finished.
+        // Links to scenes are followed. Names that begin with a dot belong to unfinished output.
         if !path.is_dir() || entry.file_name().to_string_lossy().starts_with('.') {
             continue;
         }

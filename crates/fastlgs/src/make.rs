@@ -1,4 +1,4 @@
-//! The main job in one go: from photos or a video to a scene that answers. What was done is not done again.
+//! Runs preprocessing and training, and skips finished work.
 
 use crate::error::Context;
 use crate::eyes::SamPreset;
@@ -12,15 +12,15 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// What is made, and how thoroughly.
+/// Options of `make`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
-    /// Photos, scene, and how they are preprocessed.
+    /// Options of `preprocess`: photos, scene folder and models.
     #[cfg_attr(feature = "clap", command(flatten))]
     pub preprocess: preprocess::Config,
-    /// How long is trained.
+    /// Length of training.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = Config::default().effort))]
     pub effort: train::Preset,
 }
@@ -31,28 +31,28 @@ impl Default for Config {
     }
 }
 
-/// Whether there was something to do.
+/// Whether a scene was made, or existed already.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum State {
     /// The scene was made.
     Made,
-    /// It was there, made from the same photos with the same options.
+    /// The scene existed already, made from the same photos with the same options.
     Kept,
 }
 
-/// What was made.
+/// Report of `make`.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// Whether there was something to do.
+    /// Whether the scene was made, or existed already.
     pub state: State,
-    /// The photos that the scene was trained on, and those that were kept aside.
+    /// Number of training photos, and number of held-out photos.
     pub photos: [usize; 2],
-    /// How it was trained.
+    /// Report of the training.
     pub train: train::Report,
 }
 
-/// Makes the scene `config.preprocess.output`. A run that was broken off goes on where it was.
+/// Makes the scene `config.preprocess.output`, and continues an interrupted run.
 ///
 /// # Errors
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
@@ -68,7 +68,8 @@ pub fn make(config: &Config, run: &Run) -> Result<Report> {
     Ok(Report { state, photos: [manifest.training(&cameras).len(), manifest.held_out(&cameras).len()], train })
 }
 
-/// Makes a scene with all options of both stages, each in a run of its own. `train.scene` must be `preprocess.output`.
+/// Makes a scene with all options of both stages; `runs` holds the run of each. `train.scene` must
+/// be `preprocess.output`.
 ///
 /// # Errors
 /// Those of both stages.
@@ -76,7 +77,7 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     let photos = &preprocess.photos;
     let photos = photos.canonicalize().with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
     let seeds = runs.map(|run| run.seed);
-    // A scene may be moved.
+    // Leave out the paths of the scene, because a scene may be moved.
     let how = preprocess::Config { photos: photos.clone(), output: PathBuf::new(), ..preprocess.clone() };
     let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
     check_apart(&photos, &preprocess.output)?;
@@ -88,7 +89,8 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         return Ok((State::Kept, report));
     }
     let lock = SceneLock::take(&preprocess.output, "make")?;
-    // What preprocessing left is found again in the scene's cache; steps of training in its checkpoint.
+    // An interrupted preprocessing continues by the cache, an interrupted training by its
+    // checkpoint.
     let begun = known.is_some() && checkpoints::is_begun(&folder);
     if !begun {
         checkpoints::forget(&folder);
@@ -99,13 +101,14 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
     }
     let report = train::train_locked(&train::Config { resume: begun || train.resume, ..train.clone() }, &lock, runs[1])?;
     let mut manifest = folder.manifest()?;
-    // Photos that came or changed while it trained are not in it.
+    // Record the photos as they were before training: later changes are not in the scene.
     manifest.notes.insert(train::MADE.to_owned(), made);
     folder.save_manifest(&manifest)?;
     Ok((State::Made, report))
 }
 
-/// What tells whether a video, or a folder's files, are still the same: names, sizes and times of all of them.
+/// Returns the fingerprint of a video, or those of all files in a folder by name. Hidden files are
+/// skipped.
 fn files(folder: &Path) -> Result<Value> {
     if folder.is_file() {
         return fingerprint(folder);
@@ -115,7 +118,7 @@ fn files(folder: &Path) -> Result<Value> {
     for entry in std::fs::read_dir(folder).map_err(refused)? {
         let entry = entry.map_err(refused)?;
         let name = entry.file_name().to_string_lossy().into_owned();
-        // Through links, which folders of photos often are.
+        // Follow links, which are common in folders of photos.
         let Some(about) = std::fs::metadata(entry.path()).ok().filter(|_| !name.starts_with('.')) else { continue };
         let value = if about.is_dir() { files(&entry.path())? } else { fingerprint(&entry.path())? };
         found.insert(name, value);

@@ -1,4 +1,4 @@
-//! Masks of a view, and what describes each: its embedding and colour distribution.
+//! Masks of a view with their descriptors: embedding and colour histogram.
 
 use crate::cache::{self, Cache};
 use crate::{Result, Run, eyes};
@@ -9,7 +9,8 @@ use fastlgs_vision::{Encoder, histogram};
 use image::RgbImage;
 use rayon::prelude::*;
 
-/// Embedding and colour distribution of every mask of a photo, by label.
+/// Computes embedding and colour histogram of every mask of a photo, sorted by label. `map` holds
+/// the label of each pixel.
 pub fn described(name: &str, photo: &RgbImage, view: usize, map: &LabelMap, encoder: &dyn Encoder) -> Result<Vec<Mask>> {
     let embeddings = encoder.embed_masks(name, photo, map)?;
     let histograms = histogram::histograms(photo, map);
@@ -21,13 +22,14 @@ pub fn described(name: &str, photo: &RgbImage, view: usize, map: &LabelMap, enco
     Ok(masks.filter(|m| m.area > 0.0).collect())
 }
 
-/// The masks of the paper's *whole* level, one a pixel.
+/// Returns the label map of the masks of level whole.
 pub fn whole(folder: &SceneFolder, camera: &Camera) -> Result<LabelMap> {
     Ok(folder.masks(camera)?.painted(Level::Whole))
 }
 
-/// What describes every mask of the training views, sorted by view and label; kept in the scene folder. Only Algorithm 1 and fields
-/// without objects ask for it: global mapping embeds what it finds.
+/// Returns the descriptors of all masks of the training views, sorted by view and label. Computes
+/// and stores them if the scene folder has none for its encoder. Only Algorithm 1 and fields
+/// without objects need them: global mapping embeds its objects.
 ///
 /// # Errors
 /// Missing masks or models.
@@ -35,7 +37,7 @@ pub fn evidence(folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<
     let manifest = folder.manifest()?;
     if evidence::masks_path(folder).is_file() {
         let (masks, encoder) = evidence::load_masks(folder)?;
-        // An earlier version may have left them.
+        // Stored descriptors may come from another encoder.
         if eyes::is_current(&manifest, &encoder, masks.iter().map(|mask| &mask.embedding)) {
             return Ok(masks);
         }
@@ -44,7 +46,9 @@ pub fn evidence(folder: &SceneFolder, training: &[Camera], run: &Run) -> Result<
     describe(folder, training, encoder.as_ref(), Some(&eyes::identity_of(&manifest)), run)
 }
 
-/// The same anew. `identity` tells what made the embeddings; without it they come from files that may change unseen.
+/// Computes and stores the descriptors of all masks. `identity` is that of the encoder, for the
+/// cache. It is `None` for imported embeddings, which are not cached because their files can
+/// change.
 pub(crate) fn describe(
     folder: &SceneFolder,
     training: &[Camera],
@@ -66,7 +70,7 @@ pub(crate) fn describe(
             None => make()?,
         };
         work.advance()?;
-        // A photo keeps what is known of it when others come or go before it.
+        // Cached descriptors have view 0, so that they stay valid when photos are added or removed.
         Ok(found.into_iter().map(|mask| Mask { view, ..mask }).collect())
     };
     let found: Vec<Mask> = training.par_iter().enumerate().map(of_view).collect::<Result<Vec<_>>>()?.concat();

@@ -1,37 +1,39 @@
-//! The photos of a folder, and how the names in poses' files find them.
+//! Finds the photos of a folder and matches them with the names in pose files.
 
 use super::{first_few, is_photo};
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Component, Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
-/// Folders of photos within PHOTOS: of COLMAP and nerfstudio, and of the original 3DGS's conversion script.
+/// Subfolders of PHOTOS that may contain the photos. COLMAP and nerfstudio use `images`; the
+/// conversion script of the original 3DGS uses `input`.
 const FOLDERS: [&str; 2] = ["images", "input"];
-/// The sets of NeRF's synthetic scenes.
+/// Subfolders of NeRF's synthetic scenes, one for each split.
 const SETS: [&str; 3] = ["train", "test", "val"];
-/// Folders below a folder of photos that are searched, such as one for each camera.
+/// Levels of subfolders that are searched for photos, for example one folder for each camera.
 const DEPTH: usize = 4;
 
-/// The folder that photos lie in: PHOTOS/images, PHOTOS/input, or PHOTOS itself where photos lie in it.
+/// Returns the folder that contains the photos: PHOTOS/images, PHOTOS/input, or PHOTOS itself if it
+/// contains photos.
 pub fn images_folder(photos: &Path) -> Option<PathBuf> {
     let named = FOLDERS.iter().map(|name| photos.join(name)).find(|folder| folder.is_dir());
     named.or_else(|| holds_photos(photos).then(|| photos.to_owned()))
 }
 
-/// Whether photos lie in a folder.
+/// Returns whether a folder directly contains photos.
 pub(super) fn holds_photos(folder: &Path) -> bool {
     folder.read_dir().is_ok_and(|mut entries| entries.any(|e| e.is_ok_and(|e| is_photo(&e.path()))))
 }
 
-/// The photos that poses may name.
+/// The photos of a folder, to which pose files refer by name.
 pub struct Album {
     root: PathBuf,
-    /// Every photo in the folders of photos.
+    /// Paths of all photos, sorted.
     files: Vec<PathBuf>,
 }
 
 impl Album {
-    /// The photos of a folder PHOTOS.
+    /// Lists the photos of PHOTOS, also in subfolders of its folder of images.
     pub fn of(root: &Path) -> Self {
         let mut files = Vec::new();
         match images_folder(root).filter(|folder| folder != root) {
@@ -45,10 +47,13 @@ impl Album {
         Self { root: root.to_owned(), files }
     }
 
-    /// The photo of each name, or nothing. `base` is the folder that names are relative to, if it is not PHOTOS/images.
+    /// Returns the photo of each name, or `None` if it is not found.
     ///
-    /// A name is a path, with or without an ending. A name that no path has finds the one photo that its last parts name, or whose name differs
-    /// only in case, in its ending, or in how accents are encoded, unless another name means the same photo.
+    /// A name is a path relative to `base`, PHOTOS/images, PHOTOS/input or PHOTOS, with or without
+    /// extension. If no such file exists, the longest trailing part of the path that is a file
+    /// counts. The last attempt compares file names and ignores case, extension and Unicode
+    /// normalization. If several photos fit, their parent folders decide. Inexact matches are
+    /// discarded if the photo has an exact match, or if two names match it.
     pub fn find(&self, names: &[String], base: &Path) -> Vec<Option<PathBuf>> {
         let mut folders = vec![base.to_owned()];
         folders.extend(FOLDERS.iter().map(|folder| self.root.join(folder)).chain([self.root.clone()]));
@@ -73,7 +78,7 @@ impl Album {
         let mut claims = BTreeMap::<&PathBuf, usize>::new();
         guesses.iter().flatten().for_each(|file| *claims.entry(file).or_default() += 1);
         for (found, guess) in found.iter_mut().zip(&guesses) {
-            // A photo that two names might mean is none's.
+            // Two inexact names match the same photo: neither gets it.
             if let Some(file) = guess.as_ref().filter(|file| claims[file] == 1) {
                 *found = Some(file.clone());
             }
@@ -81,7 +86,8 @@ impl Album {
         found
     }
 
-    /// What was looked for and what there is, where some names found no photo.
+    /// Returns a warning that lists the names without photo and the photos that exist; `None` if
+    /// `names` is empty. `listed` is the number of names in the pose file `file`.
     pub fn missing(&self, names: &[String], listed: usize, file: &Path) -> Option<String> {
         if names.is_empty() {
             return None;
@@ -89,24 +95,25 @@ impl Album {
         let there: Vec<String> = self.files.iter().map(|file| self.relative(file)).collect();
         let there = if there.is_empty() { "no photos".to_owned() } else { first_few(&there) };
         Some(format!(
-            "{} of {listed} photos that {} names are not there: {}; there are {there}",
+            "{} of the {listed} photos that {} lists are missing: {}; the folder contains {there}",
             names.len(),
             file.display(),
             first_few(names)
         ))
     }
 
-    /// The photos that are none of these.
+    /// Yields the paths, relative to PHOTOS, of all photos that are not in `used`.
     pub fn others<'a>(&'a self, used: &'a HashSet<&Path>) -> impl Iterator<Item = String> + 'a {
         self.files.iter().filter(|file| !used.contains(file.as_path())).map(|file| self.relative(file))
     }
 
-    /// A photo's path below PHOTOS.
+    /// Returns the path of a photo relative to PHOTOS.
     fn relative(&self, file: &Path) -> String {
         file.strip_prefix(&self.root).unwrap_or(file).display().to_string()
     }
 
-    /// Names of the views that photos become: their file names, with the folders before them where file names are not unique.
+    /// Returns the name of the view of each photo: its file name, with the parent folders as prefix
+    /// (`a_b_1.png`) if the file name is not unique.
     pub fn view_names(&self, files: &[&Path]) -> Vec<String> {
         let own = |file: &Path| file.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mut counts = HashMap::<String, usize>::new();
@@ -114,7 +121,7 @@ impl Album {
         let named = |file: &&Path| {
             let below = file.strip_prefix(&self.root).unwrap_or(file);
             let below = FOLDERS.iter().find_map(|folder| below.strip_prefix(folder).ok()).unwrap_or(below);
-            // A name never leads out of the folder that it is a name in.
+            // View names become file names. Without `..` they cannot leave their folder.
             let own_part =
                 |part: Component<'_>| matches!(part, Component::Normal(_)).then(|| part.as_os_str().to_string_lossy().into_owned());
             let parts: Vec<String> = below.components().filter_map(own_part).collect();
@@ -124,7 +131,7 @@ impl Album {
     }
 }
 
-/// The file at a path, with or without an ending, below one of these folders.
+/// Returns the file `name`, with or without extension, in the first of `folders` that has it.
 fn by_path(name: &str, folders: &[PathBuf]) -> Option<PathBuf> {
     let with_endings = |bare: PathBuf| {
         let endings = ["png", "jpg", "jpeg", "JPG"].map(|ending| PathBuf::from(format!("{}.{ending}", bare.display())));
@@ -133,13 +140,14 @@ fn by_path(name: &str, folders: &[PathBuf]) -> Option<PathBuf> {
     folders.iter().find_map(|folder| with_endings(folder.join(name)))
 }
 
-/// The file that the last parts of a path name, as many of them as possible: of absolute paths, and of those of other systems.
+/// Returns the file with the longest trailing part of the path `name`. Handles absolute paths and
+/// paths of other operating systems.
 pub(super) fn by_last_parts(name: &str, folders: &[PathBuf]) -> Option<PathBuf> {
     let parts = parts(name);
     (0..parts.len()).find_map(|first| by_path(&parts[first..].join("/"), folders))
 }
 
-/// Adds the photos of a folder and of those below it.
+/// Appends the photos of a folder and of its subfolders, down to `depth` levels.
 fn collect(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) {
     for path in folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path()) {
         if path.is_dir() && depth > 0 {
@@ -150,24 +158,25 @@ fn collect(folder: &Path, depth: usize, files: &mut Vec<PathBuf>) {
     }
 }
 
-/// The parts of a path of any system that name something.
+/// Splits a path at `/` and `\`. Drops drive letters, `.`, `..` and empty components.
 fn parts(name: &str) -> Vec<&str> {
     let is_drive = |part: &str| part.len() == 2 && part.ends_with(':');
     name.split(['/', '\\']).filter(|part| !matches!(*part, "" | "." | "..") && !is_drive(part)).collect()
 }
 
-/// A name by which names that look the same are the same.
+/// Returns the name in lower case and in Unicode normalization form C.
 fn plain(name: &str) -> String {
     name.nfc().collect::<String>().to_lowercase()
 }
 
-/// A name without its ending, if that is one of a photo.
+/// Removes the extension from a name if it is that of a photo.
 fn without_ending(name: &str) -> &str {
     let known = is_photo(Path::new(name));
     name.rsplit_once('.').filter(|_| known).map_or(name, |(bare, _)| bare)
 }
 
-/// The one file whose folders agree with most of the last parts of a name; nothing where two agree equally.
+/// Returns the file whose parent folders match the most trailing folders of the path `name`; `None`
+/// on a tie.
 fn nearest(files: &[&PathBuf], name: &str) -> Option<PathBuf> {
     let wanted: Vec<String> = parts(name).iter().rev().skip(1).map(|part| plain(part)).collect();
     let agreement = |file: &PathBuf| {
@@ -224,10 +233,10 @@ mod tests {
 
     #[test]
     fn a_photo_is_found_by_one_name_only() {
-        // The first has it by its path; the second would have it by its name.
+        // The first name is the path of the photo. The second matches only by its file name.
         assert_eq!(found(&["images/right/1.png"], &["right/1.png", "left/1.png"]), ["images/right/1.png", "-"]);
         assert_eq!(found(&["images/1.png"], &["left/1.PNG", "right/1.PNG"]), ["-", "-"]);
-        assert_eq!(found(&["images/l/1.png", "images/r/1.png"], &["1.png"]), ["-"], "two fit");
+        assert_eq!(found(&["images/l/1.png", "images/r/1.png"], &["1.png"]), ["-"], "two photos match");
         assert_eq!(found(&["images/l/1.png", "images/r/1.png"], &["L/1.PNG", "R/1"]), ["images/l/1.png", "images/r/1.png"]);
     }
 

@@ -10,12 +10,12 @@ use glam::{DVec3, Mat4};
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-/// Whether the folder holds a COLMAP model.
+/// Returns whether the folder contains a COLMAP model.
 pub fn is_model(folder: &Path) -> bool {
     ["bin", "txt"].iter().any(|e| folder.join(format!("cameras.{e}")).is_file())
 }
 
-/// Intrinsics as COLMAP states them.
+/// Intrinsics of one COLMAP camera.
 struct Lens {
     width: u32,
     height: u32,
@@ -24,7 +24,8 @@ struct Lens {
     distortion: Distortion,
 }
 
-/// A registered image: rotation (four numbers of a quaternion), translation, camera id, file name.
+/// A registered image: id, rotation quaternion in file order (COLMAP: w, x, y, z), translation,
+/// camera id and file name.
 struct Registered {
     id: u32,
     rotation: [f64; 4],
@@ -33,14 +34,14 @@ struct Registered {
     name: String,
 }
 
-/// A point with the ids of the images that show it.
+/// A 3-D point with the ids of the images in its track.
 struct Point {
     position: DVec3,
     color: [u8; 3],
     images: Vec<u32>,
 }
 
-/// Names and parameter counts of COLMAP's camera models, by id.
+/// Names and parameter counts of COLMAP's camera models, indexed by model id.
 const MODELS: [(&str, usize); 11] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -55,28 +56,28 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-/// How many photos the model in a folder places; 0 where it cannot be read.
+/// Returns the number of images that the model in a folder registers; 0 if it cannot be read.
 pub fn size(folder: &Path) -> usize {
     registered(folder).map_or(0, |(_, images)| images.len())
 }
 
-/// A file of the model, and whether it is binary.
+/// Returns the path of a file of the model, and whether the model is binary.
 fn file(folder: &Path, name: &str) -> (PathBuf, bool) {
     let binary = folder.join("cameras.bin").is_file();
     (folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" })), binary)
 }
 
-/// The images of the model, and the file that lists them.
+/// Reads the images of the model. Also returns the path of the file that lists them.
 fn registered(folder: &Path) -> Result<(PathBuf, Vec<Registered>)> {
     let (path, binary) = file(folder, "images");
     let images = if binary { images_bin(&path)? } else { images_txt(&path)? };
     Ok((path, images))
 }
 
-/// Reads the model in `folder`; photos are looked for in PHOTOS.
+/// Reads the model in `folder` and finds its photos in `album`. Image names are relative to `base`.
 ///
 /// # Errors
-/// Missing or truncated files, unknown camera models, numbers that do not parse.
+/// Missing or truncated files, unknown camera models, and fields that are not numbers.
 pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
     let ((cameras, binary), (points, _)) = (file(folder, "cameras"), file(folder, "points3D"));
     let lenses = if binary { cameras_bin(&cameras)? } else { cameras_txt(&cameras)? };
@@ -87,7 +88,7 @@ pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
     let mut photo_of = HashMap::new();
     for (image, path) in registered.iter().zip(album.find(&names, base)) {
         let lens = lenses.get(&image.lens).ok_or_else(|| {
-            Error::format(&images, format!("image '{}' names camera {}, which {} lacks", image.name, image.lens, cameras.display()))
+            Error::format(&images, format!("image '{}' refers to camera {}, which is missing from {}; export the model again", image.name, image.lens, cameras.display()))
         })?;
         match path {
             Some(path) => {
@@ -99,7 +100,8 @@ pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
     }
     if points.is_file() {
         let read = if binary { points_bin(&points)? } else { points_txt(&points)? };
-        // Some programs leave out the colours: all points are black then, and the photos tell their colours.
+        // Some programs write no colours, so that all points are black. The photos then give the
+        // colours.
         let colorless = read.iter().all(|point| point.color == [0; 3]);
         let shown_in = |point: &Point| point.images.iter().filter_map(|id| photo_of.get(id).copied()).collect();
         stated.shown_in = if colorless { read.iter().map(shown_in).collect() } else { Vec::new() };
@@ -217,17 +219,17 @@ fn points_bin(path: &Path) -> Result<Vec<Point>> {
         .collect()
 }
 
-/// The fields of each line that is not a comment, with its line number.
+/// Yields the line number and the fields of each line that is not a comment.
 fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let lines = text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'));
     lines.map(|(i, l)| (i + 1, l.split_whitespace().collect()))
 }
 
-/// Says what to do about a camera model that is not known here.
+/// Returns the error text for a camera model that is not supported.
 fn unknown(model: &str) -> String {
     let known: Vec<&str> = MODELS.iter().map(|model| model.0).collect();
     format!(
-        "the camera model {model} is not supported; undistort the photos with 'colmap image_undistorter' and use its model (supported: {})",
+        "the camera model {model} is not supported; undistort the photos with 'colmap image_undistorter' and use the model that it writes (supported: {})",
         known.join(", ")
     )
 }
@@ -236,7 +238,7 @@ fn parse<T: std::str::FromStr>(path: &Path, line: usize, fields: &[&str], i: usi
     fields
         .get(i)
         .and_then(|f| f.parse().ok())
-        .ok_or_else(|| Error::format(path, format!("line {line}, field {}: a number was expected", i + 1)))
+        .ok_or_else(|| Error::format(path, format!("line {line}, field {} is not a valid number; export the model again", i + 1)))
 }
 
 fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
@@ -247,7 +249,7 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
         let n = n.ok_or_else(|| Error::format(path, format!("line {line}: {}", unknown(&format!("'{model}'")))))?;
         if f.len() != 4 + n {
             let given = f.len().saturating_sub(4);
-            let why = format!("line {line}: the camera model {model} has {n} parameters, and this line gives {given}; export it again");
+            let why = format!("line {line}: the camera model {model} has {n} parameters, but this line has {given}; export the model again");
             return Err(Error::format(path, why));
         }
         let parameters = (0..n).map(|i| parse(path, line, &f, 4 + i)).collect::<Result<Vec<f64>>>()?;
@@ -257,10 +259,11 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
     Ok(lenses)
 }
 
-/// Fields before the name of an image.
+/// Number of fields before the name of an image.
 const BEFORE_NAME: usize = 9;
 
-/// Images, each followed by a line of its observations. Some programs leave these lines out, or only those that are empty.
+/// Reads `images.txt`: each image is followed by a line of its observations. Some programs omit
+/// these lines, or omit them only if they are empty.
 fn images_txt(path: &Path) -> Result<Vec<Registered>> {
     let content = text(path)?;
     let mut lines = content.lines().enumerate().filter(|(_, line)| !line.starts_with('#')).peekable();
@@ -277,14 +280,14 @@ fn images_txt(path: &Path) -> Result<Vec<Registered>> {
             rotation: [number(1)?, number(2)?, number(3)?, number(4)?],
             translation: [number(5)?, number(6)?, number(7)?],
             lens: parse(path, line, &f, 8)?,
-            name: name_of(row).ok_or_else(|| Error::format(path, format!("line {line}: the image's name is missing")))?,
+            name: name_of(row).ok_or_else(|| Error::format(path, format!("line {line}: the name of the image is missing; export the model again")))?,
         });
         lines.next_if(|(_, next)| is_observations(next));
     }
     Ok(images)
 }
 
-/// The name at the end of an image's line, blanks within it included.
+/// Returns the name at the end of an image's line. It may contain spaces.
 fn name_of(row: &str) -> Option<String> {
     let mut rest = row.trim();
     for _ in 0..BEFORE_NAME {
@@ -293,7 +296,8 @@ fn name_of(row: &str) -> Option<String> {
     Some(rest.to_owned()).filter(|name| !name.is_empty())
 }
 
-/// Whether a line lists observations (x, y, point), possibly none; one of an image has ten fields or a name.
+/// Returns whether a line lists observations: zero or more triples (x, y, point id). A line of an
+/// image has ten fields or a name that is not a number.
 fn is_observations(line: &str) -> bool {
     let fields: Vec<&str> = line.split_whitespace().collect();
     fields.len().is_multiple_of(3) && fields.iter().all(|field| field.parse::<f64>().is_ok())
@@ -305,7 +309,8 @@ fn points_txt(path: &Path) -> Result<Vec<Point>> {
         .map(|(line, f)| {
             let number = |i| parse::<f64>(path, line, &f, i);
             let byte = |i| parse::<u8>(path, line, &f, i);
-            // After the error come pairs of image and key point.
+            // The reprojection error (field 7) is followed by pairs of image id and key point
+            // index.
             let images = f.get(8..).unwrap_or_default().iter().step_by(2).filter_map(|id| id.parse().ok()).collect();
             Ok(Point { position: DVec3::new(number(1)?, number(2)?, number(3)?), color: [byte(4)?, byte(5)?, byte(6)?], images })
         })

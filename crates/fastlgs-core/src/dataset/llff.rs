@@ -1,5 +1,8 @@
-//! LLFF's `poses_bounds.npy`: a row of 17 numbers for each photo, in the order of their names: a 3x5 matrix (camera-to-world
-//! rotation with the axes down, right, back; position; height, width, focal length), then the nearest and farthest depth.
+//! Reads LLFF's `poses_bounds.npy`: 17 numbers for each photo, photos sorted by file name.
+//!
+//! The first 15 numbers are a 3x5 matrix in row-major order. Its columns are the camera axes down,
+//! right and back in the world, the position, and (height, width, focal length). The nearest and
+//! farthest depth follow.
 
 use super::album::images_folder;
 use super::pose::{PoseConvention, StatedPose};
@@ -9,18 +12,19 @@ use crate::{Camera, Error, Result, npy};
 use glam::{DMat4, DVec3, Mat4};
 use std::path::{Path, PathBuf};
 
-/// Name of the file.
+/// Name of the pose file in PHOTOS.
 pub const FILE: &str = "poses_bounds.npy";
 
-/// Reads `PHOTOS/poses_bounds.npy`; photos lie in `PHOTOS/images`.
+/// Reads `PHOTOS/poses_bounds.npy`. The photos are in PHOTOS/images, PHOTOS/input or PHOTOS itself.
 ///
 /// # Errors
-/// A damaged file, or another number of photos than rows.
+/// A damaged file, an entry that is not finite, or a number of photos that differs from the number
+/// of rows.
 pub fn load(photos: &Path) -> Result<Stated> {
     let path = photos.join(FILE);
     let table = npy::read(&path)?;
     let [rows, 17] = table.shape[..] else {
-        return Err(Error::format(&path, format!("shape {:?}; LLFF's poses are (photos, 17)", table.shape)));
+        return Err(Error::format(&path, format!("the array has shape {:?}, not (photos, 17); export the poses from LLFF again", table.shape)));
     };
     let folder = images_folder(photos).unwrap_or_else(|| photos.join("images"));
     let entries = std::fs::read_dir(&folder).map_err(Error::io(&folder))?;
@@ -30,13 +34,13 @@ pub fn load(photos: &Path) -> Result<Stated> {
         let count = files.len();
         return Err(Error::format(
             &path,
-            format!("{rows} poses for {count} photos in images/; they belong together by the order of names"),
+            format!("{rows} poses for {count} photos in images/; each photo needs one row, in the order of the file names"),
         ));
     }
     let posed = |(file, row): (PathBuf, &[f64])| {
         let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(bad) = row[..15].iter().find(|v| !v.is_finite()) {
-            return Err(Error::format(&path, format!("the pose of '{name}' holds {bad}; mend that row")));
+            return Err(Error::format(&path, format!("the pose of '{name}' contains {bad}; correct that row")));
         }
         let column = |k: usize| DVec3::new(row[k], row[5 + k], row[10 + k]);
         let (down, right, back, position) = (column(0), column(1), column(2), column(3));
@@ -56,7 +60,7 @@ pub fn load(photos: &Path) -> Result<Stated> {
         Ok(PosedPhoto { path: file, camera, stated, distortion: Distortion::default(), ignore: None, upright: false })
     };
     let photos = files.into_iter().zip(table.values.chunks_exact(17)).map(posed).collect::<Result<_>>()?;
-    // The file's own axes leave no choice.
+    // The format defines the axes, so there is only one convention.
     Ok(Stated { photos, conventions: vec![PoseConvention::C2wOpencv], ..Stated::default() })
 }
 
@@ -71,7 +75,8 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         std::fs::create_dir(dir.path().join("images")).unwrap();
         image::RgbImage::new(8, 6).save(dir.path().join("images/a.png")).unwrap();
-        // A camera at (1, 2, 3) that looks along world -z with y up: down is -y, right is x, back is z.
+        // A camera at (1, 2, 3) that looks along world -z with y up. Its axes are down = -y, right
+        // = x and back = z.
         let row = [0.0, 1.0, 0.0, 1.0, 6.0, -1.0, 0.0, 0.0, 2.0, 8.0, 0.0, 0.0, 1.0, 3.0, 5.0, 0.1, 9.0];
         let write = |rows: u64, values: &[f64]| {
             let mut bytes = Vec::new();
@@ -87,7 +92,7 @@ mod tests {
         assert!(camera.centre().distance(Vec3::new(1.0, 2.0, 3.0)) < 1e-5);
         assert!(camera.forward().distance(-Vec3::Z) < 1e-6);
         let above = camera.world_to_camera.transform_point3(Vec3::new(1.0, 3.0, -3.0));
-        assert!(above.y < 0.0 && above.z > 0.0, "what is above is further up in the picture");
+        assert!(above.y < 0.0 && above.z > 0.0, "a point above the optical axis has a negative y in the camera");
         write(2, &[row, row].concat());
         assert!(super::super::load(dir.path()).unwrap_err().to_string().contains("2 poses for 1 photos"));
         let mut bad = row;

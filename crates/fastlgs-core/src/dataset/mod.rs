@@ -1,4 +1,4 @@
-//! Posed photos from other programs' folders.
+//! Loads posed photos from the folders of other programs: COLMAP, nerfstudio, NeRF and LLFF.
 
 pub mod album;
 pub mod colmap;
@@ -16,75 +16,80 @@ pub use pose::{PoseConvention, StatedPose};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
-/// One photo with the camera that took it, still distorted.
+/// A photo with its camera. The photo is still distorted.
 #[derive(Clone, Debug)]
 pub struct PosedPhoto {
     /// File of the photo.
     pub path: PathBuf,
-    /// Pinhole part of the camera, at the resolution that the poses' file states, in the data set's frame.
+    /// Pinhole part of the camera in the data set's frame. Its size is the one that the pose file
+    /// states, which may differ from the photo's.
     pub camera: Camera,
-    /// Its pose as the file states it.
+    /// Pose as written in the file.
     pub stated: StatedPose,
-    /// Lens distortion to be removed.
+    /// Lens distortion that preparation removes.
     pub distortion: Distortion,
-    /// Mask of what does not count: black there.
+    /// Path of the mask of ignored pixels, which are black in it.
     pub ignore: Option<PathBuf>,
-    /// Whether the pose counts the pixels of the photo as EXIF turns it, and not as they are stored.
+    /// Whether the camera refers to the photo turned upright by its EXIF orientation, instead of
+    /// the pixels as stored.
     pub upright: bool,
 }
 
-/// A reconstructed 3-D point (structure from motion).
+/// A 3-D point from structure from motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SfmPoint {
-    /// Position in the world.
+    /// Position in the scene's frame.
     pub position: Vec3,
-    /// Colour, 0 to 255.
+    /// Colour (red, green, blue), 0 to 255.
     pub color: [u8; 3],
-    /// Numbers of the training views that are known to show it.
+    /// Indices of the training views in which the point is visible, as far as known.
     pub seen_by: Vec<u32>,
 }
 
-/// What the files of a folder state.
+/// Content of the pose files, before sorting and checks.
 #[derive(Clone, Debug, Default)]
 pub struct Stated {
-    /// Photos with poses; their cameras have neither name nor pose yet.
+    /// Photos with poses. Name and pose of their cameras are not set yet.
     photos: Vec<PosedPhoto>,
-    /// Points in the world and their colours, 0 to 255.
+    /// Points in world coordinates with their colours, 0 to 255.
     points: Vec<(DVec3, [u8; 3])>,
-    /// By point, the photos that show it, where points have no colours.
+    /// For each point, the indices of the photos in its track. Empty if the points have colours.
     shown_in: Vec<Vec<u32>>,
-    /// Conventions in which the poses may be written, the standard first.
+    /// Conventions in which the poses may be written. The first is the default.
     conventions: Vec<PoseConvention>,
-    /// Photos that their data set keeps for testing.
+    /// Photos that the data set reserves for testing.
     held_out: Vec<PathBuf>,
     warnings: Vec<String>,
 }
 
-/// Posed photos, sorted by name, and what else their folder offered.
+/// Posed photos, points and other content of a folder of photos.
 #[derive(Clone, Debug, Default)]
 pub struct Dataset {
     /// Photos with poses, sorted by name.
     pub photos: Vec<PosedPhoto>,
-    /// Structure-from-motion points; empty where the folder has none.
+    /// Points from structure from motion; empty if the folder has none.
     pub points: Vec<SfmPoint>,
-    /// By point, the indices of the photos that show it, where points came without colours; else empty.
+    /// For each point, the indices of the photos in its track; an empty entry means unknown. The
+    /// list is empty if the points have colours.
     pub shown_in: Vec<Vec<u32>>,
-    /// The frame of the cameras and points.
+    /// Frame of the cameras and points.
     pub frame: WorldFrame,
-    /// Conventions in which the poses may be written, the standard first.
+    /// Conventions in which the poses may be written. The first is the default.
     pub conventions: Vec<PoseConvention>,
-    /// Names of the views that the data set itself keeps for testing.
+    /// Names of the views that the data set reserves for testing.
     pub held_out: Vec<String>,
-    /// What was wrong but survivable, one sentence each.
+    /// Warnings about problems that do not prevent loading, one sentence each.
     pub warnings: Vec<String>,
-    /// A frame that is kept as long as the cameras fit it: that of an earlier scene, whose Gaussians stay.
+    /// Frame of the existing scene. It is kept as long as it fits the cameras, so that the scene's
+    /// Gaussians remain valid.
     pub earlier_frame: Option<WorldFrame>,
-    /// Points in the world.
+    /// Points in world coordinates, in the order of `points`.
     stated_points: Vec<DVec3>,
 }
 
 impl Dataset {
-    /// Reads the poses by a convention; the frame is chosen anew.
+    /// Sets the poses of all cameras by a convention. Chooses the frame again and transforms the
+    /// points into it.
     pub fn read_poses_by(&mut self, convention: PoseConvention) {
         let poses: Vec<_> = self.photos.iter().map(|photo| photo.stated.by(convention)).collect();
         let centres: Vec<DVec3> = poses.iter().map(|pose| pose.centre()).collect();
@@ -98,7 +103,8 @@ impl Dataset {
     }
 }
 
-/// The COLMAP model of PHOTOS that places most photos, and a sentence that names the others.
+/// Returns the COLMAP model of PHOTOS with the most registered images. If there are several models,
+/// also returns a warning that lists them.
 fn colmap_model(photos: &Path) -> Option<(PathBuf, Option<String>)> {
     let roots = ["sparse", "colmap/sparse"].map(|root| photos.join(root));
     let numbered = roots.iter().flat_map(|root| {
@@ -111,26 +117,29 @@ fn colmap_model(photos: &Path) -> Option<(PathBuf, Option<String>)> {
         return models.into_iter().next().map(|model| (model, None));
     }
     let mut sizes: Vec<(usize, PathBuf)> = models.into_iter().map(|model| (colmap::size(&model), model)).collect();
-    // Of equally large models the first counts.
+    // The sort is stable: among models of equal size, the first wins.
     sizes.sort_by_key(|(size, _)| std::cmp::Reverse(*size));
     let list = |models: &[(usize, PathBuf)]| {
         let each = models.iter().map(|(size, model)| format!("{} ({size} photos)", model.display()));
         each.collect::<Vec<_>>().join(", ")
     };
-    let warning = format!("of {} COLMAP models {} is used; not used: {}", sizes.len(), list(&sizes[..1]), list(&sizes[1..]));
+    let warning = format!("found {} COLMAP models; using {}; ignoring {}", sizes.len(), list(&sizes[..1]), list(&sizes[1..]));
     Some((sizes.swap_remove(0).1, Some(warning)))
 }
 
-/// Whether PHOTOS has poses of a kind that [`load`] reads.
+/// Returns whether PHOTOS has poses that [`load`] can read.
 pub fn has_poses(photos: &Path) -> bool {
     colmap_model(photos).is_some() || !transforms::files(photos).is_empty() || photos.join(llff::FILE).is_file()
 }
 
-/// Loads PHOTOS, with the masks in `ignore/`: a COLMAP model (binary or text) in `sparse/` or `colmap/sparse/`, `transforms.json` (nerfstudio,
-/// instant-ngp), `transforms_train.json` (NeRF's synthetic scenes) or `poses_bounds.npy` (LLFF).
+/// Loads the posed photos of PHOTOS, with the masks in `ignore/`.
+///
+/// The poses come from the first of these that exists: a COLMAP model (binary or text) in `sparse/`
+/// or `colmap/sparse/`, `transforms.json` (nerfstudio, instant-ngp), `transforms_train.json`
+/// (NeRF's synthetic scenes), or `poses_bounds.npy` (LLFF).
 ///
 /// # Errors
-/// When no poses are found, a file is damaged, a pose is not finite, or no posed photo is left.
+/// No poses, a damaged file, a pose that is not finite, or poses without any photo.
 pub fn load(photos: &Path) -> Result<Dataset> {
     if !photos.is_dir() {
         return Err(Error::Invalid(format!("{}: no such folder of photos", photos.display())));
@@ -155,7 +164,7 @@ pub fn load(photos: &Path) -> Result<Dataset> {
     assembled(photos, &album, stated)
 }
 
-/// Loads PHOTOS with the poses of a COLMAP model in any folder.
+/// Loads PHOTOS with the poses of a COLMAP model in another folder.
 ///
 /// # Errors
 /// As [`load`].
@@ -165,7 +174,7 @@ pub fn load_model(photos: &Path, model: &Path) -> Result<Dataset> {
     assembled(photos, &album, colmap::load(&album, &base, model)?)
 }
 
-/// Names, sorts and checks what files state.
+/// Names, sorts and checks the content of the pose files.
 fn assembled(photos: &Path, album: &Album, mut stated: Stated) -> Result<Dataset> {
     if stated.photos.is_empty() {
         let why = stated.warnings.iter().map(|warning| format!("; {warning}")).collect::<String>();
@@ -190,12 +199,12 @@ fn assembled(photos: &Path, album: &Album, mut stated: Stated) -> Result<Dataset
         ..Dataset::default()
     };
     if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
-        return Err(Error::format(photos, format!("two poses for the photo '{}'; remove one of them", pair[0].camera.name)));
+        return Err(Error::format(photos, format!("the photo '{}' has two poses; remove one of them", pair[0].camera.name)));
     }
     let finite: Vec<bool> = stated.points.iter().map(|(position, _)| position.is_finite()).collect();
     let lost = finite.iter().filter(|finite| !**finite).count();
     if lost > 0 {
-        dataset.warnings.push(format!("{lost} points of {} are nowhere (NaN or infinite) and are left out", finite.len()));
+        dataset.warnings.push(format!("{lost} of {} points have NaN or infinite positions and are ignored", finite.len()));
     }
     let mut keep = finite.iter();
     dataset.shown_in.retain(|_| *keep.next().unwrap_or(&true));
@@ -216,7 +225,8 @@ fn assembled(photos: &Path, album: &Album, mut stated: Stated) -> Result<Dataset
     Ok(dataset)
 }
 
-/// A principal point outside the photo belongs to a photo of another size.
+/// Returns an error if the principal point lies outside the photo. The intrinsics then belong to
+/// another image size.
 fn check_principal_point(photo: &PosedPhoto) -> Result<()> {
     let Camera { width, height, cx, cy, .. } = photo.camera;
     let within = |c: f32, side: u32| c > 0.0 && c < side as f32;
@@ -224,18 +234,19 @@ fn check_principal_point(photo: &PosedPhoto) -> Result<()> {
         return Ok(());
     }
     let why = format!(
-        "the principal point ({cx}, {cy}) of its camera lies outside its {width}x{height} pixels; state the size that the camera was calibrated          for (w and h in transforms.json), and it is scaled to the photo"
+        "the principal point ({cx}, {cy}) lies outside the {width}x{height} pixels of its camera; set the size that the camera was calibrated for (w and h in transforms.json)"
     );
     Err(Error::format(&photo.path, why))
 }
 
-/// Text of a file, without a byte order mark.
+/// Reads a UTF-8 file and removes the byte order mark.
 fn text(path: &Path) -> Result<String> {
     let text = String::from_utf8(fs::read(path)?).map_err(|_| Error::format(path, "not UTF-8 text"))?;
     Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
 }
 
-/// `PHOTOS/ignore/NAME.png`, with or without the photo's own ending, by the view's name or the photo's path below its folder.
+/// Returns the ignore mask of a photo: `PHOTOS/ignore/NAME.png`. NAME is the view's name or the
+/// photo's path in its folder, with or without the photo's extension.
 fn ignore_mask(photos: &Path, view: &str, file: &Path) -> Option<PathBuf> {
     let below = images_folder(photos).and_then(|images| Some(file.strip_prefix(images).ok()?.to_owned()));
     let names = [PathBuf::from(view), below.unwrap_or_default()];
@@ -243,20 +254,21 @@ fn ignore_mask(photos: &Path, view: &str, file: &Path) -> Option<PathBuf> {
     each.map(|name| photos.join("ignore").join(name)).find(|path| path.is_file())
 }
 
-/// Photos that no pose names are left out; the user hears of it once.
+/// Adds one warning that lists all photos without a pose.
 fn warn_of_photos_without_pose(album: &Album, dataset: &mut Dataset) {
     let posed: HashSet<&Path> = dataset.photos.iter().map(|p| p.path.as_path()).collect();
     let extra: Vec<String> = album.others(&posed).collect();
     if !extra.is_empty() {
-        let warning = format!("{} photos have no pose and are left out: {}", extra.len(), first_few(&extra));
+        let warning = format!("{} photos have no pose and are ignored: {}", extra.len(), first_few(&extra));
         dataset.warnings.push(warning);
     }
 }
 
-/// Endings of pictures that this project does not read.
+/// Extensions of image formats that cannot be read.
 const UNREAD: [&str; 11] = ["arw", "avif", "cr2", "cr3", "dng", "heic", "heif", "jp2", "jxl", "nef", "orf"];
 
-/// What to do about pictures of a folder that are not read; nothing where there are none.
+/// Returns a warning if a folder contains images that cannot be read, with their names; else
+/// `None`.
 pub fn passed_over(images: &Path) -> Option<String> {
     let ending = |path: &Path| path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
     let is_hidden = |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
@@ -265,10 +277,10 @@ pub fn passed_over(images: &Path) -> Option<String> {
     unread.sort();
     let names: Vec<String> = unread.iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
     let count = names.len();
-    (count > 0).then(|| format!("{count} pictures are in formats that cannot be read; convert them to JPEG or PNG: {}", first_few(&names)))
+    (count > 0).then(|| format!("{count} images have formats that cannot be read; convert them to JPEG or PNG: {}", first_few(&names)))
 }
 
-/// Folders of photos within a folder of photos.
+/// Returns the names of the subfolders that contain photos, sorted.
 pub fn folders_within(images: &Path) -> Vec<String> {
     let holds_photos =
         |path: &PathBuf| std::fs::read_dir(path).is_ok_and(|mut entries| entries.any(|e| e.is_ok_and(|e| is_photo(&e.path()))));
@@ -278,17 +290,18 @@ pub fn folders_within(images: &Path) -> Vec<String> {
     found
 }
 
-/// Endings of the photos that are read.
+/// Extensions of the image formats that can be read.
 const READ: [&str; 8] = ["bmp", "jfif", "jpeg", "jpg", "png", "tif", "tiff", "webp"];
 
-/// Whether the file's ending is that of a photo this project reads. Hidden files, such as the ._NAME that macOS leaves, are none.
+/// Returns whether the file extension is that of a readable photo. Hidden files, such as the
+/// `._NAME` files of macOS, are not photos.
 pub fn is_photo(path: &Path) -> bool {
     let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
     let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
     !hidden && READ.contains(&ending.as_str())
 }
 
-/// The first names of a list, for a message.
+/// Joins the first five names of a list for a message.
 fn first_few(names: &[String]) -> String {
     let printable = |name: &String| name.chars().map(|c| if c.is_control() { '?' } else { c }).collect::<String>();
     let shown = names.iter().take(5).map(printable).collect::<Vec<_>>().join(", ");

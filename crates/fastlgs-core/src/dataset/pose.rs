@@ -1,14 +1,16 @@
-//! Poses as their files state them, and the conventions in which programs write them.
+//! Poses as written in files, and the conventions of the programs that write them.
 
 use crate::world_frame::Pose;
 use glam::{DMat4, DQuat, DVec3, DVec4};
 use serde::{Deserialize, Serialize};
 
-/// Direction and axes of the poses in a file. OpenCV: x right, y down, z forward. OpenGL: x right, y up, z backward.
+/// Direction and camera axes of the poses in a file.
+///
+/// OpenCV axes: x right, y down, z forward. OpenGL axes: x right, y up, z backward.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum PoseConvention {
-    /// Camera to world, OpenGL axes: transforms.json of instant-ngp and nerfstudio.
+    /// Camera to world, OpenGL axes: `transforms.json` of instant-ngp and nerfstudio.
     C2wOpengl,
     /// Camera to world, OpenCV axes.
     C2wOpencv,
@@ -16,23 +18,23 @@ pub enum PoseConvention {
     W2cOpengl,
     /// World to camera, OpenCV axes: COLMAP.
     W2cOpencv,
-    /// As `W2cOpencv`, with quaternions in the order x, y, z, w.
+    /// As `W2cOpencv`, but with quaternions in the order x, y, z, w.
     W2cOpencvXyzw,
-    /// As `C2wOpencv`, with quaternions in the order x, y, z, w.
+    /// As `C2wOpencv`, but with quaternions in the order x, y, z, w.
     C2wOpencvXyzw,
 }
 
 impl PoseConvention {
-    /// The conventions in which matrices are found; the first is the standard.
+    /// Conventions that matrices may have. The first is the default.
     pub const OF_MATRICES: [Self; 4] = [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpencv, Self::W2cOpengl];
-    /// Those in which quaternions are found; the first is the standard.
+    /// Conventions that quaternions may have. The first is the default.
     pub const OF_QUATERNIONS: [Self; 4] = [Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencv, Self::C2wOpencvXyzw];
 
-    /// All of them.
+    /// All conventions.
     pub const ALL: [Self; 6] =
         [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpengl, Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencvXyzw];
 
-    /// Its name on the command line.
+    /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::C2wOpengl => "c2w-opengl",
@@ -45,17 +47,17 @@ impl PoseConvention {
     }
 }
 
-/// The numbers of a pose as its file states them.
+/// A pose as written in a file, before a convention is applied.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum StatedPose {
     /// A 4x4 matrix.
     Matrix(DMat4),
-    /// Four numbers of a rotation, and a translation.
+    /// The four numbers of a rotation quaternion in file order, and a translation.
     Quaternion([f64; 4], DVec3),
 }
 
 impl StatedPose {
-    /// What it means by a convention.
+    /// Converts the pose to OpenCV axes, assuming that it is written in `convention`.
     pub fn by(&self, convention: PoseConvention) -> Pose {
         use PoseConvention::{C2wOpencv, C2wOpencvXyzw, C2wOpengl, W2cOpencv, W2cOpencvXyzw, W2cOpengl};
         let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));

@@ -1,4 +1,5 @@
-//! `transforms.json` of instant-ngp and nerfstudio: camera-to-world matrices in OpenGL axes (y up, looking along -z).
+//! Reads `transforms.json` of instant-ngp and nerfstudio: camera-to-world matrices with OpenGL axes
+//! (y up, looking along -z).
 
 use super::album::{Album, by_last_parts};
 use super::pose::{PoseConvention, StatedPose};
@@ -24,18 +25,18 @@ struct Lens {
     k4: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
-    /// instant-ngp's.
+    /// Field of instant-ngp; true for an equidistant fisheye.
     is_fisheye: Option<bool>,
-    /// nerfstudio's; pinholes with or without distortion where it is left out.
+    /// Field of nerfstudio. Without it, the camera is a pinhole with optional distortion.
     camera_model: Option<String>,
 }
 
 #[derive(Deserialize)]
 struct Frame {
     file_path: String,
-    /// Black where the photo does not count.
+    /// Path of the mask of ignored pixels, which are black in it.
     mask_path: Option<String>,
-    /// Rows of four numbers; the last row may be left out.
+    /// Rows of four numbers. The last row may be missing.
     transform_matrix: Vec<[Option<f64>; 4]>,
     #[serde(flatten)]
     lens: Lens,
@@ -48,12 +49,12 @@ struct Transforms {
     frames: Vec<Frame>,
 }
 
-/// The poses of photos to train on, where a data set is divided into sets (NeRF's synthetic scenes).
+/// Pose file of the training photos in data sets with splits (NeRF's synthetic scenes).
 const TRAIN: &str = "transforms_train.json";
-/// The poses of its held-out photos.
+/// Pose file of the held-out photos in such data sets.
 const TEST: &str = "transforms_test.json";
 
-/// The files of poses in PHOTOS, and whether their photos are held out.
+/// Returns the pose files of PHOTOS, each with whether its photos are held out.
 pub fn files(photos: &Path) -> Vec<(PathBuf, bool)> {
     let one = photos.join("transforms.json");
     if one.is_file() {
@@ -63,14 +64,14 @@ pub fn files(photos: &Path) -> Vec<(PathBuf, bool)> {
     if sets[0].0.is_file() { sets.into_iter().filter(|(file, _)| file.is_file()).collect() } else { Vec::new() }
 }
 
-/// Reads the poses of PHOTOS. Frames whose photo is missing are counted in a warning and left out.
+/// Reads the poses of PHOTOS. Frames without photo are skipped, and a warning lists them.
 ///
 /// # Errors
-/// Damaged JSON, a matrix entry that is no number, or no focal length.
+/// Damaged JSON, a matrix entry that is NaN or infinite, a missing focal length, or a missing mask.
 pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<Stated> {
     let mut stated = Stated { conventions: PoseConvention::OF_MATRICES.to_vec(), ..Stated::default() };
     let read = files.iter().map(|(path, _)| read(path)).collect::<Result<Vec<_>>>()?;
-    // All at once, so that a photo is found by one name only.
+    // Names of all files are resolved together, so that no two names get the same photo.
     let names: Vec<String> = read.iter().flat_map(|file| &file.frames).map(|frame| frame.file_path.clone()).collect();
     let mut found = album.find(&names, photos).into_iter();
     for ((path, held_out), file) in files.iter().zip(&read) {
@@ -81,19 +82,20 @@ pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<S
 }
 
 fn read(path: &Path) -> Result<Transforms> {
-    // JSON has no NaN, but Python writes it: such entries become null and are refused by name below.
+    // JSON has no NaN, but Python writes it. Such entries become null, and `matrix` reports them.
     let text = without_what_is_no_number(&text(path)?);
     let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))?;
     if file.frames.is_empty() {
-        return Err(Error::format(path, "it lists no frames"));
+        return Err(Error::format(path, "the file lists no frames; export it again"));
     }
     Ok(file)
 }
 
-/// Adds the frames of a file whose photos are there.
+/// Adds the frames of a file that have a photo.
 fn add(album: &Album, path: &Path, held_out: bool, file: &Transforms, photos: Vec<Option<PathBuf>>, stated: &mut Stated) -> Result<()> {
     let matrices = file.frames.iter().map(|frame| matrix(path, frame)).collect::<Result<Vec<_>>>()?;
-    // A pose at the origin looks the same by rows and by columns: the others tell.
+    // The storage order of a pose at the origin is ambiguous. It follows the other poses of the
+    // file.
     let by_columns = matrices.iter().any(|(_, by_columns)| *by_columns);
     let mut missing = Vec::new();
     for ((frame, photo), (matrix, transposed)) in file.frames.iter().zip(photos).zip(matrices) {
@@ -109,14 +111,17 @@ fn add(album: &Album, path: &Path, held_out: bool, file: &Transforms, photos: Ve
         stated.photos.push(posed(path, photo, frame, &file.lens, matrix)?);
     }
     if by_columns {
-        let why = "its poses have their translation in the last row: they were read as transposed matrices";
+        let why = "the translations are in the last row of the matrices, so they were read as transposed";
         stated.warnings.push(format!("{}: {why}", path.display()));
     }
     stated.warnings.extend(album.missing(&missing, file.frames.len(), path));
     Ok(())
 }
 
-/// The pose of a frame, and whether its matrix is stored by columns.
+/// Returns the pose of a frame, and whether the file stores the matrix transposed.
+///
+/// # Errors
+/// A wrong number of rows, an entry that is NaN or infinite, or a last row other than (0, 0, 0, 1).
 fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
     let name = &frame.file_path;
     let mut rows = [DVec4::W; 4];
@@ -127,7 +132,7 @@ fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
     for (row, values) in rows.iter_mut().zip(&frame.transform_matrix) {
         for (k, value) in values.iter().enumerate() {
             row[k] = value.ok_or_else(|| {
-                Error::format(file, format!("the pose of '{name}' has a NaN or infinite entry; remove or mend that frame"))
+                Error::format(file, format!("the pose of '{name}' has a NaN or infinite entry; remove or correct that frame"))
             })?;
         }
     }
@@ -147,7 +152,7 @@ fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
     Err(Error::format(file, why))
 }
 
-/// Python's NaN and Infinity as null, outside of strings.
+/// Replaces Python's NaN and Infinity by null, except inside strings.
 fn without_what_is_no_number(text: &str) -> String {
     let mut within = false;
     let mut escaped = false;
@@ -174,7 +179,7 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
         }
     };
     let from_angle = either(|l| l.camera_angle_x).map(|a| w / (2.0 * (a / 2.0).tan()));
-    let fx = either(|l| l.fl_x).or(from_angle).ok_or_else(|| Error::format(file, "neither fl_x nor camera_angle_x is given"))?;
+    let fx = either(|l| l.fl_x).or(from_angle).ok_or_else(|| Error::format(file, "the focal length is missing; add fl_x or camera_angle_x"))?;
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
     let bend = match frame.lens.camera_model.as_deref().or(shared.camera_model.as_deref()) {
         None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => Bend::Fisheye,
@@ -213,7 +218,8 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
     })
 }
 
-/// The mask that a frame names, by its path or the last parts of it; never the photo itself.
+/// Returns the mask of a frame: the file with the longest trailing part of the path `mask`. The
+/// photo itself is not accepted.
 fn find_mask(file: &Path, photo: &Path, mask: &str) -> Result<PathBuf> {
     let folder = file.parent().unwrap_or(Path::new("."));
     let same = |path: &PathBuf| path.canonicalize().ok() == photo.canonicalize().ok();

@@ -1,4 +1,5 @@
-//! LERF-OVS: one JSON a view with polygons; those of one category are united.
+//! Reads labels of LERF-OVS: one JSON file of polygons per view. Polygons of one category form one
+//! label.
 
 use super::{Label, LabelledView, Region};
 use crate::{Error, Result, fs};
@@ -24,17 +25,17 @@ struct Object {
     segmentation: Vec<[f64; 2]>,
 }
 
-/// Reads the labels of a view.
+/// Reads the labels of a view from its JSON file.
 pub fn view(path: &Path) -> Result<LabelledView> {
     let file: File = fs::read_json(path)?;
     if file.info.width == 0 || file.info.height == 0 {
-        return Err(Error::format(path, "the labelled photo has no size"));
+        return Err(Error::format(path, "the width or height in 'info' is 0"));
     }
     let mut labels: Vec<(String, Vec<Vec<[f64; 2]>>)> = Vec::new();
     for object in file.objects {
         let finite = object.segmentation.iter().flatten().all(|v| v.is_finite());
         if object.segmentation.len() < 3 || !finite {
-            return Err(Error::format(path, format!("the polygon of '{}' has fewer than three finite points", object.category)));
+            return Err(Error::format(path, format!("the polygon of '{}' has fewer than three points or one that is not finite", object.category)));
         }
         match labels.iter_mut().find(|l| l.0 == object.category) {
             Some(label) => label.1.push(object.segmentation),

@@ -1,29 +1,30 @@
-//! Labels as pictures: 3D-OVS's mask of each class and view, SPIn-NeRF's mask of each view.
+//! Reads labels as mask images: one per class and view (3D-OVS), or one per view (SPIn-NeRF).
 
 use super::{Label, LabelledView, Region};
 use crate::mask_image::MaskImage;
 use crate::{Error, Result, fs};
 use std::path::{Path, PathBuf};
 
-/// The last part of a path without its ending.
+/// Returns the file name without its extension.
 fn stem(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// A mask with its size; nothing where it is black all over.
+/// Reads a mask and its size; `None` for a mask that is black everywhere.
 fn mask(path: &Path) -> Result<((u32, u32), Option<Region>)> {
     let mask = MaskImage::load(path)?;
     Ok(((mask.width, mask.height), (mask.area() > 0).then_some(Region::Mask(mask.inside))))
 }
 
-/// 3D-OVS: `VIEW/CLASS.png` for the classes that `classes.txt` lists, one a line. A class that a view does not show has no picture
-/// there, or a black one; a picture of no listed class is an error.
+/// Reads labels of 3D-OVS: `VIEW/CLASS.png` for the classes in `classes.txt`, one per line. A class
+/// that a view does not show has no image or a black one. An image of an unlisted class is an
+/// error, and so is a class that no view shows.
 pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
     let list = folder.join("classes.txt");
     let text = String::from_utf8(fs::read(&list)?).map_err(|_| Error::format(&list, "not UTF-8 text"))?;
     let classes: Vec<&str> = text.lines().map(str::trim).filter(|c| !c.is_empty()).collect();
     if classes.is_empty() {
-        return Err(Error::format(&list, "it lists no classes"));
+        return Err(Error::format(&list, "it lists no classes; write one class name per line"));
     }
     let mut views: Vec<PathBuf> = std::fs::read_dir(folder).map_err(Error::io(folder))?.flatten().map(|e| e.path()).collect();
     views.retain(|p| p.is_dir());
@@ -39,10 +40,10 @@ pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
         for picture in pictures {
             let category = stem(&picture);
             let class = classes.iter().position(|c| *c == category);
-            let class = class.ok_or_else(|| Error::format(&picture, format!("'{category}' is no class of {}", list.display())))?;
+            let class = class.ok_or_else(|| Error::format(&picture, format!("'{category}' is not a class in {}", list.display())))?;
             let (size, region) = mask(&picture)?;
             if !view.labels.is_empty() && size != (view.width, view.height) {
-                return Err(Error::format(&picture, "its size is not that of the view's other masks"));
+                return Err(Error::format(&picture, "its size differs from that of the view's other masks"));
             }
             (view.width, view.height) = size;
             if let Some(region) = region {
@@ -58,7 +59,8 @@ pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
     }
 }
 
-/// SPIn-NeRF: each picture is the mask of the one thing in the view of its name. Views that do not show it are left out.
+/// Reads labels of SPIn-NeRF: each image is the mask of the one labelled object in the view of the
+/// same name. Views with a black mask are left out.
 pub fn spin_nerf(folder: &Path, pictures: &[PathBuf], text: Option<&str>) -> Result<Vec<LabelledView>> {
     let category = text.map_or_else(|| stem(folder), str::to_owned);
     let mut out = Vec::new();
@@ -94,7 +96,7 @@ mod tests {
         let views = load(dir.path(), None).unwrap();
         let found: Vec<(&str, Vec<&str>)> =
             views.iter().map(|v| (v.name.as_str(), v.labels.iter().map(|l| l.category.as_str()).collect())).collect();
-        assert_eq!(found, [("04", vec!["camera", "red bag"]), ("10", vec!["camera"])], "a black mask is no label");
+        assert_eq!(found, [("04", vec!["camera", "red bag"]), ("10", vec!["camera"])], "a black mask is not a label");
         assert_eq!(views[0].mask(&views[0].labels[1], 6, 4).iter().filter(|m| **m).count(), 8);
         std::fs::write(root.join("classes.txt"), "camera\nred bag\nbanana\n").unwrap();
         assert!(load(dir.path(), None).unwrap_err().to_string().contains("banana"));

@@ -1,4 +1,4 @@
-//! Evaluation labels: LERF-OVS's polygons, and the masks of 3D-OVS and SPIn-NeRF.
+//! Evaluation labels: polygons of LERF-OVS, and masks of 3D-OVS and SPIn-NeRF.
 
 mod lerf;
 mod masks;
@@ -9,41 +9,41 @@ use std::path::{Path, PathBuf};
 /// One labelled object of a view.
 #[derive(Clone, Debug)]
 pub struct Label {
-    /// The text that names it.
+    /// Name of the object.
     pub category: String,
-    /// Where it is in the labelled photo.
+    /// Pixels of the object in the labelled photo.
     pub region: Region,
 }
 
-/// Pixels of a labelled photo.
+/// A region of a labelled photo.
 #[derive(Clone, Debug)]
 pub enum Region {
-    /// The union of polygons, in pixels.
+    /// Union of polygons, with vertices in pixels.
     Polygons(Vec<Vec<[f64; 2]>>),
-    /// One value a pixel, row by row.
+    /// One value per pixel, in row-major order.
     Mask(Vec<bool>),
 }
 
 /// The labels of one view.
 #[derive(Clone, Debug)]
 pub struct LabelledView {
-    /// Name of the photo; the masks' layouts give it without its ending.
+    /// Name of the photo; without extension in the mask layouts.
     pub name: String,
-    /// Width of the labelled photo.
+    /// Width of the labelled photo in pixels.
     pub width: u32,
-    /// Height of the labelled photo.
+    /// Height of the labelled photo in pixels.
     pub height: u32,
-    /// Its objects.
+    /// Labelled objects of the view.
     pub labels: Vec<Label>,
 }
 
 impl LabelledView {
-    /// Mask of a label at the given size.
+    /// Returns the mask of a label at the given size.
     pub fn mask(&self, label: &Label, width: u32, height: u32) -> Vec<bool> {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         let polygons = match &label.region {
             Region::Mask(mask) => {
-                // The pixel that a pixel's centre falls on.
+                // Index of the source pixel that contains the centre of a target pixel.
                 let from = |k: u32, n: u32, of: u32| ((2 * u64::from(k) + 1) * u64::from(of) / (2 * u64::from(n))) as usize;
                 let row = |y: u32| from(y, height, self.height) * self.width as usize;
                 return (0..width * height).map(|p| mask[row(p / width) + from(p % width, width, self.width)]).collect();
@@ -58,7 +58,8 @@ impl LabelledView {
         mask
     }
 
-    /// Boxes around a label at the given size, `[left, top, right, bottom]`: one for each polygon, or that of the mask.
+    /// Returns bounding boxes `[left, top, right, bottom]` of a label at the given size: one for
+    /// each polygon, or one for a mask.
     pub fn boxes(&self, label: &Label, width: u32, height: u32) -> Vec<[f64; 4]> {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
         let around = |points: &mut dyn Iterator<Item = [f64; 2]>| {
@@ -102,16 +103,17 @@ pub(crate) fn fill(polygon: &[[f64; 2]], width: u32, height: u32, mask: &mut [bo
     }
 }
 
-/// Reads a folder of labels; what lies in it tells the layout.
+/// Reads a folder of labels. Its files determine the layout:
 ///
-/// * LERF-OVS: one JSON a view with polygons (`*.json`).
+/// * LERF-OVS: one JSON file of polygons per view (`*.json`).
 /// * 3D-OVS: `classes.txt` and `VIEW/CLASS.png`, in the folder or in `segmentations/` below it.
-/// * SPIn-NeRF: one black-and-white picture a view (`VIEW.png`), all of one thing that `text` names, or else the folder's name.
+/// * SPIn-NeRF: one black-and-white image per view (`VIEW.png`), all of one object. Its name is
+///   `text`, or else the name of the folder.
 ///
 /// Views are sorted by file name.
 ///
 /// # Errors
-/// An empty folder, damaged files, a class without a name, a view without a label.
+/// An empty folder, damaged files, a class that no view shows, or a view without a label.
 pub fn load(folder: &Path, text: Option<&str>) -> Result<Vec<LabelledView>> {
     let segmentations = folder.join("segmentations");
     let three_d_ovs = [folder, &segmentations].into_iter().find(|f| f.join("classes.txt").is_file());
@@ -129,12 +131,12 @@ pub fn load(folder: &Path, text: Option<&str>) -> Result<Vec<LabelledView>> {
     };
     if views.is_empty() {
         return Err(Error::Invalid(format!(
-            "{}: no labels: neither *.json (LERF-OVS), nor classes.txt with VIEW/CLASS.png (3D-OVS), nor VIEW.png (SPIn-NeRF)",
+            "{}: no labels found; expected *.json (LERF-OVS), classes.txt with VIEW/CLASS.png (3D-OVS), or VIEW.png (SPIn-NeRF)",
             folder.display()
         )));
     }
     if let Some(bare) = views.iter().find(|v| v.labels.is_empty()) {
-        return Err(Error::Invalid(format!("{}: the view '{}' has no label", folder.display(), bare.name)));
+        return Err(Error::Invalid(format!("{}: the view '{}' has no label; label it or remove it", folder.display(), bare.name)));
     }
     Ok(views)
 }

@@ -1,5 +1,7 @@
-//! Masks as annotation programs export them: COCO (run lengths or polygons, a file for each photo or one for all, as CVAT and Segment Anything's script
-//! write it), labelme, and Label Studio.
+//! Reads masks in the formats of annotation programs: COCO, labelme and Label Studio.
+//!
+//! COCO files contain run lengths or polygons, for one photo or for all, as CVAT and the script of
+//! Segment Anything write them.
 
 use super::{Level, Mask, MaskList, RunLengths};
 use crate::labels::fill;
@@ -10,10 +12,10 @@ use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Pixels of a picture: places in it are counted in 32 bits.
+/// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
 const MOST_PIXELS: u64 = 1 << 31;
 
-/// A file of annotations.
+/// A file of annotations in any supported format.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum File {
@@ -27,7 +29,7 @@ enum File {
     List(Vec<Annotation>),
 }
 
-/// A picture of a COCO file.
+/// An image of a COCO file.
 #[derive(Deserialize)]
 struct Image {
     id: i64,
@@ -37,7 +39,7 @@ struct Image {
     height: u32,
 }
 
-/// A mask as COCO and Segment Anything have it.
+/// A mask in the format of COCO and Segment Anything.
 #[derive(Deserialize)]
 struct Annotation {
     segmentation: Segmentation,
@@ -51,7 +53,7 @@ struct Annotation {
     level: Option<Level>,
     #[serde(default)]
     track_id: Option<Track>,
-    /// CVAT keeps tracks here.
+    /// CVAT stores the track id here.
     #[serde(default)]
     attributes: Option<Attributes>,
 }
@@ -62,7 +64,7 @@ struct Attributes {
     track_id: Option<Track>,
 }
 
-/// What is the same for an object in all photos.
+/// Id of an object that is the same in all photos.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Track {
@@ -73,9 +75,9 @@ enum Track {
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Segmentation {
-    /// Run lengths with the size [height, width] that they belong to.
+    /// Run lengths of a mask, and its size [height, width].
     Runs { size: [u32; 2], counts: Counts },
-    /// x and y in turn.
+    /// Polygons as alternating x and y in pixels.
     Polygons(Vec<Vec<f64>>),
 }
 
@@ -103,7 +105,7 @@ struct Shape {
     group_id: Option<i64>,
     #[serde(default)]
     shape_type: Option<String>,
-    /// A PNG in base 64, at the place that the points say.
+    /// A PNG in base64. Its upper left corner is the first point.
     #[serde(default)]
     mask: Option<String>,
 }
@@ -129,7 +131,7 @@ struct Region {
     value: Option<Value>,
 }
 
-/// A region in per cent of the photo's sides.
+/// A region in per cent of the photo's width and height.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum Value {
@@ -160,16 +162,17 @@ enum Value {
     Other(serde::de::IgnoredAny),
 }
 
-/// Corners of the polygon that stands for a circle or an ellipse.
+/// Number of corners of the polygon that approximates a circle or ellipse.
 const CORNERS: usize = 64;
 
-/// Whether the names of two files mean one photo, whatever folders, endings and case they have. Label Studio puts a code and a hyphen before names.
+/// Returns whether a file name in an annotation refers to the photo of a view. Ignores folders,
+/// extension and case. Also accepts the prefix of Label Studio: eight characters and a hyphen.
 fn names_photo(name: &str, view: &str) -> bool {
     let bare = |name: &str| {
         let own = name.rsplit(['/', '\\']).next().unwrap_or(name).to_lowercase();
         Path::new(&own).file_stem().map_or(own.clone(), |stem| stem.to_string_lossy().into_owned())
     };
-    // Views of photos in several folders have these in their names.
+    // If file names are not unique, names of views contain the folder: `left_1.jpg`.
     let joined = name.replace(['/', '\\'], "_");
     if bare(&joined) == bare(view) || joined.to_lowercase().ends_with(&format!("_{}", view.to_lowercase())) {
         return true;
@@ -178,15 +181,17 @@ fn names_photo(name: &str, view: &str) -> bool {
     name == view || name.strip_suffix(view.as_str()).is_some_and(|code| code.len() == 9 && code.ends_with('-'))
 }
 
-/// Reads the masks of a photo from a file of annotations; nothing where the file is of other photos. `sides` are those of the photo, for annotations
-/// that do not state any. A file without masks has no size.
+/// Reads the masks of a photo from a file of annotations; `None` if the file is for other photos.
+///
+/// Without `view`, takes the first photo of the file. `sides` are the width and height of the
+/// photo, for annotations without a size. The list of a file without masks has size 0x0.
 ///
 /// # Errors
-/// A missing or damaged file, or masks of different or impossible sizes.
+/// A missing or damaged file, an unsupported shape, or masks of different or invalid sizes.
 pub fn load(path: &Path, view: Option<&str>, sides: Option<(u32, u32)>) -> Result<Option<MaskList>> {
     let text = fs::read(path)?;
     let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
-    let known = "COCO's annotations with run lengths or polygons, labelme's and Label Studio's JSON are read";
+    let known = "supported formats: COCO with run lengths or polygons, labelme, Label Studio";
     let file = serde_json::from_slice(text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}; {known}")))?;
     match file {
         File::List(list) => coco(path, list.iter(), None, sides).map(Some),
@@ -212,7 +217,7 @@ fn check_size(path: &Path, width: u32, height: u32) -> Result<()> {
     if (1..=MOST_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
         return Ok(());
     }
-    Err(Error::format(path, format!("masks of {width}x{height} pixels are none; state the size of the photo")))
+    Err(Error::format(path, format!("{width}x{height} pixels is not a valid mask size; set the size of the photo in the file")))
 }
 
 fn coco<'a>(
@@ -227,13 +232,13 @@ fn coco<'a>(
     };
     let Some(first) = annotations.clone().next() else { return Ok(MaskList::default()) };
     let size = of_runs(first).or(stated).or(sides);
-    let (width, height) = size.ok_or_else(|| Error::format(path, "its polygons need the size of the photo; export it with its images"))?;
+    let (width, height) = size.ok_or_else(|| Error::format(path, "polygons need the size of the photo; export the file with its list of images"))?;
     check_size(path, width, height)?;
     let mut list = MaskList::new(width, height);
     for (k, annotation) in annotations.enumerate() {
         let runs = match &annotation.segmentation {
             Segmentation::Runs { size, .. } if *size != [height, width] => {
-                return Err(Error::format(path, format!("mask {k} is {}x{}, the first one {width}x{height}", size[1], size[0])));
+                return Err(Error::format(path, format!("mask {k} has {}x{} pixels, but the first mask has {width}x{height}; export all masks in one size", size[1], size[0])));
             }
             Segmentation::Runs { counts, .. } => {
                 let pixels = u64::from(width) * u64::from(height);
@@ -241,7 +246,7 @@ fn coco<'a>(
                     Counts::Text(text) => RunLengths::from_text(text, pixels),
                     Counts::Numbers(counts) => RunLengths::from_counts(counts.clone(), pixels),
                 };
-                runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not make up {width}x{height} pixels")))?
+                runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not add up to {width}x{height} pixels; export it again")))?
             }
             Segmentation::Polygons(polygons) => {
                 let corners = |flat: &Vec<f64>| flat.as_chunks::<2>().0.to_vec();
@@ -260,19 +265,20 @@ fn coco<'a>(
     Ok(list)
 }
 
-/// The number of a track: its own, or one that its name always gives. Negative numbers stand for no track.
+/// Returns the id of a track: its number, or the 32-bit FNV-1a hash of its name. Negative numbers
+/// mean no track.
 fn track_number(track: &Track) -> Option<u32> {
     match track {
         Track::Number(number) => (*number >= 0.0 && *number <= f64::from(u32::MAX)).then_some(*number as u32),
         Track::Name(name) => match name.trim().parse::<i64>() {
             Ok(number) => u32::try_from(number).ok(),
-            // FNV-1a.
+            // FNV-1a with 32 bits.
             Err(_) => Some(name.bytes().fold(0x811c_9dc5, |hash: u32, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))),
         },
     }
 }
 
-/// The union of polygons as a mask.
+/// Rasterizes the union of polygons, given in pixels.
 fn drawn(polygons: &[Vec<[f64; 2]>], width: u32, height: u32) -> RunLengths {
     let mut inside = vec![false; (width * height) as usize];
     for polygon in polygons {
@@ -283,7 +289,7 @@ fn drawn(polygons: &[Vec<[f64; 2]>], width: u32, height: u32) -> RunLengths {
     RunLengths::of(width, height, |x, y| inside[(y * width + x) as usize])
 }
 
-/// A closed curve around `middle`, its radii turned by an angle in degrees.
+/// Returns a polygon that approximates an ellipse around `middle`. `rotation` is in degrees.
 fn ellipse(middle: [f64; 2], radii: [f64; 2], rotation: f64) -> Vec<[f64; 2]> {
     let (sin, cos) = rotation.to_radians().sin_cos();
     let corner = |k: usize| {
@@ -296,9 +302,9 @@ fn ellipse(middle: [f64; 2], radii: [f64; 2], rotation: f64) -> Vec<[f64; 2]> {
 
 fn labelme(path: &Path, file: &Labelme, sides: Option<(u32, u32)>) -> Result<MaskList> {
     let size = file.image_width.zip(file.image_height).or(sides);
-    let (width, height) = size.ok_or_else(|| Error::format(path, "it does not state the photo's size (imageWidth and imageHeight)"))?;
+    let (width, height) = size.ok_or_else(|| Error::format(path, "the size of the photo is missing; add imageWidth and imageHeight"))?;
     check_size(path, width, height)?;
-    // Shapes of one group are one object.
+    // Shapes with the same label and group belong to one object.
     type Group<'a> = Option<(&'a str, i64)>;
     let mut objects: Vec<(Group<'_>, Vec<bool>)> = Vec::new();
     for shape in &file.shapes {
@@ -314,7 +320,7 @@ fn labelme(path: &Path, file: &Labelme, sides: Option<(u32, u32)>) -> Result<Mas
     Ok(MaskList { masks: objects.into_iter().map(mask).collect(), ..MaskList::new(width, height) })
 }
 
-/// The pixels of a labelme shape; nothing for lines and points, which have none.
+/// Returns the pixels of a labelme shape; `None` for points and lines, which have no area.
 fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<Option<Vec<bool>>> {
     let mut inside = vec![false; (width * height) as usize];
     let polygon = match (shape.shape_type.as_deref(), shape.points.as_slice()) {
@@ -340,7 +346,7 @@ fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<O
         }
         (Some("point" | "points" | "line" | "linestrip"), _) => return Ok(None),
         (Some(other), _) => {
-            return Err(Error::format(path, format!("the shape_type '{other}' of '{}' is not read; draw polygons", shape.label)));
+            return Err(Error::format(path, format!("the shape_type '{other}' of '{}' is not supported; draw a polygon instead", shape.label)));
         }
     };
     fill(&polygon, width, height, &mut inside);
@@ -348,7 +354,7 @@ fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<O
 }
 
 fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
-    // The last annotation of a task is the one that counts.
+    // A task may have several annotations; the last one is used.
     let regions = task.annotations.last().map(|annotation| annotation.result.as_slice()).unwrap_or_default();
     let Some(first) = regions.iter().find(|region| region.value.is_some() && region.original_width > 0) else {
         return Ok(MaskList::default());
@@ -369,7 +375,7 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
             }
             Value::Brush { rle } => {
                 let alpha = brush(rle).filter(|alpha| alpha.len() == (width * height) as usize);
-                let alpha = alpha.ok_or_else(|| Error::format(path, "a brush mask cannot be unpacked; export as COCO with run lengths"))?;
+                let alpha = alpha.ok_or_else(|| Error::format(path, "a brush mask cannot be decoded; export as COCO with run lengths"))?;
                 list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| alpha[(y * width + x) as usize] > 127)));
                 continue;
             }
@@ -381,8 +387,13 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
     Ok(list)
 }
 
-/// The alpha channel of Label Studio's brush: RGBA bytes in blocks that repeat one byte or list several. A header tells in five bits the bits of a value,
-/// and in four times four bits those of the four lengths among which each block chooses.
+/// Decodes the run lengths of Label Studio's brush and returns the alpha channel; `None` if the
+/// data are damaged.
+///
+/// The data are a bit stream with the most significant bit first: 32 bits with the number of values
+/// (RGBA), then 5 bits with the width of a value less 1. Four times 4 bits give the widths, less 1,
+/// of four kinds of lengths. In each block, one bit selects a repeated value or a list of values.
+/// Two bits select the kind of length. The length less 1 and the values follow.
 fn brush(rle: &[u8]) -> Option<Vec<u8>> {
     let mut at = 0;
     let mut take = |bits: usize| -> Option<u32> {
@@ -426,7 +437,7 @@ fn brush(rle: &[u8]) -> Option<Vec<u8>> {
 mod tests {
     use super::*;
 
-    /// The areas of the masks that a text gives for a photo of 10x8 pixels.
+    /// Returns the areas of the masks in a JSON text for a photo of 10x8 pixels.
     fn areas(text: &str, view: &str) -> Option<Vec<usize>> {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.json");
@@ -489,7 +500,8 @@ mod tests {
 
     #[test]
     fn brushes_of_label_studio() {
-        // Two pixels: one repeated block of four zeros, one list of four bytes; lengths in four bits, values in eight.
+        // Two pixels: a block of four repeated zeros, then a list of four values. Lengths have four
+        // bits, values eight.
         let mut bits = String::new();
         let mut put = |value: u32, count: usize| bits.push_str(&format!("{value:0count$b}"));
         put(8, 32);

@@ -1,45 +1,47 @@
-//! Pixels that lie in the same set of masks: votes for these are votes for all masks at once.
+//! Divides a photo into atoms: the pixels that lie in the same masks. Votes for atoms are votes for
+//! all their masks.
 
 use super::{MaskList, gaps};
 use crate::LabelMap;
 use std::collections::BTreeMap;
 
-/// A photo cut where any of its masks ends.
+/// The atoms of a photo.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Atoms {
-    /// Atom of each pixel; 0 where no mask lies.
+    /// Atom of each pixel; 0 for pixels in no mask.
     pub map: LabelMap,
-    /// Which masks an atom lies in.
+    /// Masks of each atom.
     pub table: Table,
 }
 
-/// Which masks the atoms of a photo lie in.
+/// Relations between the atoms and masks of a photo.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Table {
-    /// By atom: its masks, by their places in the list, rising.
+    /// For each atom, the indices of its masks in the list, in ascending order.
     masks: Vec<Vec<u16>>,
-    /// By mask: its pixels; 0 for a mask that was left out.
+    /// For each mask, its area in pixels; 0 for a mask that was left out.
     pub areas: Vec<u32>,
-    /// By mask: its number in all photos.
+    /// For each mask, its track id, if any.
     pub tracks: Vec<Option<u32>>,
-    /// Masks that would have needed more atoms than 16 bits can number.
+    /// Number of masks left out because their atoms would not fit in 16-bit labels.
     pub left_out: usize,
 }
 
 impl Table {
-    /// How many atoms there are, with the one that lies in no mask.
+    /// Returns the number of atoms, including atom 0, which lies in no mask.
     pub fn count(&self) -> usize {
         self.masks.len()
     }
 
-    /// The masks that an atom lies in, by their places in the list.
+    /// Returns the indices of the masks of an atom, in ascending order.
     pub fn masks(&self, atom: u16) -> &[u16] {
         &self.masks[usize::from(atom)]
     }
 }
 
 impl Atoms {
-    /// The same with narrow gaps between masks closed: each pixel of a gap joins the atom nearest to it.
+    /// Closes narrow gaps between masks: each pixel of a gap joins the nearest atom. The areas of
+    /// that atom's masks grow accordingly.
     #[must_use]
     pub fn without_gaps(mut self) -> Self {
         let before = self.map.labels.clone();
@@ -52,17 +54,19 @@ impl Atoms {
 }
 
 impl MaskList {
-    /// The atoms of these masks. Masks beyond the 65,535th and those that ask for more atoms than that are left out.
+    /// Computes the atoms of these masks. Leaves out masks after the 65,535th, and masks that would
+    /// create more atoms than 16-bit labels allow.
     pub fn atoms(&self) -> Atoms {
         const MOST: usize = u16::MAX as usize;
-        // By atom: masks and pixels. Atom 0 is what lies in no mask, even if there is none.
+        // For each atom, its masks and its number of pixels. Atom 0 lies in no mask; it exists even
+        // if masks cover all pixels.
         let mut atoms: Vec<(Vec<u16>, u32)> = vec![(Vec::new(), self.width * self.height)];
         let mut at = vec![0u32; (self.width * self.height) as usize];
         let mut table = Table { tracks: self.masks.iter().map(|m| m.track).collect(), ..Table::default() };
         for (k, mask) in self.masks.iter().enumerate() {
             let mut common: BTreeMap<u32, u32> = BTreeMap::new();
             self.places(mask).for_each(|p| *common.entry(at[p]).or_default() += 1);
-            // An atom that the mask holds whole is not cut.
+            // An atom that lies completely inside the mask is not divided.
             let whole = |atom: u32, pixels: u32| atom > 0 && pixels == atoms[atom as usize].1;
             let cut = common.iter().filter(|c| !whole(*c.0, *c.1)).count();
             if k >= MOST || atoms.len() + cut > MOST {
@@ -109,7 +113,7 @@ mod tests {
         let masks: Vec<&[u16]> = atoms.map.labels.iter().map(|a| atoms.table.masks(*a)).collect();
         assert_eq!(masks, [&[0][..], &[0], &[0, 1, 2], &[0, 1, 2], &[1], &[1], &[], &[]]);
         assert_eq!((atoms.table.areas, atoms.table.left_out), (vec![4, 4, 2, 0], 0));
-        assert_eq!(atoms.table.masks.len(), 4, "a mask that is an atom already makes none");
+        assert_eq!(atoms.table.masks.len(), 4, "a mask equal to an existing atom adds no atom");
     }
 
     #[test]

@@ -1,20 +1,21 @@
-//! `masks/NAME.json`: what Segment Anything's own script for whole photos writes with run lengths, and reads back; with the level beside it.
+//! Reads and writes `masks/NAME.json`: the COCO run lengths of Segment Anything's automatic mask
+//! script, with a `level` for each mask.
 
 use super::{Level, Mask, MaskList, RunLengths};
 use crate::{Error, Result, fs};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Pixels of a picture: places in it are counted in 32 bits.
+/// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
 const MOST_PIXELS: u64 = 1 << 31;
 
-/// One mask as COCO's annotations have it.
+/// A mask as a COCO annotation.
 #[derive(Serialize, Deserialize)]
 struct Annotation {
     segmentation: Segmentation,
     #[serde(default)]
     area: f64,
-    /// Left, top, width, height.
+    /// Left, top, width and height in pixels.
     #[serde(default)]
     bbox: [f64; 4],
     #[serde(default = "one")]
@@ -31,7 +32,7 @@ fn one() -> f32 {
     1.0
 }
 
-/// Run lengths with the size [height, width] that they belong to.
+/// Run lengths of a mask, and its size [height, width].
 #[derive(Serialize, Deserialize)]
 struct Segmentation {
     size: [u32; 2],
@@ -45,7 +46,7 @@ enum Counts {
     Numbers(Vec<u32>),
 }
 
-/// A file is the list itself, or has it under this name.
+/// Content of a file: the list itself, or an object with the list as `annotations`.
 #[derive(Deserialize)]
 #[serde(untagged)]
 enum File {
@@ -54,10 +55,10 @@ enum File {
 }
 
 impl MaskList {
-    /// Writes COCO's annotations, atomically.
+    /// Writes the masks as COCO annotations, atomically.
     ///
     /// # Errors
-    /// The system's refusal.
+    /// The file cannot be written.
     pub fn save(&self, path: &Path) -> Result<()> {
         let annotation = |mask: &Mask| {
             let mut b = [u32::MAX, u32::MAX, 0, 0];
@@ -79,23 +80,24 @@ impl MaskList {
         fs::write_json(path, &self.masks.iter().map(annotation).collect::<Vec<_>>())
     }
 
-    /// Reads COCO's annotations, with run lengths as text or as numbers. A file without masks has no size.
+    /// Reads COCO annotations with run lengths as text or as numbers. The list of a file without
+    /// masks has size 0x0.
     ///
     /// # Errors
-    /// A missing or damaged file, or masks of different or impossible sizes.
+    /// A missing or damaged file, or masks of different or invalid sizes.
     pub fn load(path: &Path) -> Result<Self> {
         let annotations = match fs::read_json(path)? {
             File::List(list) | File::Named { annotations: list } => list,
         };
         let [height, width] = annotations.first().map_or([0, 0], |a| a.segmentation.size);
         if !annotations.is_empty() && !(1..=MOST_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
-            return Err(Error::format(path, format!("masks of {width}x{height} pixels are none")));
+            return Err(Error::format(path, format!("{width}x{height} pixels is not a valid mask size; create the masks again")));
         }
         let mut list = Self::new(width, height);
         for (k, annotation) in annotations.into_iter().enumerate() {
             let Segmentation { size, counts } = annotation.segmentation;
             if size != [height, width] {
-                return Err(Error::format(path, format!("mask {k} is {}x{}, the first one {width}x{height}", size[1], size[0])));
+                return Err(Error::format(path, format!("mask {k} has {}x{} pixels, but the first mask has {width}x{height}; create all masks in one size", size[1], size[0])));
             }
             let pixels = u64::from(width) * u64::from(height);
             let runs = match counts {
@@ -103,7 +105,7 @@ impl MaskList {
                 Counts::Numbers(counts) => RunLengths::from_counts(counts, pixels),
             };
             let runs =
-                runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not make up {width}x{height} pixels")))?;
+                runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not add up to {width}x{height} pixels; create it again")))?;
             let (level, predicted_iou) = (annotation.level, annotation.predicted_iou);
             list.masks.push(Mask { level, predicted_iou, stability: annotation.stability_score, track: annotation.track_id, runs });
         }

@@ -1,21 +1,23 @@
-//! Gaps between masks: segmenters leave a pixel or two between things that touch, which belong to one of them all the same.
+//! Closes gaps between masks. Segmenters leave one or two uncovered pixels between adjacent
+//! objects, although each pixel belongs to one of them.
 
 use crate::LabelMap;
 use crate::metrics::dilate;
 
-/// Half the width of the widest gap, in pixels: what a square of five does not fit into.
+/// Half side of the square that defines a gap, in pixels. Uncovered pixels are a gap where no
+/// uncovered 5x5 square fits: gaps are at most 4 pixels wide.
 const HALF: u32 = 2;
 
-/// Gives every pixel of a gap, which lies in no mask (label 0), the label nearest to it. What is wider than a gap stays: it is what no mask
-/// covers.
+/// Gives each pixel of a gap (label 0) the nearest label. Wider uncovered areas keep label 0,
+/// because no mask covers them.
 pub(super) fn close(map: &mut LabelMap) {
     let (width, height) = (map.width as usize, map.height as usize);
     let covered: Vec<bool> = map.labels.iter().map(|label| *label > 0).collect();
-    // What a square fits into, where nothing is: what is free, eroded and dilated again.
+    // Morphological opening of the uncovered pixels: erosion, then dilation.
     let widened = |mask: &[bool]| dilate(mask, map.width, map.height, [HALF; 2]);
     let wide = widened(&widened(&covered).iter().map(|near| !near).collect::<Vec<_>>());
     let mut gaps: Vec<usize> = (0..covered.len()).filter(|&p| !covered[p] && !wide[p]).collect();
-    // From both sides at once, a pixel a round.
+    // Each round extends all labels by one pixel into the gaps.
     for _ in 0..2 * HALF {
         let beside = |p: &usize| {
             let (x, y) = (p % width, p / width);
@@ -34,7 +36,7 @@ mod tests {
 
     #[test]
     fn a_gap_goes_to_both_sides_and_what_is_wide_stays() {
-        // Labels 1 and 2 with four columns between them, then eight columns of nothing.
+        // Labels 1 and 2 with four uncovered columns between them, then eight uncovered columns.
         let column = |x: u32| match x {
             0..6 => 1,
             10..16 => 2,

@@ -1,4 +1,5 @@
-//! The masks of one photo. They may overlap: a cup, the cup on its saucer, the handle of the cup.
+//! The masks of one photo. They may overlap, for example a cup, the cup with its saucer, and the
+//! handle of the cup.
 
 pub mod annotations;
 mod atoms;
@@ -12,24 +13,24 @@ pub use atoms::{Atoms, Table};
 pub use run_lengths::RunLengths;
 use serde::{Deserialize, Serialize};
 
-/// How large a thing is that a mask stands for.
+/// Size class of a mask.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// An object (the paper's *whole* level).
+    /// A whole object (the paper's *whole* level).
     #[default]
     Whole,
-    /// A part of one.
+    /// A part of an object.
     Part,
     /// A part of a part.
     Subpart,
 }
 
 impl Level {
-    /// Coarse to fine.
+    /// All levels, coarse to fine.
     pub const ALL: [Self; 3] = [Self::Whole, Self::Part, Self::Subpart];
 
-    /// Name in files and options.
+    /// Returns the name in files and options.
     pub fn name(self) -> &'static str {
         ["whole", "part", "subpart"][self as usize]
     }
@@ -38,20 +39,20 @@ impl Level {
 /// One mask.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Mask {
-    /// What it stands for.
+    /// Size class.
     pub level: Level,
-    /// IoU with the thing that its maker predicts for it, 0 to 1; 1 where nobody said.
+    /// IoU with the true object, as the segmenter predicts it, 0 to 1; 1 if unknown.
     pub predicted_iou: f32,
-    /// IoU of the masks that a stricter and a laxer threshold give, 0 to 1; 1 where nobody said.
+    /// IoU between the masks of a higher and a lower threshold, 0 to 1; 1 if unknown.
     pub stability: f32,
-    /// Number of the thing in all photos, where a tracker gave one.
+    /// Id that a tracker gave the object, the same in all photos; `None` without tracker.
     pub track: Option<u32>,
-    /// Its pixels.
+    /// Pixels of the mask.
     pub runs: RunLengths,
 }
 
 impl Mask {
-    /// A mask of which no more is known.
+    /// Creates a mask with scores of 1 and no track id.
     pub fn new(level: Level, runs: RunLengths) -> Self {
         Self { level, predicted_iou: 1.0, stability: 1.0, track: None, runs }
     }
@@ -64,17 +65,18 @@ pub struct MaskList {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
-    /// In the order in which they were found.
+    /// Masks in the order in which they were found.
     pub masks: Vec<Mask>,
 }
 
 impl MaskList {
-    /// No masks.
+    /// Creates an empty list for photos of this size.
     pub fn new(width: u32, height: u32) -> Self {
         Self { width, height, masks: Vec::new() }
     }
 
-    /// The masks of label maps of one size, one map a level, coarse to fine.
+    /// Creates the list of the masks in three label maps of one size, one for each level, coarse to
+    /// fine.
     pub fn of_levels(levels: &[LabelMap; 3]) -> Self {
         let mut list = Self::new(levels[0].width, levels[0].height);
         for (level, map) in Level::ALL.into_iter().zip(levels) {
@@ -83,7 +85,7 @@ impl MaskList {
         list
     }
 
-    /// Appends the masks of a label map, in the order of their labels; returns those labels.
+    /// Appends the masks of a label map in ascending order of their labels. Returns these labels.
     pub fn add(&mut self, level: Level, map: &LabelMap) -> Vec<u16> {
         let boxes = map.boxes();
         let mut labels = Vec::new();
@@ -95,24 +97,26 @@ impl MaskList {
         labels
     }
 
-    /// Row-major places of a mask's pixels.
+    /// Yields the row-major indices of a mask's pixels.
     pub fn places(&self, mask: &Mask) -> impl Iterator<Item = usize> {
         mask.runs.places(self.width, self.height)
     }
 
-    /// Masks of a level.
+    /// Returns the number of masks of a level.
     pub fn count(&self, level: Level) -> usize {
         self.masks.iter().filter(|m| m.level == level).count()
     }
 
-    /// The masks as the ideal pinhole `camera` of their size would have seen them; those of which nothing is left go.
+    /// Removes lens distortion: returns the masks as seen by the pinhole `camera` of the same size.
+    /// Masks that become empty are removed.
     #[must_use]
     pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
         let masks = self.redrawn(|map| map.undistorted(camera, distortion)).flatten().collect();
         Self { masks, ..Self::new(self.width, self.height) }
     }
 
-    /// Each mask drawn anew: `redraw` gets it as a map of ones. Nothing where none of it is left.
+    /// Transforms each mask with `redraw`, which receives a map that is 1 inside the mask and 0
+    /// elsewhere. Yields `None` for masks that become empty.
     pub fn redrawn(&self, redraw: impl Fn(LabelMap) -> LabelMap) -> impl Iterator<Item = Option<Mask>> {
         self.masks.iter().map(move |mask| {
             let mut map = LabelMap::new(self.width, self.height);
@@ -123,7 +127,8 @@ impl MaskList {
         })
     }
 
-    /// A level's masks as a label map: large ones first, so that smaller ones lie on top. Labels 1, 2, ... follow falling area.
+    /// Returns the masks of a level as a label map. Labels 1, 2, ... are in descending order of
+    /// area. Smaller masks cover larger ones. Masks after the 65,535th are dropped.
     pub fn painted(&self, level: Level) -> LabelMap {
         let mut order: Vec<(usize, &Mask)> = self.masks.iter().filter(|m| m.level == level).map(|m| (m.runs.area(), m)).collect();
         order.sort_by_key(|(area, _)| std::cmp::Reverse(*area));

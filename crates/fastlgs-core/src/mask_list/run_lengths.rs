@@ -1,16 +1,19 @@
-//! Run lengths of a mask as COCO has them: column by column, pixels outside and inside in turn, outside first.
+//! COCO run lengths of a mask: alternating numbers of pixels outside and inside, column by column,
+//! starting outside.
 
-/// A mask by its runs.
+/// A mask as run lengths.
 #[derive(Clone, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct RunLengths(Vec<u32>);
 
-/// Numbers of COCO's text are told in groups of five bits; the sixth says that more follow, and 48 makes each a printable character.
+/// COCO text stores each count in groups of five bits, least significant group first. Bit 5 means
+/// that another group follows. The last group is sign-extended. An offset of 48 makes each group a
+/// printable character.
 const BITS: u32 = 5;
 const MORE: i64 = 1 << BITS;
 const FIRST: u8 = 48;
 
 impl RunLengths {
-    /// Runs of the pixels for which `member` (x, y) holds.
+    /// Creates the run lengths of the pixels (x, y) for which `member` returns true.
     pub fn of(width: u32, height: u32, member: impl Fn(u32, u32) -> bool) -> Self {
         let (mut runs, mut inside, mut length) = (Vec::new(), false, 0);
         for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
@@ -24,12 +27,12 @@ impl RunLengths {
         Self(runs)
     }
 
-    /// The runs of a mask of `pixels` pixels; `None` where their sum is another.
+    /// Creates run lengths from counts; `None` if their sum is not `pixels`.
     pub fn from_counts(counts: Vec<u32>, pixels: u64) -> Option<Self> {
         (counts.iter().map(|c| u64::from(*c)).sum::<u64>() == pixels).then_some(Self(counts))
     }
 
-    /// From COCO's text; `None` where it is damaged or tells another number of pixels.
+    /// Decodes COCO text; `None` if it is damaged or the counts do not add up to `pixels`.
     pub fn from_text(text: &str, pixels: u64) -> Option<Self> {
         let mut counts: Vec<u32> = Vec::new();
         let mut bytes = text.bytes();
@@ -45,17 +48,17 @@ impl RunLengths {
                     }
                     break;
                 }
-                // A count has at most 32 bits, and a sign.
+                // A count has at most 32 bits and a sign: seven groups.
                 byte = bytes.next().filter(|_| shift <= 30)?;
             }
-            // From the third on, the difference from the count before the last.
+            // From index 3 on, the text stores the difference from the count two places earlier.
             let before = if counts.len() > 2 { counts[counts.len() - 2] } else { 0 };
             counts.push(u32::try_from(value + i64::from(before)).ok()?);
         }
         Self::from_counts(counts, pixels)
     }
 
-    /// COCO's text.
+    /// Encodes the run lengths as COCO text.
     pub fn to_text(&self) -> String {
         let mut text = String::new();
         for (k, &count) in self.0.iter().enumerate() {
@@ -73,12 +76,12 @@ impl RunLengths {
         text
     }
 
-    /// Pixels of the mask.
+    /// Returns the number of pixels inside the mask.
     pub fn area(&self) -> usize {
         self.0.iter().skip(1).step_by(2).map(|n| *n as usize).sum()
     }
 
-    /// Row-major places of the mask's pixels, column by column.
+    /// Yields the row-major indices of the mask's pixels, in column-major order.
     pub fn places(&self, width: u32, height: u32) -> impl Iterator<Item = usize> {
         let mut start = 0;
         self.0.iter().enumerate().flat_map(move |(k, &length)| {
@@ -107,7 +110,8 @@ mod tests {
 
     #[test]
     fn text_round_trips_and_is_that_of_coco() {
-        // Written by hand from the rule: 6 -> "6", 1 -> "1", 40 -> 8 with more, 1; 4 - 1 -> "3"; 0 - 40 -> "hN"; 9 - 4 -> "5".
+        // Derived by hand: 6 -> "6"; 1 -> "1"; 40 -> group 8 with bit 5, then group 1; 4 - 1 ->
+        // "3"; 0 - 40 -> "hN"; 9 - 4 -> "5".
         let mask = RunLengths(vec![6, 1, 40, 4, 0, 9]);
         assert_eq!(mask.to_text(), "61X13hN5");
         for runs in [vec![0, 100_000], vec![3, 2, 1, 70_000, 12, 1, 500, 0, 31, 32], vec![4_000_000_000]] {

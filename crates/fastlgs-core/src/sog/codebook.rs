@@ -1,11 +1,12 @@
-//! Numbers as one of 256 that stand for all: a codebook in one dimension.
+//! Scalar codebooks of 256 numbers, by k-means in one dimension.
 
-/// Numbers that a byte can tell apart.
+/// Number of entries of a codebook (the values of a byte).
 pub const CODES: usize = 256;
-/// Rounds of Lloyd's algorithm; later ones hardly move anything.
+/// Iterations of Lloyd's algorithm; more hardly change the result.
 const ROUNDS: usize = 12;
 
-/// 256 numbers in rising order, so chosen that the nearest of them is near most of `values` (k-means in one dimension).
+/// Computes a codebook for `values` with k-means, in ascending order. All entries are 0 without
+/// values.
 pub fn codebook(values: impl Iterator<Item = f32>) -> [f32; CODES] {
     let mut sorted: Vec<f32> = values.collect();
     sorted.sort_unstable_by(f32::total_cmp);
@@ -13,7 +14,8 @@ pub fn codebook(values: impl Iterator<Item = f32>) -> [f32; CODES] {
         return [0.0; CODES];
     }
     let n = sorted.len();
-    // Half from where values are many and half from all over their range, so that rare ones count as well.
+    // Half of the initial entries are quantiles and half are evenly spaced, so that rare values get
+    // entries too.
     let (low, high) = (sorted[0], sorted[n - 1]);
     let evenly = |k: usize| low + (high - low) * (k as f32 + 0.5) / (CODES / 2) as f32;
     let often = |k: usize| sorted[(2 * k + 1) * n / CODES];
@@ -36,7 +38,7 @@ pub fn codebook(values: impl Iterator<Item = f32>) -> [f32; CODES] {
     codes
 }
 
-/// The place of the nearest code.
+/// Returns the index of the nearest entry.
 pub fn nearest(codes: &[f32; CODES], value: f32) -> u8 {
     let above = codes.partition_point(|c| *c < value).min(CODES - 1);
     let below = above.saturating_sub(1);

@@ -1,9 +1,12 @@
-//! SOG, the compressed Gaussian format of PlayCanvas (version 2 of its specification,
-//! developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog): an archive of lossless WebP pictures, in which each pixel is a
-//! Gaussian, and `meta.json`, which tells what the pixels mean. Features and object ids have no place in it.
+//! Reads and writes SOG, the compressed Gaussian format of PlayCanvas (version 2,
+//! developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog).
 //!
-//! Positions are logarithmic in 16 bits, rotations the three smallest components in 8 bits each; scales and colours are places in codebooks,
-//! and the SH coefficients of a Gaussian a row of a palette. Axes are those of 3DGS's PLY files.
+//! A file is an archive of lossless WebP images, in which each pixel is a Gaussian, and
+//! `meta.json`, which describes them. The format has no features or object ids.
+//!
+//! Positions are logarithmic with 16 bits. Rotations are the three smallest components with 8 bits
+//! each. Scales and colours are indices into codebooks, and the SH coefficients of a Gaussian are a
+//! row of a palette. The axes are those of 3DGS PLY files.
 
 mod codebook;
 mod palette;
@@ -23,9 +26,9 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 const VERSION: u32 = 2;
-/// Rows of the palette beside each other in a row of its picture.
+/// Palette rows per row of the palette image.
 const PALETTE_COLUMNS: usize = 64;
-/// The fourth channel of rotations names the component that is left out, w first.
+/// Fourth channel of a rotation whose omitted component is w; 253 to 255 stand for x, y and z.
 const FIRST_TAG: u8 = 252;
 
 #[derive(Serialize, Deserialize)]
@@ -74,7 +77,7 @@ struct Rest {
     files: [String; 2],
 }
 
-/// RGBA pixels.
+/// An RGBA image of the archive.
 struct Picture {
     name: &'static str,
     width: usize,
@@ -85,7 +88,7 @@ fn byte(value: f32) -> u8 {
     (255.0 * value).round().clamp(0.0, 255.0) as u8
 }
 
-/// What spreads positions near the middle and draws those far away together.
+/// Compresses positions far from the origin: sign(v) ln(|v| + 1).
 fn log(v: Vec3) -> Vec3 {
     (v.abs() + 1.0).map(f32::ln) * v.signum()
 }
@@ -94,18 +97,18 @@ fn exp(v: Vec3) -> Vec3 {
     (v.abs().map(f32::exp) - 1.0) * v.signum()
 }
 
-/// Writes the scene atomically. What the format cannot hold (features, object ids) is left out; Gaussians that are near each other in space
-/// come near each other in the file.
+/// Writes the scene atomically, without features and object ids. Sorts Gaussians along a Morton
+/// curve, so that the images compress well.
 ///
 /// # Errors
-/// [`Error::Invalid`] for an empty scene, and the system's refusal.
+/// [`Error::Invalid`] for an empty scene, [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     if scene.is_empty() {
         return Err(Error::Invalid(format!("{}: there are no Gaussians to write", path.display())));
     }
     let scene = &scene.select(&along_curve(&scene.means));
     let n = scene.len();
-    // Whole blocks of four pixels, as the specification's own encoder has them.
+    // Width and height are multiples of four, as in the encoder of the specification.
     let width = ((n as f64).sqrt() / 4.0).ceil() as usize * 4;
     let pixels = width * n.div_ceil(width).next_multiple_of(4);
     let mut pictures = Vec::new();
@@ -166,11 +169,11 @@ fn with_alpha([r, g, b]: [u8; 3], a: u8) -> [u8; 4] {
     [r, g, b, a]
 }
 
-/// The archive as bytes, written at once.
+/// Builds the archive in memory and writes it atomically.
 fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
-    let damaged = |error: &dyn std::fmt::Display| Error::format(path, format!("cannot be made: {error}"));
+    let damaged = |error: &dyn std::fmt::Display| Error::format(path, format!("the SOG archive cannot be written: {error}"));
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
-    // Pictures are compressed already.
+    // WebP images are compressed already.
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
     let mut add = |name: &str, data: &[u8]| {
         archive.start_file(name, options).map_err(|e| damaged(&e))?;
@@ -188,7 +191,8 @@ fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
     fs::write_atomic(path, |file| file.write_all(&data))
 }
 
-/// The three smallest of (w, x, y, z), between -1 and 1 after a stretch by the square root of 2, and which one is left out.
+/// Packs a quaternion (w, x, y, z) into its three smallest components and the index of the omitted
+/// one. Components are scaled by sqrt(2) to [-1, 1] and stored as bytes.
 fn packed_rotation(q: [f32; 4]) -> [u8; 4] {
     let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
     let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
@@ -207,23 +211,23 @@ fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
     out.try_into().ok()
 }
 
-/// Reads a scene; features are zero and object ids 0.
+/// Reads a scene. Features are zero and object ids 0.
 ///
 /// # Errors
-/// [`Error::Format`] for files that are no SOG, are cut off, or of another version.
+/// [`Error::Format`] for other content, truncated files and other versions.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let bad = |reason: String| Error::format(path, reason);
     let data = fs::read(path)?;
-    let mut archive = ZipArchive::new(Cursor::new(data)).map_err(|e| bad(format!("not a whole SOG file ({e}); copy it again")))?;
+    let mut archive = ZipArchive::new(Cursor::new(data)).map_err(|e| bad(format!("not a complete SOG file ({e}); copy it again")))?;
     let mut member = |name: &str| -> Result<Vec<u8>> {
         let mut data = Vec::new();
-        let mut file = archive.by_name(name).map_err(|e| bad(format!("{name} is missing in it ({e})")))?;
+        let mut file = archive.by_name(name).map_err(|e| bad(format!("it does not contain {name} ({e}); export it again")))?;
         file.read_to_end(&mut data).map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
         Ok(data)
     };
     let meta: Meta = serde_json::from_slice(&member("meta.json")?).map_err(|e| bad(format!("meta.json: {e}")))?;
     if meta.version != VERSION {
-        return Err(bad(format!("SOG version {}; only version {VERSION} can be read", meta.version)));
+        return Err(bad(format!("SOG version {} is not supported; export it as version {VERSION}", meta.version)));
     }
     let n = meta.count;
     let mut picture = |name: &str, least: usize| -> Result<Vec<[u8; 4]>> {
@@ -232,7 +236,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         let decoder = WebPDecoder::new(Cursor::new(data)).map_err(damaged)?;
         let channels = usize::from(decoder.color_type().channel_count());
         let (width, height) = decoder.dimensions();
-        // Checked before anything is allocated for it.
+        // Check the size before allocating memory for it.
         if (width as usize) * (height as usize) < least {
             return Err(bad(format!("{name} has {width}x{height} pixels, too few for {n} Gaussians")));
         }
@@ -242,7 +246,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         Ok(values.chunks_exact(channels).map(pixel).collect())
     };
     let of = |codes: &[f32], name: &str| {
-        <[f32; CODES]>::try_from(codes).map_err(|_| bad(format!("the codebook of {name} has no {CODES} numbers")))
+        <[f32; CODES]>::try_from(codes).map_err(|_| bad(format!("the codebook of {name} does not have {CODES} numbers; export it again")))
     };
     let look = |codes: [f32; CODES]| move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)]));
 
@@ -255,7 +259,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     };
     let means = low.iter().zip(&high).take(n).map(mean).collect();
     let rotations = picture(&meta.quats.files[0], n)?.into_iter().take(n).map(rotation).collect::<Option<Vec<_>>>();
-    let rotations = rotations.ok_or_else(|| bad(format!("{} holds no rotations", meta.quats.files[0])))?;
+    let rotations = rotations.ok_or_else(|| bad(format!("{} has pixels that are not rotations; export it again", meta.quats.files[0])))?;
     let scale = look(of(&meta.scales.codebook, "scales")?);
     let log_scales = picture(&meta.scales.files[0], n)?.into_iter().take(n).map(scale).collect();
     let colors = picture(&meta.sh0.files[0], n)?;
@@ -267,7 +271,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     if let Some(rest) = &meta.rest {
         sh_degree = rest.bands;
         if sh_degree > MAX_SH_DEGREE {
-            return Err(bad(format!("SH degree {sh_degree}; at most {MAX_SH_DEGREE} is known")));
+            return Err(bad(format!("SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less")));
         }
         let width = rest_len(sh_degree);
         let centroids = picture(&rest.files[0], rest.count * width)?;
@@ -275,7 +279,7 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         let value = look(of(&rest.codebook, "shN")?);
         for label in labels.iter().take(n) {
             let at = usize::from(u16::from_le_bytes([label[0], label[1]])) * width;
-            let row = centroids.get(at..at + width).ok_or_else(|| bad(format!("{} names rows that the palette lacks", rest.files[1])))?;
+            let row = centroids.get(at..at + width).ok_or_else(|| bad(format!("{} refers to rows that the palette does not have; export it again", rest.files[1])))?;
             sh_rest.extend(row.iter().map(|p| value(*p)));
         }
     }
@@ -296,7 +300,7 @@ mod tests {
             g.push_sphere(mean, rng.range(0.001, 0.5), rng.range(0.1, 0.9), [rng.uniform(), rng.uniform(), rng.uniform()]);
             g.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
         }
-        // Surfaces of a few kinds, each with its own gloss.
+        // Each Gaussian has one of 20 sets of SH coefficients, with a little noise.
         let kinds: Vec<Vec3> = (0..20 * rest_len(2)).map(|_| 0.1 * Vec3::new(rng.normal(), rng.normal(), rng.normal())).collect();
         for row in g.sh_rest.chunks_exact_mut(rest_len(2)) {
             let kind = (20.0 * rng.uniform()) as usize * rest_len(2);
@@ -326,7 +330,7 @@ mod tests {
         let again = dir.path().join("again.sog");
         write(&again, &sample(3000)).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap(), "the same scene gives the same bytes");
-        // Without what depends on the direction, and with a single Gaussian.
+        // A single Gaussian without view-dependent colour.
         write(&path, &sample(1).with_sh_degree(0)).unwrap();
         assert_eq!(read(&path).unwrap().len(), 1);
         assert!(write(&path, &Gaussians::default()).is_err());
@@ -342,7 +346,7 @@ mod tests {
         assert!(read(&path).unwrap_err().to_string().contains("scene.sog"));
         std::fs::write(&path, b"ply\n").unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("SOG"));
-        // A count that the pictures do not hold.
+        // A count that is larger than the images.
         let count = data.windows(10).position(|w| w == b"\"count\":50").unwrap();
         let mut more = data;
         more[count..count + 10].copy_from_slice(b"\"count\":99");

@@ -1,28 +1,29 @@
-//! Rows of numbers as one of a few rows that stand for all: k-means.
+//! Vector quantisation: represents many rows of numbers by a palette of few, with k-means.
 
 use rayon::prelude::*;
 
-/// Most rows of a palette. The format takes 65,536; each row costs time with every one of the scene's.
+/// Largest palette, in rows. The format allows 65,536, but time grows with palette rows times scene
+/// rows.
 const MOST: usize = 4096;
-/// Rows for each of the palette's: of small scenes a longer palette would be most of the file, and four times as long it gives 2.7 dB more than the
-/// 47 that are left of a trained table.
+/// Scene rows per palette row. In small scenes a longer palette would be most of the file; four
+/// times the rows gain only 2.7 dB over 47 dB.
 const SHARE: usize = 16;
-/// Rows that the palette is learned from; all others are only assigned to it.
+/// Number of rows that train the palette; the others are only assigned to it.
 const LEARNED_FROM: usize = 65_536;
-/// Rounds of Lloyd's algorithm.
+/// Iterations of Lloyd's algorithm.
 const ROUNDS: usize = 8;
-/// Numbers that are summed beside each other.
+/// Number of independent partial sums, for vector instructions.
 const LANES: usize = 8;
 
-/// A palette, and which of its rows stands for each.
+/// A palette and the assignment of rows to it.
 pub struct Palette {
-    /// Its rows, one after the other.
+    /// Palette rows, one after the other.
     pub rows: Vec<f32>,
-    /// Row of the palette for each row.
+    /// Index of the palette row of each input row.
     pub labels: Vec<u16>,
 }
 
-/// The palette of `rows`, each of `width` numbers. The same rows give the same palette.
+/// Computes a palette for `rows` of `width` numbers each. Deterministic.
 pub fn palette(rows: &[f32], width: usize) -> Palette {
     let n = rows.len() / width;
     let count = (n / SHARE).clamp(1, MOST);
@@ -48,7 +49,7 @@ pub fn palette(rows: &[f32], width: usize) -> Palette {
     Palette { rows: (0..count).flat_map(|k| centres.row(k)[..width].to_vec()).collect(), labels }
 }
 
-/// Rows, filled up with zeros to whole vectors.
+/// Rows, padded with zeros to a multiple of `LANES` numbers.
 struct Rows {
     values: Vec<f32>,
     stride: usize,
@@ -73,9 +74,10 @@ impl Rows {
         &mut self.values[k * self.stride..][..self.stride]
     }
 
-    /// The row of this palette that is nearest to each of others; the first of several.
+    /// Returns, for each row of `others`, the index of the nearest row in `self`; the first one of
+    /// ties.
     fn nearest(&self, others: &Self) -> Vec<u16> {
-        // |x - c|^2 = |x|^2 - 2 (x c - |c|^2 / 2), of which |x| decides nothing.
+        // |x - c|^2 = |x|^2 - 2 (x c - |c|^2 / 2), and |x|^2 is the same for all c.
         let halves: Vec<f32> = (0..self.len()).map(|k| 0.5 * dot(self.row(k), self.row(k))).collect();
         let of = |row: &[f32]| {
             let (mut best, mut place) = (f32::NEG_INFINITY, 0);

@@ -1,4 +1,5 @@
-//! Things of a furnished room, each in metres, standing on y = 0 with its front towards +z: what classifiers of photographs know.
+//! Furniture and household objects, in metres, that image classifiers recognise. Each object stands
+//! on y = 0 with its front towards +z.
 
 use super::props::{BRASS, DARKER, Look, Make, OWN, Piece, WOOD, piece};
 use super::solid::Shape::{Ball, Block, Cone, Cylinder};
@@ -8,7 +9,7 @@ use std::f32::consts::{FRAC_PI_2, TAU};
 const BLACK: Look = Look::Painted(Vec3::new(0.07, 0.07, 0.08));
 const STEEL: Look = Look::Painted(Vec3::new(0.62, 0.64, 0.67));
 const WHITE: Look = Look::Painted(Vec3::new(0.93, 0.93, 0.92));
-/// Colours of spines in a bookcase.
+/// Colours of the book spines in a bookcase.
 const SPINES: [Vec3; 7] = [
     Vec3::new(0.62, 0.13, 0.12),
     Vec3::new(0.13, 0.25, 0.5),
@@ -19,18 +20,18 @@ const SPINES: [Vec3; 7] = [
     Vec3::new(0.9, 0.88, 0.84),
 ];
 
-/// A thing in its place.
+/// An object with its position in the room.
 pub struct Placed {
     pub name: &'static str,
     pub make: Make,
-    /// Of what has no colour of its own.
+    /// Colour of the pieces that have no colour of their own.
     pub color: Vec3,
     pub at: [f32; 3],
-    /// Turn around y, in radians.
+    /// Rotation around y in radians.
     pub yaw: f32,
 }
 
-/// A round table with small things on it, and larger ones around it.
+/// Returns a round table with small objects on it and furniture around it.
 pub fn study() -> [Placed; 12] {
     let [red, orange_peel, oak] = [Vec3::new(0.75, 0.1, 0.1), Vec3::new(0.95, 0.5, 0.08), Vec3::new(0.42, 0.27, 0.15)];
     let top = 0.738;
@@ -51,7 +52,7 @@ pub fn study() -> [Placed; 12] {
     ]
 }
 
-/// Shelves full of books.
+/// A bookcase full of books.
 fn bookcase() -> Vec<Piece> {
     let (width, height, depth, shelves) = (0.5, 1.7, 0.16, 5);
     let mut pieces = vec![piece(Block, [0.0, 0.5 * height, -0.9 * depth], [width, 0.5 * height, 0.012], WOOD)];
@@ -63,7 +64,8 @@ fn bookcase() -> Vec<Piece> {
         pieces.push(piece(Block, [0.0, floor.max(0.015), 0.0], [width, 0.015, depth], WOOD));
         let mut x = -width + 0.03;
         while shelf < shelves && x < width - 0.06 {
-            // Neither heights nor widths repeat soon.
+            // Heights and widths of the books have different periods, so that the pattern does not
+            // repeat soon.
             let (thick, tall) = (0.014 + 0.006 * (book * 5 % 4) as f32, 0.1 + 0.012 * (book * 7 % 5) as f32);
             let look = Look::Painted(SPINES[book * 3 % SPINES.len()]);
             pieces.push(piece(Block, [x + thick, floor + 0.015 + tall, -0.01], [thick, tall, 0.8 * depth], look));
@@ -74,7 +76,7 @@ fn bookcase() -> Vec<Piece> {
     pieces
 }
 
-/// A dark screen in a frame on a low cabinet.
+/// A dark screen with a frame on a low cabinet.
 fn television() -> Vec<Piece> {
     let screen = Look::Painted(Vec3::new(0.16, 0.22, 0.3));
     vec![
@@ -102,7 +104,7 @@ fn washing_machine() -> Vec<Piece> {
     ]
 }
 
-/// Three lights one below the other, on a pole.
+/// Three vertically stacked lights on a pole.
 fn traffic_light() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.03, 0.0], [0.16, 0.03, 0.16], STEEL),
@@ -111,7 +113,7 @@ fn traffic_light() -> Vec<Piece> {
     ];
     let lights = [(1.45, Vec3::new(1.0, 0.12, 0.08)), (1.2, Vec3::new(0.45, 0.33, 0.05)), (0.95, Vec3::new(0.04, 0.25, 0.1))];
     for (y, color) in lights {
-        // From both sides.
+        // The lights are visible from both sides.
         for side in [-1.0, 1.0] {
             pieces.push(piece(Cylinder, [0.0, y, side * 0.1], [0.1, 0.012, 0.1], Look::Painted(color)).tilted(0.0, FRAC_PI_2));
             pieces.push(piece(Block, [0.0, y + 0.1, side * 0.15], [0.11, 0.012, 0.05], BLACK));
@@ -120,7 +122,7 @@ fn traffic_light() -> Vec<Piece> {
     pieces
 }
 
-/// A ball of black pentagons and white hexagons.
+/// A ball with black pentagons and white hexagons.
 fn soccer_ball() -> Vec<Piece> {
     vec![piece(Ball, [0.0, 0.2, 0.0], [0.2; 3], Look::Football)]
 }
@@ -132,9 +134,9 @@ fn dumbbell() -> Vec<Piece> {
     vec![bar, disc(-0.17, 0.13), disc(-0.245, 0.105), disc(0.17, 0.13), disc(0.245, 0.105)]
 }
 
-/// A shade on a pole on a foot.
+/// A lamp with a foot, a pole and a shade.
 fn table_lamp() -> Vec<Piece> {
-    // Discs for a shade: a cone would end in a tip.
+    // The shade is a stack of discs, because a cone would end in a tip.
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.012, 0.0], [0.09, 0.012, 0.09], BRASS),
         piece(Cylinder, [0.0, 0.18, 0.0], [0.014, 0.17, 0.014], BRASS),
@@ -152,7 +154,7 @@ fn table_lamp() -> Vec<Piece> {
     pieces
 }
 
-/// A fruit with a stem.
+/// An orange with its stem.
 fn orange() -> Vec<Piece> {
     vec![
         piece(Ball, [0.0, 0.075, 0.0], [0.078, 0.075, 0.078], OWN),
@@ -160,7 +162,7 @@ fn orange() -> Vec<Piece> {
     ]
 }
 
-/// A cup of coffee with a handle.
+/// A mug of coffee with a handle.
 fn coffee_mug() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.075, 0.0], [0.062, 0.075, 0.062], OWN),
@@ -174,7 +176,7 @@ fn coffee_mug() -> Vec<Piece> {
     pieces
 }
 
-/// A candle that burns, in a holder.
+/// A burning candle in a holder.
 fn candle() -> Vec<Piece> {
     vec![
         piece(Cylinder, [0.0, 0.01, 0.0], [0.085, 0.01, 0.085], BRASS),
@@ -194,7 +196,7 @@ fn dining_table() -> Vec<Piece> {
     ]
 }
 
-/// Segments of cloth over a pole.
+/// An open umbrella on a pole: a cone with a small ball at the end of each rib.
 fn umbrella() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.6, 0.0], [0.018, 0.6, 0.018], STEEL),

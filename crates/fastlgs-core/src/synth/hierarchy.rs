@@ -1,27 +1,28 @@
-//! A tree of boxes around solids: the nearest hit of a ray without asking each solid.
+//! A bounding volume hierarchy that finds the nearest hit of a ray without testing every solid.
 
 use super::solid::{Crossing, Solid};
 use glam::Vec3;
 
-/// Boxes that halve the solids until few are left.
+/// A binary tree of axis-aligned boxes. Each inner node divides its solids into two halves.
 pub struct Hierarchy {
     nodes: Vec<Node>,
-    /// Solids in the order of the leaves.
+    /// Indices of the solids in the order of the leaves.
     order: Vec<u32>,
 }
 
 struct Node {
     bounds: [Vec3; 2],
-    /// Solids `first..first + count` of `order`, or the right child's place with count 0; the left child follows its parent.
+    /// For a leaf, the solids are `order[first..first + count]`. For an inner node, `count` is 0
+    /// and `first` is the index of the right child; the left child directly follows its parent.
     first: u32,
     count: u32,
 }
 
-/// Solids in a leaf.
+/// Largest number of solids in a leaf.
 const FEW: usize = 4;
 
 impl Hierarchy {
-    /// Builds the tree.
+    /// Builds the tree by median splits along the longest axis of each box.
     pub fn new(solids: &[Solid]) -> Self {
         let mut tree = Self { nodes: Vec::new(), order: (0..solids.len() as u32).collect() };
         let bounds: Vec<[Vec3; 2]> = solids.iter().map(Solid::bounds).collect();
@@ -49,7 +50,7 @@ impl Hierarchy {
         (self.nodes[place].first, self.nodes[place].count) = (right, 0);
     }
 
-    /// The solid that a ray meets first, and where.
+    /// Returns the index of the first solid that a ray meets, and the crossing.
     pub fn nearest(&self, solids: &[Solid], origin: Vec3, direction: Vec3) -> Option<(usize, Crossing)> {
         let inverse = direction.recip();
         let mut best: Option<(usize, Crossing)> = None;

@@ -1,4 +1,5 @@
-//! The kinds of generated scenes: each shows one thing that methods fail at.
+//! The kinds of generated scenes. Most kinds contain one difficulty for reconstruction or
+//! segmentation.
 
 use super::furniture;
 use super::hierarchy::Hierarchy;
@@ -14,13 +15,14 @@ use std::f32::consts::{FRAC_PI_2, TAU};
 use std::path::Path;
 use std::sync::Arc;
 
-/// Pictures that the room needs, by file name: all of them ship with scikit-image.
+/// Names of the room's objects and the files of their pictures. All pictures ship with
+/// scikit-image.
 pub const PICTURES: [(&str, &str); 4] =
     [("cat", "chelsea.png"), ("coffee", "coffee.png"), ("rocket", "rocket.jpg"), ("astronaut", "astronaut.png")];
-/// Textures of its floor and walls.
+/// Textures of the room's floor and walls.
 pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
 
-/// What a generated scene is about: [`KINDS`] says it for each.
+/// Kind of a generated scene; [`KINDS`] describes each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs)]
 pub enum Kind {
@@ -39,24 +41,24 @@ pub enum Kind {
     Big,
 }
 
-/// Every kind with its name and what it shows.
+/// All kinds, each with its name and a description for users.
 pub const KINDS: [(&str, Kind, &str); 13] = [
     ("room", Kind::Room, "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room"),
-    ("study", Kind::Study, "a furnished room: a table with small things on it, a bookcase, a television and more around it"),
-    ("table", Kind::Table, "a dozen different things on a table"),
-    ("twins", Kind::Twins, "three pairs of the same thing, side by side"),
-    ("nested", Kind::Nested, "things with parts with parts"),
+    ("study", Kind::Study, "a furnished room: a table with small objects, a bookcase, a television and other furniture"),
+    ("table", Kind::Table, "twelve different objects on a table"),
+    ("twins", Kind::Twins, "three pairs of identical objects, side by side"),
+    ("nested", Kind::Nested, "objects with parts that have parts"),
     ("containers", Kind::Containers, "cups on saucers, chests with drawers and bottles with labels"),
     ("thin", Kind::Thin, "wires, spokes and leaves"),
-    ("mirror", Kind::Mirror, "things before a mirror and a mirrored ball"),
-    ("glass", Kind::Glass, "things behind a pane and a ball of glass"),
-    ("dark", Kind::Dark, "the table under light that drifts from view to view"),
-    ("sparse", Kind::Sparse, "the table, seen from few places"),
-    ("long", Kind::Long, "a walk along a corridor that ends where it began"),
-    ("big", Kind::Big, "a thousand things"),
+    ("mirror", Kind::Mirror, "objects in front of a mirror, and a mirrored ball"),
+    ("glass", Kind::Glass, "objects behind a glass pane and a glass ball"),
+    ("dark", Kind::Dark, "the table with exposure and white balance that vary between views"),
+    ("sparse", Kind::Sparse, "the table, seen in only a few views (8 by default)"),
+    ("long", Kind::Long, "a walk along a corridor that forms a closed loop"),
+    ("big", Kind::Big, "a thousand objects"),
 ];
 
-/// Colours by name, in the order in which things get them.
+/// Colours of objects, by name.
 const COLORS: [(&str, Vec3); 12] = [
     ("red", Vec3::new(0.85, 0.12, 0.12)),
     ("blue", Vec3::new(0.15, 0.3, 0.85)),
@@ -72,16 +74,16 @@ const COLORS: [(&str, Vec3); 12] = [
     ("grey", Vec3::new(0.5, 0.5, 0.52)),
 ];
 
-/// Height of the table's top.
+/// Height of the table top in metres.
 const TABLE: f32 = 0.75;
 
 impl Kind {
-    /// The kind of a name.
+    /// Returns the kind with a name.
     pub fn of(name: &str) -> Option<Self> {
         KINDS.iter().find(|k| k.0 == name).map(|k| k.1)
     }
 
-    /// Photos, where the user names no number.
+    /// Returns the default number of photos.
     pub fn views(self) -> usize {
         match self {
             Self::Sparse => 8,
@@ -91,10 +93,11 @@ impl Kind {
         }
     }
 
-    /// Builds the scene with `views` cameras of `size`. `pictures` is the folder of [`PICTURES`] and [`TEXTURES`], which only the room needs.
+    /// Builds the scene with `views` cameras of `size` (width, height) pixels. `pictures` is the
+    /// folder with [`PICTURES`] and [`TEXTURES`]; only [`Kind::Room`] reads it.
     ///
     /// # Errors
-    /// When a picture is missing.
+    /// A picture is missing or damaged.
     pub fn world(self, pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<World> {
         let mut build = Builder::new(seed);
         let ring = Ring { radius: 2.9, height: 1.75, wave: 0.35, target: Vec3::Y * (TABLE + 0.12), fov: 0.85 };
@@ -140,14 +143,15 @@ impl Kind {
     }
 }
 
-/// Light that goes from full to a third and back twice, and from warm to cold once.
+/// Returns the exposure factor of each channel at `along`, 0 to 1. Brightness falls from 1 to about
+/// 1/3 and recovers twice; the colour changes from warm to cold once.
 fn drift(along: f32) -> Vec3 {
     let level = 0.67 + 0.33 * (2.0 * TAU * along).cos();
     let warmth = 0.12 * (TAU * along).sin();
     Vec3::new(1.0 + warmth, 1.0, 1.0 - warmth) * level
 }
 
-/// What the thing's own colour is made of.
+/// Material of the pieces with the object's own colour.
 #[derive(Clone, Copy)]
 enum Material {
     Grain(Vec3),
@@ -155,14 +159,14 @@ enum Material {
     Glass,
 }
 
-/// A world that grows thing by thing.
+/// Builds a world object by object.
 struct Builder {
     things: Vec<Thing>,
     solids: Vec<Solid>,
     rng: Rng,
 }
 
-/// Where a thing stands.
+/// Position, scale and rotation of an object.
 struct Place {
     at: Vec3,
     scale: f32,
@@ -174,7 +178,8 @@ impl Builder {
         Self { things: Vec::new(), solids: Vec::new(), rng: Rng::new(seed, "synth things") }
     }
 
-    /// The number of a thing with a name and parent, made where there is none.
+    /// Returns the id of the object with a name and parent. Creates the object if it does not
+    /// exist.
     fn thing(&mut self, name: &str, parent: u16) -> u16 {
         let thing = Thing { name: name.to_owned(), parent };
         let known = self.things.iter().position(|t| *t == thing);
@@ -185,7 +190,7 @@ impl Builder {
         place as u16 + 1
     }
 
-    /// Adds a thing; with `parts`, its parts are things of their own ("NAME's PART").
+    /// Adds an object. With `parts`, its parts become objects named "NAME's PART".
     fn add(&mut self, name: &str, pieces: Vec<Piece>, material: Material, place: &Place, parts: bool) {
         let whole = self.thing(name, 0);
         let to_world = Mat3::from_rotation_y(place.yaw);
@@ -228,13 +233,14 @@ impl Builder {
         }
     }
 
-    /// A place on a circle on the table.
+    /// Returns a place on a circle on the table with a random rotation. `turn` is the position on
+    /// the circle as a fraction of a full turn.
     fn on_table(&mut self, radius: f32, turn: f32, scale: f32) -> Place {
         let (s, c) = (TAU * turn).sin_cos();
         Place { at: Vec3::new(radius * c, TABLE, radius * s), scale, yaw: self.rng.range(0.0, TAU) }
     }
 
-    /// Every entry of the catalogue once, in colours dealt at random.
+    /// Adds each catalogue entry once, with random colours and positions.
     fn dozen(&mut self) {
         self.table();
         let mut colors = COLORS;
@@ -262,7 +268,7 @@ impl Builder {
         for (name, make, color, third) in pairs {
             let (s, c) = (TAU * third / 3.0).sin_cos();
             for (twin, side) in [(1, -1.0), (2, 1.0)] {
-                // Side by side as seen from the middle.
+                // The pair is side by side as seen from the centre of the table.
                 let at = Vec3::new(0.75 * c - side * 0.27 * s, TABLE, 0.75 * s + side * 0.27 * c);
                 let place = Place { at, scale: 0.5, yaw: 0.0 };
                 self.add(&format!("{} {name} {twin}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, false);
@@ -282,12 +288,12 @@ impl Builder {
         self.with_parts(&things);
     }
 
-    /// Six things on a ring on the table, whose parts have names.
+    /// Adds six objects with named parts on a circle on the table.
     fn with_parts(&mut self, things: &[(&str, Make, usize); 6]) {
         self.table();
         for (k, &(name, make, color)) in things.iter().enumerate() {
             let turn = k as f32 / 6.0;
-            // Drawers look outwards.
+            // Drawers face outwards.
             let place = Place { yaw: FRAC_PI_2 - TAU * turn, ..self.on_table(0.88, turn, 0.55) };
             self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, true);
         }
@@ -321,7 +327,8 @@ impl Builder {
         }
     }
 
-    /// Some of the catalogue on the table's outer circle, at these places out of eight.
+    /// Adds these catalogue entries on the outer circle of the table. Entry `k` is at `k` eighths
+    /// of the circle.
     fn around(&mut self, places: &[usize]) {
         self.table();
         for &k in places {
@@ -373,7 +380,7 @@ impl Builder {
     }
 }
 
-/// Blocks with pictures, on a ring and turned at random.
+/// Builds the room: textured blocks on a circle, with random rotations.
 fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<World> {
     let load = |file: &str| {
         let path = pictures.join(file);
@@ -410,7 +417,7 @@ fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<Wo
 mod tests {
     use super::*;
 
-    /// Every thing can be seen, and names tell things apart.
+    /// Nearly every object is visible in some view, and names are unique.
     #[test]
     fn kinds_show_what_they_name() {
         for (name, kind, _) in KINDS.into_iter().filter(|k| k.1 != Kind::Room) {
@@ -425,9 +432,10 @@ mod tests {
                 view.instances.labels.iter().for_each(|l| seen[usize::from(*l)] = true);
                 assert!(view.depth.iter().all(|d| *d > 0.0 && d.is_finite()), "{name}");
             }
-            // A thing that has parts shows through them; the smallest hide behind others in few views.
+            // An object with parts is visible through its parts. With few views, other objects hide
+            // some of the smallest ones.
             let hidden = (1..seen.len()).filter(|&k| !seen[k] && !world.things.iter().any(|t| usize::from(t.parent) == k)).count();
-            assert!(hidden * 10 <= world.things.len(), "{name}: {hidden} of {} things cannot be seen", world.things.len());
+            assert!(hidden * 10 <= world.things.len(), "{name}: {hidden} of {} objects are not visible in any view", world.things.len());
         }
     }
 

@@ -1,6 +1,7 @@
-//! Generated scenes with exact poses, depths, instance masks and part trees, ray-traced from one seed.
+//! Generates scenes with exact poses, depths, instance masks and part trees by ray tracing. A seed
+//! determines the scene.
 //!
-//! World axes: x and z along the floor y = 0, y up; units are about metres.
+//! World axes: x and z span the floor y = 0, y points up. Units are about metres.
 
 mod furniture;
 mod hierarchy;
@@ -22,16 +23,16 @@ use rayon::prelude::*;
 use solid::{Shape, Solid};
 use surface::Surface;
 
-/// Something with a name: an object, or a part of one.
+/// An object or a part of one.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Thing {
-    /// The text that names it; no two things of a world share one.
+    /// Name, unique in its world.
     pub name: String,
-    /// The thing that it is a part of, by number; 0 for none.
+    /// Id of the object that contains it; 0 for none.
     pub parent: u16,
 }
 
-/// Inside of a box in which everything stands.
+/// The inside of a box that encloses the scene.
 struct Backdrop {
     half: Vec3,
     floor: Surface,
@@ -39,49 +40,50 @@ struct Backdrop {
     ceiling: Surface,
 }
 
-/// Everything that can be seen, and from where.
+/// A generated scene with its cameras.
 pub struct World {
-    /// Things 1, 2, ...: the first is number 1.
+    /// Objects and parts. The id of an object is its index plus 1.
     pub things: Vec<Thing>,
     /// The views, sorted by name.
     pub cameras: Vec<Camera>,
-    /// Factor of each view's colours, per channel.
+    /// Exposure factor of each view, for each channel.
     exposures: Vec<Vec3>,
     solids: Vec<Solid>,
     tree: Hierarchy,
     backdrop: Backdrop,
 }
 
-/// One exact view.
+/// An exact rendering of one view.
 pub struct View {
-    /// Colours.
+    /// Rendered image.
     pub photo: RgbImage,
-    /// Smallest thing at each pixel by number; 0 is background.
+    /// Id of the smallest object or part at each pixel; 0 for the background.
     pub instances: LabelMap,
-    /// Distance along the viewing axis.
+    /// Depth of each pixel: distance along the viewing axis.
     pub depth: Vec<f32>,
 }
 
-/// What a ray meets.
+/// Nearest hit of a ray.
 struct Hit {
     thing: u16,
     t: f32,
     color: Vec3,
 }
 
-/// Reflections and refractions that are followed.
+/// Largest number of reflections and refractions that are traced.
 const BOUNCES: u32 = 4;
 
 /// Refractive index of glass.
 const GLASS: f32 = 1.35;
 
 impl World {
-    /// Renders view `index` with `samples` x `samples` rays a pixel; instance and depth are those of the centre ray.
+    /// Renders view `index` with `samples` x `samples` rays for each pixel. Object ids and depth
+    /// are those of the ray through the pixel centre.
     pub fn render(&self, index: usize, samples: u32) -> View {
         let (camera, exposure) = (&self.cameras[index], self.exposures[index]);
         let to_world = Mat3::from_mat4(camera.world_to_camera).transpose();
         let (eye, w) = (camera.centre(), camera.width);
-        // The direction's depth is 1, so that multiples of it are depths.
+        // The direction has a depth of 1 in the camera, so the ray parameter t is the depth.
         let trace = |pixel: Vec2| self.trace(eye, to_world * camera.ray(pixel), BOUNCES);
         let pixels: Vec<_> = (0..w * camera.height)
             .into_par_iter()
@@ -104,7 +106,8 @@ impl World {
         }
     }
 
-    /// Takes a thing and its parts away: the truth of what lay behind them. Numbers of things stay. Whether there was one of that name.
+    /// Removes an object and its parts, to render what they hide. Ids of other objects do not
+    /// change. Returns whether the object exists.
     pub fn remove(&mut self, name: &str) -> bool {
         let Some(number) = (1..).zip(&self.things).find(|(_, thing)| thing.name == name).map(|(number, _)| number) else { return false };
         self.solids.retain(|solid| !chain(&self.things, solid.thing).any(|id| id == number));
@@ -112,13 +115,13 @@ impl World {
         true
     }
 
-    /// Names of the things that are there: not of those that were taken away.
+    /// Returns the names of all objects that have not been removed.
     pub fn names(&self) -> Vec<&str> {
         let there = |number: u16| self.solids.iter().any(|solid| chain(&self.things, solid.thing).any(|id| id == number));
         (1..).zip(&self.things).filter(|(number, _)| there(*number)).map(|(_, thing)| thing.name.as_str()).collect()
     }
 
-    /// Nearest hit of a ray.
+    /// Returns the nearest hit of a ray, with its shaded colour.
     fn trace(&self, origin: Vec3, direction: Vec3, bounces: u32) -> Hit {
         let Some((index, hit)) = self.tree.nearest(&self.solids, origin, direction) else { return self.backdrop.hit(origin, direction) };
         let solid = &self.solids[index];
@@ -132,7 +135,8 @@ impl World {
         Hit { thing: solid.thing, t: hit.t, color }
     }
 
-    /// Colour of glass: what it mirrors and what stands behind, by Schlick's approximation of Fresnel's law. Nothing stands in it.
+    /// Returns the colour of glass: reflected and refracted light, mixed by Schlick's approximation
+    /// of the Fresnel equations. Ignores solids inside the glass.
     fn through_glass(&self, solid: &Solid, point: Vec3, direction: Vec3, normal: Vec3, tint: Vec3, bounces: u32) -> Vec3 {
         let facing = -direction.dot(normal);
         let straight = ((GLASS - 1.0) / (GLASS + 1.0)).powi(2);
@@ -166,13 +170,13 @@ impl Backdrop {
     }
 }
 
-/// A thing and all that contain it, from small to large.
+/// Yields an object's id and the ids of all objects that contain it, from small to large.
 fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
     let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0);
     std::iter::successors(Some(id).filter(|id| *id > 0), above)
 }
 
-/// Light from above and from the side; nothing is black.
+/// Returns the brightness of a surface under light from above and from the side, 0.64 to 1.
 fn light(normal: Vec3) -> f32 {
     0.82 + 0.18 * normal.dot(Vec3::new(0.4, 0.8, 0.3).normalize())
 }
@@ -181,7 +185,8 @@ fn reflect(direction: Vec3, normal: Vec3) -> Vec3 {
     direction - 2.0 * direction.dot(normal) * normal
 }
 
-/// Snell's law for a unit direction; nothing at total reflection. `ratio` is the index before over the index behind the surface.
+/// Refracts a unit direction by Snell's law; `None` at total internal reflection. `ratio` is the
+/// refractive index in front of the surface over the one behind it.
 fn refract(direction: Vec3, normal: Vec3, ratio: f32) -> Option<Vec3> {
     let cosine = -direction.dot(normal);
     let rest = 1.0 - ratio * ratio * (1.0 - cosine * cosine);
@@ -201,7 +206,7 @@ mod tests {
         assert_eq!(reflect(down, Vec3::Y), Vec3::new(0.6, 0.8, 0.0));
     }
 
-    /// A block before a mirror is seen twice, but only its own pixels are its instance.
+    /// A mirror shows the ball behind the camera, but its pixels have the id of the mirror.
     #[test]
     fn mirrors_and_depths() {
         let surface = Surface::Mirror(Vec3::ONE);

@@ -1,37 +1,39 @@
-//! Things to place: each a few solids, standing on y = 0 before x and z = 0, about one unit high.
+//! Objects to place in scenes. Each consists of solids, stands on y = 0 around the y axis, and is
+//! about one unit high.
 
 use super::solid::Shape::{self, Ball, Block, Cone, Cylinder};
 use glam::Vec3;
 
-/// A solid of a thing.
+/// One solid of an object.
 pub struct Piece {
-    /// Names of the part and of the part's part that it belongs to, from outside in; empty for the thing itself.
+    /// Names of the part and subpart that contain the solid, outermost first; empty if it belongs
+    /// directly to the object.
     pub part: Vec<String>,
     pub shape: Shape,
     pub centre: Vec3,
     pub half: Vec3,
-    /// Turn around z, then around x, in radians.
+    /// Rotations around z and around x in radians.
     pub tilt: [f32; 2],
     pub look: Look,
 }
 
-/// What a piece looks like.
+/// Appearance of a piece.
 #[derive(Clone, Copy)]
 pub enum Look {
-    /// A multiple of the thing's colour.
+    /// The object's colour times this factor.
     Own(f32),
-    /// A colour of its own.
+    /// A fixed colour.
     Fixed(Vec3),
-    /// The same, and hardly any grain.
+    /// A fixed colour with almost no grain.
     Painted(Vec3),
-    /// The black pentagons and white hexagons of a football.
+    /// Black pentagons and white hexagons of a football.
     Football,
 }
 
-/// How a thing is made.
+/// A function that creates the pieces of an object.
 pub type Make = fn() -> Vec<Piece>;
 
-/// Every catalogue entry: its name, and how it is made.
+/// Names of the catalogue objects and the functions that create them.
 pub const CATALOGUE: [(&str, Make); 12] = [
     ("mug", mug),
     ("ball", ball),
@@ -153,7 +155,7 @@ fn hat() -> Vec<Piece> {
     ]
 }
 
-/// A cart with wheels with hubs: three levels.
+/// A cart whose wheels have hubs: three levels.
 pub fn cart() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Block, [0.0, 0.55, 0.0], [0.75, 0.22, 0.4], OWN).of(&["body"]),
@@ -169,7 +171,7 @@ pub fn cart() -> Vec<Piece> {
     pieces
 }
 
-/// A cabinet with drawers with knobs: three levels.
+/// A cabinet whose drawers have knobs: three levels.
 pub fn cabinet() -> Vec<Piece> {
     let mut pieces = vec![piece(Block, [0.0, 0.65, 0.0], [0.5, 0.65, 0.35], OWN).of(&["frame"])];
     for (name, y) in [("lower", 0.25), ("middle", 0.65), ("upper", 1.05)] {
@@ -180,7 +182,7 @@ pub fn cabinet() -> Vec<Piece> {
     pieces
 }
 
-/// A cup on a saucer: neither is all of it.
+/// A cup on a saucer: every solid belongs to one of the two parts.
 pub fn cup_and_saucer() -> Vec<Piece> {
     vec![
         piece(Cylinder, [0.0, 0.05, 0.0], [0.62, 0.05, 0.62], CREAM).of(&["saucer"]),
@@ -189,7 +191,7 @@ pub fn cup_and_saucer() -> Vec<Piece> {
     ]
 }
 
-/// A chest with a drawer in its front, and nothing else with a name.
+/// A chest with a drawer as its only part.
 pub fn chest() -> Vec<Piece> {
     vec![piece(Block, [0.0, 0.45, 0.0], [0.6, 0.45, 0.4], OWN), piece(Block, [0.0, 0.5, 0.42], [0.45, 0.25, 0.04], CREAM).of(&["drawer"])]
 }
@@ -203,7 +205,7 @@ pub fn labelled_bottle() -> Vec<Piece> {
     ]
 }
 
-/// A wire frame: twelve thin rods.
+/// The edges of a cube as twelve thin rods.
 pub fn wire_frame() -> Vec<Piece> {
     let (r, thin) = (0.5, 0.014);
     let mut pieces = Vec::new();
@@ -215,7 +217,7 @@ pub fn wire_frame() -> Vec<Piece> {
     pieces
 }
 
-/// A wheel of thin spokes.
+/// A wheel with thin spokes.
 pub fn spoked_wheel() -> Vec<Piece> {
     let (count, radius) = (14, 0.5);
     let mut pieces = vec![piece(Ball, [0.0, 0.55, 0.0], [0.07; 3], BRASS)];
@@ -242,7 +244,7 @@ pub fn plant() -> Vec<Piece> {
     pieces
 }
 
-/// A standing slab.
+/// A standing slab on a wooden foot.
 pub fn slab() -> Vec<Piece> {
     vec![piece(Block, [0.0, 0.06, 0.0], [0.55, 0.06, 0.2], WOOD), piece(Block, [0.0, 0.75, 0.0], [0.5, 0.65, 0.03], OWN)]
 }

@@ -1,54 +1,55 @@
-//! Solids that rays can hit: balls, blocks, cylinders and cones, stretched and turned.
+//! Solids for ray tracing: balls, blocks, cylinders and cones, scaled and rotated.
 
 use super::surface::Surface;
 use glam::{Mat3, Vec3};
 
-/// A solid of half extent 1 around the origin.
+/// A shape with half extents of 1 around the origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Shape {
     /// The unit ball.
     Ball,
     /// The cube [-1, 1]^3.
     Block,
-    /// Radius 1 around y, from -1 to 1.
+    /// Cylinder of radius 1 around the y axis, from y = -1 to 1.
     Cylinder,
-    /// Radius 1 at y = -1, its tip at y = 1.
+    /// Cone around the y axis: radius 1 at y = -1, tip at y = 1.
     Cone,
 }
 
-/// A stretched and turned shape in the world.
+/// A scaled and rotated shape in the world.
 #[derive(Clone, Debug)]
 pub struct Solid {
-    /// What it is stretched from.
+    /// Shape before scaling and rotation.
     pub shape: Shape,
-    /// Its middle in the world.
+    /// Centre in the world.
     pub centre: Vec3,
-    /// Half extents along its own axes.
+    /// Half extents along the solid's own axes.
     pub half: Vec3,
-    /// World to its own axes.
+    /// Rotation from the world to the solid's own axes.
     pub turn: Mat3,
-    /// What it looks like.
+    /// Appearance.
     pub surface: Surface,
-    /// The thing that it belongs to; 0 for what is only background.
+    /// Id of the object that it belongs to; 0 for the background.
     pub thing: u16,
 }
 
-/// Where a ray passes a solid's surface.
+/// A point where a ray crosses the surface of a solid.
 #[derive(Clone, Copy, Debug)]
 pub struct Crossing {
-    /// Multiples of the ray's direction.
+    /// Ray parameter: the point is origin + t * direction.
     pub t: f32,
-    /// Outer normal in the world, of length 1.
+    /// Outward unit normal in the world.
     pub normal: Vec3,
-    /// The point in the frame of the unstretched shape.
+    /// The point in the coordinates of the unscaled shape.
     pub local: Vec3,
 }
 
-/// What counts as touching the surface that a ray starts from.
+/// Smallest ray parameter of a hit, so that a ray does not hit the surface that it starts from.
 const NEAR: f32 = 1e-3;
 
 impl Solid {
-    /// Where a ray enters and leaves, in this order; nothing where it passes by.
+    /// Returns where a ray enters and leaves the solid, in this order; `None` if it misses. Both
+    /// ray parameters may be negative.
     pub fn crossings(&self, origin: Vec3, direction: Vec3) -> Option<[Crossing; 2]> {
         let o = self.turn * (origin - self.centre) / self.half;
         let d = self.turn * direction / self.half;
@@ -71,12 +72,13 @@ impl Solid {
         Some(pair.map(crossing))
     }
 
-    /// The nearest point before the eye where a ray meets the surface: entering, or leaving where it starts inside.
+    /// Returns the first crossing in front of the origin. It is the exit if the ray starts inside
+    /// the solid.
     pub fn hit(&self, origin: Vec3, direction: Vec3) -> Option<Crossing> {
         self.crossings(origin, direction)?.into_iter().find(|c| c.t > NEAR)
     }
 
-    /// Corners of the box around it, in the world.
+    /// Returns the minimum and maximum corner of the bounding box in the world.
     pub fn bounds(&self) -> [Vec3; 2] {
         let axes = self.turn.transpose();
         let reach = axes.x_axis.abs() * self.half.x + axes.y_axis.abs() * self.half.y + axes.z_axis.abs() * self.half.z;
@@ -84,7 +86,7 @@ impl Solid {
     }
 }
 
-/// Entry and exit of the cube [-1, 1]^3, each with its normal.
+/// Returns entry and exit of the cube [-1, 1]^3, each with its ray parameter and outward normal.
 fn block(o: Vec3, d: Vec3) -> Option<[(f32, Vec3); 2]> {
     let (mut enter, mut exit) = ((f32::NEG_INFINITY, Vec3::ZERO), (f32::INFINITY, Vec3::ZERO));
     for k in 0..3 {
@@ -101,7 +103,8 @@ fn block(o: Vec3, d: Vec3) -> Option<[(f32, Vec3); 2]> {
     (enter.0 < exit.0).then_some([enter, exit])
 }
 
-/// Both roots of `sum of weight * p^2 + slope . p + constant = 0` on the ray, in order.
+/// Returns both roots t of `weight . p^2 + slope . p + constant = 0` with `p = o + t d`, in
+/// ascending order; `None` without real roots.
 fn quadric(o: Vec3, d: Vec3, weight: Vec3, slope: Vec3, constant: f32) -> Option<[f32; 2]> {
     let a = (weight * d).dot(d);
     let b = 2.0 * (weight * o).dot(d) + slope.dot(d);
@@ -110,13 +113,14 @@ fn quadric(o: Vec3, d: Vec3, weight: Vec3, slope: Vec3, constant: f32) -> Option
     if root < 0.0 || a == 0.0 {
         return None;
     }
-    // The form that does not cancel.
+    // The numerically stable form of the quadratic formula: it avoids cancellation.
     let q = -0.5 * (b + b.signum() * root.sqrt());
     let (s, t) = (q / a, c / q);
     Some([s.min(t), s.max(t)])
 }
 
-/// A cylinder's two crossings: those of its endless side where they lie between the planes y = -1 and 1, else those of the planes.
+/// Returns the two crossings of a cylinder between the planes y = -1 and y = 1. `sides` are the
+/// crossings of the infinite cylinder.
 fn between_planes(o: Vec3, d: Vec3, sides: Option<[f32; 2]>, normal: impl Fn(Vec3) -> Vec3) -> Option<[(f32, Vec3); 2]> {
     let [low, high] = match sides {
         Some(ts) => ts,
@@ -130,7 +134,8 @@ fn between_planes(o: Vec3, d: Vec3, sides: Option<[f32; 2]>, normal: impl Fn(Vec
     (enter.0 < exit.0).then_some([enter, exit])
 }
 
-/// A cone's two crossings, of its side below the tip and of its base.
+/// Returns the two crossings of a cone. `sides` are the crossings of the infinite double cone; only
+/// those between base and tip count.
 fn cone(o: Vec3, d: Vec3, sides: Option<[f32; 2]>) -> Option<[(f32, Vec3); 2]> {
     let mut found: Vec<(f32, Vec3)> = Vec::with_capacity(3);
     for t in sides.into_iter().flatten() {
@@ -159,14 +164,15 @@ mod tests {
 
     #[test]
     fn rays_cross_where_geometry_says() {
-        // Along x through the middle: half extent 0.5; a cone has half its radius there.
+        // A ray along x through the centre: the half extent is 0.5. A cone has half its radius
+        // there.
         for (shape, reach) in [(Shape::Ball, 0.5), (Shape::Block, 0.5), (Shape::Cylinder, 0.5), (Shape::Cone, 0.25)] {
             let [enter, exit] = solid(shape).crossings(Vec3::new(-3.0, 2.0, 3.0), Vec3::X).expect("a hit");
             assert!((enter.t - (4.0 - reach)).abs() < 1e-5 && (exit.t - (4.0 + reach)).abs() < 1e-5, "{shape:?} {enter:?} {exit:?}");
             assert!(enter.normal.x < -0.5 && exit.normal.x > 0.5, "{shape:?} {enter:?}");
             assert!(solid(shape).crossings(Vec3::new(-3.0, 5.0, 3.0), Vec3::X).is_none(), "{shape:?}");
         }
-        // From above: the cone's tip, and the flat top of the others.
+        // A ray from above hits the tip of the cone and the top of the other shapes.
         for (shape, t) in [(Shape::Ball, 3.0), (Shape::Block, 3.0), (Shape::Cylinder, 3.0), (Shape::Cone, 3.0)] {
             let hit = solid(shape).hit(Vec3::new(1.001, 6.0, 3.0), Vec3::NEG_Y).expect("a hit");
             assert!((hit.t - t).abs() < 0.02, "{shape:?} {hit:?}");

@@ -1,38 +1,43 @@
-//! What surfaces look like: pictures, grain, mirrors and glass.
+//! Appearance of surfaces: grain, pictures, mirrors and glass.
 
 use glam::Vec3;
 use image::RgbImage;
 use std::sync::Arc;
 
-/// The look of a solid.
+/// Appearance of a solid.
 #[derive(Clone, Debug)]
 pub enum Surface {
-    /// Two colours (0..1) mixed by noise of `grain` bumps along the shape's half extent, so that there is something to match.
+    /// Two colours (0 to 1) mixed by noise, so that surfaces have detail to match. `grain` is the
+    /// number of noise cells along the half extent of the shape.
     Grain { colors: [Vec3; 2], grain: f32 },
-    /// A football: around each corner of an icosahedron a black pentagon, and seams between white hexagons.
+    /// A football: black pentagons at the corners of an icosahedron, and white hexagons with seams
+    /// between them.
     Football,
-    /// A picture on each side of a block.
+    /// A picture on each face of a block.
     Picture(Arc<RgbImage>),
-    /// A picture that repeats over the world's planes, with its tint and the times it repeats in a unit.
+    /// A repeating picture on axis-aligned planes of the world. `tint` is a factor on its colours;
+    /// `times` is the number of repetitions in one world unit.
     Tiles { picture: Arc<RgbImage>, tint: Vec3, times: f32 },
-    /// Reflects, with a tint.
+    /// A mirror with a tint.
     Mirror(Vec3),
-    /// Reflects at grazing angles and bends light that passes, with a tint.
+    /// Tinted glass: it refracts light and reflects more at grazing angles.
     Glass(Vec3),
 }
 
 impl Surface {
-    /// A colour with faint grain.
+    /// Creates a surface of one colour with 3 noise cells along the half extent.
     pub fn plain(color: Vec3) -> Self {
         Self::grained(color, 3.0)
     }
 
-    /// A colour with marked grain.
+    /// Creates a surface with shades of one colour (0.55 to 1.15 times) and `grain` noise cells
+    /// along the half extent.
     pub fn grained(color: Vec3, grain: f32) -> Self {
         Self::Grain { colors: [color * 0.55, (color * 1.15).min(Vec3::ONE)], grain }
     }
 
-    /// Colour (0..1) at a point before light; `local` in the unstretched shape, `normal` and `world` in the world.
+    /// Returns the unlit colour (0 to 1) at a point. `local` is the point in the coordinates of the
+    /// unscaled shape; `world` and `normal` are in the world.
     pub fn color(&self, local: Vec3, world: Vec3, normal: Vec3) -> Vec3 {
         match self {
             Self::Grain { colors, grain } => {
@@ -42,7 +47,7 @@ impl Surface {
             Self::Football => football(local.normalize_or_zero()),
             Self::Picture(picture) => {
                 let p = local;
-                // The face is the axis along which the point lies farthest out.
+                // The largest coordinate determines the face of the block.
                 let (u, v) = match p.abs() {
                     a if a.y >= a.x && a.y >= a.z => (p.x, p.z),
                     a if a.x >= a.z => (-p.z * p.x.signum(), p.y),
@@ -65,13 +70,13 @@ impl Surface {
     }
 }
 
-/// Colour of a football in a direction from its middle.
+/// Returns the colour of a football in a direction from its centre.
 fn football(direction: Vec3) -> Vec3 {
     let golden = 0.5 * (1.0 + 5f32.sqrt());
     let signs = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)];
     let around =
         |a: f32, b: f32| signs.map(|(s, t)| [Vec3::new(0.0, s * a, t * b), Vec3::new(s * a, t * b, 0.0), Vec3::new(t * b, 0.0, s * a)]);
-    // Middles of the pentagons, and of the hexagons between three of them.
+    // Centres of the 12 pentagons and of the 20 hexagons.
     let pentagons = around(1.0, golden);
     let hexagons = around(1.0 / golden, golden);
     let cubes = signs.map(|(s, t)| [Vec3::new(s, t, -1.0), Vec3::new(s, t, 1.0), Vec3::ZERO]);
@@ -85,7 +90,8 @@ fn football(direction: Vec3) -> Vec3 {
     }
 }
 
-/// Bilinear, repeating texture sample in 0..1; (0, 0) is the upper left.
+/// Samples a repeating texture with bilinear interpolation. (u, v) = (0, 0) is the upper left
+/// corner, (1, 1) the lower right. Returns a colour in 0 to 1.
 fn sample(picture: &RgbImage, u: f32, v: f32) -> Vec3 {
     let (w, h) = (picture.width(), picture.height());
     let (x, y) = (u.rem_euclid(1.0) * w as f32 - 0.5, v.rem_euclid(1.0) * h as f32 - 0.5);
@@ -98,14 +104,14 @@ fn sample(picture: &RgbImage, u: f32, v: f32) -> Vec3 {
     at(i, j).lerp(at(i + 1.0, j), fx).lerp(at(i, j + 1.0).lerp(at(i + 1.0, j + 1.0), fx), fy) / 255.0
 }
 
-/// Smooth noise in 0..1, one bump a unit.
+/// Returns smooth value noise in 0 to 1 with one lattice cell per unit.
 fn noise(p: Vec3) -> f32 {
     let cell = p.floor();
     let f = p - cell;
     let f = f * f * (3.0 - 2.0 * f);
     let corner = |x: f32, y: f32, z: f32| {
         let [x, y, z] = (cell + Vec3::new(x, y, z)).to_array().map(|v| v as i32 as u32);
-        // A cheap integer hash; only its look counts.
+        // A simple integer hash. Its statistical quality does not matter.
         let mut h = x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
         h = (h ^ (h >> 13)).wrapping_mul(0x5bd1_e995);
         (h ^ (h >> 15)) as f32 / u32::MAX as f32

@@ -1,10 +1,10 @@
-//! From where generated scenes are seen.
+//! Camera paths of generated scenes.
 
 use crate::Camera;
 use glam::{Mat3, Vec3};
 use std::f32::consts::TAU;
 
-/// Cameras on a wavy ring that look at one point.
+/// Cameras on a circle whose height varies as a sine wave. All look at one point.
 pub struct Ring {
     pub radius: f32,
     pub height: f32,
@@ -24,16 +24,17 @@ impl Ring {
     }
 }
 
-/// Half extents of the corridor's outside, and of the block that it goes around.
+/// Half extents of the corridor's outer walls (`CORRIDOR`) and of the block inside it (`CORE`).
 pub const CORRIDOR: Vec3 = Vec3::new(6.5, 1.5, 6.5);
 pub const CORE: Vec3 = Vec3::new(3.5, 1.5, 3.5);
 
-/// A point of the square path in the middle of the corridor; `along` in 0..1.
+/// Returns a point at floor level on the square path in the middle of the corridor. `along` is the
+/// fraction of one round, 0 to 1; other values wrap around.
 pub fn path(along: f32) -> Vec3 {
     let side = 4.0 * along.rem_euclid(1.0);
     let r = 0.5 * (CORRIDOR.x + CORE.x);
     let t = 2.0 * side.fract() - 1.0;
-    // Corners are cut, as feet do.
+    // Corners of the square are cut off.
     let cut = |v: f32| v.clamp(-0.8, 0.8);
     let p = match side as u32 {
         0 => Vec3::new(1.0, 0.0, cut(t)),
@@ -44,11 +45,12 @@ pub fn path(along: f32) -> Vec3 {
     p * r
 }
 
-/// A walk along the corridor, looking ahead and to both sides.
+/// Returns `count` cameras on one walk around the corridor. They look ahead and swing to both
+/// sides.
 pub fn walk(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
     let at = |k: usize| {
         let along = k as f32 / count as f32;
-        // The mean of a stretch of path, so that corners are rounded.
+        // A moving average of the path, which rounds the corners.
         let smooth = |from: f32| (0..9).map(|s| path(from + (s as f32 - 4.0) * 0.008)).sum::<Vec3>() / 9.0;
         let (eye, ahead) = (smooth(along) + Vec3::Y * 1.25, smooth(along + 0.05) + Vec3::Y * 0.75);
         let sway = Mat3::from_rotation_y(0.55 * (TAU * k as f32 / 17.0).sin());

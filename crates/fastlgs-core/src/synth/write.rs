@@ -1,4 +1,4 @@
-//! A generated scene as a folder of photos.
+//! Writes a generated scene as a folder of photos.
 
 use super::{Thing, World, chain};
 use crate::mask_list::{Mask, RunLengths};
@@ -6,23 +6,24 @@ use crate::{Camera, Error, LabelMap, Level, MaskList, Result, exr_image, fs, ima
 use serde_json::json;
 use std::path::Path;
 
-/// How exact masks are written.
+/// Format of the exact masks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Masks {
-    /// Three levels of label maps: `masks/`, `masks/part/` and `masks/subpart/` (16-bit).
+    /// Label maps (16-bit) of three levels: `masks/`, `masks/part/` and `masks/subpart/`.
     Levels,
-    /// Lists of whole masks, which overlap, and of which nothing tells the level: `masks/NAME.json`.
+    /// Lists of overlapping masks, all with the level `whole`: `masks/NAME.json`.
     Lists,
 }
 
-/// A view that shows less than one part in so many of what the best view shows of a thing shows a sliver of it, often a line of one pixel, which
-/// nobody would outline: it is not labelled there.
+/// An object is labelled in a view if its area there is at least 1/SLIVER of its largest area in
+/// any view. Smaller slivers, often one pixel wide, would not be outlined by a person.
 const SLIVER: usize = 100;
 
-/// Names of the things. Written first: a folder with it is one of generated photos.
+/// File with the names of the objects. It is written first and marks a folder of generated photos.
 const INSTANCES: &str = "instances.json";
 
-/// Photos of the user's must not be mixed with generated ones, nor replaced by them.
+/// Returns an error if the folder contains anything but generated photos, which must neither be
+/// mixed with other photos nor replace them.
 fn check_output(out: &Path) -> Result<()> {
     #[derive(serde::Deserialize)]
     struct Instance {
@@ -36,13 +37,14 @@ fn check_output(out: &Path) -> Result<()> {
     if is_ours || is_empty {
         return Ok(());
     }
-    Err(Error::Invalid(format!("{}: it is not empty and holds no generated photos; name a folder that does not exist yet", out.display())))
+    Err(Error::Invalid(format!("{}: the folder is not empty and does not contain generated photos; choose a new folder", out.display())))
 }
 
-/// Writes PHOTOS: `images/`, `transforms.json`, exact masks, `depth/` (EXR) and `labels/` of every `holdout`-th view.
+/// Writes PHOTOS: `images/`, `transforms.json`, exact masks, `depth/` (EXR), and `labels/` of every
+/// `holdout`-th view. Calls `done` after each view.
 ///
 /// # Errors
-/// The system's refusal.
+/// A file cannot be written, or `out` contains other files than generated photos.
 pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: impl FnMut()) -> Result<()> {
     check_output(out)?;
     let instances = world.things.iter().enumerate().map(|(k, t)| json!({ "instance": k + 1, "name": t.name, "parent": t.parent }));
@@ -78,20 +80,21 @@ pub fn write(out: &Path, world: &World, holdout: usize, masks: Masks, mut done: 
         write_labels(out, &world.things, camera, instances, &slivers(areas, &most))?;
     }
     let first = &world.cameras[0];
-    // Written last: its presence says that the folder is whole.
+    // Written last: its presence shows that the folder is complete.
     let transforms = json!({
         "fl_x": first.fx, "fl_y": first.fy, "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height, "frames": frames,
     });
     fs::write_json(&out.join("transforms.json"), &transforms)
 }
 
-/// What a thing belongs to at a level: 0 whole things, 1 their parts, 2 parts of parts.
+/// Returns the object that contains `id` at a level: 0 whole, 1 part, 2 subpart. Returns `id`
+/// itself if it is above that level, and 0 for the background.
 fn at_level(things: &[Thing], id: u16, level: usize) -> u16 {
     let chain: Vec<u16> = chain(things, id).collect();
     chain.iter().rev().nth(level).or(chain.first()).copied().unwrap_or(0)
 }
 
-/// The mask of every thing that can be seen, its parts included.
+/// Returns the mask of each visible object and part. The mask of an object includes its parts.
 fn overlapping(things: &[Thing], instances: &LabelMap) -> MaskList {
     let mut list = MaskList::new(instances.width, instances.height);
     for own in 1..=things.len() as u16 {
@@ -104,19 +107,21 @@ fn overlapping(things: &[Thing], instances: &LabelMap) -> MaskList {
     list
 }
 
-/// By thing, the pixels that it and its parts have.
+/// Returns the area of each object in pixels, including its parts.
 fn areas(things: &[Thing], instances: &LabelMap) -> Vec<usize> {
     let mut areas = vec![0; things.len()];
     instances.labels.iter().for_each(|id| chain(things, *id).for_each(|own| areas[usize::from(own) - 1] += 1));
     areas
 }
 
-/// The things of which so few pixels are slivers, by the most that a view shows of them.
+/// Returns for each object whether its area is a sliver: less than 1/SLIVER of `most`, its largest
+/// area in any view.
 fn slivers(areas: &[usize], most: &[usize]) -> Vec<bool> {
     areas.iter().zip(most).map(|(area, most)| SLIVER * area < *most).collect()
 }
 
-/// Exact labels of things and parts in the LERF-OVS layout: one rectangle for each run of pixels in a row.
+/// Writes exact labels of objects and parts in the LERF-OVS layout. Each horizontal run of pixels
+/// becomes a rectangle.
 fn write_labels(out: &Path, things: &[Thing], camera: &Camera, instances: &LabelMap, sliver: &[bool]) -> Result<()> {
     let mut objects = Vec::new();
     for (k, thing) in things.iter().enumerate().filter(|(k, _)| !sliver[*k]) {
@@ -152,7 +157,7 @@ mod tests {
         assert_eq!([0, 1, 2].map(|level| at_level(&things, 3, level)), [1, 2, 3]);
         assert_eq!([0, 1, 2].map(|level| at_level(&things, 4, level)), [4, 4, 4]);
         assert_eq!(at_level(&things, 0, 1), 0);
-        // A pixel each of nothing, the cart, its wheel, the hub, and the ball.
+        // One pixel each of the background, the cart, its wheel, the hub and the ball.
         let map = LabelMap { width: 5, height: 1, labels: vec![0, 1, 2, 3, 4] };
         let of_masks: Vec<usize> = overlapping(&things, &map).masks.iter().map(|m| m.runs.area()).collect();
         assert_eq!((of_masks, areas(&things, &map)), (vec![3, 2, 1, 1], vec![3, 2, 1, 1]));

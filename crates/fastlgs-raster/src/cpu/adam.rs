@@ -1,7 +1,9 @@
+//! CPU twin of `shaders/adam.wgsl`: Adam on the trained values of a page.
+
 use crate::Step;
 use fastlgs_core::gaussians::{BASE_CHANNELS, sigmoid};
 
-/// Twin of `shaders/adam.wgsl`.
+/// Applies one Adam step to the trained channels of a page.
 pub fn adam(step: &Step, gradients: &[f32], params: &mut [f32], moment1: &mut [f32], moment2: &mut [f32]) {
     let n = 4 * step.quads as usize;
     for channel in step.first_channel as usize..step.end_channel as usize {
@@ -11,7 +13,7 @@ pub fn adam(step: &Step, gradients: &[f32], params: &mut [f32], moment1: &mut [f
     }
 }
 
-/// One trained value.
+/// Applies one Adam step to one trained value.
 #[inline]
 fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f32, moment1: &mut f32, moment2: &mut f32) {
     let g = if channel == OPACITY { gradient + opacity_penalty(step, *param) } else { gradient };
@@ -21,17 +23,17 @@ fn adam_one(step: &Step, channel: usize, gradient: f32, param: &mut f32, moment1
 
 /// Channel of the opacity.
 pub(crate) const OPACITY: usize = 10;
-/// Channels of the feature, which stays in the unit cube.
+/// Channels of the feature. Its values are clamped to 0..1.
 pub(crate) const FEATURES: std::ops::Range<usize> = 14..BASE_CHANNELS;
 
-/// Gradient of the opacity penalty.
+/// Returns the gradient of the opacity penalty by the opacity logit.
 #[inline]
 pub(crate) fn opacity_penalty(step: &Step, opacity_logit: f32) -> f32 {
     let opacity = sigmoid(opacity_logit);
     step.opacity_weight * opacity * (1.0 - opacity)
 }
 
-/// The next value; moments change with it.
+/// Returns the value after one Adam step and updates its moments.
 #[inline(always)]
 pub(crate) fn moved(step: &Step, rate: f32, g: f32, param: f32, moment1: &mut f32, moment2: &mut f32) -> f32 {
     let m1 = 0.9 * *moment1 + 0.1 * g;

@@ -1,24 +1,27 @@
+//! CPU twin of `shaders/blend.wgsl`: front-to-back blending.
+
 use super::{Splat, alpha};
 use crate::View;
 use crate::channels::Channels;
 use crate::view::TILE;
 use rayon::prelude::*;
 
-/// Gaussians between two looks at whether a tile is finished.
+/// Number of Gaussians after which blending checks whether a tile is finished.
 pub(crate) const BATCH: usize = 8;
 
-/// All pixels of a tile, those of the padding included.
+/// Returns (x, y) of all pixels of a tile, including the padding.
 pub(crate) fn pixels_of(tile: u32, view: &View) -> impl Iterator<Item = (u32, u32)> + use<> {
     let (x, y) = (tile % view.tiles[0] * TILE, tile / view.tiles[0] * TILE);
     (y..y + TILE).flat_map(move |y| (x..x + TILE).map(move |x| (x, y)))
 }
 
-/// 1 for pixels of the picture, 0 for those of the padding.
+/// Returns 1 for pixels of the image and 0 for pixels of the padding.
 pub(crate) fn shown(x: u32, y: u32, view: &View) -> f32 {
     if x < view.size[0] && y < view.size[1] { 1.0 } else { 0.0 }
 }
 
-/// Twin of `shaders/blend.wgsl`.
+/// Blends all tiles into `frame` `[8][padded pixels]`. Channels that are not requested keep their
+/// values.
 pub fn blend(
     view: &View,
     channels: Channels,

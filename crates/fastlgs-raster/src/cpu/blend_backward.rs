@@ -1,3 +1,5 @@
+//! CPU twin of `shaders/blend_backward.wgsl`: gradients of blending (docs/gradients.md, section 1).
+
 use super::blend::{pixels_of, shown};
 use super::{Splat, alpha};
 use crate::View;
@@ -5,7 +7,8 @@ use crate::channels::Channels;
 use crate::view::TILE;
 use rayon::prelude::*;
 
-/// Twin of `shaders/blend_backward.wgsl` (docs/gradients.md, section 1). `slots` holds 12 floats a pair of the window, or 4 with frozen geometry.
+/// Writes the gradient sums of each (tile, Gaussian) pair to its slot. `slots` holds 12 floats for
+/// each pair of the window, or 4 with frozen geometry.
 pub fn blend_backward(
     view: &View,
     channels: Channels,
@@ -19,7 +22,7 @@ pub fn blend_backward(
     slots: &mut [f32],
 ) {
     let n = view.padded_pixels();
-    // Channels that move geometry.
+    // Number of channels whose gradient moves geometry.
     let moving = match channels {
         Channels::Feature => 0,
         Channels::Color | Channels::Both => 3,

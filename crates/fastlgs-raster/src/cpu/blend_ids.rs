@@ -1,12 +1,15 @@
+//! CPU twin of `shaders/blend_ids.wgsl`: blending weights summed by object id.
+
 use super::{BATCH, Splat, alpha, pixels_of, shown};
 use crate::View;
 use fastlgs_core::shares::{KEPT, pack};
 use rayon::prelude::*;
 
-/// What no object is called.
+/// Marks a free slot. No object has this id.
 const NO_ID: u32 = 0x1_0000;
 
-/// Adds to the id's slot, or takes the first of the lightest ones where the weight is larger.
+/// Adds `weight` to the slot of `id`. If `id` has no slot, it replaces the first of the lightest
+/// slots, provided that `weight` is larger.
 fn put(slots: &mut [(u32, f32); KEPT], id: u32, weight: f32) {
     if let Some(slot) = slots.iter_mut().find(|s| s.0 == id) {
         slot.1 += weight;
@@ -18,7 +21,8 @@ fn put(slots: &mut [(u32, f32); KEPT], id: u32, weight: f32) {
     }
 }
 
-/// Twin of `shaders/blend_ids.wgsl`.
+/// Sums the blending weights of each pixel by object id. `shares` `[4][padded pixels]` receives the
+/// packed id weights.
 pub fn blend_ids(
     view: &View,
     ranges: &[u32],
@@ -44,7 +48,8 @@ pub fn blend_ids(
                         put(slots, ids[g], weight);
                     }
                 }
-                // The invocations of a tile stop on their own; what they walk beyond that weighs next to nothing.
+                // In the shader, each invocation stops alone. The twin processes more pairs; these
+                // have negligible weight.
                 if pixels.iter().all(|p| p.1 < view.finished) {
                     break;
                 }

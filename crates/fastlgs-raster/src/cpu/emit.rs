@@ -1,7 +1,10 @@
+//! CPU twin of `shaders/emit.wgsl`: the (tile, Gaussian) pairs.
+
 use super::footprint::{Footprint, span};
 use crate::View;
 
-/// Twin of `shaders/emit.wgsl`.
+/// Writes the (tile, Gaussian) pairs in depth order. Lowers `touched` to the number of pairs
+/// written.
 pub fn emit(
     view: &View,
     order: &[u32],

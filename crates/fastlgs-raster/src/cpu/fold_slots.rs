@@ -1,7 +1,10 @@
+//! CPU twin of `shaders/fold_slots.wgsl`: partial sums of gradient slots.
+
 use crate::View;
 use crate::channels::Channels;
 
-/// Twin of `shaders/fold_slots.wgsl`. `slots` holds 12 floats a pair of the window, or 4 with frozen geometry.
+/// Adds up the slots of each Gaussian within runs of `view.fold` pairs, into its first slot of the
+/// run. `slots` holds 12 floats for each pair of the window, or 4 with frozen geometry.
 pub fn fold_slots(view: &View, channels: Channels, touched: &[u32], first_pair: &[u32], pair_gaussians: &[u32], slots: &mut [f32]) {
     let floats = 4 * channels.slot();
     let window = (view.pairs - view.slot_first).min(view.slot_count + view.tile_count()) as usize;

@@ -1,16 +1,18 @@
-//! Twin of `shaders/shared/footprint.wgsl`.
+//! CPU twin of `shaders/shared/footprint.wgsl`: the tiles that a Gaussian touches.
 
 use crate::view::TILE;
 
-/// The ellipse on which alpha falls to its minimum: (mean.xy, lean, spread) (half height^2, apex, first and end tile row).
+/// Ellipse on which alpha equals `ALPHA_MIN`: (mean.xy, lean, spread) (half height^2, apex, first
+/// tile row, end tile row).
 pub type Footprint = [[f32; 4]; 2];
 
-/// Tiles of a row of tiles that the ellipse touches.
+/// Returns the columns of a row of tiles that the ellipse touches.
 #[inline(always)]
 pub fn span(f: &Footprint, row: u32, tiles_x: u32) -> std::ops::Range<u32> {
     let [[mean_x, mean_y, lean, spread], [height2, apex, ..]] = *f;
     let half_height = height2.sqrt();
-    // Conversions are signed: processors convert nothing else at once. Nothing branches, so that some rows can be done at once.
+    // Conversions are signed because AVX2 has no unsigned ones. The code has no branches, so that
+    // several rows are computed at once.
     let top = ((row * TILE) as i32 as f32 + 0.5 - mean_y).max(-half_height);
     let bottom = ((row * TILE + TILE) as i32 as f32 - 0.5 - mean_y).min(half_height);
     let half_width = |dy: f32| ((height2 - dy * dy).max(0.0) * spread).sqrt();

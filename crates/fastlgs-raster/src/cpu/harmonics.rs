@@ -1,8 +1,9 @@
-//! Twin of `shaders/shared/harmonics.wgsl`.
+//! CPU twin of `shaders/shared/harmonics.wgsl`: spherical harmonics.
 
 use glam::Vec3;
 
-/// Real spherical harmonics of degrees 1 to 3, with the signs of 3DGS.
+/// Returns the real spherical harmonics of degrees 1 to 3 in the direction `d` of length 1, with
+/// the signs of 3DGS.
 pub fn basis(d: Vec3) -> [f32; 15] {
     let (xx, yy, zz) = (d.x * d.x, d.y * d.y, d.z * d.z);
     [
@@ -24,7 +25,7 @@ pub fn basis(d: Vec3) -> [f32; 15] {
     ]
 }
 
-/// Derivatives of the basis by the direction.
+/// Returns the derivatives of `basis` by the direction.
 pub fn basis_slopes(d: Vec3) -> [Vec3; 15] {
     let (xx, yy, zz) = (d.x * d.x, d.y * d.y, d.z * d.z);
     let v = Vec3::new;

@@ -1,8 +1,10 @@
+//! CPU twin of `shaders/loss_gradient.wgsl`: gradient of the loss by the frame.
+
 use super::ssim_columns::blur_column;
 use super::{RUN, shown_target};
 use crate::view::Plane;
 
-/// Twin of `shaders/loss_gradient.wgsl`.
+/// Writes dL/d frame of one channel, and sums for the loss, the exposure and the background.
 pub fn loss_gradient(plane: &Plane, frame: &[f32], targets: &[u32], rows: &[f32], gradient: &mut [f32], sums: &mut [f32]) {
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
     let runs = h / RUN;

@@ -1,7 +1,9 @@
-//! CPU twins: one plain function for each WGSL pass, of the same name, on the same buffers in the same order.
+//! CPU twins: one plain function for each WGSL pass, with the same name and the same buffers in the
+//! same order.
 //!
-//! They are the reference of the parity tests and can stand in for the first passes of a frame, to find a wrong one
-//! (`run`). What concerns a single Gaussian is shared with the fast backend in `native`.
+//! They are the reference of the parity tests. They can replace the first passes of a frame, to
+//! locate a faulty pass (`run`). Functions on a single Gaussian are shared with the CPU engine in
+//! `native`.
 
 mod adam;
 mod blend;
@@ -58,43 +60,43 @@ pub use tile_ranges::tile_ranges;
 
 use crate::view::{Job, Plane};
 
-/// Outputs of one invocation of the loss passes; `shaders/shared/window.wgsl`.
+/// Number of rows that one invocation of the loss passes computes; `shaders/shared/columns.wgsl`.
 pub const RUN: usize = 8;
 
-/// What blending reads of one projected Gaussian; `shaders/project.wgsl`.
+/// A projected Gaussian as blending reads it; layout in `shaders/project.wgsl`.
 pub type Splat = [[f32; 4]; 3];
 
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
 pub(crate) const SOLID: f32 = 0.9;
-/// Its logarithm to base 2, for those who bound the exponent.
+/// log2 of `ALPHA_MAX`: the upper bound of the exponent.
 pub(crate) const LOG2_ALPHA_MAX: f32 = -0.014_499_57;
 pub(crate) const DILATION: f32 = 0.3;
 pub(crate) const NEAR: f32 = 0.5;
 
-/// The chunks of a job, in order; `shaders/shared/chunks.wgsl`.
+/// Returns the index ranges of a job's chunks, in order; `shaders/shared/chunks.wgsl`.
 pub(crate) fn chunks(job: &Job) -> impl Iterator<Item = std::ops::Range<usize>> {
     let (n, length) = (job.n as usize, job.n.div_ceil(job.chunks) as usize);
     (0..job.chunks as usize).map(move |t| (t * length).min(n)..((t + 1) * length).min(n))
 }
 
-/// Alpha of a splat at offset (dx, dy) from its mean; 0 where it is not drawn.
+/// Returns alpha of a splat at the offset (dx, dy) in pixels from its mean; 0 below `ALPHA_MIN`.
 pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32) -> f32 {
     let exponent = dx * (splat[0][2] * dx + splat[0][3] * dy) + (splat[1][0] * dy * dy + splat[1][1]);
     let alpha = exponent.exp2().min(ALPHA_MAX);
     if alpha >= ALPHA_MIN { alpha } else { 0.0 }
 }
 
-/// Whether a pixel of a padded plane lies in the picture: 1 or 0.
+/// Returns 1 if a pixel of a padded plane lies in the image, else 0.
 fn shown_plane(plane: &Plane, i: usize, j: usize) -> f32 {
     if i < plane.size[0] as usize && j < plane.size[1] as usize { 1.0 } else { 0.0 }
 }
 
-/// What the loss compares at one pixel; `shaders/shared/window.wgsl`.
+/// Rendered value x and target value y of one pixel; `shaders/shared/window.wgsl`.
 struct Compared {
     x: f32,
     y: f32,
-    /// 1 where the pixel counts.
+    /// 1 if the pixel enters the loss, else 0.
     weight: f32,
 }
 

@@ -1,3 +1,5 @@
+//! CPU twin of `shaders/project.wgsl`: projection of Gaussians into a view.
+
 use super::footprint::{Footprint, span};
 use super::harmonics::basis;
 use super::{ALPHA_MAX, ALPHA_MIN, NEAR, SOLID, Splat, covariance, pcg3d};
@@ -6,7 +8,7 @@ use crate::view::{TILE, stride};
 use fastlgs_core::gaussians::{BASE_CHANNELS, CLEAR, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, UVec3, Vec2, Vec3};
 
-/// One Gaussian in the image.
+/// A Gaussian projected into the image.
 #[derive(Clone, Copy)]
 pub(crate) struct Projected {
     pub splat: Splat,
@@ -14,10 +16,10 @@ pub(crate) struct Projected {
     pub footprint: Footprint,
 }
 
-/// Key of a Gaussian that is not drawn: it sorts last.
+/// Depth key of a Gaussian that is not drawn. It sorts last.
 pub(crate) const NOT_DRAWN: u32 = 0xff_ffff;
 
-/// Twin of `shaders/project.wgsl`.
+/// Projects the Gaussians of a page. Gaussians that touch no tile are not drawn.
 pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [u32], footprints: &mut [Footprint], touched: &mut [u32]) {
     let (page, first) = (view.page as usize, view.first as usize);
     for i in 0..page {
@@ -32,7 +34,8 @@ pub fn project(view: &View, params: &[f32], splats: &mut [Splat], depths: &mut [
     }
 }
 
-/// Projects Gaussian `g`, whose channels `param` gives; nothing where it is not drawn, other than for touching no tile.
+/// Projects Gaussian `g`; `param` returns the value of a channel. Returns none if the Gaussian is
+/// not drawn. Does not check whether it touches a tile.
 #[inline(always)]
 pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> Option<Projected> {
     if view.dropped > 0 && pcg3d(UVec3::new(g, view.draw, 2)).x < view.dropped {
@@ -81,7 +84,7 @@ pub(crate) fn project_one(view: &View, g: u32, param: impl Fn(usize) -> f32) -> 
     Some(Projected { splat, depth: (t.z.to_bits() >> 7).min(NOT_DRAWN - 1), footprint })
 }
 
-/// Colour before it is cut off at zero.
+/// Returns the colour before it is clamped at 0.
 #[inline(always)]
 fn color_of(view: &View, mean: Vec3, param: impl Fn(usize) -> f32) -> Vec3 {
     let param3 = |c: usize| Vec3::new(param(c), param(c + 1), param(c + 2));

@@ -1,3 +1,5 @@
+//! CPU twin of `shaders/project_backward.wgsl`: gradients of the trained values.
+
 use super::harmonics::{basis, basis_slopes};
 use super::{ALPHA_MAX, DILATION, Splat, covariance};
 use crate::View;
@@ -6,7 +8,8 @@ use crate::view::stride;
 use fastlgs_core::gaussians::{BASE_CHANNELS, SH_C0, rest_len, sigmoid};
 use glam::{Mat4, Vec2, Vec3, Vec4};
 
-/// Twin of `shaders/project_backward.wgsl`. `slots` holds 12 floats a pair, or 4 with frozen geometry.
+/// Sums the gradient slots of each Gaussian and computes the gradients of its trained values.
+/// `slots` holds 12 floats for each pair, or 4 with frozen geometry.
 pub fn project_backward(
     view: &View,
     channels: Channels,
@@ -43,7 +46,7 @@ pub fn project_backward(
     }
 }
 
-/// Sum of the slots of `pairs`; slots of four floats are the last four of the twelve.
+/// Sums the slots of `pairs`. Slots of 4 floats are the last 4 of the 12.
 fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f32; 12] {
     let mut slot = [0.0; 12];
     for pair in pairs {
@@ -54,8 +57,10 @@ fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f3
     slot
 }
 
-/// Carries one Gaussian's summed slot to its trained values (docs/gradients.md, sections 2 to 6, whose symbols the names follow), which `put(channel, gradient)` receives. Returns the length
-/// of the projected mean's gradient in half-image units for Gaussians that are drawn.
+/// Propagates the summed slot of one Gaussian to its trained values and passes the gradients to
+/// `put(channel, gradient)`. Formulas and symbols are those of docs/gradients.md, sections 2 to 6.
+/// Returns the length of the gradient of the projected mean in half-image units, 0 with frozen
+/// geometry, or none if the Gaussian is not drawn.
 pub(crate) fn backward_one(
     view: &View,
     channels: Channels,
@@ -78,7 +83,7 @@ pub(crate) fn backward_one(
         return None;
     }
     let mean = param3(0);
-    // Section 6. Colour is cut off at 0 from below.
+    // Section 6. Colour is clamped at 0 from below.
     let shown = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
     let d_color = Vec3::select(shown, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
     put3(11, SH_C0 * d_color);
@@ -114,7 +119,7 @@ pub(crate) fn backward_one(
     let [jw_x, jw_y] = covariance::affine(t, view);
     let (a_x, a_y) = (r.transpose() * jw_x * s, r.transpose() * jw_y * s);
     let cov = covariance::dilated(a_x, a_y);
-    // Section 2. Opacity is clamped at ALPHA_MAX from above: where it is, only what would lower it passes.
+    // Section 2. Where opacity is clamped at ALPHA_MAX, only a gradient that lowers it passes.
     let opacity = sigmoid(param(10));
     let dets = covariance::determinants(a_x, a_y);
     let clamped = view.kept_gain() * opacity * covariance::compensation(dets, view) >= ALPHA_MAX;

@@ -1,7 +1,10 @@
+//! CPU twin of `shaders/radix_scatter.wgsl`: one digit of a radix sort.
+
 use super::chunks;
 use crate::view::Job;
 
-/// Twin of `shaders/radix_scatter.wgsl`.
+/// Moves keys and values to their sorted positions for one digit. Keys with equal digits keep their
+/// order.
 pub fn radix_scatter(job: &Job, keys: &[u32], values: &[u32], histogram: &[u32], keys_out: &mut [u32], values_out: &mut [u32]) {
     for (t, chunk) in chunks(job).enumerate() {
         let mut next: Vec<usize> = histogram[t..].iter().step_by(job.chunks as usize).take(256).map(|to| *to as usize).collect();

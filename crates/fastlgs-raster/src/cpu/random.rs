@@ -1,8 +1,8 @@
-//! Random words of `shaders/shared/random.wgsl`.
+//! CPU twin of `shaders/shared/random.wgsl`: a hash.
 
 use glam::UVec3;
 
-/// Three random words from three (Jarzynski & Olano 2020).
+/// Returns three random words from three words (PCG3D, Jarzynski & Olano 2020).
 pub(crate) fn pcg3d(seed: UVec3) -> UVec3 {
     let step = |v: &mut UVec3| {
         v.x = v.x.wrapping_add(v.y.wrapping_mul(v.z));

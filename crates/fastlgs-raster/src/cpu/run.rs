@@ -1,11 +1,12 @@
-//! Any twin by its name, on raw buffers.
+//! Runs a CPU twin by its name on raw buffers.
 
 use super::*;
 use crate::channels::Channels;
 use crate::view::Planes;
 use bytemuck::{Pod, cast_slice as read, cast_slice_mut as write};
 
-/// Runs the twin of the pass `name` on its uniform and its storage buffers, in the order of the bindings.
+/// Runs the twin of the pass `name` on its uniform and its storage buffers. `buffers` is in the
+/// order of the bindings.
 ///
 /// # Panics
 /// If there is no such pass, or a buffer is too small.
@@ -66,7 +67,7 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
         ("adam", [gradients, params, moment1, moment2]) => {
             adam(&uniform_of(uniform), read(gradients), write(params), write(moment1), write(moment2));
         }
-        (name, buffers) => panic!("no twin '{name}' of {} buffers", buffers.len()),
+        (name, buffers) => panic!("no CPU twin '{name}' with {} buffers", buffers.len()),
     }
 }
 
@@ -74,7 +75,8 @@ fn uniform_of<T: Pod>(bytes: &[u8]) -> T {
     bytemuck::pod_read_unaligned(&bytes[..size_of::<T>()])
 }
 
-/// Hands each plane to a twin with its own maps: four of `rows`, and three of `partials` where there are any.
+/// Runs a twin on each plane with the plane's own maps: four of `rows`, and three of `partials` if
+/// given.
 fn each_plane(planes: &Planes, rows: &mut [u32], partials: &mut [u32], mut twin: impl FnMut(&Plane, &mut [u32], &mut [u32])) {
     for (number, plane) in planes.each[..planes.count as usize].iter().enumerate() {
         let size = (4 * plane.quads * plane.rows) as usize;

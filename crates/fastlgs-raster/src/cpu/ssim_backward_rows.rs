@@ -1,7 +1,9 @@
+//! CPU twin of `shaders/ssim_backward_rows.wgsl`: blur of the derivatives of SSIM.
+
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
-/// Twin of `shaders/ssim_backward_rows.wgsl`.
+/// Blurs the three derivatives of SSIM along rows.
 pub fn ssim_backward_rows(plane: &Plane, partials: &[f32], rows: &mut [f32]) {
     let window = ssim_window();
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);

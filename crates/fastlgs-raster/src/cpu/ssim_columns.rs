@@ -1,8 +1,10 @@
+//! CPU twin of `shaders/ssim_columns.wgsl`: SSIM and its derivatives.
+
 use super::{RUN, shown_plane};
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
-/// Blurs one map of `rows` along its column at (i, j).
+/// Returns one map of `rows` blurred along its column at (i, j).
 pub(super) fn blur_column(plane: &Plane, rows: &[f32], map: usize, i: usize, j: usize) -> f32 {
     let window = ssim_window();
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
@@ -10,7 +12,7 @@ pub(super) fn blur_column(plane: &Plane, rows: &[f32], map: usize, i: usize, j: 
     taps.map(|k| window[k + SSIM_RADIUS - j] * rows[(map * h + k) * w + i]).sum()
 }
 
-/// Twin of `shaders/ssim_columns.wgsl`.
+/// Blurs the local moments along columns. Computes SSIM and its derivatives by three moments.
 pub fn ssim_columns(plane: &Plane, rows: &[f32], partials: &mut [f32], sums: &mut [f32]) {
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);
     let runs = h / RUN;

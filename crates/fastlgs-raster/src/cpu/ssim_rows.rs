@@ -1,8 +1,10 @@
+//! CPU twin of `shaders/ssim_rows.wgsl`: blur of the moments of SSIM.
+
 use super::shown_target;
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
-/// Twin of `shaders/ssim_rows.wgsl`.
+/// Blurs x, y, x^2 + y^2 and x y along rows.
 pub fn ssim_rows(plane: &Plane, frame: &[f32], targets: &[u32], rows: &mut [f32]) {
     let window = ssim_window();
     let (w, h) = (4 * plane.quads as usize, plane.rows as usize);

@@ -1,6 +1,8 @@
+//! CPU twin of `shaders/tile_load.wgsl`: sort keys of tiles.
+
 use crate::View;
 
-/// Twin of `shaders/tile_load.wgsl`.
+/// Writes the sort key of each tile: the longer its list, the smaller the key.
 pub fn tile_load(view: &View, ranges: &[u32], keys: &mut [u32]) {
     for tile in 0..view.tile_count() as usize {
         let length = ranges[2 * tile + 1] - ranges[2 * tile];

@@ -1,6 +1,8 @@
+//! CPU twin of `shaders/tile_ranges.wgsl`: the list of each tile.
+
 use crate::View;
 
-/// Twin of `shaders/tile_ranges.wgsl`.
+/// Writes first and end pair of each tile. Tiles without pairs keep their values.
 pub fn tile_ranges(view: &View, sorted_tiles: &[u32], ranges: &mut [u32]) {
     let pairs = view.pairs as usize;
     for i in 0..pairs {

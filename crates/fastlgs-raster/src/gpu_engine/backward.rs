@@ -1,4 +1,6 @@
-//! From the frame's gradient to that of the Gaussians, and the optimiser's step. Gradient slots of the pairs are bound window by window.
+//! The passes from the frame's gradient to those of the Gaussians, and the optimiser step.
+//!
+//! Gradient slots of the pairs are bound in windows, because one binding may not hold all.
 
 use super::kernels::{Blending, GROUP, Training};
 use super::lists::Lists;
@@ -10,27 +12,29 @@ use crate::view::{Step, View, stride};
 use crate::{Error, Gpu, Result};
 use wgpu::Buffer;
 
-/// Gradient slots of a window of pairs.
+/// Buffer of gradient slots for a window of pairs.
 #[derive(Default)]
 pub struct Slots(Option<Buffer>);
 
-/// Pairs whose Gaussians start in a window: the first of them, and their number.
+/// First pair of a window, and the number of pairs whose Gaussians start in it.
 type Window = (u32, u32);
 
 impl Slots {
-    /// What they take.
+    /// Returns the size of the buffer in bytes.
     pub fn bytes(&self) -> u64 {
         self.0.as_ref().map_or(0, Buffer::size)
     }
 
-    /// Room for all pairs, or for as many as one binding holds.
+    /// Returns a buffer for all pairs, or for as many as one binding holds, and its windows. A
+    /// Gaussian that starts in a window may have up to `tile_count` pairs beyond its end, so each
+    /// window leaves room for them.
     fn windows(&mut self, gpu: &Gpu, view: &View, channels: Channels) -> Result<(&Buffer, Vec<Window>)> {
         let bytes = 16 * channels.slot();
         let most = (gpu.max_binding as usize / bytes).min(u32::MAX as usize / 2);
         let (pairs, spare) = (view.pairs as usize, view.tile_count() as usize);
         let window = if pairs <= most { pairs } else { most.saturating_sub(spare) };
         if window == 0 && pairs > 0 {
-            return Err(Error::TooLarge(format!("{spare} tiles are too many for '{}'; lower --size", gpu.name)));
+            return Err(Error::TooLarge(format!("{spare} tiles are too many for '{}'; lower the option size", gpu.name)));
         }
         let needed = (bytes * pairs.min(most)) as u64;
         let slots = match self.0.take().filter(|slots| slots.size() >= needed) {
@@ -47,7 +51,7 @@ impl Slots {
         Ok((slots, windows))
     }
 
-    /// Gradients of all Gaussians from that of the frame.
+    /// Records the passes that compute the gradients of all Gaussians from that of the frame.
     pub fn record(
         &mut self,
         gpu: &Gpu,
@@ -82,7 +86,7 @@ impl Slots {
     }
 }
 
-/// Adam on all pages.
+/// Records Adam on all pages.
 pub fn adam(passes: &Training, r: &mut Recorder, g: &Gaussians, step: &Step) -> Result<()> {
     for page in &g.pages {
         let step = Step { quads: stride(page.n) as u32 / 4, ..*step };

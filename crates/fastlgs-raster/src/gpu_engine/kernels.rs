@@ -26,7 +26,7 @@ pub struct Listing {
     pub tile_load: Typed<shaders::TileLoad>,
 }
 
-/// Passes of the loss, and of what follows the gradients.
+/// Passes of the loss and the optimiser.
 pub struct Training {
     pub ssim_rows: Typed<shaders::SsimRows>,
     pub ssim_columns: Typed<shaders::SsimColumns>,
@@ -35,7 +35,7 @@ pub struct Training {
     pub adam: Typed<shaders::Adam>,
 }
 
-/// Passes that differ with what is trained.
+/// Passes that are compiled for each kind of frame.
 pub struct Blending {
     pub project: Typed<shaders::Project>,
     pub blend: Typed<shaders::Blend>,
@@ -44,10 +44,10 @@ pub struct Blending {
     pub project_backward: Typed<shaders::ProjectBackward>,
 }
 
-/// Which of these a frame needs: its channels, and whether colour depends on the view.
+/// Kind of a frame: its channels, and whether colour depends on the view.
 pub type Kind = (Channels, bool);
 
-/// The kind of a frame.
+/// Returns the kind of a frame.
 pub fn kind(view: &View, channels: Channels) -> Kind {
     (channels, view.sh_degree > 0)
 }
@@ -62,7 +62,7 @@ pub struct Kernels {
 }
 
 impl Kernels {
-    /// Compiles all but those that differ with what is trained.
+    /// Compiles all passes except those of `Blending`.
     pub fn new(gpu: &Gpu) -> Self {
         macro_rules! pass {
             () => {
@@ -84,7 +84,7 @@ impl Kernels {
         }
     }
 
-    /// Compiles what a kind of frame needs, unless that is done.
+    /// Compiles the passes of a kind of frame, unless they exist.
     pub fn prepare(&mut self, gpu: &Gpu, kind: Kind) {
         let (channels, harmonics) = kind;
         self.blending.entry(kind).or_insert_with(|| Blending {
@@ -96,7 +96,7 @@ impl Kernels {
         });
     }
 
-    /// What a kind of frame needs.
+    /// Returns the passes of a kind of frame.
     ///
     /// # Panics
     /// If it was not prepared.

@@ -1,4 +1,5 @@
-//! From Gaussians to the lists of tiles: projection, depth order, (tile, Gaussian) pairs, and the order of the tiles.
+//! Tile lists of a frame: projection, depth order, (tile, Gaussian) pairs, and the order of the
+//! tiles.
 
 use super::kernels::{GROUP, Kernels, Kind};
 use super::pages::Gaussians;
@@ -11,10 +12,10 @@ use crate::{Error, Gpu, Result};
 use std::collections::HashMap;
 use wgpu::Buffer;
 
-/// Views' lists are kept for feature training as long as they take no more than this.
+/// Bytes from which no more tile lists are cached for feature training.
 const CACHE_LIMIT: u64 = 1 << 30;
 
-/// What blending walks through; buffers are handles, so that copies are cheap.
+/// Tile lists that blending reads. Buffers are handles, so clones are cheap.
 #[derive(Clone)]
 pub struct Lists {
     pub view: View,
@@ -34,21 +35,21 @@ impl Lists {
     }
 }
 
-/// Buffers with one item a tile.
+/// Buffers with one item for each tile.
 struct Tiles {
     size: [u32; 2],
     ranges: Buffer,
     sort: Sort,
 }
 
-/// Buffers with one item a (tile, Gaussian) pair.
+/// Buffers with one item for each (tile, Gaussian) pair.
 struct Pairs {
     capacity: usize,
     gaussians: Buffer,
     sort: Sort,
 }
 
-/// Makes lists, and keeps those of views whose geometry is frozen.
+/// Builds tile lists, and caches those of views with frozen geometry.
 #[derive(Default)]
 pub struct ListMaker {
     tiles: Option<Tiles>,
@@ -57,17 +58,17 @@ pub struct ListMaker {
 }
 
 impl ListMaker {
-    /// Other Gaussians make all kept lists wrong.
+    /// Drops all cached lists, because the Gaussians have changed.
     pub fn forget(&mut self) {
         self.frozen.clear();
     }
 
-    /// A new target makes its view's kept lists wrong.
+    /// Drops the cached lists of a view, because its target has changed.
     pub fn forget_view(&mut self, id: usize) {
         self.frozen.remove(&id);
     }
 
-    /// Projection and sorting: everything that blending needs.
+    /// Runs projection and sorting. Returns the tile lists.
     pub fn lists(&mut self, gpu: &Gpu, kernels: &Kernels, g: &Gaussians, mut view: View, kind: Kind, on_cpu: &mut usize) -> Result<Lists> {
         self.prepare_tiles(gpu, &view)?;
         let n = g.n as u32;
@@ -81,10 +82,10 @@ impl ListMaker {
         r.run(&listing.gather_counts, &view, GatherCountsBuffers { order, touched, offsets }, groups)?;
         g.scan.record(gpu, sorting, &mut r, offsets, n)?;
         *on_cpu = r.submit();
-        // Counted before anything is written, so that no list can overflow.
+        // The pairs are counted before any is written, so no list can overflow.
         view.pairs = g.scan.total(gpu, n)?;
         if view.pairs == u32::MAX {
-            let reason = "more than 4 billion pairs of tiles and Gaussians: the scene has huge Gaussians; prune them or lower --size";
+            let reason = "more than 4 billion (tile, Gaussian) pairs: some Gaussians are too large; remove them, or lower the option size";
             return Err(Error::TooLarge(reason.to_owned()));
         }
         self.prepare_pairs(gpu, view.pairs as usize)?;
@@ -113,7 +114,8 @@ impl ListMaker {
         })
     }
 
-    /// The lists of a view whose geometry is frozen: made once, then kept with the view's target.
+    /// Returns the lists of a view with frozen geometry. They are built once and cached until the
+    /// target of the view changes.
     pub fn frozen(
         &mut self,
         gpu: &Gpu,
@@ -165,7 +167,7 @@ impl ListMaker {
         Ok(())
     }
 
-    /// Room for `pairs` pairs, with a quarter to spare so that growth is rare.
+    /// Makes room for `pairs` pairs, with a quarter to spare so that reallocations are rare.
     fn prepare_pairs(&mut self, gpu: &Gpu, pairs: usize) -> Result<()> {
         if self.pairs.as_ref().is_none_or(|p| p.capacity < pairs) {
             let most = (gpu.max_binding / 4) as usize;
@@ -178,7 +180,7 @@ impl ListMaker {
         Ok(())
     }
 
-    /// Adds what it takes.
+    /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
         memory.lists += self.pairs.as_ref().map_or(0, |p| p.gaussians.size() + p.sort.bytes());
         memory.frame += self.tiles.as_ref().map_or(0, |t| t.ranges.size() + t.sort.bytes());
@@ -186,7 +188,7 @@ impl ListMaker {
     }
 }
 
-/// Projects all pages.
+/// Records the projection of all pages.
 fn project(kernels: &Kernels, r: &mut Recorder, g: &Gaussians, view: &View, kind: Kind) -> Result<()> {
     let pass = &kernels.blending(kind).project;
     for page in &g.pages {
@@ -198,7 +200,7 @@ fn project(kernels: &Kernels, r: &mut Recorder, g: &Gaussians, view: &View, kind
     Ok(())
 }
 
-/// Whether lists made for `a` serve `b`.
+/// Returns whether lists built for `a` are valid for `b`.
 fn same_camera(a: &View, b: &View) -> bool {
     let key = |v: &View| (v.world_to_camera, v.focal, v.centre, v.size, v.gaussians, v.antialias);
     key(a) == key(b)

@@ -1,4 +1,4 @@
-//! The passes on a wgpu device.
+//! The engine on a wgpu device.
 
 mod backward;
 mod kernels;
@@ -32,17 +32,19 @@ pub struct GpuEngine {
     lists: ListMaker,
     gaussians: Option<Gaussians>,
     picture: Option<Picture>,
-    /// Made on the first step.
+    /// Created on the first step.
     loss: Option<Loss>,
     slots: Slots,
     targets: HashMap<usize, ([u32; 2], Buffer)>,
     last: Option<(View, Channels)>,
-    /// This many first passes of every frame run as their CPU twins, to find a wrong one; `FASTLGS_PASSES_ON_CPU` sets it.
+    /// Number of passes at the start of every frame that run as their CPU twins, to find a faulty
+    /// pass. The environment variable `FASTLGS_PASSES_ON_CPU` sets it.
     pub passes_on_cpu: usize,
 }
 
 impl GpuEngine {
-    /// Compiles the passes; those that differ with what is trained follow when they are needed.
+    /// Compiles the passes. Those that depend on the kind of frame are compiled when they are first
+    /// needed.
     pub fn new(gpu: Gpu) -> Self {
         Self {
             kernels: Kernels::new(&gpu),
@@ -58,12 +60,13 @@ impl GpuEngine {
         }
     }
 
-    /// Prepares what a frame needs, and makes its lists; those of view `frozen` are kept.
+    /// Compiles what a frame needs and builds its tile lists. With `frozen`, the lists of that view
+    /// are cached.
     fn prepare(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
         let held = self.len();
         let kind = kind(&view, channels);
         let Some(g) = self.gaussians.as_ref().filter(|g| g.n == view.gaussians as usize && g.n > 0) else {
-            return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {held}", view.gaussians)));
+            return Err(Error::Invalid(format!("the view has {} Gaussians, but the engine holds {held}; both must be equal and more than 0", view.gaussians)));
         };
         self.kernels.prepare(&self.gpu, kind);
         self.picture = Some(Picture::fitting(self.picture.take(), &self.gpu, &view)?);
@@ -73,7 +76,7 @@ impl GpuEngine {
         }
     }
 
-    /// Everything up to blending into the frame buffer.
+    /// Runs all passes up to blending into the frame buffer.
     fn forward(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
         let lists = self.prepare(view, channels, frozen, on_cpu)?;
         let (splats, frame) = (&self.gaussians().splats, &self.picture().frame);
@@ -86,12 +89,12 @@ impl GpuEngine {
         Ok(Lists { view, ..lists })
     }
 
-    /// After [`Self::prepare`].
+    /// Returns the Gaussians; needs [`Self::prepare`] first.
     fn gaussians(&self) -> &Gaussians {
         self.gaussians.as_ref().expect("checked when the frame was prepared")
     }
 
-    /// After [`Self::prepare`].
+    /// Returns the frame buffer; needs [`Self::prepare`] first.
     fn picture(&self) -> &Picture {
         self.picture.as_ref().expect("made when the frame was prepared")
     }
@@ -113,7 +116,7 @@ impl Engine for GpuEngine {
     fn set_state(&mut self, state: &State) -> Result<()> {
         let (n, sh_degree) = (state.len(), state.sh_degree);
         self.lists.forget();
-        // Old buffers go before new ones are made.
+        // Free the old buffers before new ones are created.
         let known = self.gaussians.take().filter(|g| (g.n, g.sh_degree) == (n, sh_degree));
         let g = match known {
             Some(g) => g,
@@ -122,7 +125,7 @@ impl Engine for GpuEngine {
         g.write(&self.gpu, state);
         let mut r = Recorder::new(&self.gpu, 0);
         r.clear(&g.stats);
-        // Gradients of channels that are not trained stay what they are: zero.
+        // Gradients of untrained channels stay zero.
         g.pages.iter().for_each(|page| r.clear(&page.gradients));
         r.submit();
         self.gaussians = Some(g);
@@ -153,7 +156,7 @@ impl Engine for GpuEngine {
     fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()> {
         let camera_less =
             View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
-        let buffer = self.gpu.storage_with("a target picture", &target.padded(&camera_less))?;
+        let buffer = self.gpu.storage_with("a target image", &target.padded(&camera_less))?;
         self.targets.insert(id, (target.size, buffer));
         self.lists.forget_view(id);
         Ok(())
@@ -179,7 +182,7 @@ impl Engine for GpuEngine {
         let lists = self.prepare(view, Channels::Feature, None, &mut on_cpu)?;
         let words: Vec<u32> = ids.iter().map(|id| u32::from(*id)).collect();
         let ids = &self.gpu.storage_with("object ids", &words)?;
-        // The frame has room for eight words a pixel, shares need four.
+        // The frame has eight words a pixel; the id weights need four.
         let (splats, shares) = (&self.gaussians().splats, &self.picture().frame);
         let mut r = Recorder::new(&self.gpu, on_cpu);
         let Lists { ranges, sorted_pairs, pair_gaussians, .. } = &lists;
@@ -199,13 +202,13 @@ impl Engine for GpuEngine {
         let channels = options.channels;
         let mut on_cpu = self.passes_on_cpu;
         let frozen = (channels == Channels::Feature).then_some(id);
-        // Lists that are kept hold all Gaussians.
+        // Cached lists contain all Gaussians, so none is dropped.
         let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
         let lists = self.forward(view, channels, frozen, &mut on_cpu)?;
         let view = lists.view;
         self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view, planes(&view, options).len())?);
         let target = self.targets.get(&id).filter(|t| t.0 == view.size).map(|t| &t.1);
-        let target = target.ok_or_else(|| Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])))?;
+        let target = target.ok_or_else(|| Error::Invalid(format!("view {id} has no target image of {}x{} pixels", view.size[0], view.size[1])))?;
         let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss) else { unreachable!("prepared above") };
         let mut r = Recorder::new(&self.gpu, on_cpu);
         loss.record(&self.kernels.training, &mut r, &view, options, &picture.frame, target)?;

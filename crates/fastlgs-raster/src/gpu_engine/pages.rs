@@ -1,4 +1,7 @@
-//! Buffers with one item a Gaussian. Trained values lie in pages, because 48 SH coefficients exceed a binding at 700,000 Gaussians.
+//! Buffers with one item for each Gaussian.
+//!
+//! Trained values are stored in pages: the 48 SH coefficients of 700,000 Gaussians exceed 128 MiB,
+//! the largest binding of some adapters.
 
 use super::sorting::{Scan, Sort};
 use crate::density::State;
@@ -8,7 +11,8 @@ use crate::{Gpu, Result};
 use fastlgs_core::gaussians::channels as channels_of;
 use wgpu::Buffer;
 
-/// Trained values of as many Gaussians as one binding holds, each buffer `[channel][gaussian of the page]`.
+/// Trained values of as many Gaussians as one binding holds. Each buffer is `[channel][Gaussian of
+/// the page]`.
 pub struct Page {
     pub first: usize,
     pub n: usize,
@@ -18,7 +22,7 @@ pub struct Page {
     pub gradients: Buffer,
 }
 
-/// Everything that the device holds of the Gaussians.
+/// All buffers of the Gaussians on the device.
 pub struct Gaussians {
     pub n: usize,
     pub sh_degree: u32,
@@ -34,7 +38,7 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
-    /// Room for `n` Gaussians.
+    /// Creates the buffers of `n` Gaussians.
     pub fn new(gpu: &Gpu, n: usize, sh_degree: u32) -> Result<Self> {
         let storage = |what: &str, words: usize| gpu.storage(what, 4 * words as u64);
         let channels = channels_of(sh_degree);
@@ -66,7 +70,7 @@ impl Gaussians {
         })
     }
 
-    /// Writes values and moments.
+    /// Writes trained values and moments.
     pub fn write(&self, gpu: &Gpu, state: &State) {
         for page in &self.pages {
             for (buffer, all) in [(&page.params, &state.params), (&page.moment1, &state.moment1), (&page.moment2, &state.moment2)] {
@@ -75,7 +79,7 @@ impl Gaussians {
         }
     }
 
-    /// Reads `[channel][gaussian]` of all pages.
+    /// Reads one buffer of all pages as `[channel][Gaussian]`.
     pub fn read(&self, gpu: &Gpu, what: impl Fn(&Page) -> &Buffer) -> Result<Vec<f32>> {
         let channels = channels_of(self.sh_degree);
         let mut out = vec![0.0; channels * self.n];
@@ -89,7 +93,7 @@ impl Gaussians {
         Ok(out)
     }
 
-    /// Adds what it takes.
+    /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
         let bytes = |buffers: &[&Buffer]| buffers.iter().map(|b| b.size()).sum::<u64>();
         for page in &self.pages {
@@ -101,7 +105,7 @@ impl Gaussians {
     }
 }
 
-/// The Gaussians `first..first + n` of values `[channels][all]`, with the page's stride.
+/// Returns the Gaussians `first..first + n` of values `[channel][all]`, with the page's stride.
 fn page_of(values: &[f32], all: usize, first: usize, n: usize) -> Vec<f32> {
     let padding = std::iter::repeat_n(0.0, stride(n) - n);
     values.chunks_exact(all).flat_map(|channel| channel[first..first + n].iter().copied().chain(padding.clone())).collect()

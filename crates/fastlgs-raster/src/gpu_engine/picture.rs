@@ -1,4 +1,4 @@
-//! The frame, and on it the loss with its gradient.
+//! The frame buffer, and the loss with its gradient.
 
 use super::kernels::{GROUP, Training};
 use crate::channels::Channels;
@@ -11,14 +11,14 @@ use crate::view::{Planes, View};
 use crate::{Gpu, Result};
 use wgpu::Buffer;
 
-/// Buffers with one item a pixel.
+/// Buffers with one item for each pixel.
 pub struct Picture {
     size: [u32; 2],
     pub frame: Buffer,
 }
 
 impl Picture {
-    /// A frame of the view's size: `known`, if it is.
+    /// Returns a frame buffer of the view's size; reuses `known` if its size is the same.
     pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View) -> Result<Self> {
         match known.filter(|p| p.size == view.size) {
             Some(picture) => Ok(picture),
@@ -27,13 +27,13 @@ impl Picture {
     }
 }
 
-/// What every adapter binds at once, in bytes.
+/// Bytes that every adapter can bind at once.
 const LARGEST: u64 = 128 << 20;
 
 /// Buffers of the loss.
 pub struct Loss {
     size: [u32; 2],
-    /// Planes that are done at once.
+    /// Number of planes that are processed at once.
     at_once: usize,
     pub gradient: Buffer,
     rows: Buffer,
@@ -43,13 +43,14 @@ pub struct Loss {
 }
 
 impl Loss {
-    /// Buffers for frames of the view's size and that many planes: `known`, if they are.
+    /// Returns buffers for frames of the view's size with `planes` planes; reuses `known` if it
+    /// fits.
     pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View, planes: usize) -> Result<Self> {
         let pixels = view.padded_pixels() as u64;
-        // Real GPUs have room for all; a software adapter's cache has not.
+        // Hardware adapters have room for all planes; the cache of a software adapter has not.
         let rows = 16 * pixels;
         let at_once = if gpu.shape == Shape::Wide { 1 } else { (LARGEST.min(gpu.max_binding) / rows).clamp(1, 6) };
-        // As many each time.
+        // Divide the planes into batches of equal size.
         let at_once = (planes as u64).div_ceil((planes as u64).div_ceil(at_once));
         if let Some(loss) = known.filter(|l| l.size == view.size && l.at_once as u64 == at_once) {
             return Ok(loss);
@@ -66,7 +67,7 @@ impl Loss {
         })
     }
 
-    /// The loss of a frame against its target, and the gradient by the frame.
+    /// Records the loss of a frame against its target, and the gradient with respect to the frame.
     pub fn record(
         &self,
         passes: &Training,
@@ -89,13 +90,13 @@ impl Loss {
         Ok(())
     }
 
-    /// What the last recorded loss was.
+    /// Reads the losses of the last recorded step.
     pub fn read(&self, gpu: &Gpu, view: &View, channels: Channels) -> Result<Losses> {
         let sums = 6 * RUN * view.tile_count() as usize;
         Ok(losses_of(view, channels, &gpu.read(&self.ssim_sums, sums)?, &gpu.read(&self.sums, 4 * sums)?))
     }
 
-    /// Adds what it takes.
+    /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
         let own = [&self.gradient, &self.rows, &self.partials, &self.ssim_sums, &self.sums];
         memory.frame += own.iter().map(|b| b.size()).sum::<u64>();
@@ -103,7 +104,7 @@ impl Loss {
 }
 
 impl Picture {
-    /// Adds what it takes.
+    /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
         memory.frame += self.frame.size();
     }

@@ -1,4 +1,4 @@
-//! Prefix sums and stable radix sorts, by chunks.
+//! Prefix sums and stable radix sorts over chunks of items.
 
 use super::kernels::Sorting;
 use crate::pass::Recorder;
@@ -7,10 +7,11 @@ use crate::view::Job;
 use crate::{Gpu, Result};
 use wgpu::Buffer;
 
-/// Values of an 8-bit digit.
+/// Number of values of an 8-bit digit.
 const DIGITS: u32 = 256;
 
-/// Ping-pong buffers of a radix sort, and the places of its digits in its chunks. Keys go into `keys[0]`.
+/// Double buffers of a radix sort, and the positions of its digits by chunk. Keys are written to
+/// `keys[0]`.
 pub struct Sort {
     pub keys: [Buffer; 2],
     pub values: [Buffer; 2],
@@ -19,7 +20,7 @@ pub struct Sort {
 }
 
 impl Sort {
-    /// Room for `n` keys.
+    /// Creates the buffers for `n` keys.
     pub fn new(gpu: &Gpu, what: &str, n: usize) -> Result<Self> {
         let make = || gpu.storage(what, 4 * n as u64);
         let places = DIGITS * gpu.shape.chunks(n as u32).0;
@@ -27,13 +28,14 @@ impl Sort {
         Ok(Self { keys: [make()?, make()?], values: [make()?, make()?], histogram, scan: Scan::new(gpu, what, places)? })
     }
 
-    /// What it takes.
+    /// Returns the size of the buffers in bytes.
     pub fn bytes(&self) -> u64 {
         let lists: u64 = self.keys.iter().chain(&self.values).map(Buffer::size).sum();
         lists + self.histogram.size() + self.scan.bytes()
     }
 
-    /// Sorts the first `n` keys by the lowest `bits`; returns the side that holds the result. Values come out as former places.
+    /// Sorts the first `n` keys by their lowest `bits`. Returns the index of the buffers that hold
+    /// the result. The values are the previous positions of the keys.
     pub fn record(&self, gpu: &Gpu, passes: &Sorting, r: &mut Recorder, n: u32, bits: u32) -> Result<usize> {
         let mut side = 0;
         let histogram = &self.histogram;
@@ -51,23 +53,24 @@ impl Sort {
     }
 }
 
-/// An exclusive prefix sum: the totals of its chunks, then that of all.
+/// Buffer of an exclusive prefix sum: the totals of its chunks, then the total of all items.
 pub struct Scan {
     totals: Buffer,
 }
 
 impl Scan {
-    /// For at most `n` items.
+    /// Creates the buffer for at most `n` items.
     pub fn new(gpu: &Gpu, what: &str, n: u32) -> Result<Self> {
         Ok(Self { totals: gpu.storage(what, 4 * (u64::from(gpu.shape.chunks(n).0) + 1))? })
     }
 
-    /// What it takes.
+    /// Returns the size of the buffer in bytes.
     pub fn bytes(&self) -> u64 {
         self.totals.size()
     }
 
-    /// Replaces `items` by their sums; [`Self::total`] then reads that of all.
+    /// Replaces `items` by their exclusive prefix sums. [`Self::total`] then reads the sum of all
+    /// items.
     pub fn record(&self, gpu: &Gpu, passes: &Sorting, r: &mut Recorder, items: &Buffer, n: u32) -> Result<()> {
         let (chunks, groups) = gpu.shape.chunks(n);
         let job = Job { n, shift: 0, first: 0, chunks };
@@ -76,7 +79,7 @@ impl Scan {
         r.run(&passes.scan_apply, &job, ScanApplyBuffers { items, totals }, groups)
     }
 
-    /// Sum of the `n` items of the last scan; `u32::MAX` where it is too large.
+    /// Returns the sum of the `n` items of the last scan; `u32::MAX` if it exceeds 32 bits.
     pub fn total(&self, gpu: &Gpu, n: u32) -> Result<u32> {
         let chunks = gpu.shape.chunks(n).0 as usize;
         Ok(gpu.read::<u32>(&self.totals, chunks + 1)?[chunks])

@@ -1,16 +1,16 @@
-//! Adam over the values of some Gaussians at once.
+//! Adam on the trained values of a block of Gaussians.
 
 use super::simd::vectorised;
 use crate::cpu::{FEATURES, OPACITY, moved, opacity_penalty};
 use crate::view::Step;
 
-/// Gaussians whose values lie together in the cache.
+/// Number of Gaussians updated together, so that their values stay in the cache.
 pub const BLOCK: usize = 32;
 
-/// Channels of a Gaussian with colour of the highest degree.
+/// Channels of a Gaussian with SH of degree 3, the highest.
 const MOST: usize = fastlgs_core::gaussians::channels(3);
 
-/// Values of up to [`BLOCK`] Gaussians, each `[gaussians][channels]`.
+/// Values, moments and gradients of up to [`BLOCK`] Gaussians, each `[gaussians][channels]`.
 pub struct Values<'a> {
     pub params: &'a mut [f32],
     pub moment1: &'a mut [f32],
@@ -18,7 +18,8 @@ pub struct Values<'a> {
     pub gradients: &'a [f32],
 }
 
-/// The next values of the trained channels. `rates` are those of [`BLOCK`] Gaussians, like the values.
+/// Updates the trained channels of a block. `rates` holds the learning rates of [`BLOCK`]
+/// Gaussians, laid out like the values.
 pub fn block(step: &Step, width: usize, rates: &[f32], values: Values) {
     let Values { params, moment1, moment2, gradients } = values;
     let trained = step.first_channel as usize..(step.end_channel as usize).min(width);
@@ -45,7 +46,7 @@ pub fn block(step: &Step, width: usize, rates: &[f32], values: Values) {
 }
 
 vectorised! {
-    /// Adam on values with their gradients.
+    /// Applies one Adam step to each value.
     fn adam(step: &Step, rates: &[f32], gradients: &[f32], params: &mut [f32], moment1: &mut [f32], moment2: &mut [f32]) = adam_body
 }
 

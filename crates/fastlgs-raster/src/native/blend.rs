@@ -1,20 +1,21 @@
-//! Blending and its gradients, a tile at a time: one of its rows in a vector of eight, or two in one of sixteen.
+//! Blending and its gradients, one tile at a time. A vector of 8 lanes holds one row of a tile, a
+//! vector of 16 lanes two.
 
 use super::lists::{Band, Lists};
 use super::simd::{SUMS, Vector, dispatched};
 use crate::cpu::{ALPHA_MIN, BATCH, LOG2_ALPHA_MAX, Splat};
 use crate::view::View;
 
-/// Pixels along a tile's edge.
+/// Tile edge in pixels.
 pub const EDGE: usize = crate::view::TILE as usize;
 
 /// A value for each pixel of a tile, row by row.
 pub type Tile = [f32; EDGE * EDGE];
 
-/// Zeros.
+/// A tile of zeros.
 pub const EMPTY: Tile = [0.0; EDGE * EDGE];
 
-/// Offsets of a tile's pixels from its upper left corner.
+/// x offsets of the pixel centres from the tile's upper left corner.
 const COLUMNS: Tile = {
     let mut out = EMPTY;
     let mut p = 0;
@@ -25,7 +26,7 @@ const COLUMNS: Tile = {
     out
 };
 
-/// The same along y.
+/// y offsets of the pixel centres from the tile's upper left corner.
 const ROWS: Tile = {
     let mut out = EMPTY;
     let mut p = 0;
@@ -36,19 +37,20 @@ const ROWS: Tile = {
     out
 };
 
-/// What the forward pass makes of a tile.
+/// Result of the forward pass for one tile.
 #[derive(Clone)]
 pub struct Blended {
-    /// r, g, b, f0, f1, f2; [`forward`] leaves the background out.
+    /// Sums of r, g, b, f0, f1, f2; [`forward`] does not add the background.
     pub sums: [Tile; 6],
-    /// Transmittance left.
+    /// Transmittance behind the processed Gaussians.
     pub transmittance: Tile,
-    /// Pairs walked.
+    /// Number of pairs processed.
     pub walked: u32,
 }
 
 impl Blended {
-    /// Writes the beginning of row `y` of a channel of [`Frame`](crate::engine::Frame).
+    /// Writes row `y` of one channel of [`Frame`](crate::engine::Frame) to `out`, which may be
+    /// shorter than a tile edge.
     pub fn write_row(&self, channel: usize, y: usize, out: &mut [f32]) {
         let own = y * EDGE..y * EDGE + out.len();
         match channel {
@@ -59,35 +61,35 @@ impl Blended {
     }
 }
 
-/// A tile's place and its list.
+/// A tile to blend: its position and its list of Gaussians.
 pub struct Job<'a> {
-    /// Upper left pixel.
+    /// x of the upper left pixel.
     pub x: f32,
-    /// Upper left pixel.
+    /// y of the upper left pixel.
     pub y: f32,
-    /// Places of the tile's Gaussians in its band, front to back.
+    /// Indices into the band's Gaussians, front to back.
     list: &'a [u32],
     band: &'a Band,
     lists: &'a Lists,
-    /// Transmittance below which a pixel needs no more of them.
+    /// Transmittance below which a pixel needs no more Gaussians.
     finished: f32,
 }
 
 impl<'a> Job<'a> {
-    /// The job of tile number `tile`.
+    /// Creates the job of tile `tile`; tiles are numbered row by row.
     pub fn new(view: &View, tile: usize, lists: &'a Lists) -> Self {
         let (column, row) = (tile % view.tiles[0] as usize, tile / view.tiles[0] as usize);
         let band = &lists.bands[row];
         Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, list: band.tile(column), band, lists, finished: view.finished }
     }
 
-    /// The Gaussians front to back.
+    /// Returns the Gaussians of the tile, front to back.
     pub fn gaussians(&self) -> impl Iterator<Item = u32> {
         self.list.iter().map(|place| self.band.gaussians[*place as usize])
     }
 }
 
-/// 1 for the pixels of the picture, 0 for those of the padding.
+/// Returns 1 for pixels of the image and 0 for pixels of the padding.
 pub fn shown(view: &View, job: &Job) -> Tile {
     let [w, h] = view.size.map(|s| s as f32);
     if job.x + EDGE as f32 <= w && job.y + EDGE as f32 <= h {
@@ -96,18 +98,18 @@ pub fn shown(view: &View, job: &Job) -> Tile {
     std::array::from_fn(|p| if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h { 1.0 } else { 0.0 })
 }
 
-/// A splat as it lies to a tile.
+/// A splat relative to a tile. log2 of its alpha is level + slope dy + qz dy^2.
 struct Placed<'a, V> {
     splat: &'a Splat,
-    /// Offsets of a vector's pixels along x; all vectors of the tile have the same.
+    /// x offsets of a vector's pixels from the mean, the same for all vectors of the tile.
     dx: V,
-    /// From the mean to the tile's upper edge.
+    /// y of the tile's upper edge minus y of the mean.
     down: f32,
-    /// Logarithm of alpha to base 2 where dy is 0.
+    /// log2 of alpha at dy = 0.
     level: V,
-    /// How fast it changes with dy there.
+    /// Derivative of log2 of alpha by dy at dy = 0.
     slope: V,
-    /// First pixels of the vectors in which it can reach the least alpha.
+    /// First pixel of each vector in which alpha may reach `ALPHA_MIN`.
     pixels: std::iter::StepBy<std::ops::Range<usize>>,
 }
 
@@ -126,37 +128,38 @@ impl<'a, V: Vector> Placed<'a, V> {
         Self { splat, dx, down, level, slope: V::splat(qy).mul(dx), pixels }
     }
 
-    /// Offsets along y of the vector that begins at pixel `p`.
+    /// Returns the y offsets from the mean of the vector that starts at pixel `p`.
     #[inline(always)]
     fn dy(&self, p: usize) -> V {
         V::load(&ROWS[p..]).add(V::splat(self.down))
     }
 
-    /// Alphas of that vector.
+    /// Returns the alphas of a vector with the y offsets `dy`.
     #[inline(always)]
     fn alphas(&self, dy: V) -> V {
         let [_, [qz, ..], _] = *self.splat;
         let exponent = V::splat(qz).madd(dy, self.slope).madd(dy, self.level);
-        // Far out on a long needle, rounding would lift it above any opacity. What is not a number stays none here, and becomes 0 below.
+        // The minimum is needed because rounding lifts the exponent far out on a long, thin
+        // Gaussian. A NaN passes the minimum and becomes 0 in the comparison.
         V::splat(LOG2_ALPHA_MAX).min(exponent).exp2().at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
-    /// Colour and feature.
+    /// Returns colour and feature, one vector for each channel.
     #[inline(always)]
     fn values(&self) -> [V; 6] {
         let [_, [_, _, r, g], [b, f0, f1, f2]] = *self.splat;
-        // `map` is not inlined here.
+        // Written out, because `map` is not inlined here.
         [V::splat(r), V::splat(g), V::splat(b), V::splat(f0), V::splat(f1), V::splat(f2)]
     }
 }
 
-/// Whether no pixel of the tile needs more.
+/// Returns whether all pixels are below the transmittance limit.
 #[inline(always)]
 fn finished(job: &Job<'_>, transmittance: &Tile) -> bool {
     transmittance.iter().all(|t| *t < job.finished)
 }
 
-/// What a vector of pixels takes of the light: the weights of a Gaussian with these alphas.
+/// Returns the blending weights for these alphas and subtracts them from the transmittance.
 #[inline(always)]
 fn taken<V: Vector>(alpha: V, transmittance: &mut [f32]) -> V {
     let light = V::load(transmittance);
@@ -165,14 +168,14 @@ fn taken<V: Vector>(alpha: V, transmittance: &mut [f32]) -> V {
     w
 }
 
-/// Channels of a step: colour 0..3, feature 3..6.
+/// Returns the channels of a step: colour 0..3, feature 3..6.
 #[inline(always)]
 fn channels<const COLOR: bool, const FEATURE: bool>() -> std::ops::Range<usize> {
     (if COLOR { 0 } else { 3 })..(if FEATURE { 6 } else { 3 })
 }
 
 dispatched! {
-    /// Blends the list of a tile; `out.transmittance` must hold 1 for pixels of the picture and 0 for others.
+    /// Blends the list of a tile. `out.transmittance` must be 1 in the image and 0 in the padding.
     fn forward<const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) = forward_body
 }
 
@@ -198,8 +201,9 @@ fn forward_body<V: Vector, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>
 }
 
 dispatched! {
-    /// Blending weights of a tile's Gaussians, summed by their ids: those that occur, in the order of the list.
-    /// `transmittance` must hold 1 for pixels of the picture and 0 for others.
+    /// Sums the blending weights of a tile's Gaussians by object id. The ids are in the order of
+    /// their first occurrence.
+    /// `transmittance` must be 1 in the image and 0 in the padding.
     fn by_id(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) = by_id_body
 }
 
@@ -228,8 +232,8 @@ fn by_id_body<V: Vector>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, s
 }
 
 dispatched! {
-    /// Blending weights of each Gaussian of a tile, summed over the pixels of each of `masks` (1 inside, 0 outside):
-    /// `[Gaussian of the list][mask]`, as far as the list is walked.
+    /// Sums the blending weights of each Gaussian over the pixels of each mask (1 inside, 0
+    /// outside). `sums` is `[Gaussian of the list][mask]` and ends where the tile is finished.
     fn by_mask(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) = by_mask_body
 }
 
@@ -243,7 +247,7 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
             for p in placed.pixels.clone() {
                 taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]).store(&mut weights[p..]);
             }
-            // Twelve masks at a time, as sums are added up.
+            // `V::sums` reduces SUMS vectors at a time.
             for masks in masks.chunks(SUMS) {
                 let mut inside = [V::splat(0.0); SUMS];
                 for (sum, mask) in inside.iter_mut().zip(masks) {
@@ -261,8 +265,10 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
 }
 
 dispatched! {
-    /// How much each Gaussian of a tile changes its pixels: the sum of squares of what colour, times `brightness`, they would gain or lose without
-    /// it, `[Gaussian of the list]`, as far as the list is walked. `behind` holds the tile's colours, background included.
+    /// Measures how much the pixels of a tile change without each Gaussian: the sum of squared
+    /// colour differences, each difference times `brightness`. `changes` has one value for each
+    /// Gaussian of the list, up to where the tile is finished. On entry `behind` holds the tile's
+    /// colours including the background.
     fn by_change(job: &Job<'_>, brightness: &[Tile; 3], behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>)
         = by_change_body
 }
@@ -285,7 +291,8 @@ fn by_change_body<V: Vector>(
             for p in placed.pixels.clone() {
                 let alpha = placed.alphas(placed.dy(p));
                 let w = taken(alpha, &mut transmittance[p..]);
-                // What lies behind is seen as if the Gaussian let all light through.
+                // Without the Gaussian, the colour behind it increases by alpha / (1 - alpha) times
+                // itself.
                 let more = alpha.div(one.sub(alpha));
                 for ((behind, brightness), value) in behind.iter_mut().zip(brightness).zip(values) {
                     let own = w.mul(value);
@@ -305,20 +312,20 @@ fn by_change_body<V: Vector>(
     }
 }
 
-/// What the backward pass starts from.
+/// Inputs of the backward pass for one tile.
 pub struct Given {
     /// dL/d(colour, feature).
     pub gradient: [Tile; 6],
-    /// R.g of the light behind; docs/gradients.md, section 1.
+    /// R.g, with R the colour behind the Gaussians processed so far; docs/gradients.md, section 1.
     pub r_dot_g: Tile,
-    /// 1 for pixels of the picture, 0 for others.
+    /// On entry 1 in the image and 0 in the padding.
     pub transmittance: Tile,
-    /// Pairs that the forward pass walked.
+    /// Number of pairs that the forward pass processes.
     pub walked: u32,
 }
 
 dispatched! {
-    /// Adds a tile's gradients to those of its band's Gaussians.
+    /// Adds the gradients of a tile to the slots of its band.
     fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; SUMS]])
         = backward_body
 }
@@ -373,7 +380,7 @@ mod tests {
     use crate::density::State;
     use crate::tests::{camera, cloud};
 
-    /// All that the bodies leave behind, with vectors of one width.
+    /// Runs all bodies with vectors of one width and concatenates their results.
     fn by<V: Vector>(view: &View, lists: &Lists, ids: &[u16], masks: &[Tile]) -> Vec<f32> {
         let mut out = Vec::new();
         for tile in 0..(view.tiles[0] * view.tiles[1]) as usize {
@@ -409,7 +416,7 @@ mod tests {
     fn vectors_of_sixteen_give_what_those_of_eight_do() {
         let scene = cloud(3000, 4, 1, true);
         let state = State::of(&scene);
-        // Neither side is a multiple of a tile's.
+        // Neither image side is a multiple of the tile edge.
         let view = View::new(&camera(93, 61), scene.len(), 1);
         let lists = Lists::new(&view, &transposed(&state.params, scene.len()));
         let ids: Vec<u16> = (0..scene.len() as u16).map(|k| k % 7).collect();

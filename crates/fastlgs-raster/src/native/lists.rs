@@ -5,44 +5,47 @@ use crate::cpu::{self, Footprint, NOT_DRAWN, Projected, Splat, span};
 use crate::view::View;
 use rayon::prelude::*;
 
-/// What blending walks through.
+/// Projected Gaussians of a view and its tile lists: the input of blending.
 pub(crate) struct Lists {
     /// Projected Gaussians.
     pub splats: Vec<Splat>,
-    /// Pixels up and down from each Gaussian's mean within which it reaches the least alpha.
+    /// Half height in pixels of the ellipse on which alpha equals the minimum, for each Gaussian.
     pub reach: Vec<f32>,
-    /// Rows of tiles.
+    /// One band for each row of tiles.
     pub bands: Vec<Band>,
-    /// Where each Gaussian stands in the bands, if their Gaussians are counted on from band to band: `places[first[g]..first[g + 1]]`.
+    /// Positions of each Gaussian in the concatenated `gaussians` of all bands. Those of Gaussian
+    /// `g` are `places[first[g]..first[g + 1]]`.
     pub places: Vec<u32>,
-    /// See `places`.
+    /// Start of each Gaussian's range in `places`, and the end of the last range.
     pub first: Vec<u32>,
 }
 
-/// A row of tiles. What a Gaussian adds up in its tiles stays at hand while the row is walked.
+/// A row of tiles. Gradients are summed for each row, so that the sums stay in the cache while its
+/// tiles are processed.
 pub(crate) struct Band {
-    /// The Gaussians that touch it, front to back.
+    /// Gaussians that touch the row, front to back.
     pub gaussians: Vec<u32>,
-    /// Lists of its tiles, one after the other: places in `gaussians`, front to back.
+    /// Concatenated lists of the row's tiles: indices into `gaussians`, front to back.
     pairs: Vec<u32>,
-    /// Where each tile's list ends.
+    /// End of each tile's list in `pairs`.
     ends: Vec<u32>,
 }
 
-/// A Gaussian in a row of tiles: the columns that it touches.
+/// The columns that one Gaussian touches in a row of tiles.
 struct Touch {
     gaussian: u32,
     columns: std::ops::Range<u32>,
 }
 
-/// Added to the reach: alphas are rounded.
+/// Pixels added to `reach`, because alphas are rounded.
 const ROUNDING: f32 = 0.01;
 
-/// Gaussians are listed in so many parts, whatever the number of threads.
+/// Number of parts in which Gaussians are assigned to rows of tiles, independent of the number of
+/// threads.
 const PARTS: usize = 16;
 
 impl Lists {
-    /// Lists of a view over Gaussians, `[n][channels]`.
+    /// Builds the lists of a view from trained values `[n][channels]`.
     pub fn new(view: &View, params: &[f32]) -> Self {
         let projected = project(view, params);
         let bands = bands(view, &projected);
@@ -51,19 +54,20 @@ impl Lists {
         Self { splats: splats(&projected), reach, bands, places, first }
     }
 
-    /// Projects again where only what does not move geometry has changed.
+    /// Projects the Gaussians again and keeps the lists. Only values that do not move geometry may
+    /// have changed.
     pub fn refresh(&mut self, view: &View, params: &[f32]) {
         self.splats = splats(&project(view, params));
     }
 
-    /// Memory that they take.
+    /// Returns the size of the lists in bytes.
     pub fn bytes(&self) -> usize {
         let words = |band: &Band| band.gaussians.len() + band.pairs.len() + band.ends.len();
         let words: usize = self.bands.iter().map(words).sum();
         size_of_val(self.splats.as_slice()) + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
     }
 
-    /// The places of a Gaussian; none beyond the last one.
+    /// Returns the places of a Gaussian, or an empty slice beyond the last Gaussian.
     pub fn places_of(&self, gaussian: usize) -> &[u32] {
         match self.first.get(gaussian..gaussian + 2) {
             Some([first, end]) => &self.places[*first as usize..*end as usize],
@@ -71,14 +75,15 @@ impl Lists {
         }
     }
 
-    /// Pairs of a tile and a Gaussian.
+    /// Returns the number of (tile, Gaussian) pairs.
     pub fn pairs(&self) -> usize {
         self.bands.iter().map(|band| band.pairs.len()).sum()
     }
 }
 
 impl Band {
-    /// From what touches the row, front to back: a counting sort by column, which keeps that order.
+    /// Builds the lists of a row from `touches`, which are sorted front to back. The counting sort
+    /// by column is stable and keeps that order.
     fn new<'a>(columns: u32, touches: impl Iterator<Item = &'a Touch> + Clone) -> Self {
         let mut next = vec![0; columns as usize + 1];
         for column in touches.clone().flat_map(|t| t.columns.clone()) {
@@ -98,17 +103,17 @@ impl Band {
         Self { gaussians: touches.map(|t| t.gaussian).collect(), pairs, ends: next }
     }
 
-    /// The list of a tile.
+    /// Returns the list of a tile: indices into `gaussians`, front to back.
     pub fn tile(&self, column: usize) -> &[u32] {
         let start = if column == 0 { 0 } else { self.ends[column - 1] };
         &self.pairs[start as usize..self.ends[column] as usize]
     }
 }
 
-/// Gaussians that are projected in one piece.
+/// Number of Gaussians that one task projects.
 const BLOCK: usize = 256;
 
-/// Projects Gaussians, `[n][channels]`.
+/// Projects all Gaussians from trained values `[n][channels]`.
 fn project(view: &View, params: &[f32]) -> Vec<Projected> {
     let nothing = Projected { splat: [[0.0; 4]; 3], depth: NOT_DRAWN, footprint: [[0.0; 4]; 2] };
     let mut projected = vec![nothing; view.gaussians as usize];
@@ -122,7 +127,7 @@ fn project(view: &View, params: &[f32]) -> Vec<Projected> {
 }
 
 vectorised! {
-    /// Projects some Gaussians, from number `first` on; `out` holds what is not drawn.
+    /// Projects the Gaussians from index `first` on. On entry `out` marks all of them as not drawn.
     fn project_block(view: &View, first: u32, width: usize, params: &[f32], out: &mut [Projected]) = project_block_body
 }
 
@@ -139,19 +144,19 @@ fn splats(projected: &[Projected]) -> Vec<Splat> {
     projected.par_iter().map(|p| p.splat).collect()
 }
 
-/// Drawn Gaussians by ascending depth; those of the same depth by their number.
+/// Returns the drawn Gaussians by ascending depth. Equal depths are ordered by index.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
     let depths: Vec<u32> = projected.par_iter().map(|p| p.depth).collect();
     let drawn = (0..).zip(&depths).filter(|(_, depth)| **depth != NOT_DRAWN).map(|(g, _)| g).collect();
-    // The lower digit first: sorting by the higher one keeps the order of those that have it in common.
+    // Radix sort: the lower digit first, as the stable sort by the higher digit keeps its order.
     [0, DIGIT].into_iter().fold(drawn, |order, shift| by_digit(&order, |g| (depths[g as usize] >> shift) as usize % (1 << DIGIT)))
 }
 
-/// Bits of a digit of depths, which have two.
+/// Bits of a radix digit. A depth key has two digits.
 const DIGIT: u32 = 12;
 const _: () = assert!(NOT_DRAWN < 1 << (2 * DIGIT));
 
-/// Counting sort.
+/// Sorts stably by one digit (counting sort).
 fn by_digit(order: &[u32], digit: impl Fn(u32) -> usize) -> Vec<u32> {
     let mut next = vec![0; (1 << DIGIT) + 1];
     order.iter().for_each(|g| next[digit(*g) + 1] += 1);
@@ -167,7 +172,7 @@ fn by_digit(order: &[u32], digit: impl Fn(u32) -> usize) -> Vec<u32> {
     sorted
 }
 
-/// The rows of tiles, each with its Gaussians in order of depth.
+/// Builds the rows of tiles, each with its Gaussians in depth order.
 fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
     let order = in_depth_order(projected);
     let touched = |gaussians: &[u32]| {
@@ -180,11 +185,11 @@ fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
     (0..view.tiles[1] as usize).into_par_iter().map(band).collect()
 }
 
-/// Rows of tiles that are looked at together.
+/// Number of rows of tiles whose spans are computed together, so that the loop vectorises.
 const ROWS: usize = 8;
 
 vectorised! {
-    /// Adds to each row of tiles what touches it, in the order of `gaussians`.
+    /// Appends each Gaussian to the rows of tiles that it touches, in the order of `gaussians`.
     fn touches(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) = touches_body
 }
 
@@ -209,7 +214,7 @@ fn touches_body<const FMA: bool>(view: &View, projected: &[Projected], gaussians
     }
 }
 
-/// Where each Gaussian's places begin, and the places; see [`Lists::places`].
+/// Returns `first` and `places` of `Lists`.
 fn places(bands: &[Band], count: usize) -> (Vec<u32>, Vec<u32>) {
     let all = || bands.iter().flat_map(|band| &band.gaussians).map(|g| *g as usize);
     let mut first = vec![0; count + 1];
@@ -230,7 +235,7 @@ mod tests {
     use super::*;
     use fastlgs_core::rng::Rng;
 
-    /// Gaussians that are nothing but a depth and a footprint.
+    /// Returns a Gaussian that has only a depth and a footprint.
     fn of(depth: u32, footprint: Footprint) -> Projected {
         Projected { splat: [[0.0; 4]; 3], depth, footprint }
     }
@@ -249,7 +254,7 @@ mod tests {
 
     #[test]
     fn rows_of_tiles_hold_what_touches_them() {
-        // Nineteen rows of tiles, and ellipses from a fraction of one to more than all.
+        // 19 rows of tiles. The ellipses cover from less than one row to more than all rows.
         let view = View::new(&crate::tests::camera(90, 150), 4, 0);
         let round = |x: f32, y: f32, r: f32| {
             let rows = |y: f32| (y / 8.0).floor().clamp(0.0, 19.0);

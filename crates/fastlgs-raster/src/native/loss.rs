@@ -1,4 +1,4 @@
-//! L1 + D-SSIM and its gradient, row by row.
+//! The loss (1 - lambda) L1 + lambda (1 - SSIM) and its gradient, computed row by row.
 
 use super::picture::Picture;
 use super::simd::{madd, vectorised};
@@ -7,20 +7,21 @@ use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 use rayon::prelude::*;
 
-/// Intermediate pictures of the loss, kept between steps.
+/// Intermediate images of the loss, reused between steps.
 #[derive(Default)]
 pub struct Scratch {
-    /// What is compared, x and y, and the weights of pixels: `[h][3][w]`.
+    /// Rendered value x, target value y and weight of each pixel, `[h][3][w]`.
     compared: Vec<f32>,
-    /// Derivatives of SSIM by its moments, blurred along rows: `[h][3][w]`.
+    /// Derivatives of SSIM by three local moments, blurred along rows, `[h][3][w]`.
     blurred: Vec<f32>,
 }
 
-/// Weights of SSIM's window.
+/// Weights of the SSIM window.
 type Window = [f32; 2 * SSIM_RADIUS + 1];
 
 vectorised! {
-    /// Weighted sums of the same places of some rows: of neighbours along a row, the rows are that row shifted.
+    /// Writes out[i] = sum over k of window[k] rows[k][i]. For a blur along a row, `rows` are
+    /// shifted slices of that row.
     fn blur(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) = blur_body
 }
 
@@ -36,12 +37,13 @@ fn blur_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS +
     }
 }
 
-/// Blurs a row; `padded` holds it with SSIM_RADIUS zeros on both sides.
+/// Blurs a row. `padded` is the row with SSIM_RADIUS zeros on both sides.
 fn blur_row(window: &Window, padded: &[f32], out: &mut [f32]) {
     blur(window, &std::array::from_fn(|k| &padded[k..k + out.len()]), out);
 }
 
-/// For each tap of the window around row `j` its weight, and the row, of `rows` of `line` floats. Beyond the picture there are zeros.
+/// Returns the weight and the row of each tap of the window around row `j`. `rows` holds rows of
+/// `line` floats. Taps outside the image have weight 0.
 fn taps<'a>(window: &Window, rows: &'a [f32], line: usize, j: usize) -> (Window, [&'a [f32]; 2 * SSIM_RADIUS + 1]) {
     let held = |k: usize| (j + k).checked_sub(SSIM_RADIUS).and_then(|row| rows.get(row * line..(row + 1) * line));
     let taps: [_; 2 * SSIM_RADIUS + 1] = std::array::from_fn(held);
@@ -50,7 +52,8 @@ fn taps<'a>(window: &Window, rows: &'a [f32], line: usize, j: usize) -> (Window,
 }
 
 vectorised! {
-    /// Weighted sums of x, y, x^2 + y^2 and x y over rows that hold x and then y, into four lines of `out` from place SSIM_RADIUS on.
+    /// Writes the weighted sums over `rows` of x, y, x^2 + y^2 and x y to the four lines of `out`.
+    /// Each row holds x, then y. The values of a line start at SSIM_RADIUS.
     fn moments(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) = moments_body
 }
 
@@ -71,7 +74,8 @@ fn moments_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIU
 }
 
 vectorised! {
-    /// x, y and the weights of a row of pixels `[3][w]`.
+    /// Writes x, y and the weights of a row of pixels to `out` `[3][w]`. x is the rendered value
+    /// with exposure applied, y the target.
     fn compare(plane: &Plane, rendered: &[f32], packed: &[u32], out: &mut [f32]) = compare_body
 }
 
@@ -89,11 +93,11 @@ fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32]
     }
 }
 
-/// Values of a row that are worked on together.
+/// Number of values of a row that are processed together.
 const LANES: usize = 16;
 
-/// The values of some rows from place `first` on; beyond their ends there are zeros. (`map` over an array is a function of its own, which would not be
-/// compiled for the vectors of the one that calls it.)
+/// Returns `LANES` values of each row from index `first` on, with zeros beyond the end of a row. A
+/// loop is used because `map` over an array is not compiled with the caller's vector instructions.
 #[inline(always)]
 fn lanes<const ROWS: usize>(rows: [&[f32]; ROWS], first: usize) -> [[f32; LANES]; ROWS] {
     let mut values = [[0.0; LANES]; ROWS];
@@ -107,7 +111,7 @@ fn lanes<const ROWS: usize>(rows: [&[f32]; ROWS], first: usize) -> [[f32; LANES]
     values
 }
 
-/// Writes values to a row from place `first` on, as far as it goes.
+/// Writes values to a row from index `first` on, up to the end of the row.
 #[inline(always)]
 fn put(row: &mut [f32], first: usize, values: &[f32; LANES]) {
     let rest = &mut row[first..];
@@ -118,12 +122,13 @@ fn put(row: &mut [f32], first: usize, values: &[f32; LANES]) {
 }
 
 impl Scratch {
-    /// Floats held.
+    /// Returns the number of floats held.
     pub fn words(&self) -> usize {
         self.compared.len() + self.blurred.len()
     }
 
-    /// Writes dL/d frame of one channel into `gradient` and adds to `losses`; `targets` is `[2][h][w]`, not padded.
+    /// Writes dL/d frame of one channel to `gradient` and its part of the loss to `losses`.
+    /// `targets` is `[2][h][w]` without padding.
     pub fn plane(&mut self, plane: &Plane, frame: &Picture<8>, targets: &[u32], gradient: &mut Picture<6>, losses: &mut Losses) {
         let [w, h] = plane.size.map(|s| s as usize);
         let channel = plane.channel as usize;
@@ -174,7 +179,8 @@ impl Scratch {
     }
 }
 
-/// Room for a row of windows: lines with SSIM_RADIUS zeros on both sides, and without.
+/// Buffers for the SSIM windows of one row of pixels. Lines of `padded` have SSIM_RADIUS zeros on
+/// both sides.
 struct Moments {
     padded: Vec<f32>,
     moments: Vec<f32>,
@@ -186,7 +192,8 @@ impl Moments {
         Self { padded: vec![0.0; 4 * (w + 2 * SSIM_RADIUS)], moments: vec![0.0; 4 * w], partials: vec![0.0; 3 * w] }
     }
 
-    /// The sum of SSIM over a row of windows; its derivatives by the moments, blurred along the row, into `out` `[3][w]`.
+    /// Returns the sum of SSIM over a row of pixels. Writes its derivatives by the moments, blurred
+    /// along the row, to `out` `[3][w]`.
     fn ssim(&mut self, window: &Window, weights: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) -> f64 {
         let w = out.len() / 3;
         let Self { padded, moments: blurred, partials } = self;
@@ -207,7 +214,8 @@ impl Moments {
 }
 
 vectorised! {
-    /// SSIM of a row from its four local moments `[4][w]`, summed; `out` `[3][w]` gets its derivatives.
+    /// Computes the SSIM of a row from its four local moments `[4][w]`. Writes its derivatives by
+    /// the mean of x, of x^2 + y^2 and of x y to `out` `[3][w]`, and its sum to `sum`.
     fn derivatives(moments: &[f32], out: &mut [f32], sum: &mut f64) = derivatives_body
 }
 
@@ -233,7 +241,7 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
             by[0][i] = 2.0 * my[i] * (b - a) * inverse - 2.0 * mx[i] * ssim * (d - c) * inverse;
             by[1][i] = -ssim * (c * inverse);
             by[2][i] = 2.0 * a * inverse;
-            // Beyond the row both pictures are black.
+            // Lanes beyond the row compare zeros and must not count.
             sums[i] += if first + i < w { ssim } else { 0.0 };
         }
         [&mut *by_mean, by_square, by_product].into_iter().zip(&by).for_each(|(row, values)| put(row, first, values));
@@ -242,8 +250,10 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
 }
 
 vectorised! {
-    /// dL/d frame of a row into `out`, and sums of |x - y| and of dL/d gain, offset and background. `by` `[3][w]`: SSIM by its moments, blurred;
-    /// `light`: what was rendered, and transmittance.
+    /// Writes dL/d frame of a row to `out`. `sums` receives the sums of |x - y| and of dL/d gain,
+    /// dL/d offset and dL/d background.
+    /// `by` `[3][w]` holds the blurred derivatives of SSIM by its moments, `light` the rendered
+    /// values and the transmittance.
     fn gradients(plane: &Plane, compared: &[f32], by: &[f32], light: [&[f32]; 2], out: &mut [f32], sums: &mut [f64; 4]) = gradients_body
 }
 
@@ -255,7 +265,7 @@ fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], 
     let [by_mean, by_square, by_product] = [0, 1, 2].map(|m| &by[m * w..(m + 1) * w]);
     let mut totals = [[0.0; LANES]; 4];
     for first in (0..w).step_by(LANES) {
-        // Beyond the row weights are 0.
+        // Lanes beyond the row have weight 0.
         let [x, y, weight, rendered, transmittance] = lanes([x, y, weight, rendered, transmittance], first);
         let [by_mean, by_square, by_product] = lanes([by_mean, by_square, by_product], first);
         let mut values = [0.0; LANES];

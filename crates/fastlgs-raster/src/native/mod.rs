@@ -1,4 +1,4 @@
-//! The fast CPU backend: the same frames and gradients as the shaders', with vectors and all cores.
+//! The CPU engine: computes the same frames and gradients as the shaders, with SIMD on all cores.
 
 mod adam;
 pub(crate) mod blend;
@@ -24,15 +24,16 @@ use simd::{AHEAD, SUMS};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
-/// Bytes of lists that are kept where Gaussians do not move; further views make theirs anew.
+/// Limit in bytes of the tile lists that are kept while geometry is frozen. Lists of further views
+/// are computed anew in every step.
 const CACHE_LIMIT: usize = 1 << 30;
 
-/// [`Engine`] on the processor.
+/// [`Engine`] on the CPU.
 #[derive(Default)]
 pub struct CpuEngine {
     n: usize,
     sh_degree: u32,
-    /// Trained values and moments, each `[n][channels]`.
+    /// Trained values, `[n][channels]`. Moments and gradients have the same layout.
     params: Vec<f32>,
     moment1: Vec<f32>,
     moment2: Vec<f32>,
@@ -43,22 +44,24 @@ pub struct CpuEngine {
     gradient: Picture<6>,
     scratch: loss::Scratch,
     walked: Vec<u32>,
-    /// Sums over the tiles of a row, for each place of [`Lists::places`].
+    /// Gradient sums of a Gaussian over the tiles of one row. [`Lists::places`] holds indices into
+    /// it.
     slots: Vec<[f32; SUMS]>,
     lists: Option<Lists>,
-    /// Lists of views whose geometry is frozen.
+    /// Tile lists by target id, kept while geometry is frozen.
     cached: HashMap<usize, Lists>,
     losses: Losses,
     profile: Option<BTreeMap<&'static str, f64>>,
 }
 
-/// `[n][channels]` from `[channels][n]`, or with the roles changed the other way round.
+/// Transposes `[channels][n]` into `[n][channels]`. With the number of channels as `n`, transposes
+/// back.
 pub(crate) fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
     let channels = columns.len() / n.max(1);
     (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
 }
 
-/// The heaviest ids, heavier ones first.
+/// Returns the `KEPT` ids with the largest weights as packed id weights, in descending order.
 fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
     let mut best = [(0, 0.0); KEPT];
     for (id, weight) in weights {
@@ -71,7 +74,7 @@ fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
     best.map(|(id, weight)| pack(id, weight))
 }
 
-/// What a tile shows, background included; channels that are not asked for are 0.
+/// Blends a tile including the background. Channels that are not requested are 0.
 fn blended<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, tile: usize) -> Blended {
     let job = Job::new(view, tile, lists);
     let shown = blend::shown(view, &job);
@@ -87,7 +90,7 @@ fn blended<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, t
     out
 }
 
-/// [`blended`] with these channels.
+/// Returns [`blended`] for these channels.
 fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
     match channels {
         Channels::Color => blended::<true, false>,
@@ -97,7 +100,7 @@ fn blended_by(channels: Channels) -> fn(&View, &Lists, usize) -> Blended {
 }
 
 impl CpuEngine {
-    /// An engine without Gaussians.
+    /// Creates an engine without Gaussians.
     pub fn new() -> Self {
         Self::default()
     }
@@ -111,10 +114,11 @@ impl CpuEngine {
         out
     }
 
-    /// Projects and lists the Gaussians of a view.
+    /// Projects the Gaussians of a view and builds its tile lists. `frozen` is the id of the target
+    /// whose cached lists are reused while geometry is frozen.
     fn list(&mut self, view: &View, frozen: Option<usize>) -> Result<()> {
         if view.gaussians as usize != self.n || self.n == 0 {
-            return Err(Error::Invalid(format!("the view was made for {} Gaussians, the device holds {}", view.gaussians, self.n)));
+            return Err(Error::Invalid(format!("the view expects {} Gaussians, but the engine holds {}", view.gaussians, self.n)));
         }
         self.timed("lists", |s| {
             s.lists = match frozen.and_then(|id| s.cached.remove(&id)) {
@@ -128,7 +132,7 @@ impl CpuEngine {
         Ok(())
     }
 
-    /// What the losses compare, and how far each tile's list was walked.
+    /// Renders the frame that the loss compares. Stores how many pairs each tile processes.
     fn blend(&mut self, view: &View, channels: Channels) {
         self.frame.prepare(view);
         self.walked.resize(view.tile_count() as usize, 0);
@@ -152,7 +156,7 @@ impl CpuEngine {
         let lists = self.lists.as_ref().expect("made by the forward pass");
         self.slots.resize(lists.places.len(), [0.0; SUMS]);
         let tiles_x = view.tiles[0] as usize;
-        // Each row of tiles owns a stretch of the slots.
+        // Each row of tiles owns a contiguous range of the slots.
         let mut bands = Vec::new();
         let mut rest = &mut self.slots[..];
         for band in &lists.bands {
@@ -180,7 +184,7 @@ impl CpuEngine {
         });
     }
 
-    /// From slots to gradients, statistics and the next values.
+    /// Computes gradients, statistics and the next trained values from the slots.
     fn update(&mut self, view: &View, channels: Channels, step: &Step) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
         let (slots, width) = (&self.slots, channels_of(self.sh_degree));
@@ -269,7 +273,7 @@ impl Engine for CpuEngine {
         self.list(&view, None)?;
         let (lists, blended) = (self.lists.as_ref().expect("made a line above"), blended_by(channels));
         let (mut frame, width) = (Frame::new(&View { pairs: lists.pairs() as u32, ..view }), view.size[0] as usize);
-        // Of each plane what lies in a row of tiles.
+        // Splits each plane into the pixel rows of each row of tiles.
         let mut planes: Vec<_> = frame.data.chunks_exact_mut(view.pixels()).map(|plane| plane.chunks_mut(EDGE * width)).collect();
         let band = |_| -> Vec<&mut [f32]> { planes.iter_mut().filter_map(Iterator::next).collect() };
         let bands: Vec<Vec<&mut [f32]>> = (0..view.tiles[1]).map(band).collect();
@@ -310,15 +314,15 @@ impl Engine for CpuEngine {
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {
         let channels = options.channels;
         if self.targets.get(&id).is_none_or(|t| t.size != view.size) {
-            return Err(Error::Invalid(format!("no target {id} of {}x{}", view.size[0], view.size[1])));
+            return Err(Error::Invalid(format!("target {id} of size {}x{} is missing; call set_target first", view.size[0], view.size[1])));
         }
         if channels.feature() {
-            // Pixels without feature do not count.
-            let target = self.targets.get_mut(&id).expect("looked at above");
+            // Pixels without a feature do not enter the loss.
+            let target = self.targets.get_mut(&id).expect("checked above");
             target.color.resize(2 * view.pixels(), 0);
         }
         let frozen = (channels == Channels::Feature).then_some(id);
-        // Lists that are kept hold all Gaussians.
+        // Cached lists must contain all Gaussians, so no Gaussian is dropped.
         let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
         self.list(&view, frozen)?;
         self.timed("blend", |s| s.blend(&view, channels));
@@ -371,7 +375,7 @@ impl Engine for CpuEngine {
     }
 }
 
-/// Which vectors the processor has, for reports.
+/// Returns the vector instructions of the processor, for reports.
 fn x86_vectors() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {

@@ -1,36 +1,36 @@
-//! What is rendered and its gradient, as rows of tiles are written and read.
+//! Image planes of the CPU engine, laid out so that a row of tiles is contiguous.
 
 use super::blend::{self, Job, Tile};
 use crate::view::{TILE, View};
 use rayon::prelude::*;
 
-/// Planes padded to whole tiles, `[row][C][padded width]`, so that a row of tiles is one piece of memory.
+/// Planes padded to whole tiles, `[row][C][padded width]`. A row of tiles is contiguous in memory.
 #[derive(Default)]
 pub struct Picture<const C: usize> {
-    /// Padded pixels along x.
+    /// Padded width in pixels.
     pub width: usize,
-    /// The values.
+    /// Values of all planes.
     pub data: Vec<f32>,
 }
 
 impl<const C: usize> Picture<C> {
-    /// Takes the size of a view.
+    /// Resizes the planes for a view.
     pub fn prepare(&mut self, view: &View) {
         self.width = (view.tiles[0] * TILE) as usize;
         self.data.resize(C * view.padded_pixels(), 0.0);
     }
 
-    /// A row of pixels of a channel.
+    /// Returns a row of pixels of one channel.
     pub fn row(&self, channel: usize, y: usize) -> &[f32] {
         &self.data[(y * C + channel) * self.width..][..self.width]
     }
 
-    /// Rows of pixels, all channels of each.
+    /// Iterates in parallel over the rows of pixels, each with all channels.
     pub fn rows_mut(&mut self) -> rayon::slice::ChunksExactMut<'_, f32> {
         self.data.par_chunks_exact_mut(C * self.width)
     }
 
-    /// The pixels of a tile.
+    /// Returns the pixels of a tile of one channel.
     pub fn tile(&self, channel: usize, job: &Job) -> Tile {
         let mut tile = blend::EMPTY;
         for (y, row) in tile.chunks_exact_mut(TILE as usize).enumerate() {

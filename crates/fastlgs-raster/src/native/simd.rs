@@ -1,20 +1,21 @@
-//! Arithmetic of the vectorised bodies: [`fastlgs_core::simd`] where the compiler finds the vectors by itself, and [`Vector`] where it does not.
+//! SIMD arithmetic: [`fastlgs_core::simd`] for loops that the compiler vectorises, [`Vector`] for
+//! loops that it does not.
 
 pub(super) use fastlgs_core::vectorised;
 
 #[cfg(target_arch = "x86_64")]
 pub(super) use x86::{Avx2, Avx512};
 
-/// a * b + c.
+/// Returns a * b + c, fused if `FMA`.
 #[inline(always)]
 pub fn madd<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
     if FMA { a.mul_add(b, c) } else { a * b + c }
 }
 
-/// So many Gaussians before it is their turn, what is known of them and lies anywhere is [`prefetch`]ed.
+/// Number of Gaussians that [`prefetch`] runs ahead of scattered reads.
 pub const AHEAD: usize = 8;
 
-/// Has a value of up to two cache lines brought to the cache.
+/// Prefetches a value of up to two cache lines into the cache.
 #[inline(always)]
 pub fn prefetch<T>(value: &T) {
     #[cfg(target_arch = "x86_64")]
@@ -22,7 +23,7 @@ pub fn prefetch<T>(value: &T) {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         let first = std::ptr::from_ref(value).cast::<i8>();
         for end in [first, first.wrapping_add(size_of::<T>() - 1)] {
-            // SAFETY: a hint, of an address that is there.
+            // SAFETY: a prefetch is only a hint, and the addresses lie in `value`.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(end) };
         }
     }
@@ -30,53 +31,56 @@ pub fn prefetch<T>(value: &T) {
     let _ = value;
 }
 
-/// Sums that a pair leaves behind.
+/// Number of floats of a gradient slot.
 pub const SUMS: usize = 12;
 
-/// One register of floats.
+/// One SIMD register of floats.
 ///
-/// In a body with many sums the compiler packs sums instead of pixels into registers, and shuffles more than it adds: so registers have a type.
+/// The type is explicit because, in a body with many sums, the compiler packs sums instead of
+/// pixels into registers and mostly shuffles.
 pub trait Vector: Copy {
-    /// Floats in it.
+    /// Number of floats.
     const LANES: usize;
 
-    /// The same value everywhere.
+    /// Returns a vector with `value` in all lanes.
     fn splat(value: f32) -> Self;
-    /// The first values of a slice.
+    /// Loads the first values of a slice. Panics if the slice is too short.
     fn load(from: &[f32]) -> Self;
-    /// Writes the first values of a slice.
+    /// Writes to the first values of a slice. Panics if the slice is too short.
     fn store(self, to: &mut [f32]);
-    /// self + b.
+    /// Returns self + b.
     fn add(self, b: Self) -> Self;
-    /// self - b.
+    /// Returns self - b.
     fn sub(self, b: Self) -> Self;
-    /// self * b.
+    /// Returns self * b.
     fn mul(self, b: Self) -> Self;
-    /// self / b.
+    /// Returns self / b.
     fn div(self, b: Self) -> Self;
-    /// self * b + c.
+    /// Returns self * b + c.
     fn madd(self, b: Self, c: Self) -> Self;
-    /// The larger of both.
+    /// Returns the larger value of each lane; `b` if either is NaN.
     fn max(self, b: Self) -> Self;
-    /// The smaller of both.
+    /// Returns the smaller value of each lane; `b` if either is NaN.
     fn min(self, b: Self) -> Self;
-    /// self, and 0 where it is below `least`.
+    /// Returns self, with 0 in lanes that are below `least` or NaN.
     fn at_least_or_zero(self, least: Self) -> Self;
-    /// The sum of each vector's floats.
+    /// Returns the sum of the lanes of each vector.
     fn sums(all: &[Self; SUMS]) -> [f32; SUMS];
 
-    /// The nearest whole numbers, as [`Self::times_power_of_two`] takes them, and what is left of self.
+    /// Splits self into the nearest integers, as [`Self::times_power_of_two`] expects them, and the
+    /// remainders.
     fn split(self) -> (Self, Self);
-    /// self * 2^k.
+    /// Returns self * 2^k, with k from [`Self::split`].
     fn times_power_of_two(self, k: Self) -> Self;
 
-    /// 2^x for x up to 126, within 2e-7 of it; for x below -126 something from 0 to 2^-126.
+    /// Returns 2^self for self up to 126, with a relative error of about 2e-7. Below -126 the
+    /// result lies between 0 and 2^-126.
     #[inline(always)]
-    // One coefficient is nearly ln 2.
+    // One coefficient is close to ln 2.
     #[allow(clippy::approx_constant)]
     fn exp2(self) -> Self {
         let (k, f) = self.split();
-        // The polynomial of degree 5 with 1 at 0 whose largest relative error from -1/2 to 1/2 is least.
+        // Polynomial of degree 5 with p(0) = 1 and the least maximum relative error on [-1/2, 1/2].
         let mut p = Self::splat(1.326_472_7e-3);
         for c in [9.671_513e-3, 5.550_733_6e-2, 2.402_224_2e-1, 6.931_47e-1, 1.0] {
             p = p.madd(f, Self::splat(c));
@@ -85,10 +89,10 @@ pub trait Vector: Copy {
     }
 }
 
-/// Added, it rounds to the nearest whole number, which then stands in the lowest bits.
+/// 1.5 * 2^23. Adding it rounds to the nearest integer, which is then in the lowest mantissa bits.
 const ROUND: f32 = 12_582_912.0;
 
-/// [`Vector::split`] where no instruction does it.
+/// Implements [`Vector::split`] without a rounding instruction.
 #[inline(always)]
 fn split<V: Vector>(x: V) -> (V, V) {
     let x = x.max(V::splat(-126.0));
@@ -96,7 +100,7 @@ fn split<V: Vector>(x: V) -> (V, V) {
     (shifted, x.sub(shifted.sub(V::splat(ROUND))))
 }
 
-/// Floats that the compiler may keep in whatever registers there are.
+/// `N` floats in an array. The compiler chooses the registers.
 #[derive(Clone, Copy)]
 pub struct Portable<const N: usize>([f32; N]);
 
@@ -117,12 +121,12 @@ impl<const N: usize> Vector for Portable<N> {
 
     #[inline(always)]
     fn load(from: &[f32]) -> Self {
-        Self(*from.first_chunk().expect("as long as a vector"))
+        Self(*from.first_chunk().expect("slice holds a vector"))
     }
 
     #[inline(always)]
     fn store(self, to: &mut [f32]) {
-        *to.first_chunk_mut().expect("as long as a vector") = self.0;
+        *to.first_chunk_mut().expect("slice holds a vector") = self.0;
     }
 
     #[inline(always)]
@@ -190,8 +194,8 @@ impl<const N: usize> Vector for Portable<N> {
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
-    //! Registers of x86-64. Each function of a type may only be called where the processor has what the type is named after, which is what
-    //! [`super::dispatched`] looks for; slices that are too short are refused.
+    //! SIMD registers of x86-64. The functions of a type require the instructions that the type is
+    //! named after; [`super::dispatched`] checks for them. Slices that are too short cause a panic.
 
     use super::{SUMS, Vector};
     use std::arch::x86_64::*;
@@ -204,7 +208,7 @@ mod x86 {
     #[derive(Clone, Copy)]
     pub struct Avx512(__m512);
 
-    /// Implements a method by an expression of intrinsics.
+    /// Implements methods by intrinsics.
     macro_rules! by_intrinsics {
         ($(fn $name:ident($($arg:ident),*) = $body:expr;)*) => {
             $(
@@ -250,14 +254,14 @@ mod x86 {
 
         #[inline(always)]
         fn load(from: &[f32]) -> Self {
-            assert!(from.len() >= Self::LANES, "as long as a vector");
+            assert!(from.len() >= Self::LANES, "slice is shorter than a vector");
             // SAFETY: see the module.
             Self(unsafe { _mm256_loadu_ps(from.as_ptr()) })
         }
 
         #[inline(always)]
         fn store(self, to: &mut [f32]) {
-            assert!(to.len() >= Self::LANES, "as long as a vector");
+            assert!(to.len() >= Self::LANES, "slice is shorter than a vector");
             // SAFETY: see the module.
             unsafe { _mm256_storeu_ps(to.as_mut_ptr(), self.0) }
         }
@@ -265,9 +269,10 @@ mod x86 {
         #[inline(always)]
         fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
             let mut out = [0.0; SUMS];
-            // SAFETY: see the module; `out` has eight and four floats.
+            // SAFETY: see the module; `out` holds 8 + 4 floats.
             unsafe {
-                // Halves of two vectors are added side by side, then quarters of four, then eighths of eight.
+                // Adds the halves of two vectors, then the quarters of four, then the eighths of
+                // eight.
                 let halves = |i: usize, j: usize| {
                     let (a, b) = (all[i].0, all[j].0);
                     _mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b))
@@ -313,14 +318,14 @@ mod x86 {
 
         #[inline(always)]
         fn load(from: &[f32]) -> Self {
-            assert!(from.len() >= Self::LANES, "as long as a vector");
+            assert!(from.len() >= Self::LANES, "slice is shorter than a vector");
             // SAFETY: see the module.
             Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
         }
 
         #[inline(always)]
         fn store(self, to: &mut [f32]) {
-            assert!(to.len() >= Self::LANES, "as long as a vector");
+            assert!(to.len() >= Self::LANES, "slice is shorter than a vector");
             // SAFETY: see the module.
             unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
         }
@@ -337,8 +342,8 @@ mod x86 {
     }
 }
 
-/// `dispatched! { fn name<const ...>(args) = body }`: `name` runs `body::<V, ...>` with the widest [`Vector`] that the processor has. The body is an
-/// `#[inline(always)]` function.
+/// `dispatched! { fn name<const ...>(args) = body }` defines `name`, which runs `body::<V, ...>`
+/// with the widest [`Vector`] of the processor. `body` must be `#[inline(always)]`.
 macro_rules! dispatched {
     ($(#[$doc:meta])* fn $name:ident $(<$(const $p:ident: bool),+>)? ($($arg:ident: $ty:ty),* $(,)?) = $body:ident) => {
         $(#[$doc])*
@@ -373,11 +378,11 @@ mod tests {
     use super::*;
 
     dispatched! {
-        /// The widest vectors.
+        /// Checks the widest vectors of the processor.
         fn widest(check: &mut u32) = check_body
     }
 
-    /// A vector's arithmetic against that of its floats.
+    /// Checks vector arithmetic against scalar arithmetic.
     #[inline(always)]
     fn check_body<V: Vector>(checked: &mut u32) {
         let read = |v: V| {
@@ -408,7 +413,7 @@ mod tests {
         for low in [-1e9, -1000.5, -160.0, -127.3] {
             assert!((0.0..1.2e-38).contains(&read(V::splat(low).exp2())[0]), "2^{low}");
         }
-        // As alphas are made: what is not a number reaches nothing.
+        // Alphas are computed like this. NaN must give 0.
         let alpha = |x: f32| read(V::splat(-0.5).min(V::splat(x)).exp2().at_least_or_zero(V::splat(0.01)))[0];
         assert_eq!([f32::NAN, f32::NEG_INFINITY, -200.0].map(alpha), [0.0; 3]);
         assert_eq!([f32::INFINITY, 1e9].map(alpha), [alpha(-0.5); 2]);
@@ -421,7 +426,7 @@ mod tests {
         check_body::<Portable<8>>(&mut checked);
         check_body::<Portable<16>>(&mut checked);
         widest(&mut checked);
-        println!("checked: portable ones of 8 and 16, and vectors of {}", checked - 24);
+        println!("checked: portable vectors of 8 and 16 lanes, and vectors of {} lanes", checked - 24);
         assert!(checked >= 32);
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {

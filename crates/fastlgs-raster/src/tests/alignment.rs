@@ -1,4 +1,4 @@
-//! Cameras are found again where the scene says that they were.
+//! Tests of pose refinement: displaced cameras return to their true poses.
 
 use super::{camera, cloud};
 use crate::align::{self, STEPS, align};
@@ -8,7 +8,7 @@ use fastlgs_core::Camera;
 use fastlgs_core::rng::Rng;
 use glam::{Mat4, Quat, Vec3};
 
-/// The camera, turned and shifted by about so many pixels.
+/// Returns the camera, rotated and shifted at random by about `pixels`.
 fn moved(camera: &Camera, pixels: f32, rng: &mut Rng) -> Camera {
     let mut random = |size: f32| size * Vec3::new(rng.normal(), rng.normal(), rng.normal());
     let turn = Quat::from_scaled_axis(random(pixels / camera.fx));
@@ -16,7 +16,7 @@ fn moved(camera: &Camera, pixels: f32, rng: &mut Rng) -> Camera {
     Camera { world_to_camera: Mat4::from_rotation_translation(turn, shift) * camera.world_to_camera, ..camera.clone() }
 }
 
-/// Mean distance in pixels between where two cameras see points of the cloud.
+/// Returns the mean pixel distance between the projections of eight points by two cameras.
 fn apart(a: &Camera, b: &Camera) -> f32 {
     let points: Vec<Vec3> = (0..8).map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5).collect();
     let see = |c: &Camera, p: &Vec3| c.to_pixel(c.world_to_camera.transform_point3(*p));
@@ -33,7 +33,7 @@ fn a_camera_is_found_again() {
     let shown = engine.render(frame(&truth), Channels::Color).unwrap();
     let exposure = Exposure { gain: [0.8, 0.9, 1.0], offset: [0.05, 0.0, 0.0] };
     let byte = |c: usize, p: usize| ((exposure.gain[c] * shown.channels(c, c + 1)[p] + exposure.offset[c]).clamp(0.0, 1.0) * 255.0) as u8;
-    // A tenth of the photo shows something else.
+    // A tenth of the photo shows something that the scene does not contain.
     let pixel = |p: usize| if p % 203 < 20 { pack([250, 0, 250], true) } else { pack([byte(0, p), byte(1, p), byte(2, p)], true) };
     let image = TargetImage { size: [203, 151], color: (0..203 * 151).map(pixel).collect(), feature: Vec::new() };
     let mut rng = Rng::new(1, "poses");
@@ -50,7 +50,7 @@ fn all_together_cameras_stay() {
     let mut rng = Rng::new(2, "poses");
     let eye = |k: usize| 4.0 * Vec3::new((0.3 * k as f32).sin(), 0.1, -(0.3 * k as f32).cos());
     let before: Vec<Camera> = (0..12).map(|k| Camera::look_at("a", eye(k), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)).collect();
-    // The whole ring is moved, and each camera a little.
+    // All cameras move together, and each one by a small random amount.
     let whole = Mat4::from_rotation_translation(Quat::from_rotation_y(0.02), Vec3::new(0.1, -0.05, 0.02));
     let shifted = |c: &Camera| Camera { world_to_camera: c.world_to_camera * whole, ..c.clone() };
     let mut after: Vec<Camera> = before.iter().map(|c| moved(&shifted(c), 0.2, &mut rng)).collect();

@@ -1,4 +1,5 @@
-//! Whole frames and steps: GPU against CPU, pages and windows against one piece, passes as twins against all on the device.
+//! Tests of whole frames and steps: GPU against CPU, several pages and windows against one, CPU
+//! twins in place of GPU passes.
 
 use super::{CHANNELS, assert_close, camera, cloud, gpu, shaped, target};
 use crate::density::State;
@@ -11,7 +12,8 @@ fn options(channels: Channels) -> StepOptions {
     StepOptions { channels, lambda: 0.2, feature_weight: 0.7, exposure }
 }
 
-/// Frame (channels that were asked for, and transmittance) and gradients of one step with learning rates of zero.
+/// Returns the frame (requested channels and transmittance), gradients and losses of one step with
+/// learning rates of 0.
 fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, size: (u32, u32)) -> (Vec<f32>, Vec<f32>, crate::Losses) {
     engine.set_state(state).unwrap();
     engine.set_target(0, target(size.0, size.1)).unwrap();
@@ -21,7 +23,7 @@ fn once(engine: &mut dyn Engine, view: View, channels: Channels, state: &State, 
     let n = (size.0 * size.1) as usize;
     let asked = |c: usize| if c < 3 { channels.color() } else { c >= 6 || channels.feature() };
     let planes = frame.data.chunks_exact(n).take(7).enumerate();
-    assert!(planes.clone().filter(|(c, _)| !asked(*c)).all(|(_, plane)| plane.iter().all(|v| *v == 0.0)), "what was not asked for is 0");
+    assert!(planes.clone().filter(|(c, _)| !asked(*c)).all(|(_, plane)| plane.iter().all(|v| *v == 0.0)), "channels that were not requested are 0");
     let shown = planes.filter(|(c, _)| asked(*c)).flat_map(|(_, plane)| plane.to_vec()).collect();
     (shown, engine.gradients().unwrap(), engine.losses().unwrap())
 }
@@ -69,27 +71,29 @@ fn many_bindings_give_what_one_gives() {
     let state = State::of(&scene);
     let view = View::new(&camera(96, 64), scene.len(), 1).without(0.25, 7);
     for (whole, mut small) in shaped().zip(shaped()) {
-        // Pages of 64 Gaussians' values would be 26 x 64 x 4 bytes; the splats need 48 bytes each in one piece.
+        // Trained values need 26 x 4 bytes for each Gaussian and may be split into pages. Splats
+        // need 48 bytes for each Gaussian in one binding.
         small.max_binding = 48 * scene.len() as u64 + 16;
-        assert!(u64::from(26 * scene.len() as u32 * 4) > small.max_binding / 2, "several pages");
+        assert!(u64::from(26 * scene.len() as u32 * 4) > small.max_binding / 2, "the trained values need several pages");
         let shape = whole.shape;
         let (mut whole, mut small) = (GpuEngine::new(whole), GpuEngine::new(small));
         for channels in CHANNELS {
             let a = once(&mut whole, view, channels, &state, (96, 64));
             let b = once(&mut small, view, channels, &state, (96, 64));
             assert_eq!(a.0, b.0, "{channels:?}, {shape:?}");
-            // Windows begin runs of slots elsewhere, and so add them up in another order.
+            // Runs of slots start elsewhere in each window, so that sums are added in another
+            // order.
             if shape.fold() == 1 {
                 assert_eq!(a.1, b.1, "{channels:?}, {shape:?}");
             }
             assert_close(&format!("gradients, {channels:?}, {shape:?}"), &a.1, &b.1, 1e-3, 0.001);
         }
     }
-    // Half of that does not hold the splats: said, not drawn wrong.
+    // Half of that cannot hold the splats. The engine must report an error.
     let Some(mut tiny) = super::gpu() else { return };
     tiny.max_binding = 24 * scene.len() as u64;
     let message = GpuEngine::new(tiny).set_state(&state).unwrap_err().to_string();
-    assert!(message.contains("lower --size or --budget"), "{message}");
+    assert!(message.contains("lower the option size or budget"), "{message}");
 }
 
 #[test]
@@ -127,7 +131,7 @@ fn frozen_geometry_keeps_its_lists_and_learns_features() {
         }
         assert!(errors[19] < 0.9 * errors[0], "{}: {errors:?}", engine.name());
         let after = engine.state().unwrap().params;
-        assert_eq!(after[..14 * 2000], state.params[..14 * 2000], "geometry and colour stay");
+        assert_eq!(after[..14 * 2000], state.params[..14 * 2000], "geometry and colour do not change");
     }
 }
 
@@ -157,7 +161,7 @@ fn gpu_and_cpu_agree_on_objects() {
     for (n, w, h) in [(300, 17, 13), (5000, 270, 479), (20_000, 1440, 1080)] {
         let scene = cloud(n, 5, 0, true);
         let view = View::new(&camera(w, h), scene.len(), 0);
-        // Objects are patches of space, as in scenes, so that few meet in a pixel.
+        // Objects are compact regions, as in real scenes, so that few objects meet in a pixel.
         let ids: Vec<u16> = scene.means.iter().map(|m| u16::from(m.x > 0.0) + 2 * u16::from(m.y > 0.0)).collect();
         let both = [&mut device as &mut dyn Engine, &mut cpu].map(|engine| {
             engine.set_state(&State::of(&scene)).unwrap();
@@ -176,7 +180,7 @@ fn gpu_and_cpu_agree_on_objects() {
 fn what_is_clear_shows_nothing_but_hides_where_it_counts_as_solid() {
     let mut scene = cloud(2000, 5, 0, true);
     let plain = scene.clone();
-    // A pane before the left half of the picture, in four rows of spheres.
+    // A transparent pane in front of the left half of the image: four rows of spheres.
     let camera = camera(96, 64);
     let to_world = camera.world_to_camera.inverse();
     for k in 0..24 {
@@ -220,12 +224,12 @@ fn a_step_leaves_out_its_share() {
     let [all, some, others] = [view, view.without(0.2, 1), view.without(0.2, 2)].map(&mut drawn);
     let count = |drawn: &[bool]| drawn.iter().filter(|d| **d).count() as f64;
     assert!((count(&some) / count(&all) - 0.8).abs() < 0.02, "{} of {}", count(&some), count(&all));
-    assert_ne!(some, others, "each step draws anew");
+    assert_ne!(some, others, "each draw leaves out other Gaussians");
 }
 
 #[test]
 fn those_that_are_left_make_up_for_the_others() {
-    // Faint enough that half of the light passes.
+    // Low opacities let about half of the light through.
     let mut scene = cloud(1500, 3, 0, true);
     scene.opacity_logits.fill(-1.5);
     let view = View::new(&camera(96, 64), scene.len(), 0);
@@ -240,7 +244,8 @@ fn those_that_are_left_make_up_for_the_others() {
         };
         (0..20).map(of_draw).sum::<f64>() / 20.0
     };
-    // The last without what makes up: its opacities are lowered by as much.
+    // In the third case, opacities are multiplied by 0.8, which cancels the gain of the Gaussians
+    // that are kept.
     let (whole, thinned, without) = (through(1.0, 0.0), through(1.0, 0.2), through(0.8, 0.2));
     assert!((0.2..0.8).contains(&whole) && (thinned - whole).abs() < 0.2 * (without - whole), "{whole}, {thinned}, {without}");
 }

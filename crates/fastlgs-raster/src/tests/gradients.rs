@@ -1,4 +1,5 @@
-//! Gradients of all that is trained against differences of an independent renderer and loss in double precision.
+//! Tests of all gradients against finite differences of an independent renderer and loss in double
+//! precision.
 
 use super::{camera, shaped};
 use crate::density::State;
@@ -12,7 +13,7 @@ const SIZE: (usize, usize) = (24, 16);
 const LAMBDA: f64 = 0.2;
 const FEATURE_WEIGHT: f64 = 0.7;
 
-/// What is not stored with the Gaussians.
+/// Trained values that are not stored with the Gaussians: background and exposure.
 #[derive(Clone)]
 struct Around {
     background: [f64; 6],
@@ -30,7 +31,7 @@ struct Splat {
     values: [f64; 6],
 }
 
-/// Six planes and the loss's picture of them: every Gaussian on every pixel, from the formulas of the 3DGS paper.
+/// Renders six planes with the formulas of the 3DGS paper, every Gaussian at every pixel.
 fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
     let n = view.gaussians as usize;
     let at = |c: usize, i: usize| params[c * n + i];
@@ -88,7 +89,8 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
     planes
 }
 
-/// Real spherical harmonics of degrees 1 to 3, from the table of Sloan (2008) with the signs of 3DGS.
+/// Returns the real spherical harmonics of degrees 1 to 3, from the table of Sloan (2008) with the
+/// signs of 3DGS.
 fn harmonics(d: DVec3) -> [f64; 15] {
     let (x, y, z) = (d.x, d.y, d.z);
     let pi = std::f64::consts::PI;
@@ -114,7 +116,8 @@ fn harmonics(d: DVec3) -> [f64; 15] {
     ]
 }
 
-/// (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the weighted one of the feature.
+/// Returns (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the same of the feature times its
+/// weight.
 fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
     let (w, h) = SIZE;
     let n = w * h;
@@ -151,7 +154,8 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
         .sum()
 }
 
-/// Wide, faint Gaussians that cover the whole picture, so that no cut-off moves under a difference; far enough to be drawn.
+/// Returns wide, faint Gaussians that cover the whole image, so that no finite difference crosses a
+/// cut-off. They are far enough to be drawn.
 fn scene(sh_degree: u32) -> Gaussians {
     let mut rng = Rng::new(11, "gradients");
     let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
@@ -177,7 +181,7 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
         background_feature: [x, y, z, 0.0],
         ..View::new(&camera(SIZE.0 as u32, SIZE.1 as u32), n, sh_degree)
     };
-    // One of the six is left out by this draw.
+    // This draw leaves out one of the six Gaussians.
     let view = if sh_degree == 1 { view.without(0.2, 6) } else { view };
     let wave = |i: usize| (127.0 + 100.0 * (i as f64 * 0.05).sin()) as u8;
     let pixels = SIZE.0 * SIZE.1;
@@ -225,7 +229,8 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     }
 }
 
-/// A Gaussian whose opacity reaches its limit only by the gain of DropGaussian: light that wants more of it moves nothing.
+/// Checks a Gaussian whose opacity reaches its limit only by the gain of DropGaussian. A loss that
+/// asks for more opacity must give the gradient 0.
 fn check_limit(engine: &mut dyn Engine) {
     let mut scene = Gaussians::default();
     // 0.9 / (1 - 0.2) is above the largest opacity.
@@ -233,7 +238,7 @@ fn check_limit(engine: &mut dyn Engine) {
     let (w, h) = (SIZE.0 as u32, SIZE.1 as u32);
     let drawn = |draw: u32| View::new(&camera(w, h), 1, 0).without(0.2, draw);
     let is_drawn = |view: &View| crate::cpu::pcg3d(glam::UVec3::new(0, view.draw, 2)).x >= view.dropped;
-    let view = (0..).map(drawn).find(is_drawn).expect("most draws leave it in");
+    let view = (0..).map(drawn).find(is_drawn).expect("most draws keep the Gaussian");
     engine.set_state(&State::of(&scene)).unwrap();
     let target = TargetImage { size: view.size, color: vec![pack([255; 3], true); SIZE.0 * SIZE.1], feature: Vec::new() };
     engine.set_target(0, target).unwrap();

@@ -1,4 +1,5 @@
-//! Every pass against its CPU twin on a real adapter, both engines against each other, and gradients against differences.
+//! Tests: every pass against its CPU twin, both engines against each other, gradients against
+//! finite differences.
 
 mod alignment;
 mod engines;
@@ -11,7 +12,8 @@ use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
 use glam::Vec3;
 
-/// The adapter, or a loud skip. FASTLGS_REQUIRE_GPU=1 turns the skip into a failure (set by test.sh).
+/// Opens the adapter. Without one, prints that the test is skipped, or panics if
+/// FASTLGS_REQUIRE_GPU is set (test.sh sets it).
 pub(crate) fn gpu() -> Option<Gpu> {
     match Gpu::open("auto") {
         Ok(gpu) => Some(gpu),
@@ -23,7 +25,7 @@ pub(crate) fn gpu() -> Option<Gpu> {
     }
 }
 
-/// The adapter in each kernel shape, as it would be opened for it.
+/// Opens the adapter once for each kernel shape.
 pub(crate) fn shaped() -> impl Iterator<Item = Gpu> {
     Shape::ALL.into_iter().filter_map(|shape| {
         let mut gpu = gpu()?;
@@ -36,10 +38,11 @@ pub(crate) fn camera(width: u32, height: u32) -> Camera {
     Camera::look_at("test", Vec3::new(0.3, 0.5, -4.0), Vec3::ZERO, Vec3::Y, width, height, 0.9)
 }
 
-/// A cloud around the origin; `nasty` adds Gaussians that must not be drawn or are hard to draw.
+/// Returns a random cloud around the origin. `nasty` adds Gaussians that must not be drawn or are
+/// hard to draw.
 pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussians {
     let mut rng = Rng::new(seed, "cloud");
-    // The more there are, the smaller they are, as in trained scenes.
+    // Larger clouds have smaller Gaussians, as trained scenes do.
     let shrink = (n as f32 / 20_000.0).max(1.0).ln();
     let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
     for i in 0..n {
@@ -55,23 +58,24 @@ pub(crate) fn cloud(n: usize, seed: u64, sh_degree: u32, nasty: bool) -> Gaussia
         scene.push_sphere(Vec3::new(0.0, 0.0, -9.0), 0.1, 0.5, [1.0; 3]); // behind the camera
         scene.push_sphere(at(f32::NAN), 0.1, 0.5, [1.0; 3]);
         scene.push_sphere(at(0.1), 1e-8, 0.9, [1.0, 0.0, 0.0]);
-        scene.push_sphere(at(0.2), 4.0, 0.1, [0.0, 1.0, 0.0]); // fills the picture, and yet is drawn
-        scene.push_sphere(at(0.22), 50.0, 0.1, [0.0, 1.0, 0.0]); // one stands in it
-        scene.push_sphere(at(0.25), 1e30, 0.1, [0.0, 1.0, 0.0]); // a covariance that is not finite
+        scene.push_sphere(at(0.2), 4.0, 0.1, [0.0, 1.0, 0.0]); // fills the image, but is drawn
+        scene.push_sphere(at(0.22), 50.0, 0.1, [0.0, 1.0, 0.0]); // contains the camera
+        scene.push_sphere(at(0.25), 1e30, 0.1, [0.0, 1.0, 0.0]); // covariance is not finite
         scene.push_sphere(at(0.3), 0.1, 0.5, [0.0, 0.0, 1.0]);
-        scene.push_sphere(at(0.3), 0.1, 0.5, [1.0, 0.0, 1.0]); // the same depth
+        scene.push_sphere(at(0.3), 0.1, 0.5, [1.0, 0.0, 1.0]); // same depth as the previous one
         *scene.opacity_logits.last_mut().unwrap() = 40.0; // opacity 1
         scene.push_sphere(at(0.4), 0.1, 0.5, [1.0; 3]);
         *scene.opacity_logits.last_mut().unwrap() = -40.0; // opacity 0
         scene.push_sphere(at(0.5), 0.1, 0.5, [1.0; 3]);
-        *scene.rotations.last_mut().unwrap() = [0.0; 4]; // no rotation at all
-        // Black is where colour is cut off: its gradient there is a matter of rounding, which devices have not in common.
+        *scene.rotations.last_mut().unwrap() = [0.0; 4]; // zero quaternion
+        // Colours are clamped at black. The gradient there depends on rounding, which differs
+        // between devices.
         scene.sh_dc[n..].iter_mut().for_each(|c| *c = c.max(Vec3::splat(-1.7)));
     }
     scene
 }
 
-/// A wavy picture; every 31st pixel does not count.
+/// Returns a target of waves. Every 31st pixel does not enter the loss.
 pub(crate) fn target(width: u32, height: u32) -> TargetImage {
     let wave = |i: u32, c: u32| (127.0 + 100.0 * ((i + 977 * c) as f32 * 0.013).sin()) as u8;
     let plane = |from: u32| (0..width * height).map(|i| pack([wave(i, from), wave(i, from + 1), wave(i, from + 2)], i % 31 != 0)).collect();
@@ -84,7 +88,8 @@ fn floats(words: &[u32]) -> &[f32] {
     bytemuck::cast_slice(words)
 }
 
-/// Tight agreement but for a bounded share of values, which flip where a Gaussian crosses a cut-off.
+/// Asserts that `a` and `b` agree within `tolerance`, except for the share `flips` of the values.
+/// Values flip where a Gaussian crosses a cut-off.
 fn assert_close(what: &str, a: &[f32], b: &[f32], tolerance: f32, flips: f64) {
     assert_eq!(a.len(), b.len(), "{what}: lengths");
     let scale = b.iter().filter(|v| v.is_finite()).fold(0.0f32, |m, v| m.max(v.abs())).max(1e-6);

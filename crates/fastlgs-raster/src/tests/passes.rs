@@ -1,4 +1,4 @@
-//! Each WGSL pass against its twin, on the twins' own inputs.
+//! Tests of each WGSL pass against its CPU twin, on inputs that the twins compute.
 
 use super::{CHANNELS, assert_close, camera, cloud, floats, gpu};
 use crate::Shape;
@@ -12,10 +12,11 @@ use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::rng::Rng;
 use std::collections::BTreeMap;
 
-/// Gaussians, width, height: from one to two hundred thousand, in pictures with empty and with crowded tiles.
+/// (Gaussians, width, height): 1 to 200,000 Gaussians, in images with empty and with crowded tiles.
 const SIZES: [(usize, u32, u32); 5] = [(1, 17, 13), (300, 64, 48), (5000, 97, 61), (20_000, 270, 480), (200_000, 480, 360)];
 
-/// Runs one pass on the device; `buffers` hold the storage buffers in the order of their bindings and are replaced.
+/// Runs one pass on the device. `buffers` holds the storage buffers in the order of their bindings;
+/// the results replace them.
 fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mut [Vec<u32>], groups: Groups) {
     let storages: Vec<_> = buffers.iter().map(|b| gpu.storage_with("test", b).unwrap()).collect();
     let mut r = Recorder::new(gpu, 0);
@@ -26,7 +27,7 @@ fn on_device<U: bytemuck::Pod>(gpu: &Gpu, pass: &Pass, uniform: &U, buffers: &mu
     }
 }
 
-/// Both results of a pass on the same buffers: the device's, then the twin's.
+/// Runs a pass and its twin on the same buffers. Returns the device's buffers, then the twin's.
 fn both<U: bytemuck::Pod>(
     gpu: &Gpu,
     shader: &'static Shader,
@@ -43,7 +44,7 @@ fn both<U: bytemuck::Pod>(
     [device, twin]
 }
 
-/// One page with the kernels' stride, as words.
+/// Returns `[channels][n]` as one page with the kernels' stride, as words.
 fn page(params: &[f32], n: usize) -> Vec<u32> {
     let padding = std::iter::repeat_n(0.0f32, stride(n) - n);
     params.chunks_exact(n).flat_map(|c| c.iter().copied().chain(padding.clone())).map(f32::to_bits).collect()
@@ -53,7 +54,7 @@ fn zeros(n: usize) -> Vec<u32> {
     vec![0; n]
 }
 
-/// Everything up to blending, by the twins.
+/// Results of all passes before blending, computed by the twins.
 struct Lists {
     view: View,
     params: Vec<u32>,
@@ -69,7 +70,7 @@ fn twin<U: bytemuck::Pod>(all: &mut BTreeMap<&'static str, Vec<u32>>, name: &str
     }
 }
 
-/// Stable sort of `keys`; the former places go to `values`.
+/// Sorts `keys` stably. `values` receives the original indices.
 fn sort_twin(all: &mut BTreeMap<&'static str, Vec<u32>>, keys: &'static str, values: &'static str) {
     let list = &all[keys];
     let mut order: Vec<u32> = (0..list.len() as u32).collect();
@@ -147,7 +148,7 @@ fn sorting_and_scanning() {
         let values: Vec<u32> = (0..n as u32).rev().collect();
         let (chunks, groups) = shape.chunks(n as u32);
         let job = Job { n: n as u32, shift: 8, first: 0, chunks };
-        // Results of the buffers from `judged` on are the twin's.
+        // Buffers from index `judged` on must equal the twin's.
         let exact = |shader: &'static Shader, job: &Job, buffers: &[&[u32]], groups: u32, judged: usize| {
             let [device, twin] = both(&gpu, shader, Channels::Both, false, job, buffers, groups);
             assert_eq!(device[judged..], twin[judged..], "{} of {n} in the shape {shape:?}", shader.name);
@@ -163,12 +164,12 @@ fn sorting_and_scanning() {
         };
         let (places, total) = scanned(&histogram);
         assert_eq!(total as usize, n);
-        // What a chunk leaves behind in its places is its own affair.
+        // The pass uses the histogram as scratch space, so that it is not compared.
         let sorted = exact(shaders::RadixScatter::SHADER, &job, &[&keys, &values, &places, &zeros(n), &zeros(n)], groups, 3);
         assert!(sorted[3].windows(2).all(|p| p[0] >> 8 <= p[1] >> 8));
-        // Ties keep their order, which here is that of falling values.
+        // Equal digits keep their order; here their values descend.
         assert!((1..n).all(|i| sorted[3][i - 1] >> 8 != sorted[3][i] >> 8 || sorted[4][i - 1] > sorted[4][i]));
-        // Sums beyond 32 bits stay at the largest value instead of starting anew.
+        // Sums beyond 32 bits saturate instead of wrapping.
         assert_eq!(scanned(&vec![u32::MAX / 2; 3 * n.max(2)]).1, u32::MAX);
     }
 }
@@ -190,7 +191,7 @@ fn listing() {
             [b("order"), b("offsets"), b("footprints"), b("touched"), &blank[..pairs], &blank[..pairs], &blank[..b("first").len()]];
         exact(shaders::Emit::SHADER, &inputs, l.view.gaussians * gpu.shape.writers());
         exact(shaders::TileRanges::SHADER, &[b("tiles"), &vec![0; b("ranges").len()]], l.view.pairs);
-        // log2 may differ in its last bit, and with it the key by one.
+        // log2 may differ in its last bit, and the key by 1.
         let [device, twin] = both(
             &gpu,
             shaders::TileLoad::SHADER,
@@ -242,10 +243,10 @@ fn room_that_emit_leaves_over_is_nobodys() {
     let groups = (n as u32 * gpu.shape.writers()).div_ceil(64);
     let [device, emitted] = both(&gpu, shaders::Emit::SHADER, Channels::Both, false, &view, &inputs, groups);
     assert_eq!(device, emitted);
-    assert_eq!(emitted[3], b("touched"), "what is counted is what was found");
+    assert_eq!(emitted[3], b("touched"), "`touched` is the number of tiles found");
     let nowhere = emitted[4].iter().filter(|tile| **tile == view.tile_count()).count();
     assert_eq!(nowhere, 3 * touched.iter().filter(|t| **t > 0).count());
-    // Slots of leftover room are never written, and must not be added up.
+    // Slots of surplus pairs are never written and must not be added up.
     let slots: Vec<u32> =
         emitted[4].iter().flat_map(|tile| [if *tile == view.tile_count() { f32::NAN } else { 1.0 }; 12]).map(f32::to_bits).collect();
     let inputs = [&emitted[3][..], &emitted[6], &emitted[5], &slots];
@@ -270,7 +271,7 @@ fn blending_and_its_gradients() {
         let l = lists(n, w, h, sh_degree, k % 2 == 1);
         let view = l.view;
         let b = |name: &str| &l.buffers[name][..];
-        // The largest size once, the others in all shapes and for all that can be trained.
+        // The largest size runs once, the others in all shapes and with all channels.
         let choices = Shape::ALL.iter().rev().flat_map(|s| CHANNELS.iter().map(move |c| (*s, *c)));
         for (shape, channels) in choices.take(if n > 100_000 { 1 } else { 12 }) {
             gpu.shape = shape;
@@ -315,7 +316,8 @@ fn blending_and_its_gradients() {
     }
 }
 
-/// Shares of the same pixel agree whatever their order: the weight of each id to a thousandth, but for a few pixels.
+/// Asserts that the id weights of each pixel agree within 0.001 in any order, except for the share
+/// `flips` of the pixels.
 fn assert_same_shares(what: &str, a: impl Iterator<Item = [u32; 4]>, b: impl Iterator<Item = [u32; 4]>, flips: f64) {
     let weight = |pixel: &[u32; 4], id: u32| pixel.iter().filter(|s| *s >> 16 == id).map(|s| s & 0xffff).sum::<u32>();
     let agree = |a: &[u32; 4], b: &[u32; 4]| a.iter().chain(b).all(|s| weight(a, s >> 16).abs_diff(weight(b, s >> 16)) <= 66);
@@ -332,7 +334,8 @@ fn blending_ids() {
         let l = lists(n, w, h, 0, false);
         let b = |name: &str| &l.buffers[name][..];
         let pixels = l.view.padded_pixels();
-        // With three objects nothing is ever dropped; with forty, where many Gaussians overlap, the lightest are.
+        // With 3 objects no id is dropped. With 40 objects the lightest ids are dropped where many
+        // Gaussians overlap.
         for (objects, flips) in [(3, 0.002), (40, 0.01)] {
             let ids: Vec<u32> = (0..l.view.gaussians).map(|g| g % objects).collect();
             let buffers = [b("ranges"), b("sorted"), b("gaussians"), b("splats"), &ids, &zeros(4 * pixels)];
@@ -389,6 +392,6 @@ fn adam() {
         for k in 1..4 {
             assert_close("adam", floats(&device[k]), floats(&twin[k]), 1e-3, 0.0);
         }
-        assert_eq!(device[1][..3 * stride(n)], params[..3 * stride(n)], "channels that are not trained stay");
+        assert_eq!(device[1][..3 * stride(n)], params[..3 * stride(n)], "channels that are not trained do not change");
     }
 }

@@ -1,4 +1,5 @@
-//! Whole runs: resumed ones, all strategies, and what is learned beside the Gaussians.
+//! Tests of whole trainings: resumed runs, budgets, free space, and learned exposure and
+//! background.
 
 use super::{camera, cloud, gpu, target};
 use crate::{Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, TrainConfig, TrainReport, Trainer};
@@ -93,7 +94,7 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
     resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     assert!(whole.gaussians().unwrap() == resumed.gaussians().unwrap());
     let (by_color, _) = run(config.clone());
-    assert!(whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means, "geometry follows masks");
+    assert!(whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means, "masks change geometry");
     let refused = start().couple(|_, _| Err(crate::Error::Invalid("no objects".to_owned())));
     assert!(refused.is_err());
 }
@@ -102,7 +103,7 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
 fn what_views_look_through_stays_empty() {
     let config = TrainConfig { iterations: 100, refine_until: 0.8, budget: Budget::Fixed(400), ..TrainConfig::default() };
     let cameras: Vec<Camera> = views(24).into_iter().map(|view| view.camera).collect();
-    // A wall behind the cloud, which three cameras are known to see.
+    // A wall behind the cloud, observed by three cameras.
     let steps = || (-20..=20).map(|k| 0.1 * k as f32);
     let wall = steps().flat_map(|x| steps().map(move |y| Vec3::new(x, y, 3.0)));
     let wall: Vec<SfmPoint> = wall.map(|position| SfmPoint { position, color: [0; 3], seen_by: vec![0, 1, 2] }).collect();
@@ -116,7 +117,7 @@ fn what_views_look_through_stays_empty() {
         trainer.gaussians().unwrap().means.iter().filter(|mean| free.holds(**mean)).count()
     };
     let [as_it_is, kept_free] = [false, true].map(left);
-    assert!(as_it_is > 20 && 10 * kept_free < as_it_is, "{as_it_is} before the wall, and {kept_free}");
+    assert!(as_it_is > 20 && 10 * kept_free < as_it_is, "{as_it_is} Gaussians in free space without the rule, {kept_free} with it");
 }
 
 #[test]
@@ -136,7 +137,8 @@ fn an_automatic_budget_removes_what_changes_little() {
 
 #[test]
 fn exposure_and_background_are_learned() {
-    // Photos of a constant grey that nothing but background and exposure can explain: no Gaussian is in sight.
+    // Photos of constant grey. No Gaussian is visible, so that only background and exposure can fit
+    // them.
     let mut targets = views(2);
     let gray = |v: u8| vec![crate::pack([v; 3], true); 64 * 48];
     (targets[0].image.color, targets[1].image.color) = (gray(100), gray(110));

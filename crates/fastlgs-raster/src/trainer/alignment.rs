@@ -1,4 +1,4 @@
-//! Cameras of the training views move to where the scene says that they were.
+//! Alignment of the training cameras to the scene during training.
 
 use super::{Trainer, view_of};
 use crate::Result;
@@ -8,21 +8,25 @@ use crate::schedule::Alignment;
 use crate::target::Target;
 use fastlgs_core::Camera;
 
-/// Steps of an alignment while training, at a quarter, half and all of the resolution: the next alignment goes on.
+/// Alignment steps at a quarter, half and full resolution. They are few, because the next alignment
+/// continues from the result.
 const ALIGNING: [usize; 3] = [2, 1, 0];
-/// What the watched views have to gain by alignment, in dB, before the others are aligned: exact poses gain some hundredths.
+/// Smallest PSNR gain of the validation views, in dB, for which all views are aligned. With exact
+/// poses the gain is some hundredths.
 const ALIGNMENT_PAYS: f64 = 0.3;
 
 impl Trainer {
-    /// A view's camera where the scene as it is now looks most like its photo.
+    /// Returns a view's camera at the pose from which the current scene looks most like its photo.
     pub(super) fn aligned(&mut self, target: &Target, exposure: &Exposure) -> Result<Camera> {
         let degree = self.course.config.degree(self.course.iteration);
         let (course, gaussians) = (&self.course, self.engine.len());
         align::align(self.engine.as_mut(), |camera| view_of(course, gaussians, camera, degree), target, exposure, ALIGNING)
     }
 
-    /// Moves the training views to where the scene as it is now says that they were; all together they stay where they are. Unless that was
-    /// asked for, only if the watched views, which know nothing of the scene yet, gain by it: good poses are better left alone.
+    /// Aligns the training views to the current scene, and keeps their mean pose.
+    ///
+    /// With `Alignment::Auto` this happens only if the validation views gain enough, because good
+    /// poses are better left alone. Under an automatic budget these views are not trained on yet.
     pub(super) fn align(&mut self) -> Result<()> {
         if self.course.alignment_gain.is_none() && self.course.config.alignment == Alignment::Auto {
             let watched = self.watched();
@@ -35,7 +39,7 @@ impl Trainer {
                 moved.cameras[id] = self.aligned(&target, &self.known_exposure(&target))?;
             }
             let gain = self.quality(&moved, None)?.zip(self.quality(&watched, None)?).map_or(0.0, |(after, before)| after - before);
-            tracing::info!(gain, "watched views gained by aligning their poses");
+            tracing::info!(gain, "PSNR gain of the validation views by alignment, in dB");
             self.course.alignment_gain = Some(gain);
         }
         if self.course.config.alignment == Alignment::Auto && self.course.alignment_gain.is_some_and(|gain| gain < ALIGNMENT_PAYS) {
@@ -55,7 +59,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Cameras of the training views as they are now.
+    /// Returns the current cameras of the training views.
     pub fn cameras(&self) -> Vec<Camera> {
         self.targets.cameras.clone()
     }

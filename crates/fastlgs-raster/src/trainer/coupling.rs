@@ -1,4 +1,6 @@
-//! Masks that shape Gaussians: from some step on the feature is trained as well, towards a code for each thing, and moves geometry with colour.
+//! Masks that shape Gaussians: from some step on, the feature loss moves geometry too.
+//!
+//! The feature of each pixel is trained towards the code of its object, together with colour.
 
 use super::Trainer;
 use crate::channels::Channels;
@@ -6,25 +8,27 @@ use crate::{Error, Result};
 use fastlgs_core::{Camera, Gaussians};
 use std::ops::Range;
 
-/// The feature among the channels of a Gaussian.
+/// Channels of the feature.
 pub(super) const FEATURE: Range<usize> = 14..17;
 
 impl Trainer {
-    /// Whether masks shape the Gaussians by now.
+    /// Returns whether the feature loss already moves geometry.
     pub fn is_coupled(&self) -> bool {
         self.course.coupled
     }
 
-    /// What the coming step trains.
+    /// Returns the channels that the next step trains.
     pub(super) fn channels(&self) -> Channels {
         if self.course.coupled { Channels::Coupled } else { self.course.config.channels }
     }
 
-    /// Has the feature trained from now on, from where `features` sets it for the Gaussians as they are now; they are trained with these cameras.
-    /// What views are trained towards, [`Trainer::towards`] tells.
+    /// Starts to train the feature, which then moves geometry too.
+    ///
+    /// `features` gets the current Gaussians and the training cameras, and sets the initial
+    /// features. [`Trainer::towards`] sets the codes that views are trained towards.
     ///
     /// # Errors
-    /// When the device fails, and whatever `features` returns; then nothing has changed.
+    /// When the device fails, or `features` returns an error. Then nothing has changed.
     pub fn couple<E: From<Error>>(&mut self, features: impl FnOnce(&mut Gaussians, &[Camera]) -> Result<(), E>) -> Result<(), E> {
         let mut state = self.engine.state()?;
         state.keep_finite();
@@ -40,7 +44,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// The code of each pixel of a view, as [`TargetImage::feature`](crate::TargetImage::feature) has it, the same whenever it is asked.
+    /// Sets the code images of the views. `codes` returns the pixels of a view in the format of
+    /// [`TargetImage::feature`](crate::TargetImage::feature), the same on every call.
     pub fn towards(&mut self, codes: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) {
         self.targets = self.targets.clone().with_features(codes);
         self.hide();

@@ -1,4 +1,4 @@
-//! Training of scene and semantic field together (paper, "Training Features for Gaussians").
+//! Trains the scene and its semantic features (paper, "Training Features for Gaussians").
 
 mod alignment;
 mod coupling;
@@ -27,58 +27,60 @@ use shown::Shown;
 use std::path::Path;
 use std::time::Instant;
 
-/// State of a run, for progress bars.
+/// Progress of a run, for progress bars.
 #[derive(Clone, Copy, Debug)]
 pub struct Progress {
     /// Steps done.
     pub iteration: u32,
-    /// Losses of the last measured step: where photos are few, of a picture without the Gaussians that it left out.
+    /// Losses of the last measured step. With few photos, its render lacks the Gaussians that were
+    /// dropped.
     pub losses: Losses,
     /// PSNR of the last measured training view in dB, estimated from its absolute error.
     pub psnr: f64,
-    /// Gaussians now.
+    /// Current number of Gaussians.
     pub gaussians: usize,
-    /// Seconds in steps and density control so far.
+    /// Seconds of steps and density control so far.
     pub seconds: f64,
 }
 
-/// What a finished run reports.
+/// Report of a finished run.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrainReport {
     /// Steps done, including those before a resume.
     pub iterations: u32,
     /// Steps of this process.
     pub steps_here: u32,
-    /// Seconds of this process in steps and density control, after the first step (which compiles the kernels); without those in which photos were read.
+    /// Seconds of this process in steps and density control, without reading photos. The time
+    /// starts after the first step, which compiles the kernels.
     pub seconds: f64,
-    /// Steps a second in that time.
+    /// Steps per second in that time.
     pub iterations_per_second: f64,
-    /// Gaussians at the end.
+    /// Final number of Gaussians.
     pub gaussians: usize,
-    /// What the automatic budget removed.
+    /// Removals by the automatic budget.
     pub removals: Vec<Removal>,
-    /// Colour and feature behind everything.
+    /// Background colour and feature.
     pub background: [f32; 6],
-    /// What the watched views gained by aligning their poses, in dB, where that was looked at.
+    /// PSNR gain of the validation views by alignment, in dB; `None` if it was not measured.
     pub alignment_gain: Option<f64>,
-    /// Adapter.
+    /// Name of the device.
     pub adapter: String,
 }
 
-/// A training run; drive it with [`Trainer::run`].
+/// A training run; [`Trainer::run`] completes it.
 pub struct Trainer {
     engine: Box<dyn Engine>,
     targets: Targets,
     extent: f32,
     /// Standard deviation of the photos' brightness.
     contrast: f32,
-    /// Where nothing may be.
+    /// Space in which density control removes Gaussians.
     free: FreeSpace,
     course: Course,
     shown: Shown,
 }
 
-/// The frame of a camera as a run has it.
+/// Returns the view of a camera with the options and the background of a run.
 fn view_of(course: &Course, gaussians: usize, camera: &Camera, sh_degree: u32) -> View {
     let [r, g, b, x, y, z] = course.background.values;
     View {
@@ -90,10 +92,10 @@ fn view_of(course: &Course, gaussians: usize, camera: &Camera, sh_degree: u32) -
 }
 
 impl Trainer {
-    /// Puts the first Gaussians on the device.
+    /// Loads the first Gaussians onto the device.
     ///
     /// # Errors
-    /// When there is nothing to train, it does not fit the device, or a picture cannot be read.
+    /// When there is nothing to train, it does not fit the device, or an image cannot be read.
     pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, targets: impl Into<Targets>, config: TrainConfig) -> Result<Self> {
         let mut targets: Targets = targets.into();
         if scene.is_empty() || targets.is_empty() {
@@ -125,12 +127,13 @@ impl Trainer {
         Ok(Self { engine, extent, contrast, free: FreeSpace::default(), targets, course, shown: Shown::default() })
     }
 
-    /// Tells what the views look through, as their cameras are now: the classic strategy's density control removes what it finds there.
+    /// Sets the free space for the current cameras. Density control removes Gaussians in it.
     pub fn keep_free(&mut self, free: FreeSpace) {
         self.free = free;
     }
 
-    /// The next training view: every view once in random order, then again. Under an automatic budget watched views wait until growth is over.
+    /// Returns the next training view: every view once in random order, then again. Under an
+    /// automatic budget, validation views are left out until growth ends.
     fn next_view(&mut self) -> usize {
         let growing = matches!(self.course.config.budget, Budget::Auto(_)) && self.grows();
         if self.course.order.is_empty() {
@@ -177,7 +180,7 @@ impl Trainer {
                 exposure::pin_mean(&mut self.course.exposures);
             }
             if config.learn_background {
-                // Behind all features there is nothing: queries know no other background.
+                // The background feature stays 0, because queries expect no other.
                 let [r, g, b, ..] = losses.by_background;
                 self.course.background.step([r, g, b, 0.0, 0.0, 0.0], BACKGROUND_RATE);
             }
@@ -186,7 +189,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// A round of density control.
+    /// Runs a round of density control.
     fn refine(&mut self) -> Result<()> {
         let mut state = self.engine.state()?;
         let config = &self.course.config;
@@ -200,7 +203,8 @@ impl Trainer {
         self.replace(&state)
     }
 
-    /// Makes all Gaussians faint, so that those that no photo asks for stay so. What was counted of gradients goes on being counted.
+    /// Lowers all opacities; those that no photo needs stay low. The statistics of gradients are
+    /// kept.
     fn reset_opacity(&mut self) -> Result<()> {
         let (mut state, stats) = (self.engine.state()?, self.engine.stats()?);
         density::reset_opacity(&mut state, 0.01);
@@ -210,7 +214,7 @@ impl Trainer {
 
     fn replace(&mut self, state: &State) -> Result<()> {
         if state.is_empty() {
-            return Err(Error::Invalid("every Gaussian became transparent; check the poses of the photos".to_owned()));
+            return Err(Error::Invalid("all Gaussians were removed, because none contributes to the photos; check the camera poses".to_owned()));
         }
         self.engine.set_state(state)
     }
@@ -219,16 +223,18 @@ impl Trainer {
         self.course.exposures.get(id).map_or_else(Exposure::default, LearnedExposure::exposure)
     }
 
-    /// The exposure of a view that was not trained on, as far as it is known: else photos of other brightness would hide what a scene gains.
+    /// Returns the exposure of a view that is not trained on, from its measured brightness. Without
+    /// it, differences in brightness would hide changes of quality.
     fn known_exposure(&self, target: &Target) -> Exposure {
         if self.course.config.exposure { Exposure { gain: target.gain, ..Exposure::default() } } else { Exposure::default() }
     }
 
-    /// Mean PSNR of the scene as it is now against views, which need not be those of the training; pixels that do not
-    /// count are left out. Colour up to `sh_degree`, else up to the degree in use. Nothing where there are no views, or nothing counts in any.
+    /// Returns the mean PSNR in dB of the current scene on any views, over the pixels that count.
+    /// Colour has SH degree `sh_degree`, or the degree in use if `None`. Returns `None` if there
+    /// are no views, or no pixel counts.
     ///
     /// # Errors
-    /// As [`Engine::render`], and when a picture cannot be read.
+    /// As [`Engine::render`], and when an image cannot be read.
     pub fn quality(&mut self, views: &Targets, sh_degree: Option<u32>) -> Result<Option<f64>> {
         let degree = sh_degree.unwrap_or_else(|| self.course.config.degree(self.course.iteration));
         let mut sum = 0.0;
@@ -251,10 +257,12 @@ impl Trainer {
         Ok((count > 0).then(|| sum / f64::from(count)))
     }
 
-    /// Runs to the end. `report` is called every 20 steps; `checkpoint`, where given, is written every 500 steps.
+    /// Runs to the end. `report` is called every 20 steps. The checkpoint, if given, is written
+    /// every 500 steps.
     ///
     /// # Errors
-    /// When the device fails, the scene degenerates, or a checkpoint cannot be written; and whatever `report` returns, which ends the run.
+    /// When the device fails, the scene degenerates, or a checkpoint cannot be written. An error of
+    /// `report` ends the run.
     pub fn run<E: From<Error>>(
         &mut self,
         checkpoint: Option<&Path>,
@@ -262,13 +270,13 @@ impl Trainer {
     ) -> Result<TrainReport, E> {
         let first = self.course.iteration;
         let mut started = Instant::now();
-        // Time of what `report` does is not the run's.
+        // The time of `report` does not count.
         let mut aside = 0.0;
         while self.course.iteration < self.course.config.iterations {
             self.step()?;
             let iteration = self.course.iteration;
             if iteration == first + 1 {
-                // The driver compiles kernels in their first dispatch.
+                // Drivers compile kernels in their first dispatch.
                 self.engine.losses()?;
                 started = Instant::now();
                 self.shown.reading = 0.0;
@@ -287,7 +295,8 @@ impl Trainer {
             }
             if iteration.is_multiple_of(20) || self.course.config.couples_at == Some(iteration) {
                 let losses = self.engine.losses()?;
-                // For errors spread like a Gaussian, mean square = pi/2 x squared mean absolute error.
+                // For normally distributed errors, mean square = pi/2 x squared mean absolute
+                // error.
                 let psnr = -10.0 * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2).max(1e-12).log10();
                 let seconds = started.elapsed().as_secs_f64() - aside - self.shown.reading;
                 let reporting = Instant::now();
@@ -313,7 +322,7 @@ impl Trainer {
         })
     }
 
-    /// The Gaussians as they are now.
+    /// Returns the current Gaussians.
     ///
     /// # Errors
     /// When the device failed, or no Gaussian is finite.
@@ -321,15 +330,15 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let lost = state.keep_finite();
         if lost > 0 {
-            tracing::warn!(lost, "Gaussians that were no longer finite were removed");
+            tracing::warn!(lost, "removed Gaussians whose values are not finite");
         }
         if state.is_empty() {
-            return Err(Error::Invalid("training diverged: no Gaussian is finite any more; check the poses".to_owned()));
+            return Err(Error::Invalid("training diverged: no Gaussian has finite values; check the camera poses".to_owned()));
         }
         Ok(Gaussians::from_channels(&state.params, state.sh_degree, None))
     }
 
-    /// Renders any camera with the current scene.
+    /// Renders the current scene from any camera.
     ///
     /// # Errors
     /// As [`Engine::render`].
@@ -337,44 +346,44 @@ impl Trainer {
         self.engine.render(self.view(camera, self.course.config.degree(self.course.iteration)), Channels::Both)
     }
 
-    /// Exposures of the training views, where they are learned.
+    /// Returns the exposures of the training views; empty if they are not learned.
     pub fn exposures(&self) -> Vec<Exposure> {
         self.course.exposures.iter().map(LearnedExposure::exposure).collect()
     }
 
-    /// Writes a checkpoint: `path.json`, and the tensors that it names.
+    /// Writes a checkpoint: `path.json`, and the tensor file that it names.
     ///
     /// # Errors
-    /// The system's refusal; an earlier checkpoint then stays.
+    /// When a file cannot be written; the previous checkpoint then remains.
     pub fn save(&self, path: &Path) -> Result<()> {
         let state = self.engine.state()?;
         let course = Course { gaussians: state.len(), ..self.course.clone() };
         checkpoint::save(path, &course, &state, &self.engine.stats()?)
     }
 
-    /// Continues from a checkpoint of the same configuration. Returns false where there is none.
+    /// Continues from a checkpoint of the same configuration. Returns false if there is none.
     ///
     /// # Errors
-    /// A damaged checkpoint, or one of another configuration.
+    /// When the checkpoint is damaged, or belongs to another configuration.
     pub fn resume(&mut self, path: &Path) -> Result<bool> {
         let Some((course, state, stats)) = checkpoint::load(path)? else { return Ok(false) };
         let other = match () {
             () if course.config != self.course.config => Some("with other options"),
             () if course.views != self.course.views => Some("from other photos"),
-            () if course.shown != 0 && course.shown != self.course.shown => Some("from other pictures, objects or first Gaussians"),
+            () if course.shown != 0 && course.shown != self.course.shown => Some("from other images, objects or first Gaussians"),
             () => None,
         };
         if let Some(other) = other {
             let header = path.with_extension("json");
             let header = header.display();
-            return Err(Error::Invalid(format!("{header}: the checkpoint was made {other}; leave out --resume, or delete it")));
+            return Err(Error::Invalid(format!("{header}: the checkpoint was made {other}; train without resuming, or delete it")));
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;
         for (camera, pose) in self.targets.cameras.iter_mut().zip(&course.poses) {
             camera.world_to_camera = *pose;
         }
-        tracing::info!(iteration = course.iteration, "training goes on from its checkpoint");
+        tracing::info!(iteration = course.iteration, "training continues from its checkpoint");
         self.course = course;
         Ok(true)
     }

@@ -1,22 +1,23 @@
-//! The pictures on the device: all of them where there is room, and read again where there is not.
+//! Target images on the device: all of them if they fit, else some are read again.
 
 use super::Trainer;
 use crate::Result;
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// Bytes of pictures that stay on the device.
+/// Default limit of the target images on the device, in bytes.
 const ROOM: usize = 1 << 30;
 
-/// Which views' pictures are on the device.
+/// The target images that are on the device.
 pub(super) struct Shown {
-    /// Whether they are there at half the resolution.
+    /// Whether they have half the resolution.
     coarse: bool,
-    /// Bytes of each.
+    /// Bytes of each view's image.
     views: BTreeMap<usize, usize>,
-    /// Bytes that may stay.
+    /// Largest number of bytes.
     pub room: usize,
-    /// Seconds in which pictures were read: what steps cost, a short run does not tell by them.
+    /// Seconds in which images were read. They are not counted as time of steps, which they would
+    /// distort in short runs.
     pub reading: f64,
 }
 
@@ -27,7 +28,7 @@ impl Default for Shown {
 }
 
 impl Trainer {
-    /// Puts what a view shows on the device, at the resolution of the coming step.
+    /// Loads the target image of a view onto the device, at the resolution of the next step.
     pub(super) fn show(&mut self, id: usize) -> Result<()> {
         let coarse = self.course.config.coarse(self.course.iteration);
         if self.shown.coarse != coarse {
@@ -46,13 +47,13 @@ impl Trainer {
         Ok(())
     }
 
-    /// Takes all pictures from the device, as they are no longer what shall be seen.
+    /// Removes all target images from the device, because they are outdated.
     pub(super) fn hide(&mut self) {
         std::mem::take(&mut self.shown.views).into_keys().for_each(|id| self.engine.forget_target(id));
     }
 
-    /// After its step, what came when there was no room left goes again. Views come once each before any comes again: no other choice of those that
-    /// stay would be read less often.
+    /// Removes the image of view `id` after its step if the limit is exceeded. Each view is used
+    /// once before any is used again, so no other choice causes fewer reads.
     pub(super) fn make_room(&mut self, id: usize) {
         if self.shown.views.values().sum::<usize>() > self.shown.room {
             self.shown.views.remove(&id);
@@ -72,7 +73,8 @@ mod tests {
 
     const VIEWS: usize = 12;
 
-    /// Views of 64x48 pixels; `reads` counts how often one is read, and `broken` cannot be after so many times.
+    /// Returns views of 64x48 pixels. `reads` counts the reads, which fail after the first
+    /// `broken`.
     fn views(reads: Arc<AtomicUsize>, broken: usize) -> Targets {
         let around = |k: usize| {
             let angle = k as f32 * 0.3;
@@ -87,7 +89,8 @@ mod tests {
         })
     }
 
-    /// A run with room for so many bytes: its Gaussians, how many pictures were read, and the bytes of pictures on the device at its end.
+    /// Runs a training with room for `room` bytes of images. Returns its Gaussians, the number of
+    /// reads, and the bytes of images on the device at the end.
     fn run(room: Option<usize>, broken: usize) -> crate::Result<(fastlgs_core::Gaussians, usize, u64)> {
         let reads = Arc::new(AtomicUsize::new(0));
         let config = TrainConfig { iterations: 240, budget: Budget::Fixed(400), ..TrainConfig::default() };
@@ -101,11 +104,11 @@ mod tests {
     fn room_changes_memory_and_nothing_else() {
         let picture = 4 * 64 * 48;
         let (all, read, held) = run(None, usize::MAX).unwrap();
-        // Once for their contrast, once at half the resolution, once at all of it.
+        // Once for the contrast, once at half and once at full resolution.
         assert_eq!((read, held), (3 * VIEWS, (VIEWS * picture) as u64));
         let (same, read, held) = run(Some(5 * picture), usize::MAX).unwrap();
-        assert!(all == same, "the same Gaussians, wherever the pictures were");
-        // Half of the run is at a quarter of the bytes, for which there is room.
+        assert!(all == same, "the limit does not change the Gaussians");
+        // At half the resolution, an image has a quarter of the bytes, and all fit.
         assert!(held <= 5 * picture as u64, "{held} bytes are held");
         assert!((4 * VIEWS..15 * VIEWS).contains(&read), "{read} pictures were read");
     }
@@ -114,6 +117,6 @@ mod tests {
     fn a_picture_that_went_missing_ends_the_run_in_words() {
         let message = run(Some(0), 3 * VIEWS).unwrap_err().to_string();
         assert_eq!(message, "the photo is gone");
-        assert!(run(None, 0).is_err(), "and one that never was, before the first step");
+        assert!(run(None, 0).is_err(), "a missing photo ends the run before the first step");
     }
 }

@@ -1,5 +1,7 @@
-//! What views that are watched, and not trained on while the scene grows, decide: whether a removal is bearable, and how many SH degrees the
-//! scene needs.
+//! Decisions by validation views: whether a removal is acceptable, and which SH degree the scene
+//! needs.
+//!
+//! Validation views are not trained on while the scene grows.
 
 use super::{Trainer, view_of};
 use crate::Result;
@@ -11,14 +13,14 @@ use crate::target::Targets;
 use fastlgs_core::Gaussians;
 
 impl Trainer {
-    /// The training views that are kept aside while the scene grows.
+    /// Returns the validation views: training views that are held out while the scene grows.
     pub(super) fn watched(&self) -> Targets {
         let count = self.targets.len();
         self.targets.some((0..count).filter(|&i| budget::is_watched(i, count)).collect())
     }
 
-    /// The lowest SH degree that shows the watched views as well as all degrees do, but for [`budget::DEGREE_LOSS`] dB; the
-    /// highest where the budget is fixed or no view is watched.
+    /// Returns the lowest SH degree that loses at most [`budget::DEGREE_LOSS`] dB on the validation
+    /// views. Returns the current degree if the budget is fixed or there are no validation views.
     ///
     /// # Errors
     /// As [`crate::engine::Engine::render`].
@@ -34,7 +36,7 @@ impl Trainer {
         Ok(highest)
     }
 
-    /// Removes that without which the training views would hardly change.
+    /// Removes Gaussians that the training views hardly need.
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut whole = self.engine.state()?;
         whole.keep_finite();
@@ -52,12 +54,12 @@ impl Trainer {
                 break;
             }
         }
-        tracing::info!(?removal, "Gaussians removed that change little");
+        tracing::info!(?removal, "removed unimportant Gaussians");
         self.course.removals.push(removal);
         Ok(())
     }
 
-    /// What the training views tell of each Gaussian.
+    /// Scores the Gaussians on all training views.
     fn changes(&self, state: &State) -> Result<Changes> {
         let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
         let degree = self.course.config.degree(self.course.iteration);
@@ -69,7 +71,8 @@ impl Trainer {
         Ok(changes)
     }
 
-    /// The views that tell what a removal costs: the watched ones, else some of all.
+    /// Returns the views that measure the cost of a removal: the validation views, else every tenth
+    /// view.
     pub(super) fn judges(&self) -> Targets {
         let watched = self.watched();
         if watched.is_empty() { self.targets.some((0..self.targets.len()).step_by(budget::WATCHED).collect()) } else { watched }
@@ -87,7 +90,8 @@ mod tests {
     fn of_two_that_hide_each_other_one_stays() {
         let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
         let mut scene = Gaussians::default();
-        // Alone, neither of the large ones is missed, and both could afford to go; the small one is.
+        // Each large Gaussian hides the other, so each alone could be removed. The small one is
+        // needed.
         scene.push_sphere(Vec3::ZERO, 3.0, 0.99, [0.5; 3]);
         scene.push_sphere(Vec3::ZERO, 3.0, 0.99, [0.5; 3]);
         scene.push_sphere(Vec3::NEG_Z, 0.1, 0.99, [0.9; 3]);

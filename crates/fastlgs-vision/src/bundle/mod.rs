@@ -1,5 +1,8 @@
-//! Bundle adjustment (Triggs et al. 2000): cameras, their lenses and the points that they see are moved together until the key points
-//! agree best. Levenberg-Marquardt on the cameras, points eliminated by the Schur complement, wrong matches faded out by Cauchy's loss.
+//! Bundle adjustment (Triggs et al. 2000): refines cameras, their lenses and points together.
+//!
+//! It minimises the reprojection error of the key points. Levenberg-Marquardt solves for the
+//! cameras; the Schur complement eliminates the points. Cauchy's loss reduces the weight of wrong
+//! matches.
 
 mod problem;
 
@@ -12,27 +15,32 @@ use glam::Vec3;
 use problem::{Lens, Observation, Pose, Problem, Values};
 use serde::{Deserialize, Serialize};
 
-/// Matches are loosened to this many times [`TOLERANCE`] while poses are rough, then tightened.
+/// Tolerance of matches in each round, in multiples of [`TOLERANCE`]: loose while poses are rough.
 const ROUNDS: [f32; 4] = [4.0, 4.0, 2.0, 1.0];
-/// Fewest photos by which a lens is adjusted.
+/// Smallest number of photos with the same lens for which the lens is adjusted.
 const PHOTOS_OF_A_LENS: usize = 5;
 
-/// What was adjusted, and by how much.
+/// Result of a bundle adjustment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Report {
-    /// Root mean square reprojection error in pixels, by the given poses and by the adjusted ones, each over the tracks that it allows.
+    /// Root mean square reprojection error in pixels, before and after. Each is computed over the
+    /// tracks that agree with those poses.
     pub error: [f32; 2],
-    /// Observations in these tracks.
+    /// Number of observations in these tracks, before and after.
     pub observations: [usize; 2],
-    /// For each camera the median distance, in pixels, between where it sees its points and where it saw them as given.
+    /// Median distance in pixels between the projections of a camera's points before and after, for
+    /// each camera; 0 if it has no tracks.
     pub moved: Vec<f32>,
-    /// For each camera the factor on its focal length.
+    /// Factor on the focal length of each camera; 1 if its lens was not adjusted.
     pub focal: Vec<f32>,
-    /// For each camera the first radial term of its lens that its pictures still have: a ray p lands at p (1 + k1 |p|^2).
+    /// First radial distortion coefficient k1 that remains in the photos of each camera. A
+    /// normalised image point p is distorted to p (1 + k1 |p|^2).
     pub k1: Vec<f32>,
 }
 
-/// Moves `cameras` to where `matches` agree best; none where no tracks tell. Where the centres of all cameras lie as a whole stays as given.
+/// Refines `cameras` to fit `matches` best, in the world frame of the given cameras.
+///
+/// Returns `None` if a round finds no tracks; `cameras` may have changed by then.
 pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMatches]) -> Option<Report> {
     let given = cameras.to_vec();
     let obeying = |cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32| -> Vec<Track> {
@@ -44,7 +52,8 @@ pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMa
     let mut values =
         Values { poses: Vec::new(), lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)], points: Vec::new() };
     for round in ROUNDS {
-        // Without the bend of the lens as far as it is known, or what the corners show would be left out.
+        // Remove the distortion estimated so far: otherwise matches near corners exceed the
+        // tolerance.
         let tracks = obeying(cameras, &straight(keypoints, cameras, &lens, &values.lenses), round * TOLERANCE);
         if tracks.is_empty() {
             return None;
@@ -67,7 +76,7 @@ pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMa
     })
 }
 
-/// Key points as lenses without a bend would have shown them.
+/// Returns the key points as lenses without distortion would show them.
 fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>], lenses: &[Lens]) -> Vec<Keypoints> {
     let mut out = keypoints.to_vec();
     for (view, points) in out.iter_mut().enumerate() {
@@ -77,14 +86,15 @@ fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>],
     out
 }
 
-/// Root mean square error and observations of tracks.
+/// Returns the root mean square reprojection error in pixels and the number of observations.
 fn quality(tracks: &[Track]) -> (f32, usize) {
     let count: usize = tracks.iter().map(|t| t.seen.len()).sum();
     let square: f32 = tracks.iter().map(|t| t.error * t.error * t.seen.len() as f32).sum();
     ((square / count.max(1) as f32).sqrt(), count)
 }
 
-/// Cameras of equal size and intrinsics share a lens, which is adjusted where enough photos tell about it.
+/// Returns the lens index of each camera: cameras of equal size and intrinsics share one. `None` if
+/// fewer than `PHOTOS_OF_A_LENS` cameras share it; it is then not adjusted.
 fn lenses(cameras: &[Camera]) -> Vec<Option<usize>> {
     let same = |a: &Camera, b: &Camera| (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy);
     let mut known: Vec<&Camera> = Vec::new();
@@ -102,10 +112,10 @@ fn observations(tracks: &[Track], keypoints: &[Keypoints]) -> Vec<Vec<Observatio
     tracks.iter().map(|track| track.seen.iter().map(of).collect()).collect()
 }
 
-/// Moves all cameras by the one similarity that brings them nearest to where they were.
+/// Moves all cameras by the similarity that best aligns them with `given` (fixes the gauge).
 fn keep_gauge(cameras: &mut [Camera], given: &[Camera]) {
     let extent = fastlgs_core::camera::scene_extent(given);
-    // With points before and above the cameras, those on a line tell the turn around it as well.
+    // Points in front of and above the cameras also fix the rotation about a line of cameras.
     let places = |c: &Camera| {
         let axes = c.world_to_camera.transpose();
         [c.centre(), c.centre() + extent * c.forward(), c.centre() - extent * axes.y_axis.truncate()]
@@ -116,7 +126,8 @@ fn keep_gauge(cameras: &mut [Camera], given: &[Camera]) {
     }
 }
 
-/// For each camera the median distance in pixels between where it sees the points of its tracks now and where it saw them.
+/// Returns for each camera the median distance in pixels between the projections of its tracks'
+/// points by `given` and by `cameras`; 0 without tracks.
 fn movements(given: &[Camera], cameras: &[Camera], tracks: &[Track]) -> Vec<f32> {
     let mut distances: Vec<Vec<f32>> = vec![Vec::new(); cameras.len()];
     for track in tracks {
@@ -140,7 +151,8 @@ mod tests {
     use fastlgs_core::rng::Rng;
     use glam::{Mat4, Quat, Vec2};
 
-    /// Photos around a cloud whose points have descriptors of their own, seen with half a pixel of noise, and a tenth of them wrongly.
+    /// Returns cameras around a cloud, their key points and matches. Key points have half a pixel
+    /// of noise; a tenth of them have 30 pixels.
     fn noisy_ring(count: usize) -> (Vec<Camera>, Vec<Keypoints>, Vec<PairMatches>) {
         let mut rng = Rng::new(5, "ring");
         let (cloud, cameras) = (ring::cloud(&mut rng), ring::cameras(count));
@@ -155,7 +167,8 @@ mod tests {
         (cameras, keypoints, matches)
     }
 
-    /// Median distance in pixels between where two cameras see points around the origin.
+    /// Median distance in pixels between the projections of points around the origin by two
+    /// cameras.
     fn off(a: &[Camera], b: &[Camera]) -> f32 {
         let points: Vec<Vec3> = (0..8).map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5).collect();
         let see = |c: &Camera, p: &Vec3| c.to_pixel(c.world_to_camera.transform_point3(*p));
@@ -165,7 +178,8 @@ mod tests {
         all[all.len() / 2]
     }
 
-    /// Mean difference in pixels of the turns from each camera to the next, which no choice of coordinates changes.
+    /// Mean difference, in pixels, between the rotations from each camera to the next. It does not
+    /// depend on the world frame.
     fn turned(a: &[Camera], b: &[Camera]) -> f32 {
         let turn = |c: &Camera| Quat::from_mat4(&c.world_to_camera);
         let turns = |all: &[Camera]| all.windows(2).map(|pair| turn(&pair[1]) * turn(&pair[0]).inverse()).collect::<Vec<_>>();
@@ -187,7 +201,8 @@ mod tests {
         let given = cameras.clone();
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
         let [before, after] = [turned(&given, &truth), turned(&cameras, &truth)];
-        // On a small cloud a turn and a shift look much alike: what is left of both makes up for each other.
+        // In a small cloud, rotation and translation look alike, so their remaining errors
+        // compensate.
         assert!(before > 3.0 && after < 0.2 * before, "{before} px before, {after} after");
         assert!(report.error[1] < 0.9 && report.observations[1] > 2 * report.observations[0], "{report:?}");
         assert!(report.moved.iter().all(|m| (0.3..20.0).contains(m)), "{:?}", report.moved);

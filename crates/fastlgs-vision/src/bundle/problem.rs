@@ -5,13 +5,13 @@ use glam::{DMat3, DMat4, DQuat, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector, Matrix2x3, SMatrix, SVector};
 use rayon::prelude::*;
 
-/// How well a given lens is known before any photo speaks: relative focal length, and the radial term.
+/// Prior standard deviation of a lens: of the logarithm of its focal length, and of k1.
 const LENS_DEVIATION: f64 = 0.1;
-/// Fewest observations by which a camera is moved.
+/// Smallest number of observations for which a camera's pose is adjusted.
 const FEW: usize = 20;
-/// Error in pixels from which an observation counts less.
+/// Scale of Cauchy's loss in pixels: larger errors count less.
 const SOFT: f64 = 1.0;
-/// Levenberg-Marquardt steps of a round.
+/// Largest number of Levenberg-Marquardt steps in a round.
 const STEPS: usize = 12;
 
 /// A lens that several photos share.
@@ -27,7 +27,7 @@ pub(super) struct Pose {
     translation: DVec3,
 }
 
-/// What is solved for.
+/// The unknowns of the adjustment.
 #[derive(Clone)]
 pub(super) struct Values {
     pub poses: Vec<Pose>,
@@ -35,7 +35,7 @@ pub(super) struct Values {
     pub points: Vec<DVec3>,
 }
 
-/// A key point that shows a point.
+/// A key point, in pixels, that shows a point of the scene.
 #[derive(Clone, Copy)]
 pub(super) struct Observation {
     pub view: usize,
@@ -44,18 +44,19 @@ pub(super) struct Observation {
 
 pub(super) struct Problem<'a> {
     pub cameras: &'a [Camera],
-    /// Lens of each camera, where it is adjusted.
+    /// Index of each camera's lens; `None` if the lens is not adjusted.
     pub lens: Vec<Option<usize>>,
     /// Observations of each point.
     pub seen: Vec<Vec<Observation>>,
 }
 
-/// Numbers of a camera: a turn, a shift, and its lens.
+/// Number of parameters of a pose: rotation vector and translation.
 const OWN: usize = 6;
+/// Number of parameters of a pose and its lens.
 const ALL: usize = OWN + 2;
-/// By a camera's turn, shift and lens.
+/// Derivatives of a pixel by rotation, translation and lens of its camera.
 type ByCamera = SMatrix<f64, 2, ALL>;
-/// Of a point, by those of a camera.
+/// Block of the normal matrix that couples the parameters of a camera with a point.
 type Coupling = SMatrix<f64, ALL, 3>;
 
 impl Pose {
@@ -64,7 +65,8 @@ impl Pose {
         Self { rotation: DMat3::from_mat4(pose), translation: pose.w_axis.truncate() }
     }
 
-    /// A small turn and shift after this pose: q becomes exp(turn) q + shift.
+    /// Returns this pose followed by a small rotation and translation: q becomes exp(turn) q +
+    /// shift.
     fn nudged(&self, turn: DVec3, shift: DVec3) -> Self {
         let turn = DMat3::from_quat(DQuat::from_scaled_axis(turn));
         Self { rotation: turn * self.rotation, translation: turn * self.translation + shift }
@@ -72,7 +74,7 @@ impl Pose {
 }
 
 impl Values {
-    /// Writes poses and focal lengths into cameras, which are as given but for those.
+    /// Writes poses and focal lengths into `cameras`; their other values stay unchanged.
     pub fn apply(&self, problem: &Problem, cameras: &mut [Camera]) {
         for (view, camera) in cameras.iter_mut().enumerate() {
             let Pose { rotation, translation } = self.poses[view];
@@ -84,7 +86,8 @@ impl Values {
         }
     }
 
-    /// After a step: six numbers a camera, two a lens, three a point.
+    /// Returns the values after a step. `cameras` has six numbers for each camera, then two for
+    /// each lens; `points` has one shift for each point.
     fn stepped(&self, cameras: &DVector<f64>, points: &[DVec3]) -> Self {
         let three = |k: usize| DVec3::new(cameras[k], cameras[k + 1], cameras[k + 2]);
         let lenses_at = OWN * self.poses.len();
@@ -101,14 +104,14 @@ impl Values {
     }
 }
 
-/// The normal equations of the cameras, points eliminated.
+/// Normal equations of the cameras after elimination of the points (Schur complement).
 struct Reduced {
     matrix: DMatrix<f64>,
     right: DVector<f64>,
 }
 
 impl Problem<'_> {
-    /// Where a camera sees a point; none behind it.
+    /// Returns the pixel at which a camera sees a point; `None` if the point is behind it.
     fn project(&self, values: &Values, view: usize, point: DVec3) -> Option<DVec2> {
         let (camera, pose) = (&self.cameras[view], &values.poses[view]);
         let q = pose.rotation * point + pose.translation;
@@ -118,7 +121,7 @@ impl Problem<'_> {
         (q.z > 0.0).then(|| focal * ray * (1.0 + lens.k1 * ray.length_squared()) + DVec2::new(camera.cx.into(), camera.cy.into()))
     }
 
-    /// Sum of Cauchy's loss, and what the lenses deviate from the given ones.
+    /// Returns the sum of Cauchy's loss over all observations, plus the prior of the lenses.
     fn cost(&self, values: &Values) -> f64 {
         let of_point = |(seen, point): (&Vec<Observation>, &DVec3)| -> f64 {
             let loss = |o: &Observation| {
@@ -131,7 +134,8 @@ impl Problem<'_> {
         of_points.into_iter().sum::<f64>() + of_lenses.sum::<f64>()
     }
 
-    /// Residual of an observation with its slopes by camera and by point, weighted by the loss; none behind the camera.
+    /// Returns the residual of an observation and its derivatives by camera and by point, weighted
+    /// by the loss. Returns `None` if the point is behind the camera.
     fn linear(&self, values: &Values, o: &Observation, point: DVec3) -> Option<(SVector<f64, 2>, ByCamera, Matrix2x3<f64>)> {
         let (camera, pose) = (&self.cameras[o.view], &values.poses[o.view]);
         let q = pose.rotation * point + pose.translation;
@@ -139,7 +143,7 @@ impl Problem<'_> {
         let lens = self.lens[o.view].map_or_else(Lens::default, |l| values.lenses[l]);
         let (ray, focal) = (q.truncate() / q.z, DVec2::new(camera.fx.into(), camera.fy.into()) * lens.log_focal.exp());
         let (r2, radial) = (ray.length_squared(), 1.0 + lens.k1 * ray.length_squared());
-        // Rows of d(pixel)/d(ray), then through the division by z.
+        // Rows of d(pixel)/d(ray). `by_q` multiplies them by the derivative of the division by z.
         let by_ray = [
             focal.x * DVec2::new(radial + 2.0 * lens.k1 * ray.x * ray.x, 2.0 * lens.k1 * ray.x * ray.y),
             focal.y * DVec2::new(2.0 * lens.k1 * ray.x * ray.y, radial + 2.0 * lens.k1 * ray.y * ray.y),
@@ -160,22 +164,23 @@ impl Problem<'_> {
         Some((SVector::from([weight * residual.x, weight * residual.y]), camera, point))
     }
 
-    /// Where the numbers of a view begin among those of all cameras, and those of its lens.
+    /// Returns the columns of a view's pose parameters, then those of its lens.
     fn columns(&self, view: usize) -> [usize; ALL] {
-        // A lens that is not adjusted has slopes of zero, which may go anywhere.
+        // A lens that is not adjusted has zero derivatives, so any column will do.
         let lens = OWN * self.cameras.len() + 2 * self.lens[view].unwrap_or(0);
         std::array::from_fn(|k| if k < OWN { OWN * view + k } else { lens + k - OWN })
     }
 
-    /// Columns of all cameras and lenses; one lens at least, so that [`Self::columns`] lie inside.
+    /// Returns the number of columns of all cameras and lenses. It counts at least one lens, so
+    /// that [`Self::columns`] are always valid.
     fn width(&self, values: &Values) -> usize {
         OWN * self.cameras.len() + 2 * values.lenses.len().max(1)
     }
 
-    /// The normal equations of some points, and for each what its step follows from: the inverse of its own block, its right side, and
-    /// its coupling to the cameras.
+    /// Returns the normal equations of the cameras, and for each point the values from which its
+    /// step is computed.
     fn eliminate(&self, values: &Values, damping: f64) -> (Reduced, Vec<Eliminated>) {
-        // The number of parts is fixed, so that sums do not depend on the number of threads.
+        // The number of parts is fixed: sums must not depend on the number of threads.
         const PARTS: usize = 4;
         let width = self.width(values);
         let size = self.seen.len().div_ceil(PARTS).max(1);
@@ -228,7 +233,7 @@ impl Problem<'_> {
         Eliminated { inverse, right, couplings }
     }
 
-    /// Levenberg-Marquardt steps until they no longer pay.
+    /// Takes at most `STEPS` Levenberg-Marquardt steps; stops when the relative gain is below 1e-4.
     pub fn solve(&self, values: &mut Values) {
         let (mut damping, mut cost) = (1e-4, self.cost(values));
         let mut counts = vec![0; self.cameras.len()];
@@ -244,7 +249,8 @@ impl Problem<'_> {
             }
             for k in 0..reduced.right.len() {
                 let moves = k >= OWN * self.cameras.len() || counts[k / OWN] >= FEW;
-                // What nothing holds stays: a camera without tracks, a lens that is not adjusted.
+                // Parameters without enough data stay fixed: cameras with few observations, lenses
+                // that are not adjusted.
                 if !moves || reduced.matrix[(k, k)] <= 0.0 {
                     reduced.matrix.row_mut(k).fill(0.0);
                     reduced.matrix.column_mut(k).fill(0.0);
@@ -274,7 +280,8 @@ impl Problem<'_> {
     }
 }
 
-/// What a point's step follows from, once those of the cameras are known.
+/// Values from which the step of a point is computed, once the steps of the cameras are known: the
+/// inverse of its own block, its right side, and its couplings to cameras.
 struct Eliminated {
     inverse: SMatrix<f64, 3, 3>,
     right: SVector<f64, 3>,
@@ -309,7 +316,7 @@ mod tests {
         let problem = Problem { cameras: std::slice::from_ref(&camera), lens: vec![Some(0)], seen: Vec::new() };
         let point = DVec3::new(0.7, -0.5, 0.4);
         let values = Values { poses: vec![Pose::of(&camera)], lenses: vec![Lens { log_focal: 0.02, k1: -0.1 }], points: vec![point] };
-        // The key point lies beside where the point is seen, so that the loss has a slope and a weight.
+        // The key point lies off the projection, so that the loss has a gradient and a weight.
         let observation = Observation { view: 0, pixel: problem.project(&values, 0, point).unwrap() + DVec2::new(0.4, -0.7) };
         let (residual, by_camera, by_point) = problem.linear(&values, &observation, point).unwrap();
         let weight = residual.norm() / DVec2::new(0.4, -0.7).length();
@@ -325,7 +332,7 @@ mod tests {
             let slope = weight * (at(H) - at(-H)) / (2.0 * H);
             let told = if k < ALL { by_camera.column(k) } else { by_point.column(k - ALL) };
             let apart = (slope - DVec2::new(told[0], told[1])).length();
-            assert!(apart < 1e-5 * slope.length().max(1.0), "number {k}: {slope} by differences, {told} as computed");
+            assert!(apart < 1e-5 * slope.length().max(1.0), "parameter {k}: {slope} by finite differences, {told} analytically");
         }
     }
 }

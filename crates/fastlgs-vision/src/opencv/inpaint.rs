@@ -17,15 +17,17 @@ unsafe extern "C" {
     ) -> c_int;
 }
 
-/// Fills the pixels of `picture` where `hole`, of the same size, is not 0, from what lies within `radius` pixels of them.
+/// Fills the pixels of `picture` where `hole` is not 0, from pixels within `radius` pixels. Both
+/// have the same size.
 ///
 /// # Errors
 /// When OpenCV refuses the picture.
 pub fn telea(picture: &mut RgbImage, hole: &GrayImage, radius: f32) -> Result<()> {
-    assert_eq!(picture.dimensions(), hole.dimensions(), "a hole of the picture's size");
+    assert_eq!(picture.dimensions(), hole.dimensions(), "the hole must have the size of the picture");
     let (width, height) = (side(picture.width())?, side(picture.height())?);
-    // SAFETY: the picture holds 3 x width x height bytes, which are read and written, the hole a third of them, which are only read; the reason
-    // has the room that is named, and the function writes no more than that, with its final zero.
+    // SAFETY: `picture` holds 3 x width x height bytes, which are read and written. `hole` holds
+    // width x height bytes, which are only read. The function writes at most `reason_size` bytes to
+    // `reason`, including the final zero.
     checked("inpainting", |reason, reason_size| unsafe {
         fastlgs_opencv_inpaint(picture.as_mut_ptr(), hole.as_ptr(), width, height, radius, reason, reason_size)
     })?;

@@ -1,4 +1,4 @@
-//! SIFT (`sift.cpp`).
+//! SIFT key points by OpenCV (`sift.cpp`).
 
 use super::{checked, side};
 use crate::Result;
@@ -23,7 +23,8 @@ unsafe extern "C" {
 /// Positions in pixels, and 128-byte descriptors.
 pub type Found = (Vec<Vec2>, Vec<[u8; 128]>);
 
-/// Detects and describes the `most` strongest key points; those that are as strong as the last one come on top.
+/// Detects and describes the `most` strongest key points. Key points as strong as the last of these
+/// are added, up to 2 x `most` in all.
 ///
 /// # Errors
 /// When OpenCV refuses the picture.
@@ -32,8 +33,8 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
     let mut positions = vec![[0.0f32; 2]; capacity];
     let mut descriptors = vec![[0u8; 128]; capacity];
     let (width, height) = (side(photo.width())?, side(photo.height())?);
-    // SAFETY: the picture holds width x height bytes, which are only read; positions, descriptors and reason have the room that is named, and the
-    // function writes no more than that, the reason with its final zero.
+    // SAFETY: `photo` holds width x height bytes, which are only read. The function writes at most
+    // `capacity` positions and descriptors, and at most `reason_size` bytes with the final zero.
     let count = checked("SIFT", |reason, reason_size| unsafe {
         fastlgs_opencv_sift(
             photo.as_raw().as_ptr(),
@@ -48,8 +49,8 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
         )
     })?;
     descriptors.truncate(count);
-    // OpenCV counts from the middle of the first pixel, and looks at a picture of twice the size whose first pixel it takes to lie there too: it lies
-    // a quarter of a pixel before it.
+    // OpenCV counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels
+    // from the photo's corner.
     let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.25, y + 0.25)).collect();
     Ok((positions, descriptors))
 }

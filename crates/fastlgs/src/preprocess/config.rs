@@ -1,4 +1,4 @@
-//! What `preprocess` is asked for, and what it reports.
+//! Options and report of `preprocess`.
 
 use crate::eyes::Eyes;
 use fastlgs_core::dataset::PoseConvention;
@@ -7,68 +7,75 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// What finds poses where there are none.
+/// Method that computes poses for photos without them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Sfm {
-    /// pycolmap on key points that are found and matched here; without it, the program `colmap`.
+    /// pycolmap, on key points that FastLGS detects and matches; the program `colmap` if it is
+    /// missing.
     #[default]
     Auto,
-    /// The program `colmap` from photos to poses.
+    /// The program `colmap` for all steps.
     Colmap,
 }
 
-/// What is done about given poses.
+/// Verification and correction of poses.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Poses {
-    /// Nothing.
+    /// Use the poses as they are.
     Keep,
-    /// Groups of cameras that contradict the photos are moved; all are adjusted to the key points where that mends them.
+    /// Move groups of cameras that contradict the photos. Adjust all cameras if that clearly lowers
+    /// the reprojection error.
     #[default]
     Check,
-    /// The same, and all are adjusted in any case.
+    /// As check, but adjust all cameras in any case.
     Refine,
 }
 
-/// What is preprocessed, and how.
+/// Options of `preprocess`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
-    /// Folder of photos, in images/ or as they are, with poses: sparse/0 (COLMAP), transforms.json or poses_bounds.npy; without poses pycolmap finds them. Or a video.
+    /// Folder of photos (in images/ or directly in it), or a video. Poses are read from sparse/0
+    /// (COLMAP), transforms.json or poses_bounds.npy in the folder. Without them, structure from
+    /// motion computes the poses.
     pub photos: PathBuf,
     /// Scene folder to write.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
-    /// Longer side of the working photos in pixels.
+    /// Limit on the longer side of prepared photos, in pixels.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().max_side))]
     pub max_side: u32,
-    /// Every N-th photo (by sorted name) is kept out of training and mapping; 0 for none.
+    /// Hold out every N-th photo (sorted by name) from training and mapping; 0 holds out none. If
+    /// the data set marks photos for testing, those are held out instead.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
     pub holdout: usize,
-    /// Keep out the photos that these labels name instead (of LERF-OVS, 3D-OVS or SPIn-NeRF).
+    /// Hold out the photos that these labels name (LERF-OVS, 3D-OVS or SPIn-NeRF), instead of every
+    /// N-th.
     #[cfg_attr(feature = "clap", arg(long, value_name = "DIR", conflicts_with = "holdout"))]
     pub holdout_labels: Option<PathBuf>,
-    /// What finds poses where there are none.
+    /// How to compute poses for photos without them.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub sfm: Sfm,
-    /// What is done about the poses.
+    /// How to verify and correct poses.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub poses: Poses,
-    /// How the poses are written. By default the usual convention of their file, unless the photos' key points fit another one plainly.
+    /// Convention in which the poses are written. Default: the usual one of their file, unless the
+    /// key points clearly fit another.
     #[cfg_attr(feature = "clap", arg(long, value_name = "CONVENTION", value_parser = convention_parser()))]
     pub pose_convention: Option<PoseConvention>,
     /// Segmenter and encoder.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
     pub eyes: Eyes,
-    /// Photos that each photo's key points are matched with.
+    /// Number of neighbouring photos with which each photo is matched.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().neighbours))]
     pub neighbours: usize,
-    /// How much memory photos may take while they are read, such as 500M or 4G.
+    /// Memory limit for reading photos, such as 500M or 4G.
     #[cfg_attr(feature = "clap", arg(long, default_value = "4G", value_name = "BYTES", value_parser = parse_bytes))]
     pub memory: u64,
 }
@@ -91,7 +98,7 @@ impl Default for Config {
     }
 }
 
-/// The conventions by name.
+/// Parses the name of a pose convention.
 #[cfg(feature = "clap")]
 fn convention_parser() -> impl clap::builder::TypedValueParser<Value = PoseConvention> {
     use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -100,7 +107,7 @@ fn convention_parser() -> impl clap::builder::TypedValueParser<Value = PoseConve
         .map(move |name| all.into_iter().find(|convention| convention.name() == name).expect("one of them"))
 }
 
-/// Parses `500M`.
+/// Parses a size such as `500M` into bytes. K, M and G are powers of 1,000.
 #[cfg(feature = "clap")]
 fn parse_bytes(text: &str) -> Result<u64, String> {
     let (number, unit) = text.split_at(text.trim_end_matches(char::is_alphabetic).len());
@@ -109,86 +116,89 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
         "K" | "KB" => 1e3,
         "M" | "MB" => 1e6,
         "G" | "GB" => 1e9,
-        _ => return Err(format!("'{unit}' is none of K, M and G")),
+        _ => return Err(format!("'{unit}' is not a unit of size; use K, M or G")),
     };
-    let bytes = number.parse::<f64>().ok().filter(|n| *n > 0.0).ok_or_else(|| format!("'{text}' is not a size like 4G"))?;
+    let bytes = number.parse::<f64>().ok().filter(|n| *n > 0.0).ok_or_else(|| format!("'{text}' is not a positive size; write one such as 4G"))?;
     Ok((bytes * factor) as u64)
 }
 
-/// What preprocessing found.
+/// Report of `preprocess`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Report {
     /// The scene folder.
     pub scene: PathBuf,
-    /// Photos that were read.
+    /// Number of photos that were read.
     pub photos: usize,
-    /// Those that are trained on.
+    /// Number of training photos.
     pub training_photos: usize,
-    /// Those that are not.
+    /// Number of photos without training: held out, or excluded because their poses are wrong.
     pub held_out: usize,
-    /// Size of the first working photo.
+    /// Size of the first prepared photo, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
-    /// Masks of all levels on all training photos.
+    /// Number of masks of all levels in all training photos.
     pub masks: usize,
-    /// Mean number of masks a photo, by level.
+    /// Mean number of masks per training photo, by level.
     pub masks_per_photo: BTreeMap<String, f64>,
-    /// Pairs of key points that matched, once poses were right.
+    /// Number of key point matches between training photos that agree with the final poses.
     pub key_point_matches: usize,
-    /// Points to start Gaussians from.
+    /// Number of points from which Gaussians can start.
     pub points: usize,
-    /// What found the key points.
+    /// SIFT implementation that detected the key points.
     pub sift: String,
-    /// Cameras whose poses contradicted the photos and were moved.
+    /// Number of cameras that were moved because their poses contradicted the photos.
     pub moved_cameras: usize,
-    /// How all cameras were adjusted to the key points, if they were.
+    /// Result of bundle adjustment, if it ran.
     pub adjusted: Option<Adjusted>,
-    /// What was survivable but wrong.
+    /// Warnings, one sentence each.
     pub warnings: Vec<String>,
-    /// How much the photos' brightness varies, in stops.
+    /// Typical brightness difference of two photos, in stops.
     pub brightness_spread_stops: f32,
-    /// By stage, results that were there already, and all.
+    /// By stage: number of results found in the cache, and number of all results.
     pub cached: BTreeMap<String, [usize; 2]>,
-    /// By stage.
+    /// Seconds by stage.
     pub seconds: BTreeMap<String, f64>,
-    /// Of all stages together.
+    /// Seconds of all stages together.
     pub seconds_total: f64,
 }
 
-/// How far bundle adjustment moved the cameras.
+/// Result of bundle adjustment.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Adjusted {
-    /// Root mean square reprojection error of the key points before, in pixels of the working photos.
+    /// Root mean square reprojection error before, in pixels of the prepared photos.
     pub error_before: f32,
-    /// And after.
+    /// Root mean square reprojection error after, in pixels of the prepared photos.
     pub error_after: f32,
-    /// By how much more key points the poses explain: a factor.
+    /// Number of key points in consistent tracks after, divided by the number before.
     pub explained: f32,
-    /// Median over the cameras of how far their pictures moved, in pixels.
+    /// Median over the cameras of the distance that a camera moves its points in the image, in
+    /// pixels.
     pub moved_median: f32,
-    /// The largest of these.
+    /// Largest of these distances, in pixels.
     pub moved_most: f32,
     /// Mean factor on the focal lengths.
     pub focal: f32,
-    /// Largest radial term that was left in the pictures.
+    /// Radial term of largest magnitude that the adjustment found in the photos: p maps to p (1 +
+    /// k1 |p|^2).
     pub k1: f32,
     /// Whether the adjusted poses are used.
     pub used: bool,
 }
 
-/// The manifest's note of how bright photos are.
+/// Key of the brightness note in the manifest.
 const BRIGHTNESS: &str = "brightness";
 
-/// How bright a scene's training photos are against each other.
+/// Brightness of the training photos of a scene, relative to each other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Brightness {
-    /// The typical difference of two photos in stops.
+    /// Typical difference of two photos, in stops.
     pub spread_stops: f32,
-    /// By the photo's name, how many times brighter than the mean it shows things, by channel.
+    /// By photo name: brightness relative to the mean of all photos, as a factor for each colour
+    /// channel.
     pub gains: BTreeMap<String, [f32; 3]>,
 }
 
 impl Brightness {
-    /// What preprocessing noted; as if all were alike where it noted nothing.
+    /// Reads the brightness note of a manifest. Without a note, all photos count as equally bright.
     ///
     /// # Errors
     /// A note that cannot be read.
@@ -196,7 +206,7 @@ impl Brightness {
         let Some(note) = manifest.notes.get(BRIGHTNESS) else { return Ok(Self::default()) };
         serde_json::from_value(note.clone()).map_err(|error| {
             let mend = "run 'fastlgs preprocess' again";
-            crate::Error::Invalid(format!("scene.json: the note of the photos' brightness cannot be read ({error}); {mend}"))
+            crate::Error::Invalid(format!("scene.json: the brightness of the photos cannot be read ({error}); {mend}"))
         })
     }
 
@@ -205,7 +215,7 @@ impl Brightness {
         Ok(())
     }
 
-    /// Of a photo.
+    /// Returns the gain of each colour channel of a photo; 1 for an unknown photo.
     pub fn gain(&self, name: &str) -> [f32; 3] {
         self.gains.get(name).copied().unwrap_or([1.0; 3])
     }

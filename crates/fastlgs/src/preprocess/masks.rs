@@ -1,4 +1,4 @@
-//! Masks of the training photos.
+//! Segments the training photos.
 
 use super::config::Config;
 use super::photos::Known;
@@ -12,7 +12,11 @@ use fastlgs_vision::Segmenter;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-/// Writes the masks of every training photo; returns their number, and the mean number a photo by level.
+/// Segments every training photo and writes its masks. Returns the number of masks, and the mean
+/// number per photo by level.
+///
+/// # Errors
+/// No training photo has a mask, the segmenter fails, or the run is cancelled.
 pub(super) fn segment(
     config: &Config,
     segmenter: &dyn Segmenter,
@@ -31,7 +35,7 @@ pub(super) fn segment(
             None => make()?,
         };
         if photo.bend != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
-            // Drawn on the photo before it was straightened.
+            // Imported masks show the photo before its additional distortion was removed.
             list = list.undistorted(&photo.camera, &Distortion { k1: photo.bend, ..Distortion::default() });
         }
         list.masks.retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
@@ -41,12 +45,12 @@ pub(super) fn segment(
     };
     let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
     if counts.iter().flatten().all(|count| *count == 0) {
-        bail!("{}: no mask was found in any photo to train on", config.photos.display());
+        bail!("{}: no mask was found in any training photo; check the segmenter or the imported masks", config.photos.display());
     }
     let without: Vec<&str> =
         training.iter().zip(&counts).filter(|(_, c)| c.iter().all(|n| *n == 0)).map(|(p, _)| p.camera.name.as_str()).collect();
     if !without.is_empty() && config.eyes.segmenter == SegmenterKind::Import {
-        run.warn(&format!("{} of {} photos have no mask with any pixel: {}", without.len(), training.len(), without.join(", ")));
+        run.warn(&format!("{} of {} photos have no mask, or only empty ones: {}", without.len(), training.len(), without.join(", ")));
     }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
     let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));

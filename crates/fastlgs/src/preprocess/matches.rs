@@ -1,4 +1,4 @@
-//! Key points of overlapping photos are matched; pairs of them tell which masks show the same.
+//! Matches key points of overlapping photos, and counts the matches between their masks.
 
 use super::photos::Known;
 use crate::cache::{self, Cache};
@@ -12,8 +12,9 @@ use glam::Vec2;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Matches each photo with its neighbours by the poses as given, and photos whose poses are wrong with all others, whether or not the matches
-/// obey the poses.
+/// Matches each photo with its `neighbours` nearest photos, which the given poses decide. Photos in
+/// `lost`, whose poses are wrong, are matched with all others. Matches that contradict the poses
+/// are kept.
 pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, cache: &Cache, run: &Run) -> Result<Vec<PairMatches>> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let mut chosen: BTreeSet<(usize, usize)> = tracks::overlapping_pairs(&cameras, neighbours).into_iter().collect();
@@ -30,13 +31,14 @@ pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, 
     chosen.into_par_iter().map(match_pair).collect()
 }
 
-/// The matches of two photos, made once.
+/// Returns the matches of photos `a` and `b` as pairs of key point indices. They are cached.
 pub(super) fn of_pair(photos: &[Known], a: usize, b: usize, cache: &Cache) -> Result<Vec<(usize, usize)>> {
     let inputs = [&photos[a].key, &photos[b].key, keypoints::version().as_bytes()];
     cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))
 }
 
-/// The matches between photos that are kept, by their new places, as far as they obey the poses.
+/// Returns the matches between the photos in `kept` that agree with the poses. Photos are
+/// renumbered by their position in `kept`.
 pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
     let place: BTreeMap<usize, usize> = kept.iter().enumerate().map(|(new, old)| (*old, new)).collect();
     let renumbered = |m: &PairMatches| Some(PairMatches { a: *place.get(&m.a)?, b: *place.get(&m.b)?, pairs: m.pairs.clone() });
@@ -44,8 +46,9 @@ pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera
     matches.iter().filter_map(renumbered).map(obeying).collect()
 }
 
-/// The same photos matched again, as their poses tell where to look: for points and masks, and not for the poses, with which whatever lies on an
-/// epipolar line agrees.
+/// Matches the same pairs of photos again along the epipolar lines of their poses. The result is
+/// for points and masks. It cannot verify poses, because every match on an epipolar line agrees
+/// with them.
 pub(super) fn guided(matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
     let match_pair = |m: &PairMatches| {
         let f = keypoints::fundamental(&cameras[m.a], &cameras[m.b]);
@@ -54,10 +57,11 @@ pub(super) fn guided(matches: &[PairMatches], cameras: &[Camera], points: &[Keyp
     matches.par_iter().map(match_pair).collect()
 }
 
-/// Fewest matches by which a photo is held to share something with another.
+/// Least number of matches with another photo; a photo with fewer counts as isolated.
 const FEW: usize = 15;
 
-/// Says so where photos share too little with any other, and names the one that is turned farthest from its nearest.
+/// Returns a warning if photos overlap with no other photo, else `None`. It names the isolated
+/// photo with the largest angle to its nearest photo.
 pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Option<String> {
     let mut most = vec![0; cameras.len()];
     for m in matches {
@@ -72,7 +76,7 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
     };
     let (photo, nearest, degrees) = alone.iter().filter_map(gap).max_by(|a, b| a.2.total_cmp(&b.2))?;
     Some(format!(
-        "{} of {} photos share too little with any other to tell shapes from; the largest gap is {degrees:.0} degrees, from {} to {}: \
+        "{} of {} photos overlap too little with any other to reconstruct shapes; the largest gap is {degrees:.0} degrees, from {} to {}: \
          take photos between them",
         alone.len(),
         cameras.len(),
@@ -81,11 +85,11 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
     ))
 }
 
-/// Counts the key-point pairs between the masks of matched photos.
+/// Counts the key point matches between the masks of matched photos (level whole).
 pub(super) fn between_masks(folder: &SceneFolder, cameras: &[Camera], points: &[Keypoints], matches: &[PairMatches]) -> Result<Pairs> {
     let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<u16>> {
         let map = masks::whole(folder, camera)?;
-        // Straightened photos lose what lay at their edges.
+        // Removing distortion can move key points beyond the edges of the photo.
         let inside = |p: &Vec2| p.x >= 0.0 && p.y >= 0.0 && p.x < map.width as f32 && p.y < map.height as f32;
         let label = |p: &Vec2| if inside(p) { map.at(p.x as u32, p.y as u32) } else { 0 };
         Ok(points[view].positions.iter().map(label).collect())

@@ -1,4 +1,4 @@
-//! Everything that is done once, before training.
+//! Preprocessing: turns photos into masks, poses, key point matches and points.
 
 mod config;
 mod masks;
@@ -27,15 +27,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Instant;
 pub(crate) use video::fingerprint;
 
-/// All that preprocessing leaves, beside the manifest.
+/// Files and folders of the scene that preprocessing replaces, besides the manifest.
 const LEFT: [&str; 9] =
     ["photos", "alpha", "ignore", "sparse", "cameras", "masks", "points.safetensors", "pairs.safetensors", "embeddings.safetensors"];
 
-/// Photos to masks, embeddings, key points, poses and points, all in the scene folder `config.output`.
+/// Preprocesses photos: writes masks, cameras, points and key point matches into the scene folder
+/// `config.output`. Imported embeddings are written, too.
 ///
 /// # Errors
-/// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing models, or a cancelled run. What was
-/// made until then is found again by the next run, and an earlier scene is as it was.
+/// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing
+/// models, or a cancelled run. The earlier scene then stays unchanged, and the next run reuses
+/// finished results.
 pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
     check_apart(&config.photos, &config.output)?;
     preprocess_locked(config, &SceneLock::take(&config.output, "preprocess")?, run)
@@ -52,7 +54,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     };
     config.eyes.check()?;
     if config.max_side < 64 {
-        bail!("--max-side {} is too small: 64 pixels are the least", config.max_side);
+        bail!("max_side {} is too small; it must be at least 64 pixels", config.max_side);
     }
     let of_video =
         |video| Ok::<_, crate::Error>(Config { photos: video::photos(video, &SceneFolder::new(&config.output), run)?, ..config.clone() });
@@ -74,10 +76,10 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     };
     dataset.earlier_frame = scene.manifest().ok().map(|earlier| earlier.frame);
     let lenses = import::lenses(&dataset);
-    // Opened first: a missing model should not cost the minutes before.
+    // Load the models first, so that a missing one is reported before minutes of work.
     let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
     let encoder = config.eyes.encoder(&config.photos, &lenses)?;
-    // Of use here only for what other programs embedded, whose files may go.
+    // Only imported embeddings are stored here, because their files may disappear later.
     let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
     dataset.warnings.iter().for_each(|warning| run.warn(warning));
     let given: Vec<Camera> = dataset.photos.iter().map(|photo| photo.camera.clone()).collect();
@@ -151,7 +153,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
 
     let matches = matches::guided(&matches, &poses, &keypoints);
     let tracks = tracks::tracks(&poses, &keypoints, &matches, tracks::TOLERANCE);
-    // Those that came with the poses lie where these were.
+    // Given points are valid only for the given poses.
     let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
     let mut points =
         if poses_are_given && dataset.points.len() > tracks.len() { dataset.points.clone() } else { tracks::points(&tracks, &colors) };
@@ -169,10 +171,10 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     }
     manifest.seconds = seconds.clone();
     light.note(&mut manifest)?;
-    // Training writes the maps of objects in place.
+    // Training writes the object maps in place, so the manifest lists them now.
     let maps = poses.iter().map(|camera| SceneFolder::objects_name(&camera.name));
     staged.publish(&scene, &LEFT, maps, &manifest)?;
-    // Steps of a training on other photos.
+    // Checkpoints of a training on other photos are invalid.
     checkpoints::forget(&scene);
     cache.tidy();
     Ok(Report {
@@ -196,7 +198,11 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     })
 }
 
-/// Which views are held out: each so-manieth, or by name those that `--holdout-labels` names or that the data set keeps for testing.
+/// Returns which views are held out: N for every N-th (0 for none), and names of views. Names come
+/// from `holdout_labels`, else from the data set if it marks views for testing.
+///
+/// # Errors
+/// A labelled view is not among the photos.
 fn held_out(config: &Config, dataset: &Dataset, cameras: &[Camera]) -> Result<(usize, Vec<String>)> {
     if config.holdout_labels.is_none() && config.holdout > 0 && !dataset.held_out.is_empty() {
         return Ok((0, dataset.held_out.clone()));
@@ -204,7 +210,7 @@ fn held_out(config: &Config, dataset: &Dataset, cameras: &[Camera]) -> Result<(u
     let Some(folder) = &config.holdout_labels else { return Ok((config.holdout, Vec::new())) };
     let index = |name: &str| {
         let index = view_of(cameras.iter().map(|c| c.name.as_str()), name);
-        index.with_context(|| format!("{}: the labelled view '{name}' is none of the photos", folder.display()))
+        index.with_context(|| format!("{}: the labelled view '{name}' matches none of the photos", folder.display()))
     };
     let names: Result<Vec<String>> = labels::load(folder, None)?.iter().map(|view| Ok(cameras[index(&view.name)?].name.clone())).collect();
     Ok((0, names?))

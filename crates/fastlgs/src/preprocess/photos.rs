@@ -1,4 +1,5 @@
-//! Reading photos: undistorted, shrunk, written into the scene folder, and looked at once.
+//! Loads photos: undistorts and scales them, writes them into the scene folder, and detects key
+//! points.
 
 use super::config::Config;
 use crate::cache::{self, Cache, Key};
@@ -16,21 +17,21 @@ use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::path::PathBuf;
 
-/// A working photo: undistorted and scaled.
+/// A prepared photo: undistorted and scaled.
 pub struct Photo {
-    /// Its camera at the working size.
+    /// Camera at the size of the prepared photo.
     pub camera: Camera,
-    /// Its pixels.
+    /// RGB pixels.
     pub pixels: RgbImage,
-    /// Coverage of photos with an alpha channel.
+    /// Alpha channel, if the photo has one: 0 is transparent, 255 is opaque.
     alpha: Option<GrayImage>,
-    /// Black where nothing counts.
+    /// Mask of the pixels that count: those below 128 are ignored.
     ignore: Option<GrayImage>,
-    /// How much of the photo the mask that came with it leaves, if one did.
+    /// Share of the photo that its mask file keeps; `None` without a mask file.
     drawn: Option<Extent>,
 }
 
-/// How much of a photo something covers.
+/// Share of the pixels of a photo that a mask covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Extent {
     Nothing,
@@ -48,28 +49,29 @@ impl Extent {
     }
 }
 
-/// What is kept in memory of a photo; its pixels lie in the scene folder, so that thousands of photos fit.
+/// Data of a prepared photo that stays in memory. Pixels stay on disk, so that memory suffices for
+/// thousands of photos.
 pub(super) struct Known {
     pub camera: Camera,
     /// Fingerprint of the pixels.
     pub key: Key,
     impression: Impression,
-    /// How much of it the mask that came with it leaves.
+    /// Share of the photo that its mask file keeps; `None` without a mask file.
     drawn: Option<Extent>,
-    /// How much of it is not transparent.
+    /// Share of the photo that is not fully transparent.
     opaque: Extent,
     pub points: Keypoints,
     /// Colour at each key point.
     pub colors: Vec<[u8; 3]>,
-    /// The first radial term of a bend that was taken out of it beyond what its lens was said to have.
+    /// Radial term that `straighten` removed in addition to the stated distortion; 0 if none.
     pub bend: f32,
 }
 
-/// Blurred and repeated photos are used all the same, but the user hears of them.
+/// Warns about blurred and repeated photos, which are used nevertheless.
 pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec<String>) {
     let seen: Vec<Impression> = photos.iter().map(|p| p.impression.clone()).collect();
     for (list, what) in
-        [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "show the same as the photo before them")]
+        [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "are nearly identical to the photo before them")]
     {
         if !list.is_empty() {
             let names: Vec<&str> = list.iter().map(|&i| photos[i].camera.name.as_str()).collect();
@@ -80,28 +82,29 @@ pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec
     }
 }
 
-/// Refuses photos of which nothing would be trained, and masks that ignore nothing; where only some are so, the user hears of them.
+/// Checks the masks and alpha channels of the photos. Warns if only some of them are unusable.
 ///
 /// # Errors
-/// Masks that leave nothing, or everything, of all photos that have one, and photos that are all transparent.
+/// The mask files ignore every pixel of all photos that have one, or no pixel of them; or all
+/// photos are fully transparent.
 pub(super) fn check_masks(photos: &[Known], run: &Run, warnings: &mut Vec<String>) -> Result<()> {
     let masked: Vec<&Known> = photos.iter().filter(|p| p.drawn.is_some()).collect();
     let leaving = |extent| masked.iter().filter(|p| p.drawn == Some(extent)).map(|p| p.camera.name.as_str()).collect::<Vec<_>>();
     let (nothing, everything) = (leaving(Extent::Nothing), leaving(Extent::Everything));
     let transparent: Vec<&str> = photos.iter().filter(|p| p.opaque == Extent::Nothing).map(|p| p.camera.name.as_str()).collect();
     if !masked.is_empty() && nothing.len() == masked.len() {
-        bail!("the masks of all {} photos that have one leave nothing to train on; black is ignored: are they inverted?", masked.len());
+        bail!("the masks of all {} masked photos leave nothing to train on, because black pixels are ignored; check whether the masks are inverted", masked.len());
     }
     if !masked.is_empty() && everything.len() == masked.len() {
-        bail!("the masks of all {} photos that have one ignore nothing; are they the right files? black is ignored", masked.len());
+        bail!("the masks of all {} masked photos ignore no pixel; check that they are the right files and that ignored pixels are black", masked.len());
     }
     if transparent.len() == photos.len() {
         bail!("all {} photos are fully transparent; export them with their colours", photos.len());
     }
     for (list, what) in [
-        (nothing, "have masks that leave nothing of them; they are not trained on"),
-        (everything, "have masks that ignore nothing of them"),
-        (transparent, "are fully transparent; they show only the background"),
+        (nothing, "have masks that ignore every pixel, so that training does not use them"),
+        (everything, "have masks that ignore no pixel"),
+        (transparent, "are fully transparent and show only the background"),
     ] {
         if !list.is_empty() {
             let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), list.join(", "));
@@ -112,7 +115,7 @@ pub(super) fn check_masks(photos: &[Known], run: &Run, warnings: &mut Vec<String
     Ok(())
 }
 
-/// Gives points that came without colours the mean colour of the photos that show them.
+/// Sets the colour of points that come without one to the mean over the photos that show them.
 pub(super) fn color_points(dataset: &mut Dataset, photos: &[Known], folder: &SceneFolder) -> Result<()> {
     if dataset.shown_in.is_empty() {
         return Ok(());
@@ -135,10 +138,11 @@ pub(super) fn color_points(dataset: &mut Dataset, photos: &[Known], folder: &Sce
     Ok(())
 }
 
-/// Bytes that a photo takes while it is read, for each of its file's pixels: decoded, shrunk, undistorted, encoded again.
+/// Memory to decode, scale, undistort and encode a photo, in bytes per pixel of its file.
 const BYTES_A_PIXEL: u64 = 12;
 
-/// Reads the photos, writes them into the scene folder, and looks at each once.
+/// Loads all photos, writes the prepared photos into the scene folder, and detects their key
+/// points. `config.memory` limits how many are loaded at once.
 pub(super) fn load(dataset: &Dataset, config: &Config, folder: &SceneFolder, cache: &Cache, run: &Run) -> Result<Vec<Known>> {
     let work = run.work("photos", dataset.photos.len() as u64);
     let largest = dataset.photos.iter().map(|p| u64::from(p.camera.width) * u64::from(p.camera.height)).max().unwrap_or(1);
@@ -165,7 +169,8 @@ fn fingerprint(camera: &Camera, pixels: &RgbImage) -> Key {
     cache::key(&[&camera.width.to_le_bytes(), pixels.as_raw()])
 }
 
-/// What stays in memory of a photo.
+/// Detects key points, and measures colours, sharpness and coverage of a prepared photo. Key points
+/// are cached.
 fn known(Photo { camera, pixels, alpha, drawn, .. }: Photo, cache: &Cache) -> Result<Known> {
     let covered = |alpha: GrayImage| Extent::of(alpha.pixels().filter(|p| p[0] > 0).count(), alpha.pixels().len());
     let opaque = alpha.map_or(Extent::Everything, covered);
@@ -177,14 +182,14 @@ fn known(Photo { camera, pixels, alpha, drawn, .. }: Photo, cache: &Cache) -> Re
     Ok(Known { impression: Impression::of(&pixels), drawn, opaque, camera, key, points, colors, bend: 0.0 })
 }
 
-/// Writes a working photo with its masks into the scene folder.
+/// Writes a prepared photo with its masks into the scene folder.
 fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
     let name = &photo.camera.name;
     image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
     for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
         match mask {
             Some(mask) => image_io::save_png(&path, mask.clone())?,
-            // A mask that an earlier run left would now be wrong.
+            // A mask of an earlier run does not belong to this photo.
             None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
             None => {}
         }
@@ -192,8 +197,8 @@ fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
     Ok(())
 }
 
-/// Frees the photos in the scene folder, and their key points, from a bend of the lens that nothing had told of: `k1` for each photo, with the
-/// focal length that its camera has by now.
+/// Removes additional radial distortion from the prepared photos and their key points. `k1` holds
+/// the radial term of each photo, for the current focal length of its camera.
 pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder) -> Result<()> {
     photos.par_iter_mut().zip(k1).try_for_each(|(known, &k1)| {
         let (camera, lens) = (known.camera.clone(), Distortion { k1, ..Distortion::default() });
@@ -209,7 +214,7 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
     })
 }
 
-/// What counts in two masks, where there are two.
+/// Returns the pixels that count in both masks (the smaller value), or the only mask there is.
 fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage> {
     match (one, other) {
         (Some(mut one), Some(other)) => {
@@ -220,15 +225,20 @@ fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage
     }
 }
 
-/// Reads, shrinks and undistorts; undistorting last keeps the work small, and distortion does not depend on scale.
+/// Loads a photo, scales it to at most `max_side` pixels and undistorts it. Undistorting last is
+/// cheaper, and distortion does not depend on scale.
+///
+/// # Errors
+/// The photo or its mask cannot be read, or its proportions differ from those of its camera.
 pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     let way_up = if posed.upright { WayUp::Upright } else { WayUp::AsPosed(posed.camera.width, posed.camera.height) };
     let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, way_up)?;
-    // The file decides the true size; some tools scale photos and leave the poses' file as it was.
+    // The size of the file is authoritative: some tools scale photos and keep the file of the
+    // poses.
     let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
     if !is_alike(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
         bail!(
-            "{}: the photo is {}x{}, but its camera is {}x{}; was it rotated or cropped after the poses were made?",
+            "{}: the photo is {}x{}, but its camera is {}x{}; check whether it was rotated or cropped after the poses were computed",
             posed.path.display(),
             raw.width(),
             raw.height(),
@@ -247,7 +257,7 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
         let own = MaskImage::load(path)?;
         if !is_alike((own.width, own.height), raw.dimensions()) {
             let (width, height) = raw.dimensions();
-            bail!("{}: the mask is {}x{}, its photo {width}x{height}; was it rotated or cropped?", path.display(), own.width, own.height);
+            bail!("{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped", path.display(), own.width, own.height);
         }
         drawn = Some(Extent::of(own.area(), own.inside.len()));
         ignore = Some(mask(&own.to_gray()));
@@ -256,12 +266,13 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
     Ok(Photo { pixels, alpha, ignore, drawn, camera })
 }
 
-/// Whether two sizes have the same proportions, but for rounding.
+/// Returns whether two sizes have the same proportions within 2 %, which allows for rounding.
 fn is_alike((w, h): (u32, u32), (width, height): (u32, u32)) -> bool {
     (f64::from(w) / f64::from(h) * f64::from(height) / f64::from(width) - 1.0).abs() <= 0.02
 }
 
-/// A photo and its coverage, each resampled. Colours are weighted by coverage meanwhile: what is transparent has none to mix in.
+/// Resamples a photo and its alpha channel. Colours are multiplied by alpha before and divided by
+/// it after, so that transparent pixels do not affect opaque ones.
 fn resampled(
     pixels: &RgbImage,
     alpha: Option<&GrayImage>,
@@ -299,7 +310,7 @@ mod tests {
         let write = |name: &str, text: &str| std::fs::write(model.join(name), text).unwrap();
         write("cameras.txt", "1 PINHOLE 64 64 60 60 32 32\n");
         write("images.txt", "1 1 0 0 0 0 0 4 1 a.png\n\n2 1 0 0 0 0 0 4 1 b.png\n\n");
-        // The first is seen by both, the second by the second photo.
+        // Both photos show the first point; only the second photo shows the second point.
         write("points3D.txt", "1 0 0 0 0 0 0 0.5 1 0 2 0\n2 0.1 0 0 0 0 0 0.5 2 1\n");
         let mut dataset = fastlgs_core::dataset::load(&photos).unwrap();
         let folder = SceneFolder::new(dir.path().join("scene"));
@@ -313,7 +324,7 @@ mod tests {
 
     #[test]
     fn what_is_transparent_has_no_colour_to_mix_in() {
-        // The left half is white; the right half is transparent, and black as files have it.
+        // The left half is white. The right half is transparent and black, as files store it.
         let pixels = RgbImage::from_fn(6, 2, |x, _| Rgb([if x < 3 { 255 } else { 0 }; 3]));
         let alpha = GrayImage::from_fn(6, 2, |x, _| Luma([if x < 3 { 255 } else { 0 }]));
         let (half, covered) = resampled(&pixels, Some(&alpha), |p| image_io::resize(p, 3, 1), |m| image_io::resize_gray(m, 3, 1));

@@ -1,4 +1,4 @@
-//! Poses: found where there are none, checked where they are given.
+//! Poses: computes missing ones, and verifies and corrects given ones.
 
 use super::config::{Adjusted, Poses, Sfm};
 use super::photos::Known;
@@ -17,7 +17,11 @@ use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Structure from motion for photos without poses. The model lies in the scene and is found again as long as the photos are the same.
+/// Computes poses by structure from motion, and writes the COLMAP model to `sparse/0` of the scene
+/// folder. The result is cached by the names and contents of the photos.
+///
+/// # Errors
+/// No tool is installed, it fails or places no photo, or the run is cancelled.
 pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm, run: &Run) -> Result<Dataset> {
     let images = structure::photos_in(&dataset::images_folder(photos).unwrap_or_else(|| photos.join("images")))?;
     let mut inputs = vec![format!("{sfm:?} {} {}", run.seed, keypoints::version()).into_bytes()];
@@ -28,7 +32,8 @@ pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm,
     let model = folder.root.join("sparse/0");
     let (upright, files) = cache.get("structure", &key, || {
         let tool = Tool::find(sfm == Sfm::Colmap)?;
-        // The program counts pixels as they are stored; key points that are found here lie on upright photos.
+        // `colmap` counts pixels as stored in the file; our key points are in the upright photo
+        // (EXIF).
         Ok((matches!(tool, Tool::Pycolmap(_)), reconstruct(&tool, photos, &images, folder, run)?))
     })?;
     for (name, bytes) in files {
@@ -36,15 +41,17 @@ pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm,
     }
     let mut dataset = dataset::load_model(photos, &model)?;
     dataset.photos.iter_mut().for_each(|photo| photo.upright = upright);
-    // This model is in no other convention.
+    // The convention of a computed model is known.
     dataset.conventions.truncate(1);
     Ok(dataset)
 }
 
-/// Reads the poses in the convention that was asked for, or that the photos' key points plainly fit.
+/// Reads the poses in the convention `asked`. Without it, the usual convention applies, unless the
+/// key points clearly fit another one.
 ///
 /// # Errors
-/// A convention that the file cannot have, and key points that fit several alike but not the usual one.
+/// The file cannot have the convention `asked`; or the key points fit several other conventions
+/// equally well, but not the usual one.
 pub(super) fn settle_convention(
     dataset: &mut Dataset,
     photos: &mut [Known],
@@ -57,7 +64,7 @@ pub(super) fn settle_convention(
     let chosen = match asked {
         Some(asked) if !dataset.conventions.contains(&asked) => {
             let all = names(&dataset.conventions);
-            bail!("--pose-convention {}: the poses' file cannot have it; its conventions are {all}", asked.name());
+            bail!("pose_convention {}: the file of the poses cannot have this convention; choose one of {all}", asked.name());
         }
         Some(asked) => asked,
         None if dataset.conventions.len() < 2 => standard,
@@ -78,8 +85,8 @@ pub(super) fn settle_convention(
                 Verdict::Standard => standard,
                 Verdict::Other(found, [share, usual]) => {
                     let warning = format!(
-                        "the poses fit the photos as {} ({:.0} % of the key points' matches obey them), not as {} ({:.0} %), and are read so; \
-                         --pose-convention names one",
+                        "the poses are read as {} ({:.0} % of the key point matches agree), not as {} ({:.0} %); \
+                         set pose_convention to choose another one",
                         found.name(),
                         100.0 * share,
                         standard.name(),
@@ -90,7 +97,7 @@ pub(super) fn settle_convention(
                     found
                 }
                 Verdict::Unclear(among) => bail!(
-                    "the poses do not fit the photos as {}, but as {} alike; say by --pose-convention which one they are written in",
+                    "the poses do not fit the photos as {}, but fit equally well as {}; set pose_convention to the one in which they are written",
                     standard.name(),
                     names(&among)
                 ),
@@ -105,13 +112,14 @@ pub(super) fn settle_convention(
     Ok(())
 }
 
-/// Names and contents of the files of the model that explains most photos.
+/// Runs structure from motion. Returns names and contents of the files of the model that places
+/// most photos.
 fn reconstruct(tool: &Tool, photos: &Path, images: &[PathBuf], folder: &SceneFolder, run: &Run) -> Result<Vec<(String, Vec<u8>)>> {
     let work = run.work("poses", 0);
-    run.warn(&format!("{}: no poses; structure from motion looks for them, which takes minutes", photos.display()));
+    run.warn(&format!("{}: no poses were found; structure from motion computes them, which takes minutes", photos.display()));
     let folders = images.first().and_then(|image| image.parent()).map(dataset::folders_within).unwrap_or_default();
     if !folders.is_empty() {
-        run.warn(&format!("photos in folders within images/ are not read ({}): move them up", folders.join(", ")));
+        run.warn(&format!("photos in subfolders of images/ are not read ({}): move them to images/", folders.join(", ")));
     }
     let partial = folder.root.join(PARTIAL);
     let found = structure::reconstruct(tool, images, &partial, run.seed, |stage, line| told(&work, stage, line));
@@ -126,17 +134,19 @@ fn reconstruct(tool: &Tool, photos: &Path, images: &[PathBuf], folder: &SceneFol
     Ok(files)
 }
 
-/// Passes on what a tool prints; whether to go on.
+/// Reports a line that a tool printed. Returns whether to continue.
 fn told(work: &Work, stage: &str, line: &str) -> bool {
     work.note(&format!("{stage}: {line}"));
     work.check().is_ok()
 }
 
-/// Longer side of the pictures on which poses are checked. Its tolerances are pixels, and the coarser key points of small
-/// pictures are those that wide baselines share.
+/// Longer side of the photos for the pose check, in pixels. The tolerances of the check are in
+/// these pixels. Coarse key points of small photos match across wide baselines.
 const CHECK_SIDE: u32 = 480;
 
-/// Moves groups of cameras that contradict the others. Poses come from all photos, held out or not, as in structure from motion.
+/// Verifies the poses by key points, and moves groups of cameras that contradict the others. If
+/// many poses are wrong, all poses are computed again. Held-out photos take part, as in structure
+/// from motion.
 pub(super) fn check(
     photos: &mut [Known],
     folder: &SceneFolder,
@@ -172,10 +182,10 @@ pub(super) fn check(
         });
         match anew {
             Ok(anew) => (report, mended) = anew.unwrap_or((report, mended)),
-            // What fails is tried again by the next run; that the tool is missing, too.
+            // Errors are not cached: the next run tries again, also after pycolmap is installed.
             Err(Error::Vision(error)) => {
                 let warning =
-                    format!("many poses contradict the photos, which could not be placed anew: {error}; they are mended one by one");
+                    format!("many poses contradict the photos, but computing all poses again failed: {error}; only single groups of cameras are corrected");
                 run.warn(&warning);
                 warnings.push(warning);
             }
@@ -186,18 +196,20 @@ pub(super) fn check(
     Ok(report)
 }
 
-/// Where structure from motion keeps what it needs, in the scene's folder.
+/// Folder in the scene for the temporary files of structure from motion.
 const PARTIAL: &str = "sfm.partial";
-/// One in so many photos whose poses are doubted is a reason to place all of them anew.
+/// All poses are computed again if at least one of this many photos has a wrong pose.
 const DOUBTED: usize = 10;
 
-/// How many poses were found wrong.
+/// Returns the number of wrong poses: moved ones, and those that could not be corrected.
 fn doubted(report: &pose_check::Report) -> usize {
     report.moved.len() + report.contradictory.len()
 }
 
-/// All photos placed anew with the lenses that are given, where many poses contradict the photos: what is wrong with many is seldom mended one by one.
-/// In the frame of the poses that were right, and only where fewer of the new poses contradict the photos than of the old ones, and no more are lost.
+/// Computes all poses again with the given intrinsics, because correcting many wrong poses one by
+/// one seldom works. The result is in the frame of the given poses that were right.
+///
+/// Returns `None` unless fewer of the new poses contradict the photos, and no more photos are lost.
 fn anew(
     given: &[Camera],
     points: &[Keypoints],
@@ -206,7 +218,7 @@ fn anew(
     run: &Run,
 ) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
     let Tool::Pycolmap(python) = Tool::find(false)? else {
-        let mend = "that needs pycolmap, and only the program 'colmap' is there; 'fastlgs models install-offline' installs pycolmap";
+        let mend = "this needs pycolmap, but only the program 'colmap' is installed; run 'fastlgs models install-offline' to install pycolmap";
         return Err(Error::Vision(fastlgs_vision::Error::Missing(mend.to_owned())));
     };
     let work = run.work("poses anew", 0);
@@ -222,8 +234,8 @@ fn anew(
     let unplaced = (0..given.len()).filter(|&photo| found[photo].is_none());
     let lost: BTreeSet<usize> = unplaced.chain(again.contradictory.iter().copied()).collect();
     let doubted_now = lost.iter().chain(&again.moved).collect::<BTreeSet<_>>().len();
-    tracing::info!(doubted = doubted(checked), doubted_now, lost = lost.len(), "photos were placed anew");
-    // What was mended is trained on, and what is lost is not.
+    tracing::info!(doubted = doubted(checked), doubted_now, lost = lost.len(), "all poses were computed again");
+    // Corrected photos are trained on, lost ones are not.
     if doubted_now >= doubted(checked) || lost.len() > checked.contradictory.len() {
         return Ok(None);
     }
@@ -232,10 +244,12 @@ fn anew(
     Ok(Some((cameras, pose_check::Report { moved, contradictory: lost.into_iter().collect() })))
 }
 
-/// Matches with another photo from which these may support a pose, and the share of them that must obey it.
+/// A photo supports the pose of another one with at least this many matches, of which more than
+/// this share agrees with the pose.
 const SUPPORT: (usize, f32) = (15, 0.5);
 
-/// Adds photos to the contradictory ones whose poses lie far outside of all others and that no match with another photo supports.
+/// Marks photos as contradictory whose cameras lie far outside of all others, and whose poses no
+/// other photo supports.
 pub(super) fn leave_out_lost(photos: &[Known], cache: &Cache, checked: &mut pose_check::Report) -> Result<()> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
@@ -258,7 +272,8 @@ pub(super) fn leave_out_lost(photos: &[Known], cache: &Cache, checked: &mut pose
     Ok(())
 }
 
-/// Places photos that contradict the others by what their key points show.
+/// Computes the poses of contradictory photos by resection from matched key points, and updates
+/// `checked`.
 pub(super) fn place(photos: &mut [Known], checked: &mut pose_check::Report, matches: &[PairMatches]) {
     if checked.contradictory.is_empty() {
         return;
@@ -272,12 +287,12 @@ pub(super) fn place(photos: &mut [Known], checked: &mut pose_check::Report, matc
     checked.moved.sort_unstable();
 }
 
-/// Says which photos had wrong poses.
+/// Warns about photos whose poses were wrong.
 pub(super) fn warn(photos: &[Known], checked: &pose_check::Report, run: &Run, warnings: &mut Vec<String>) {
     let names = |list: &[usize]| list.iter().map(|&i| photos[i].camera.name.as_str()).collect::<Vec<_>>().join(", ");
     for (list, what) in [
-        (&checked.moved, "contradicted the photos and were moved to where the key points match"),
-        (&checked.contradictory, "contradict the photos and could not be mended; these views are not trained on"),
+        (&checked.moved, "contradicted the photos and were corrected by key point matches"),
+        (&checked.contradictory, "contradict the photos and could not be corrected; these views are not trained on"),
     ] {
         if !list.is_empty() {
             let warning = format!("the poses of {} of {} photos {what}: {}", list.len(), photos.len(), names(list));
@@ -287,7 +302,7 @@ pub(super) fn warn(photos: &[Known], checked: &pose_check::Report, run: &Run, wa
     }
 }
 
-/// Key points of the photos at the sizes of `cameras`.
+/// Detects key points in the photos, scaled to the sizes of `cameras`.
 fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<Vec<Keypoints>> {
     let work = run.work("key points for the pose check", cameras.len() as u64);
     let mut points = Vec::new();
@@ -299,16 +314,19 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
     Ok(points)
 }
 
-/// Photos up to which all cameras are adjusted together: time grows with the third power of their number.
+/// Largest number of photos for which [`Poses::Check`] adjusts all cameras. Time grows with the
+/// cube of their number.
 const ADJUSTED: usize = 600;
-/// Pixels by which a lens may bend a photo's corners before the photos are straightened: resampling costs some sharpness.
+/// Displacement at the corners, in pixels, above which a found distortion is removed from the
+/// photos. Resampling reduces sharpness.
 const BENT: f32 = 1.0;
-/// Adjusted poses are used where the error of the key points falls below this share of what it was: that of exact poses falls by some
-/// hundredths, as adjusting fits the noise of the key points as well.
+/// Adjusted poses are used if the reprojection error falls below this share of its old value. The
+/// error of exact poses falls slightly, too, because adjustment also fits the noise of key points.
 const MENDED: f32 = 0.9;
 
-/// Adjusts all cameras to what the key points say. Poses that explain these about as well as the adjusted ones stay, unless refining was
-/// asked for: structure from motion on larger photos knew better.
+/// Runs bundle adjustment on all cameras, and removes the lens distortion that it finds. The given
+/// poses stay if they fit almost as well, unless `asked` is [`Poses::Refine`]. They may come from
+/// larger photos, and are then more exact.
 pub(super) fn adjust(
     photos: &mut [Known],
     matches: &[PairMatches],
@@ -319,7 +337,7 @@ pub(super) fn adjust(
 ) -> Result<Option<Adjusted>> {
     if photos.len() > ADJUSTED && asked != Poses::Refine {
         let warning = format!(
-            "poses and lenses of more than {ADJUSTED} photos are adjusted only if that is asked for (--poses refine), as it takes long"
+            "poses and lenses of more than {ADJUSTED} photos are not adjusted, because it takes long; set 'poses' to 'refine' to adjust them"
         );
         run.warn(&warning);
         warnings.push(warning);
@@ -346,9 +364,9 @@ pub(super) fn adjust(
     if used && bent > BENT {
         super::photos::straighten(photos, &report.k1, folder)?;
         let warning = format!(
-            "the lens bends the photos by {bent:.1} pixels at their corners, which the given poses do not say; the photos were straightened \
-             (\"k1\": {k1:.4} in a transforms.json, or a radial term in COLMAP's camera model, does it at full size; labels drawn on them are \
-             as bent as they were)"
+            "the lens distorts the photos by {bent:.1} pixels at their corners, which the given poses do not state; the photos were straightened \
+             (\"k1\": {k1:.4} in transforms.json, or a radial term in COLMAP's camera model, removes it at full size; labels drawn on the photos are \
+             not straightened)"
         );
         run.warn(&warning);
         warnings.push(warning);

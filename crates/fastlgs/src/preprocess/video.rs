@@ -1,4 +1,4 @@
-//! A video in place of photos: its frames become photos, in the scene folder.
+//! Extracts photos from a video into the folder `video` of the scene.
 
 use crate::error::{Context, bail};
 use crate::{Result, Run};
@@ -8,30 +8,34 @@ use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
-/// Says which video the photos were made of, and their names.
+/// File beside the photos that names their video.
 const NOTE: &str = "video.json";
 
-/// The note beside the photos of a video.
+/// Contents of this file.
 #[derive(PartialEq, Serialize, Deserialize)]
 struct Note {
-    /// The video.
+    /// Path of the video.
     video: PathBuf,
-    /// Its fingerprint.
+    /// Fingerprint of the video.
     file: Value,
-    /// The version of the program that chose the frames.
+    /// Version of FastLGS that chose the frames.
     version: String,
     /// File names of the photos.
     images: Vec<String>,
 }
 
-/// What tells whether a video is still the same: its size, and when it was changed.
+/// Returns the fingerprint of a file: its size in bytes, and its modification time in Unix seconds.
 pub(crate) fn fingerprint(video: &Path) -> Result<Value> {
-    let about = video.metadata().with_context(|| format!("{}: the video cannot be opened", video.display()))?;
+    let about = video.metadata().with_context(|| format!("{}: the file cannot be opened", video.display()))?;
     let changed = about.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok()).map(|time| time.as_secs());
     Ok(json!([about.len(), changed]))
 }
 
-/// The folder of photos that a video becomes. What was made of the same video is kept.
+/// Extracts photos from a video and returns their folder. Reuses earlier photos of the same video
+/// and version.
+///
+/// # Errors
+/// The video cannot be decoded, other files are in the way, or the run is cancelled.
 pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<PathBuf> {
     let photos = folder.root.join("video");
     let (path, file, version) = (std::path::absolute(video)?, fingerprint(video)?, env!("CARGO_PKG_VERSION").to_owned());
@@ -41,9 +45,9 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
         return Ok(photos);
     }
     if earlier.is_none() && photos.exists() {
-        bail!("{}: this folder is not of FastLGS and is in the way of the video's frames; move it, or name a new scene", photos.display());
+        bail!("{}: FastLGS did not create this folder, but needs it for the frames of the video; move it, or choose a new scene folder", photos.display());
     }
-    // Those of another video stay until these are whole.
+    // Photos of another video stay until the new ones are complete.
     let partial = folder.root.join("video.partial");
     let _ = std::fs::remove_dir_all(&partial);
     std::fs::create_dir_all(&partial).map_err(fastlgs_core::Error::io(&partial))?;
@@ -70,7 +74,10 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
     Ok(photos)
 }
 
-/// Removes the frames of an earlier video. Other files that lie among them are the user's: they stay, and the folder is then in the way.
+/// Removes the frames of an earlier video.
+///
+/// # Errors
+/// Other files lie among the frames. They belong to the user and stay.
 fn remove_frames(photos: &Path, earlier: &Note) -> Result<()> {
     let images = photos.join("images");
     let names = |folder: &Path| -> Vec<String> {
@@ -79,7 +86,7 @@ fn remove_frames(photos: &Path, earlier: &Note) -> Result<()> {
     };
     let others = names(&images).iter().any(|name| !earlier.images.contains(name));
     if others || names(photos).iter().any(|name| name != NOTE && name != "images") {
-        bail!("{}: files that are not of FastLGS lie among the frames of an earlier video; move them elsewhere", photos.display());
+        bail!("{}: files that FastLGS did not create lie among the frames of an earlier video; move them elsewhere", photos.display());
     }
     for name in earlier.images.iter().filter(|name| Path::new(name).file_name().is_some_and(|own| own == name.as_str())) {
         let _ = std::fs::remove_file(images.join(name));

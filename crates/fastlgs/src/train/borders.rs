@@ -1,6 +1,9 @@
-//! Where masks end, Gaussians shall end. Photos that are blurred, or things of one colour, do not tell where one thing ends and the next begins, but their
-//! masks do. Early in a training, once shapes stand, the objects are found as the Gaussians are by then, and from there on every view is trained towards
-//! its masks as well: each in the colour of its object, which is far from those of its neighbours. What the objects are is found again at the end.
+//! Trains Gaussians to end at the borders of masks.
+//!
+//! Blurred photos, or neighbours of one colour, do not show where an object ends; masks do. Early
+//! in training, the objects of the current Gaussians are found. From then on, every view also has a
+//! target image of object codes, made from its masks. The code of an object is far from those of
+//! its neighbours. After training, the objects are found again.
 
 use crate::error::Context;
 use crate::progress::{Message, Sink};
@@ -11,27 +14,30 @@ use glam::Vec3;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Share of the iterations after which masks shape the Gaussians: while these still grow, so that borders get what they need.
+/// Share of the iterations after which masks guide training. Density control is then still active,
+/// so that borders get the Gaussians that they need.
 const FROM: f32 = 0.15;
 
-/// The iteration after which masks shape the Gaussians; `Trainer::run` reports it.
+/// Returns the iteration after which masks guide training. `Trainer::run` reports this iteration.
 pub fn begin_at(iterations: u32) -> u32 {
     ((iterations as f32 * FROM) as u32).max(1)
 }
 
-/// Where it is kept what views are trained towards: a run that was broken off goes on with it.
+/// Returns the path of a file of the mask targets. They lie beside the checkpoints, so that an
+/// interrupted run can continue.
 fn place(folder: &SceneFolder, name: &str) -> PathBuf {
     folder.root.join("checkpoints/borders").join(name)
 }
 
-/// Finds the objects, and has the views trained towards their masks from now on.
+/// Finds the objects of the current Gaussians, and sets the mask targets of all views from now on.
 pub fn begin(trainer: &mut Trainer, folder: &SceneFolder, config: &objects::Config, run: &Run) -> Result<()> {
     let run = Run { progress: &Amid(run.progress), ..*run };
     trainer.couple(|scene, cameras| find(scene, folder, cameras, config, &run))?;
     go_on(trainer, folder)
 }
 
-/// Who watches the training is told of it alone; the objects' own stages, and their warnings, come at its end.
+/// Progress sink that drops all messages, but can cancel. The stages of finding objects, and their
+/// warnings, are reported after training.
 struct Amid<'a>(&'a dyn Sink);
 
 impl Sink for Amid<'_> {
@@ -42,7 +48,7 @@ impl Sink for Amid<'_> {
     }
 }
 
-/// Has the views trained towards the masks that [`begin`] found.
+/// Sets the mask targets that [`begin`] wrote.
 pub fn go_on(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()> {
     let codes: Vec<[u8; 3]> = fs::read_json(&place(folder, "codes.json"))?;
     let (folder, names) = (folder.clone(), trainer.cameras().into_iter().map(|camera| camera.name).collect::<Vec<_>>());
@@ -51,7 +57,8 @@ pub fn go_on(trainer: &mut Trainer, folder: &SceneFolder) -> Result<()> {
     Ok(())
 }
 
-/// What a view is trained towards; what no mask of an object covers does not count.
+/// Returns the packed code of each pixel of a view. Pixels without an object, and ignored pixels,
+/// do not count.
 fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u32>> {
     let map = LabelMap::load(&place(folder, &format!("{name}.png")))?;
     let ignored = Some(folder.ignore_path(name)).filter(|path| path.is_file()).map(|path| image_io::load_gray(&path)).transpose()?;
@@ -60,7 +67,8 @@ fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u3
     Ok(map.labels.iter().enumerate().map(|(k, id)| pack(code(*id), *id > 0 && counts(k))).collect())
 }
 
-/// Finds the objects, writes where the views' masks of them are, and gives every Gaussian its object's code.
+/// Finds the objects, writes the mask targets of all views, and sets the feature of every Gaussian
+/// to the code of its object.
 fn find(scene: &mut Gaussians, folder: &SceneFolder, cameras: &[Camera], config: &objects::Config, run: &Run) -> Result<()> {
     let lists = objects::map(scene, folder, cameras, config, run)?.chosen.lists();
     let mut beside = Beside::default();
@@ -70,12 +78,13 @@ fn find(scene: &mut Gaussians, folder: &SceneFolder, cameras: &[Camera], config:
         Ok(map.save(&place(folder, &format!("{}.png", camera.name)))?)
     })?;
     let codes = beside.codes(lists.len());
-    fs::write_json(&place(folder, "codes.json"), &codes).context("what masks shape cannot be kept")?;
+    fs::write_json(&place(folder, "codes.json"), &codes).context("the object codes cannot be written")?;
     scene.features = scene.object_ids.iter().map(|id| Vec3::from(codes[usize::from(*id)].map(f32::from)) / 255.0).collect();
     Ok(())
 }
 
-/// Each atom of a view's masks as the object that most of it shows; 0 where none does.
+/// Assigns each atom of a view the object that covers more than half of its pixels; 0 if there is
+/// none.
 fn as_masks_have_it(shown: &LabelMap, atoms: &LabelMap) -> LabelMap {
     let mut counts: Vec<BTreeMap<u16, u32>> = vec![BTreeMap::new(); usize::from(atoms.max()) + 1];
     for (atom, id) in atoms.labels.iter().zip(&shown.labels) {
@@ -86,12 +95,12 @@ fn as_masks_have_it(shown: &LabelMap, atoms: &LabelMap) -> LabelMap {
         counts.iter().find(|(_, count)| 2 * **count > all).map_or(0, |(id, _)| *id)
     };
     let mut of_atom: Vec<u16> = counts.iter().map(most).collect();
-    // What no mask covers.
+    // Atom 0 holds the pixels outside of all masks.
     of_atom[0] = 0;
     LabelMap { labels: atoms.labels.iter().map(|atom| of_atom[usize::from(*atom)]).collect(), ..*atoms }
 }
 
-/// How many pixels of each object lie beside pixels of each other one, in all views.
+/// Number of adjacent pixels of each pair of objects, summed over all views.
 #[derive(Default)]
 struct Beside(BTreeMap<(u16, u16), u32>);
 
@@ -109,8 +118,9 @@ impl Beside {
         }
     }
 
-    /// A code for each of so many objects, 0 included: of the corners of the cube of features the one that is farthest from those of its neighbours, as
-    /// countries on a map have colours. Hundreds of codes would lie close together, and where objects alike meet, nothing would tell them apart.
+    /// Returns the codes of `count` ids, 0 included, as in map colouring. Each code is the corner
+    /// of the feature cube that is farthest from the codes of adjacent objects. Hundreds of
+    /// different codes would be too close together to separate similar neighbours.
     fn codes(&self, count: usize) -> Vec<[u8; 3]> {
         let mut corners: Vec<u32> = Vec::with_capacity(count);
         for id in 0..count as u16 {
@@ -121,7 +131,7 @@ impl Beside {
                     *sum += u64::from(*pixels) * u64::from((!(corner ^ corners[usize::from(*other)]) & 7).count_ones());
                 }
             }
-            // Those that are free of neighbours are spread as well.
+            // Starting at `id` also spreads the codes of objects without neighbours.
             corners.push((0..8).map(|k| (k + u32::from(id)) % 8).min_by_key(|corner| alike[*corner as usize]).unwrap_or_default());
         }
         corners.into_iter().map(|corner| std::array::from_fn(|axis| if corner >> axis & 1 == 1 { 255 } else { 0 })).collect()
@@ -135,7 +145,7 @@ mod tests {
     #[test]
     fn masks_end_where_they_end_whatever_is_shown() {
         let map = |labels: &[u16]| LabelMap { labels: labels.to_vec(), ..LabelMap::new(4, 2) };
-        // Atom 1 is mostly object 5, atom 2 half 5 and half 6, atom 3 mostly nothing.
+        // Atom 1 is mostly object 5, atom 2 half 5 and half 6, atom 3 shows no object.
         let atoms = map(&[1, 1, 1, 2, 2, 3, 3, 0]);
         let shown = map(&[5, 5, 6, 5, 6, 0, 0, 6]);
         assert_eq!(as_masks_have_it(&shown, &atoms).labels, [5, 5, 5, 0, 0, 0, 0, 0]);

@@ -1,4 +1,4 @@
-//! What `train` is asked for.
+//! Options of `train`.
 
 use crate::eyes::{EncoderKind, SegmenterKind};
 use crate::objects;
@@ -8,7 +8,7 @@ use fastlgs_raster::{Budget, FEW_VIEWS};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// How long is trained, and towards how large a scene.
+/// Length of training and size of the scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
@@ -20,12 +20,14 @@ pub enum Preset {
     Standard,
     /// 30,000 iterations.
     Paper,
-    /// The same, and all else as the paper has it: Algorithm 1 finds the objects, and codes are trained together with the scene.
+    /// 30,000 iterations, and everything else as in the paper: Algorithm 1 finds the objects, and
+    /// codes are trained together with the scene.
     LikePaper,
 }
 
 impl Preset {
-    /// Iterations, highest SH degree, and most Gaussians with an automatic budget.
+    /// Returns the number of iterations, the highest SH degree, and the limit of an automatic
+    /// budget.
     pub(super) fn values(self) -> (u32, u32, usize) {
         match self {
             Self::Quick => (3_000, 2, 200_000),
@@ -35,31 +37,31 @@ impl Preset {
     }
 }
 
-/// Whether each training photo has an affine exposure of its own.
+/// Whether training learns an affine exposure for each training photo.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Exposures {
-    /// Where the photos' brightness varies.
+    /// Learn exposures if the photos' brightness varies.
     #[default]
     Auto,
-    /// Learned.
+    /// Learn exposures.
     On,
-    /// None.
+    /// Do not learn exposures.
     Off,
 }
 
-/// Whether cameras move while training.
+/// Whether training refines the cameras of the training photos.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Align {
-    /// Where photos that are kept aside gain by it.
+    /// Refine the cameras if validation views improve by it.
     #[default]
     Auto,
-    /// They do.
+    /// Refine the cameras.
     On,
-    /// They do not.
+    /// Keep the cameras.
     Off,
 }
 
@@ -68,26 +70,28 @@ pub enum Align {
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Mapping {
-    /// The views vote over the trained Gaussians.
+    /// Consensus of all views on the trained Gaussians.
     #[default]
     Global,
     /// Algorithm 1 of the paper.
     Paper,
-    /// Those that the scene has; with --init of the trained scene, either feature mode refines what the other made.
+    /// Keep the objects of a trained scene. With --init of its scene.ply, either feature mode
+    /// refines the result of the other.
     Keep,
 }
 
-/// Whether masks tell Gaussians where things end.
+/// Whether masks guide training at the borders of objects.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Borders {
-    /// Where masks know more than the photos' edges: those of SAM and imported ones, not those of the offline segmenter.
+    /// Use masks of SAM and imported masks. Masks of the offline segmenter only follow edges of the
+    /// photos and are not used.
     #[default]
     Auto,
-    /// Yes.
+    /// Use masks.
     On,
-    /// No.
+    /// Do not use masks.
     Off,
 }
 
@@ -96,32 +100,32 @@ pub enum Borders {
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum FeatureMode {
-    /// One pass of votes.
+    /// Lifting: one pass of votes over all views.
     #[default]
     Lift,
     /// Gradient descent, as in the paper.
     Train,
 }
 
-/// What Algorithm 1 compares beside the embeddings.
+/// Cue that Algorithm 1 compares in addition to embeddings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
 pub enum Cue {
-    /// Pairs of key points.
+    /// Key point matches.
     Keypoints,
-    /// Colour distributions.
+    /// Colour histograms.
     Color,
-    /// Nothing.
+    /// No other cue.
     None,
 }
 
-/// What lies behind everything.
+/// Background of a scene.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Background {
-    /// Its colour, 0 to 1; where training starts if it is learned.
+    /// RGB colour, 0 to 1; the initial value if it is learned.
     pub color: [f32; 3],
-    /// Whether it is learned.
+    /// Whether training learns the colour.
     pub learn: bool,
 }
 
@@ -129,34 +133,34 @@ impl Background {
     /// Parses `0,0.5,1` or `learn`.
     ///
     /// # Errors
-    /// Anything else.
+    /// Any other text.
     pub fn parse(text: &str) -> Result<Self, String> {
         if text == "learn" {
             return Ok(Self { color: [0.5; 3], learn: true });
         }
         let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
-        let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1"))?;
+        let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1, separated by commas"))?;
         Ok(Self { color, learn: false })
     }
 }
 
-/// The offline encoder's cosines of two photos of one thing go down to 0.6 (median 0.87), where CLIP's hardly leave 0.9: on exact masks of the generated
-/// table, twins and mirror Algorithm 1 finds 116, 30 and 68 objects with the paper's theta, and 13, 8 and 9 with this one, where there are 13, 7 and 9.
+/// Default theta of Algorithm 1 for the offline encoder, a cosine. Its cosines of two photos of one
+/// object fall to 0.6 (median 0.87); those of CLIP hardly fall below 0.9.
 const OFFLINE_THETA: f32 = 0.7;
 
-/// The paper names no weight of the feature loss. Where masks are wrong it moves Gaussians wrongly: with 1, fox (offline masks, preset quick) falls
-/// from 31.9 to 29.6 dB, with this one to 31.8, at the same oracle mIoU; the table with exact masks rises from 36.9 dB to 37.6 with either.
+/// Default weight of the feature loss relative to the colour loss; the paper names none. Wrong
+/// masks move Gaussians wrongly: on fox, a weight of 1 costs 2.3 dB, this one 0.1 dB.
 const FEATURE_WEIGHT: f32 = 0.2;
 
-/// Pixels of the training views that stand against each Gaussian of an automatic budget. A Gaussian has 14 numbers to learn, a pixel tells three;
-/// where there are few pixels a Gaussian, as with 170,000 of them on 28 photos of 240x180, they learn the photos by heart.
+/// Least number of training pixels per Gaussian of an automatic budget. A Gaussian has 14
+/// parameters and a pixel has three values. With fewer pixels, Gaussians overfit the photos.
 const PIXELS_A_GAUSSIAN: usize = 20;
 
-/// SH degree of [`FEW_VIEWS`]: each Gaussian is seen by some of them only, and nine numbers a channel learn what each sees by heart. Oracle mIoU at
-/// degrees 0, 1, 2: generated table of 20 views 0.966, 0.959, 0.883 (30.3, 29.5, 28.2 dB), fox of 18 views 0.77, 0.83, 0.81 at the same PSNR.
+/// Highest default SH degree for fewer than [`FEW_VIEWS`] training views. Only some of them show
+/// each Gaussian, so that higher degrees overfit.
 const DEGREE_OF_FEW: u32 = 1;
 
-/// So many Gaussians; nothing for `auto`.
+/// Number of Gaussians; `None` for `auto`.
 type BudgetChoice = Option<usize>;
 
 /// Parses `auto` or a number.
@@ -168,47 +172,52 @@ fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
     text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
 }
 
-/// What is trained, and how.
+/// Options of `train`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
     /// Scene folder that `preprocess` made.
     pub scene: PathBuf,
-    /// How long is trained.
+    /// Length of training.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub preset: Preset,
-    /// Iterations, instead of the preset's.
+    /// Number of iterations, instead of the preset's.
     #[cfg_attr(feature = "clap", arg(long))]
     pub iterations: Option<u32>,
-    /// Gaussians: `auto` (as many as held-out quality gains from; at most one for 20 pixels of the training photos, and 200,000 with the preset
-    /// quick, 300,000 with standard, a million with paper), or exactly how many there may be.
+    /// Limit of Gaussians: a number, or `auto`. `auto` removes Gaussians that hardly change the
+    /// training photos. It allows at most one per 20 pixels of the training photos, and at most
+    /// 200,000 (quick), 300,000 (standard) or 1,000,000 (paper).
     #[cfg_attr(feature = "clap", arg(long, default_value = "auto", value_parser = parse_budget))]
     pub budget: BudgetChoice,
-    /// Highest spherical-harmonic degree of colour, 0 to 3; by default that of --init, else the preset's, but 1 where fewer than 25 photos are
-    /// trained on.
+    /// Highest spherical harmonics degree of colour, 0 to 3. Default: that of the --init file, else
+    /// that of the preset. With fewer than 25 training photos, it is at most 1, except with
+    /// like-paper.
     #[cfg_attr(feature = "clap", arg(long, value_parser = clap::value_parser!(u32).range(0..=3)))]
     pub sh_degree: Option<u32>,
-    /// Anti-aliasing by the 2-D Mip filter; also where --init names the scene's own Gaussians, which were trained with it.
+    /// Anti-alias with the 2-D Mip filter. It is always on if --init names the Gaussians of this
+    /// scene and they were trained with it.
     #[cfg_attr(feature = "clap", arg(long))]
     pub antialias: bool,
-    /// Colour behind everything: three numbers from 0 to 1 separated by commas, or `learn`; by default black, but that which they were trained with
-    /// where --init names the scene's own Gaussians.
+    /// Background colour: three numbers from 0 to 1 separated by commas, or `learn`. Default:
+    /// black; if --init names the Gaussians of this scene, the background of their training.
     #[cfg_attr(feature = "clap", arg(long, value_parser = Background::parse))]
     pub background: Option<Background>,
     /// Learn an affine exposure for each training photo.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t, num_args = 0..=1, default_missing_value = "on", require_equals = true))]
     pub exposure: Exposures,
-    /// Move the cameras of the training photos to where the scene says that they were; `auto` where photos that are kept aside gain by it.
+    /// Refine the cameras of the training photos. `auto` does so if validation views improve by it.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub align: Align,
-    /// Whether Gaussians learn from the masks where things end, with --mapping global and --feature-mode lift.
+    /// Use masks to train Gaussians to end at the borders of objects. Needs --mapping global and
+    /// --feature-mode lift.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub borders: Borders,
-    /// Keep geometry and colour as --init gives them; train features only.
+    /// Keep geometry and colour of the --init file, and train features only.
     #[cfg_attr(feature = "clap", arg(long, requires = "init"))]
     pub freeze: bool,
-    /// Start from the Gaussians of a file instead of points: .ply (also SuperSplat's compressed), .spz, .sog, .glb or .splat.
+    /// Start from the Gaussians of a file instead of points: .ply (including compressed files of
+    /// SuperSplat), .spz, .sog, .glb or .splat.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", visible_alias = "init-ply"))]
     #[serde(alias = "init_ply")]
     pub init: Option<PathBuf>,
@@ -218,26 +227,29 @@ pub struct Config {
     /// How Gaussians get their codes.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub feature_mode: FeatureMode,
-    /// Paper mapping: fewest key-point pairs that make two masks one object.
+    /// Paper mapping: least number of key point matches that makes two masks one object.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = PaperConfig::default().tau))]
     pub tau: u32,
-    /// Paper mapping: least similarity that makes two masks one object; by default the paper's 0.95 for CLIP, and 0.7 for the offline encoder.
+    /// Paper mapping: least similarity that makes two masks one object. Default: 0.95 as in the
+    /// paper, but 0.7 for the offline encoder.
     #[cfg_attr(feature = "clap", arg(long))]
     pub theta: Option<f32>,
     /// Paper mapping: weight of colour in the similarity.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = PaperConfig::default().alpha))]
     pub alpha: f32,
-    /// Paper mapping: what is compared beside the embeddings, separated by commas (the paper's ablation).
+    /// Paper mapping: cues to compare in addition to embeddings, separated by commas (the ablation
+    /// of the paper).
     #[cfg_attr(feature = "clap", arg(long, value_enum, value_delimiter = ',', default_value = "keypoints,color"))]
     pub cues: Vec<Cue>,
-    /// Global mapping: how well the views' masks must fit an object, as their mean IoU.
+    /// Global mapping: least support of an object, its mean IoU with the best mask of each view.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
     pub support: f32,
-    /// Measure the held-out PSNR every N iterations and report it over the seconds of training.
+    /// Measure the PSNR of held-out views every N iterations, and report it over time. N is rounded
+    /// up to a multiple of 20.
     #[cfg_attr(feature = "clap", arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..)))]
     pub curve: Option<u32>,
-    /// Weight of the feature loss against colour's, with --feature-mode train and where masks shape the Gaussians (--borders): both move these, unless
-    /// --freeze keeps them.
+    /// Weight of the feature loss relative to the colour loss, for --feature-mode train and
+    /// --borders. Both losses move Gaussians, unless --freeze is set.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = FEATURE_WEIGHT))]
     pub feature_weight: f32,
     /// Continue from the last checkpoint.
@@ -276,7 +288,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// With all that the preset says.
+    /// Returns the options with those that the preset implies.
     pub(super) fn resolved(&self) -> Self {
         match self.preset {
             Preset::LikePaper => Self { mapping: Mapping::Paper, feature_mode: FeatureMode::Train, ..self.clone() },
@@ -284,24 +296,24 @@ impl Config {
         }
     }
 
-    /// Iterations of the run.
+    /// Returns the number of iterations.
     pub fn iterations(&self) -> u32 {
         self.iterations.unwrap_or(self.preset.values().0)
     }
 
-    /// Highest SH degree of a run on so many views, unless it is asked for.
+    /// Returns the default of the highest SH degree for a number of training views.
     pub(super) fn degree(&self, views: usize) -> u32 {
         let (_, degree, _) = self.preset.values();
         if views < FEW_VIEWS && self.preset != Preset::LikePaper { degree.min(DEGREE_OF_FEW) } else { degree }
     }
 
-    /// How many Gaussians there may be, for views of so many pixels in all.
+    /// Returns the budget of Gaussians. `pixels` is the number of pixels of all training views.
     pub(super) fn budget(&self, pixels: usize) -> Budget {
         let most = self.preset.values().2.min(pixels / PIXELS_A_GAUSSIAN);
         self.budget.map_or(Budget::Auto(most.max(1)), Budget::Fixed)
     }
 
-    /// Constants of Algorithm 1 on embeddings of an encoder.
+    /// Returns the constants of Algorithm 1. `encoder` is its name in the manifest.
     pub(super) fn paper(&self, encoder: &str) -> PaperConfig {
         let theta = if encoder == EncoderKind::Offline.name() { OFFLINE_THETA } else { PaperConfig::default().theta };
         let theta = self.theta.unwrap_or(theta);
@@ -309,7 +321,7 @@ impl Config {
         PaperConfig { tau: self.tau, theta, alpha, key_points: self.cues.contains(&Cue::Keypoints) }
     }
 
-    /// Whether masks of this segmenter shape the Gaussians from some step on.
+    /// Returns whether masks guide training. `segmenter` is its name in the manifest.
     pub(super) fn masks_shape(&self, segmenter: &str) -> bool {
         let asked = match self.borders {
             Borders::Auto => segmenter != SegmenterKind::Offline.name(),
@@ -319,7 +331,7 @@ impl Config {
         asked && self.mapping == Mapping::Global && self.feature_mode == FeatureMode::Lift && !self.freeze
     }
 
-    /// Constants of global mapping.
+    /// Returns the constants of global mapping.
     pub(super) fn global(&self) -> objects::Config {
         objects::Config { antialias: self.antialias, objects: chosen::Config { min_support: self.support, ..chosen::Config::default() } }
     }

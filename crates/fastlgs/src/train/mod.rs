@@ -1,4 +1,5 @@
-//! Colour and semantic field together (paper, training features for Gaussians), and the objects on them.
+//! Training: optimises Gaussians with colour and features, then finds their objects (paper,
+//! training features for Gaussians).
 
 mod borders;
 mod config;
@@ -21,17 +22,17 @@ use settings::settings;
 pub(crate) use start::target;
 use std::time::Instant;
 
-/// Note of the manifest: with what `make` made the scene.
+/// Key of the manifest note with the inputs and options of `make`.
 pub(crate) const MADE: &str = "made";
 
-/// All that training leaves, beside the manifest and the objects' maps.
+/// Files of the scene that training replaces, besides the manifest and the object maps.
 const LEFT: [&str; 4] = ["grid.json", "grid.safetensors", "scene.ply", "cameras/trained.json"];
 
-/// Trains the scene folder `config.scene`: Gaussians, their objects, and the table of these.
+/// Trains the scene `config.scene`: writes its Gaussians, object table and object maps.
 ///
 /// # Errors
-/// Options that contradict each other, a scene that was not preprocessed, a device that fails, or a cancelled run, after which the
-/// earlier scene is as it was and `config.resume` goes on from the last checkpoint.
+/// Contradictory options, a scene that was not preprocessed, a failing device, or a cancelled run.
+/// The earlier scene then stays unchanged, and `config.resume` continues from the last checkpoint.
 pub fn train(config: &Config, run: &Run) -> Result<Report> {
     train_locked(config, &SceneLock::of_scene(&config.scene, "train")?, run)
 }
@@ -39,7 +40,7 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
 /// Trains a scene that the caller has locked.
 pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
     if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
-        bail!("--preset like-paper finds objects as the paper does: leave out --mapping keep, or name another preset");
+        bail!("preset 'like-paper' finds objects by Algorithm 1 and cannot keep existing ones: omit mapping 'keep', or choose another preset");
     }
     let config = &config.resolved();
     let by_descent = config.feature_mode == FeatureMode::Train;
@@ -51,7 +52,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let folder = SceneFolder::open(&config.scene)?;
     let mut manifest = folder.manifest()?;
     let given = folder.given_cameras()?;
-    // Gaussians that were trained before were trained with the cameras as they are now.
+    // Gaussians of an earlier training belong to its cameras, which alignment may have moved.
     let mut cameras = if config.init.is_some() { folder.cameras()? } else { given.clone() };
     let mut training = manifest.training(&cameras);
     let known = match config.mapping {
@@ -67,17 +68,18 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
     held_out.check()?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
-    // There is nothing to train in what photos see through.
+    // Gaussians of transparent objects have no colour to train.
     clear::take(&mut first);
     let kept_clear = if config.mapping == Mapping::Keep { clear::take(&mut folder.gaussians()?) } else { Gaussians::default() };
     let free = start::free_space(config, &folder, &training, &first)?;
     if let Some(codes) = codes.filter(|_| config.init.is_none() || config.mapping != Mapping::Keep) {
-        // What most views say: where they disagree, descent from elsewhere ends between their codes.
+        // Start from the objects on which most views agree. From elsewhere, descent ends between
+        // the codes of views that disagree.
         objects::lift(&mut first, &folder, &training, codes, config.antialias)?;
     }
     if config.freeze && !by_descent {
         bail!(
-            "--freeze trains features: add --feature-mode train and --mapping paper or keep; or, to lift objects only, use --iterations 0"
+            "freeze trains features only: set feature_mode to train, and mapping to paper or keep; to lift objects without training, set iterations to 0"
         );
     }
     let settings = settings(config, &first, &targets, &manifest, run.seed)?;
@@ -88,7 +90,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     trainer.keep_free(free);
     let checkpoint = checkpoints::path(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
-        run.warn(&format!("{}: no checkpoint to resume from; starting anew", checkpoint.display()));
+        run.warn(&format!("{}: there is no checkpoint to resume from; training starts from the beginning", checkpoint.display()));
     }
     if trainer.is_coupled() {
         borders::go_on(&mut trainer, &folder)?;
@@ -132,7 +134,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let grid = match known {
         Some(found) if by_descent => {
             if !found.overlaps.0.is_empty() {
-                run.warn("a feature tells one object of those that overlap at a place: the smallest, and what contains it; --feature-mode lift keeps them all");
+                run.warn("a trained feature keeps only the smallest of overlapping objects and the objects that contain it; set feature_mode to lift to keep them all");
             }
             nearest_codes(&mut scene, &found);
             found
@@ -184,18 +186,18 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         device,
     };
     manifest.seconds.insert("train".to_owned(), result.seconds);
-    // It is no more what `make` once made; where that called, it says so again.
+    // The note of `make` is invalid now; `make` writes it again if it called this function.
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
     staged.publish(&folder, &LEFT, [], &manifest)?;
     objects::end_maps(&folder);
-    // Checkpoints serve a broken run only.
+    // Only an interrupted run needs its checkpoints.
     checkpoints::forget(&folder);
     Ok(report)
 }
 
-/// Gives every Gaussian the object whose code is nearest to its trained feature; none where the origin is nearer, towards which what no mask
-/// covers was trained.
+/// Assigns every Gaussian the object whose code is nearest to its trained feature. Gaussians nearer
+/// to the origin get none: pixels outside of all masks are trained towards the origin.
 fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
     let codebook = Codebook::of(grid);
     scene.object_ids = scene.features.iter().map(|feature| codebook.owner(*feature).0).collect();

@@ -1,4 +1,4 @@
-//! What `train` reports, and the scene remembers.
+//! Report of `train`, which the manifest also stores.
 
 use super::config::{FeatureMode, Mapping, Preset};
 use crate::progress::TrainStep;
@@ -10,72 +10,72 @@ use fastlgs_raster::{Choice, View};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// What training found; also the manifest's note of it.
+/// Report of `train`. The manifest stores it as a note.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Report {
     /// The scene folder.
     pub scene: PathBuf,
-    /// As asked for.
+    /// Preset of the run.
     pub preset: Preset,
-    /// As asked for.
+    /// Mapping of the run.
     pub mapping: Mapping,
-    /// As asked for.
+    /// Feature mode of the run.
     pub feature_mode: FeatureMode,
-    /// Objects and parts.
+    /// Number of objects, parts included.
     pub objects: usize,
-    /// Seconds from Gaussians to objects.
+    /// Seconds spent on finding objects.
     pub mapping_seconds: f64,
-    /// What global mapping found.
+    /// Summary of global mapping; `None` with another mapping.
     pub mapping_summary: Option<objects::Summary>,
-    /// Steps done.
+    /// Number of iterations.
     pub iterations: u32,
     /// Seconds of training.
     pub seconds: f64,
-    /// Steps a second.
+    /// Iterations per second.
     pub iterations_per_second: f64,
-    /// Gaussians at the end.
+    /// Number of Gaussians at the end.
     pub gaussians: usize,
-    /// Those of them that are clear: they stand for what photos see through.
+    /// Number of transparent Gaussians, which represent transparent objects.
     pub clear: usize,
-    /// What the automatic budget removed.
+    /// Removals by the automatic budget.
     pub removals: Vec<Removal>,
     /// SH degree of the written scene.
     pub sh_degree: u32,
     /// Whether exposures were learned.
     pub exposure: bool,
-    /// What photos that were kept aside gained by aligning their cameras, in dB, where that was looked at.
+    /// PSNR that validation views gained by aligning their cameras, in dB, if it was measured.
     pub alignment_gain: Option<f64>,
     /// Whether the cameras of the training photos were moved.
     pub aligned: bool,
-    /// Whether masks told Gaussians where things end.
+    /// Whether masks guided training at the borders of objects.
     pub borders: bool,
     /// Whether the 2-D Mip filter was on.
     pub antialias: bool,
-    /// Colour behind everything.
+    /// RGB background colour, 0 to 1.
     pub background: [f32; 3],
-    /// Size of the first view.
+    /// Size of the first view, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
     /// Mean PSNR of the held-out views in dB.
     pub psnr_held_out: Option<f64>,
-    /// Where `curve` asked for it.
+    /// PSNR of held-out views during training, if `curve` is set.
     pub curve: Vec<CurvePoint>,
-    /// The device's name.
+    /// Name of the device.
     pub adapter: String,
-    /// What `--device` meant, and why.
+    /// Device that was chosen, and the reason.
     pub device: Choice,
 }
 
 /// A point of the curve of held-out PSNR.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct CurvePoint {
-    /// Steps done.
+    /// Number of iterations so far.
     pub iteration: u32,
     /// Seconds of training.
     pub seconds: f64,
     /// Mean PSNR of the held-out views in dB.
     pub psnr: Option<f64>,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
 }
 
@@ -85,26 +85,27 @@ impl From<TrainStep> for CurvePoint {
     }
 }
 
-/// The manifest's note of training.
+/// Key of the training note in the manifest.
 const NOTE: &str = "train";
 
 impl Report {
-    /// How the scene in a folder was trained; nothing where it was not, or was preprocessed again since.
+    /// Reads the training note of a manifest; `None` if the scene was not trained since it was
+    /// preprocessed. `root` is the scene folder.
     ///
     /// # Errors
-    /// A note that cannot be read: without it the scene would be drawn with another background and filter.
+    /// A note that cannot be read. Without it, background and filter of renders would be wrong.
     pub fn of(manifest: &Manifest, root: &Path) -> Result<Option<Self>> {
         let Some(note) = manifest.notes.get(NOTE) else { return Ok(None) };
         let read = serde_json::from_value(note.clone()).map_err(|error| {
             let root = root.display();
             Error::Invalid(format!(
-                "{root}/scene.json: the note of its training cannot be read ({error}); run 'fastlgs train {root}' again"
+                "{root}/scene.json: the training note cannot be read ({error}); run 'fastlgs train {root}' again"
             ))
         });
         read.map(Some)
     }
 
-    /// The frame of a camera, in the way the scene was trained.
+    /// Returns the view of a camera, with the background and filter of the training.
     pub fn view(&self, camera: &Camera, scene: &Gaussians) -> View {
         let mut view = View::new(camera, scene.len(), scene.sh_degree);
         view.antialias = u32::from(self.antialias);
@@ -112,7 +113,7 @@ impl Report {
         view
     }
 
-    /// Notes it in the manifest.
+    /// Stores the report in the manifest.
     pub(super) fn note(&self, manifest: &mut Manifest) -> Result<()> {
         manifest.notes.insert(NOTE.to_owned(), serde_json::to_value(self)?);
         Ok(())

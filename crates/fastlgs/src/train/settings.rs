@@ -1,4 +1,4 @@
-//! What the trainer is told, and on which device it runs.
+//! Translates options into the trainer's configuration.
 
 use super::borders;
 use super::config::{Align, Config, Exposures, FeatureMode};
@@ -8,10 +8,10 @@ use fastlgs_core::Gaussians;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_raster::{Alignment, Channels, Targets, TrainConfig};
 
-/// Difference of two photos in stops from which exposures are learned.
+/// Typical brightness difference of two photos, in stops, from which `auto` learns exposures.
 const VARYING: f32 = 0.15;
 
-/// What the trainer is told: options, else what the preset says.
+/// Returns the trainer's configuration. The preset decides what no option sets.
 pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> Result<TrainConfig> {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
@@ -22,7 +22,7 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
         channels: match (config.freeze, by_descent) {
             (true, _) => Channels::Feature,
             (false, false) => Channels::Color,
-            // As the paper's authors train.
+            // As in the paper: features move Gaussians, too.
             (false, true) => Channels::Coupled,
         },
         sh_degree: config.sh_degree.unwrap_or(if config.init.is_some() { first.sh_degree } else { config.degree(views.len()) }),

@@ -1,4 +1,4 @@
-//! What training starts from: first Gaussians, and the pictures that they shall show.
+//! Inputs of training: initial Gaussians and target images.
 
 use super::config::{Background, Config};
 use super::report::Report;
@@ -13,13 +13,14 @@ use fastlgs_raster::{Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Target
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// What training starts from; where less is known, random points make up for the rest.
+/// Least number of initial Gaussians. Random points are added if there are fewer.
 const ENOUGH: usize = 5000;
 
-/// The given PLY, else the scene's points: with a backdrop where photos are few, and random ones where all these are too few.
+/// Returns the initial Gaussians: those of `config.init`, else one for each point of the scene. A
+/// backdrop is added if views are few, and random points if there are fewer than `ENOUGH`.
 pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
     if let Some(path) = &config.init {
-        // The scene's own file is in its own coordinates.
+        // The scene's own file is already in the scene's frame.
         let frame = if is_own(folder, path) { WorldFrame::default() } else { folder.manifest()?.frame };
         let (first, warning) = splat_file::read(path, &frame)?;
         warning.into_iter().for_each(|warning| run.warn(&warning));
@@ -27,14 +28,14 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
-    // More than half the budget would leave no room to grow where it matters.
+    // Start with at most half of the budget, so that density control can add Gaussians.
     let most = (config.budget(views.pixels()).most() / 2).max(1);
-    // There is nothing behind what was cut out.
+    // Photos with an alpha channel show a cut-out object, which needs no backdrop.
     let cut_out = views.cameras.iter().any(|camera| folder.alpha_path(&camera.name).is_file());
     let behind = if views.len() < FEW_VIEWS && !cut_out { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
     let missing = ENOUGH.saturating_sub(points.len() + behind.len());
     if missing > 0 {
-        run.warn(&format!("only {} points are known; training starts from {missing} random ones as well", points.len()));
+        run.warn(&format!("the scene has only {} points; training starts from {missing} random ones in addition", points.len()));
         points.extend(init::random_points(views, missing, &mut rng)?);
     }
     rng.shuffle(&mut points);
@@ -44,12 +45,13 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
     Ok(first)
 }
 
-/// Training views by which the axes of a file of another program are checked.
+/// Number of training views that decide whether the axes of an imported file are flipped.
 const CHECKED_VIEWS: usize = 4;
-/// How many times smaller the squared error must be with turned axes.
+/// Factor by which flipped axes must lower the squared error.
 const PLAIN: f64 = 2.0;
 
-/// Gaussians of another program, in the axes of the photos' poses: some programs write y and z with the other sign, and the photos tell.
+/// Flips y and z of Gaussians of another program if the photos then fit clearly better. Some
+/// programs write y and z with the opposite sign.
 fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &Config, run: &Run) -> Result<Gaussians> {
     let background = config.background.unwrap_or_default();
     let mut engine = fastlgs_raster::open_engine("cpu")?;
@@ -73,19 +75,20 @@ fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &
     };
     let turned = first.clone().with_y_and_z_flipped();
     if error(&turned)? * PLAIN < error(&first)? {
-        run.warn(&format!("{}: its y and z have the other sign than those of the photos' poses; they were turned", path.display()));
+        run.warn(&format!("{}: y and z have the opposite sign of those of the photos' poses; the Gaussians were flipped", path.display()));
         return Ok(turned);
     }
     Ok(first)
 }
 
-/// Whether a file is the scene's own.
+/// Returns whether `path` is the `scene.ply` of this scene.
 fn is_own(folder: &SceneFolder, path: &Path) -> bool {
     let place = |path: &Path| path.canonicalize().ok();
     place(path).is_some_and(|path| Some(path) == place(&folder.ply_path()))
 }
 
-/// The options, with what the scene's own Gaussians were trained with where training starts from these and nothing else was asked for.
+/// Returns the options. If training starts from the scene's own Gaussians, their background and
+/// filter are the defaults.
 pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> Result<Config> {
     let own = config.init.as_ref().filter(|path| is_own(folder, path));
     let earlier = if own.is_some() { Report::of(manifest, &folder.root)?.unwrap_or_default() } else { Report::default() };
@@ -93,7 +96,8 @@ pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> 
     Ok(Config { background: Some(background), antialias: config.antialias || earlier.antialias, ..config.clone() })
 }
 
-/// What the views of `cameras` look through, where density control asks for it.
+/// Returns the space that the views show to be empty, in which density control removes floaters. It
+/// is empty with `FEW_VIEWS` or more views, or without iterations.
 pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], first: &Gaussians) -> Result<FreeSpace> {
     if cameras.len() >= FEW_VIEWS || config.iterations() == 0 {
         return Ok(FreeSpace::default());
@@ -101,15 +105,16 @@ pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], fir
     Ok(FreeSpace::of(cameras, &first.means, &folder.points()?))
 }
 
-/// The code of each id that object maps show, 0 included, as pictures have it.
+/// Code of each object id, 0 included, as 8-bit RGB.
 type Codes = Arc<Vec<[u8; 3]>>;
 
-/// The codes that views are trained towards.
+/// Returns the codes of all objects as 8-bit RGB.
 pub fn codes(grid: &Grid) -> Codes {
     Arc::new((0..=grid.highest()).map(|id| grid.code_of(id).to_array().map(|v| (v * 255.0).round() as u8)).collect())
 }
 
-/// The views of `cameras` as they are trained towards; `gain` tells how bright each photo is against the mean.
+/// Returns the targets of `cameras`, whose images are read on demand. `gain` returns the brightness
+/// of a photo relative to the mean, by channel.
 pub fn targets(
     folder: &SceneFolder,
     cameras: &[Camera],
@@ -123,8 +128,12 @@ pub fn targets(
     Targets::new(cameras.to_vec(), gains, move |id| read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error))))
 }
 
-/// Photo and, where features are trained, code map of a view. Pixels that the view's mask blackens do not count;
-/// transparent ones show the background.
+/// Loads the target image of a view: the photo and, with `codes`, the code map. Ignored pixels do
+/// not count; transparent pixels show the background.
+///
+/// # Errors
+/// A file that cannot be read, a photo whose size differs from its camera, or a transparent photo
+/// with a learned background.
 pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, background: &Background) -> Result<Target> {
     let photo = folder.photo(&camera.name)?;
     if (photo.width(), photo.height()) != (camera.width, camera.height) {
@@ -133,7 +142,7 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, back
     let mask = |path: PathBuf| path.is_file().then(|| image_io::load_gray(&path)).transpose();
     let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
     if alpha.is_some() && background.learn {
-        bail!("--background learn: the photo of '{}' is transparent, so that its background must be given", camera.name);
+        bail!("the background cannot be learned, because the photo of '{}' is partly transparent; set background to a colour", camera.name);
     }
     let counts = |x: u32, y: u32| ignore.as_ref().is_none_or(|m| m.get_pixel(x, y)[0] >= 128);
     let color = photo.enumerate_pixels().map(|(x, y, p)| {
@@ -145,7 +154,7 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, back
         pack([over(0), over(1), over(2)], counts(x, y))
     });
     let color = color.collect();
-    // What no mask covers is trained towards nothing.
+    // Pixels without an object are trained towards the origin.
     let code = |codes: &Codes, id: u16| codes.get(usize::from(id)).copied().unwrap_or_default();
     let feature = match codes {
         None => Vec::new(),
