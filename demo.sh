@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# The main job from photos to answers. Usage: ./demo.sh [PHOTOS [TEXT...]]
-# Without an argument it generates a small posed scene first. Pictures and reports go to scenes/NAME.
+# Runs all stages, from photos to answers. Usage: ./demo.sh [PHOTOS [TEXT...]]
+# Without arguments, generates a small scene with poses first. Writes pictures and reports to
+# scenes/NAME.
 set -euo pipefail
 start=$PWD
 cd "$(dirname "$0")"
@@ -39,4 +40,4 @@ if [ -n "$labelled" ]; then
 else
     echo "== eval"; $fastlgs eval "$scene"
 fi
-echo "demo: $(( $(date +%s) - began )) seconds after set-up; look at $scene/pictures/sheet.png"
+echo "demo: finished in $(( $(date +%s) - began )) seconds after set-up; see $scene/pictures/sheet.png"

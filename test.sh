@@ -1,16 +1,18 @@
 #!/usr/bin/env bash
-# Installs what is missing and runs the tests on whatever Vulkan device there is (lavapipe on a machine without GPU).
-# --all tests everything: twenty kills, all rows of the quick benches, long fuzzing, the packages, pip, the originals of SAM and CLIP. Before a release; about an hour on two cores.
+# Installs missing dependencies and runs the tests on any Vulkan device, such as lavapipe on
+# machines without a GPU.
+# --all runs everything before a release: twenty kills, all rows of the quick benches, long fuzzing,
+# the packages, pip, and the originals of SAM and CLIP. It takes about an hour on two cores.
 set -euo pipefail
 cd "$(dirname "$0")"
 ./setup.sh --tests
-export NODEVICE_SELECT=1          # Mesa's device chooser complains where there is no desktop session
-export FASTLGS_REQUIRE_GPU=1      # a missing device is a failure here, not a skip
-export FASTLGS_REQUIRE_MODELS=1   # and so are missing models, which setup.sh installs
+export NODEVICE_SELECT=1          # Mesa's device chooser prints warnings without a desktop session
+export FASTLGS_REQUIRE_GPU=1      # a missing device is an error, not a skip
+export FASTLGS_REQUIRE_MODELS=1   # missing models as well; setup.sh installs them
 if [ "${1:-}" = --all ]; then
     export FASTLGS_TEST_ALL=1 FASTLGS_FUZZ_SECONDS=${FASTLGS_FUZZ_SECONDS:-5}
 fi
-# The same as setup.sh, so that nothing is built twice.
+# The same options as in setup.sh, so that nothing is built twice.
 with="--workspace --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv"
 export PYO3_BUILD_EXTENSION_MODULE=1
 lap() { printf 'test: %s took %d s\n' "$1" $((SECONDS - began)); began=$SECONDS; }
@@ -18,7 +20,7 @@ began=$SECONDS
 cargo fmt --all --check
 # shellcheck disable=SC2086
 cargo clippy --release --locked --all-targets $with --quiet -- -D warnings
-# Also what a build without OpenCV has: key points in pure Rust.
+# Also checks the build without OpenCV, which has key points in pure Rust.
 # shellcheck disable=SC2086
 cargo clippy --release --locked ${with/opencv/rust-sift} --quiet -- -D warnings
 lap "formatting and clippy"
@@ -31,11 +33,11 @@ lap "wasm and packages"
 tests/python.sh
 lap "Python"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
-# Counts of kills, damaged inputs and benches are part of the log, and so is what takes longest.
+# The log shows the numbers of kills, damaged inputs and benches, and the slowest tests.
 # shellcheck disable=SC2086
 python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
-    # Both kinds of key points, against each other.
+    # Tests both kinds of key points against each other.
     cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output
     tests/reference.sh
 fi

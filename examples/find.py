@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Asks a trained scene from Python: the binary does the work, JSON comes back. Needs nothing but Python itself.
+"""Queries a trained scene from Python through the binary. Needs only Python's standard library.
 
     examples/find.py SCENE cat coffee bicycle
 
-One process answers all texts, so that the encoder is loaded once; each answer is a line of JSON with the fields of
-`fastlgs query --json`. FASTLGS names the binary where it is not on the PATH.
+One process answers all texts, so the encoder is loaded only once. Each answer is a line of JSON
+with the fields of `fastlgs query --json`. Set FASTLGS if the binary is not on the PATH.
 """
 
 import json
@@ -14,7 +14,7 @@ import sys
 
 
 class Scene:
-    """A scene that answers texts until it is closed."""
+    """A running `fastlgs query` process, which answers texts until it is closed."""
 
     def __init__(self, path, *options):
         program = os.environ.get("FASTLGS", "fastlgs")
@@ -22,12 +22,12 @@ class Scene:
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def ask(self, text):
-        """What the scene answers to a text: a dict; `found` tells whether anything matches."""
+        """Returns the answer to a text as a dict. `found` is true if an object matches."""
         self.process.stdin.write(text.replace("\n", " ") + "\n")
         self.process.stdin.flush()
         line = self.process.stdout.readline()
         if not line:
-            raise RuntimeError(f"fastlgs ended with code {self.process.wait()}; what it said is above")
+            raise RuntimeError(f"fastlgs ended with code {self.process.wait()}; see its message above")
         answer = json.loads(line)
         if "error" in answer:
             raise ValueError(answer["error"])

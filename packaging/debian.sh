@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Makes a Debian package of the binary, its manual pages and completions. Usage: packaging/debian.sh [FOLDER]
-# The package holds no encoder weights; `fastlgs models install-offline` gets them for the user who runs it.
+# Makes a Debian package of the binary, its manual pages and completions. Usage: packaging/debian.sh
+# [FOLDER]
+# The package has no encoder weights. Each user installs them with `fastlgs models install-offline`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=$(mkdir -p "${1:-target/debian}" && realpath "${1:-target/debian}")
@@ -20,7 +21,7 @@ mkdir -p "$root/usr/share/bash-completion/completions" "$root/usr/share/zsh/vend
 "$root/usr/bin/fastlgs" completions zsh >"$root/usr/share/zsh/vendor-completions/_fastlgs"
 "$root/usr/bin/fastlgs" completions fish >"$root/usr/share/fish/vendor_completions.d/fastlgs.fish"
 install -Dm644 -t "$root/usr/share/doc/fastlgs" README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE docs/*.md
-# What the binary was linked against, by package.
+# Packages of the shared libraries that the binary needs.
 libraries=$(mkdir -p "$root/debian" && touch "$root/debian/control" && cd "$root" &&
     dpkg-shlibdeps -O --ignore-missing-info usr/bin/fastlgs 2>/dev/null | sed 's/^shlibs:Depends=//') || libraries="libc6, libgcc-s1"
 rm -rf "$root/debian"
@@ -36,8 +37,8 @@ Depends: ${libraries:-libc6, libgcc-s1}
 Recommends: mesa-vulkan-drivers, python3-venv
 Suggests: colmap
 Description: open-vocabulary 3-D scenes from photos, without CUDA
- Trains 3-D Gaussians with a language field from posed photos and answers
- texts with pixel-accurate masks, on any Vulkan device or the CPU alone.
+ Trains 3-D Gaussians with a language field from photos, and answers text
+ queries with masks, on any Vulkan device or on the CPU alone.
 CONTROL
 dpkg-deb --root-owner-group --build "$root" "$out/fastlgs_${version}_${architecture}.deb" >/dev/null
 echo "$out/fastlgs_${version}_${architecture}.deb"

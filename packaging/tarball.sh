@@ -1,7 +1,9 @@
 #!/usr/bin/env bash
-# Makes a tarball that runs on any Linux with the same or a newer C library: binary, manual pages, completions, documents.
-# Usage: packaging/tarball.sh [FOLDER]. For the oldest systems run it in a container of the oldest that is to be served; Vulkan and
-# ONNX Runtime are loaded at run time, so the binary itself needs nothing but the C library.
+# Makes a tarball of binary, manual pages, completions and documents for Linux.
+# Usage: packaging/tarball.sh [FOLDER]
+# It runs on systems with the same or a newer C library. For old systems, run this script in a
+# container of the oldest one. Vulkan and ONNX Runtime are loaded at run time, so the binary links
+# only to the C library.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=$(mkdir -p "${1:-target/tarball}" && realpath "${1:-target/tarball}")

@@ -42,16 +42,16 @@ fn add(quad: ptr<function, Quad>, dx: vec4<f32>, dy: f32, s0: vec4<f32>, s1: vec
 
 fn store_quad(quad: Quad, x: u32, y: u32, walked: f32) {
     let t = quad.transmittance;
-    let shown = inside(x, y, view);
+    let inside_image = inside(x, y, view);
 #ifdef WITH_COLOR
-    frame[quad_at(0u, x, y, view)] = shown * (quad.r + t * view.background_color.r);
-    frame[quad_at(1u, x, y, view)] = shown * (quad.g + t * view.background_color.g);
-    frame[quad_at(2u, x, y, view)] = shown * (quad.b + t * view.background_color.b);
+    frame[quad_at(0u, x, y, view)] = inside_image * (quad.r + t * view.background_color.r);
+    frame[quad_at(1u, x, y, view)] = inside_image * (quad.g + t * view.background_color.g);
+    frame[quad_at(2u, x, y, view)] = inside_image * (quad.b + t * view.background_color.b);
 #endif
 #ifdef WITH_FEATURE
-    frame[quad_at(3u, x, y, view)] = shown * (quad.f0 + t * view.background_feature.x);
-    frame[quad_at(4u, x, y, view)] = shown * (quad.f1 + t * view.background_feature.y);
-    frame[quad_at(5u, x, y, view)] = shown * (quad.f2 + t * view.background_feature.z);
+    frame[quad_at(3u, x, y, view)] = inside_image * (quad.f0 + t * view.background_feature.x);
+    frame[quad_at(4u, x, y, view)] = inside_image * (quad.f1 + t * view.background_feature.y);
+    frame[quad_at(5u, x, y, view)] = inside_image * (quad.f2 + t * view.background_feature.z);
 #endif
     frame[quad_at(6u, x, y, view)] = t;
     frame[quad_at(7u, x, y, view)] = vec4<f32>(walked);
@@ -68,7 +68,7 @@ const BATCH: u32 = 8u;
 const_assert BATCH == 8u && TILE_LANES == 2u * BATCH;
 
 // Bit mask of the workgroup's tiles that are not finished.
-var<workgroup> open: atomic<u32>;
+var<workgroup> unfinished_tiles: atomic<u32>;
 #endif
 
 @compute @workgroup_size(LANES)
@@ -109,32 +109,32 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
     }
 #else
-    var fetched = fetch(start, lane.number, length);
-    var goes_on = length > 0u;
+    var fetched = fetch(start, lane.plane_index, length);
+    var unfinished = length > 0u;
     for (var k = 0u; ; k += BATCH) {
         if index == 0u {
-            atomicStore(&open, 0u);
+            atomicStore(&unfinished_tiles, 0u);
         }
         if k % TILE_LANES == 0u {
-            put_down(fetched, lane.tile, k + lane.number);
-            fetched = fetch(start, k + TILE_LANES + lane.number, length);
+            stage(fetched, lane.tile, k + lane.plane_index);
+            fetched = fetch(start, k + TILE_LANES + lane.plane_index, length);
         }
         workgroupBarrier();
-        if goes_on {
+        if unfinished {
             walked = min(k + BATCH, length);
 #each K 8
             let at$K = staged_at(lane.tile, k + $Ku);
             add(&q0, px - staged_splats[at$K][0].x, py - staged_splats[at$K][0].y, staged_splats[at$K][0], staged_splats[at$K][1], staged_splats[at$K][2]);
 #end
             if walked < length && any(q0.transmittance >= vec4<f32>(view.finished)) {
-                atomicOr(&open, 1u << lane.tile);
+                atomicOr(&unfinished_tiles, 1u << lane.tile);
             }
         }
-        let still_open = workgroupUniformLoad(&open);
+        let still_open = workgroupUniformLoad(&unfinished_tiles);
         if still_open == 0u {
             break;
         }
-        goes_on = (still_open & (1u << lane.tile)) != 0u;
+        unfinished = (still_open & (1u << lane.tile)) != 0u;
     }
 #endif
     if lane.exists {

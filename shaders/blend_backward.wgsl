@@ -144,27 +144,27 @@ fn slot_of(c0: Column, c1: Column, sums: Sums, dx: vec4<f32>) -> Slot {
 #import stage
 
 // Number of Gaussians whose sums are added over a tile's invocations in one round.
-const ROUND: u32 = 4u;
+const GAUSSIANS_PER_ROUND: u32 = 4u;
 // The unrolled loops below require these values.
-const_assert ROUND == 4u && TILE_LANES == 16u;
+const_assert GAUSSIANS_PER_ROUND == 4u && TILE_LANES == 16u;
 // Floats of a slot.
-const NUMBERS: u32 = 4u * SLOT;
+const SLOT_FLOATS: u32 = 4u * SLOT;
 
 // [tile][Gaussian of the round][float of the slot][invocation]. Each row is rotated by its index,
 // so that neither writing columns nor reading rows causes bank conflicts.
-var<workgroup> exchange: array<f32, TILES * ROUND * NUMBERS * TILE_LANES>;
+var<workgroup> exchange: array<f32, TILES * GAUSSIANS_PER_ROUND * SLOT_FLOATS * TILE_LANES>;
 // Largest number of pairs to process among the workgroup's tiles.
-var<workgroup> longest: atomic<u32>;
+var<workgroup> max_length: atomic<u32>;
 
-fn exchange_at(tile: u32, row: u32, number: u32) -> u32 {
-    return (tile * ROUND * NUMBERS + row) * TILE_LANES + (number + row) % TILE_LANES;
+fn exchange_at(tile: u32, row: u32, plane_index: u32) -> u32 {
+    return (tile * GAUSSIANS_PER_ROUND * SLOT_FLOATS + row) * TILE_LANES + (plane_index + row) % TILE_LANES;
 }
 
-fn exchange_put(tile: u32, row: u32, number: u32, v: vec4<f32>) {
-    exchange[exchange_at(tile, row, number)] = v.x;
-    exchange[exchange_at(tile, row + 1u, number)] = v.y;
-    exchange[exchange_at(tile, row + 2u, number)] = v.z;
-    exchange[exchange_at(tile, row + 3u, number)] = v.w;
+fn exchange_put(tile: u32, row: u32, plane_index: u32, v: vec4<f32>) {
+    exchange[exchange_at(tile, row, plane_index)] = v.x;
+    exchange[exchange_at(tile, row + 1u, plane_index)] = v.y;
+    exchange[exchange_at(tile, row + 2u, plane_index)] = v.z;
+    exchange[exchange_at(tile, row + 3u, plane_index)] = v.w;
 }
 #endif
 
@@ -207,17 +207,17 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
     }
 #else
-    var fetched = fetch(start, lane.number, length);
+    var fetched = fetch(start, lane.plane_index, length);
     if index == 0u {
-        atomicStore(&longest, 0u);
+        atomicStore(&max_length, 0u);
     }
     workgroupBarrier();
-    atomicMax(&longest, length);
-    let most = workgroupUniformLoad(&longest);
-    for (var k = 0u; k < most; k += ROUND) {
+    atomicMax(&max_length, length);
+    let most = workgroupUniformLoad(&max_length);
+    for (var k = 0u; k < most; k += GAUSSIANS_PER_ROUND) {
         if k % TILE_LANES == 0u {
-            put_down(fetched, lane.tile, k + lane.number);
-            fetched = fetch(start, k + TILE_LANES + lane.number, length);
+            stage(fetched, lane.tile, k + lane.plane_index);
+            fetched = fetch(start, k + TILE_LANES + lane.plane_index, length);
         }
         workgroupBarrier();
         // Unrolled, so that four Gaussians are computed in parallel.
@@ -233,21 +233,21 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #each K 4
         let slot$K = slot_of(column$K, Column(), sums$K, dx$K);
 #ifdef WITH_COLOR
-        exchange_put(lane.tile, NUMBERS * $Ku, lane.number, slot$K.a);
-        exchange_put(lane.tile, NUMBERS * $Ku + 4u, lane.number, slot$K.b);
+        exchange_put(lane.tile, SLOT_FLOATS * $Ku, lane.plane_index, slot$K.a);
+        exchange_put(lane.tile, SLOT_FLOATS * $Ku + 4u, lane.plane_index, slot$K.b);
 #endif
-        exchange_put(lane.tile, NUMBERS * $Ku + NUMBERS - 4u, lane.number, slot$K.c);
+        exchange_put(lane.tile, SLOT_FLOATS * $Ku + SLOT_FLOATS - 4u, lane.plane_index, slot$K.c);
 #end
         workgroupBarrier();
-        for (var row = lane.number; row < NUMBERS * ROUND; row += TILE_LANES) {
+        for (var row = lane.plane_index; row < SLOT_FLOATS * GAUSSIANS_PER_ROUND; row += TILE_LANES) {
             var sum = 0.0;
 #each K 16
             sum += exchange[exchange_at(lane.tile, row, $Ku)];
 #end
-            let i = k + row / NUMBERS;
+            let i = k + row / SLOT_FLOATS;
             let e = staged_pairs[staged_pair_at(lane.tile, i)];
             if i < length && in_window(e, view) {
-                slots[NUMBERS * (e - view.slot_first) + row % NUMBERS] = sum;
+                slots[SLOT_FLOATS * (e - view.slot_first) + row % SLOT_FLOATS] = sum;
             }
         }
     }
@@ -265,10 +265,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #else
     // Neighbouring invocations write neighbouring floats. In dense scenes, most pairs are of this
     // kind.
-    for (var i = lane.number; i < NUMBERS * (lane.end - start - length); i += TILE_LANES) {
-        let e = sorted_pairs[start + length + i / NUMBERS];
+    for (var i = lane.plane_index; i < SLOT_FLOATS * (lane.end - start - length); i += TILE_LANES) {
+        let e = sorted_pairs[start + length + i / SLOT_FLOATS];
         if in_window(e, view) {
-            slots[NUMBERS * (e - view.slot_first) + i % NUMBERS] = 0.0;
+            slots[SLOT_FLOATS * (e - view.slot_first) + i % SLOT_FLOATS] = 0.0;
         }
     }
 #endif

@@ -31,14 +31,14 @@ fn add(quad: ptr<function, Quad>, dx: vec4<f32>, dy: f32, s0: vec4<f32>, s1: vec
     let t = (*quad).transmittance;
     let w = t * alphas(dx, s0.z, row_of(s0, s1, dy));
     (*quad).transmittance = t - w;
-    var known = vec4<bool>(false);
+    var has_slot = vec4<bool>(false);
 #each K 4
     let is$K = (*quad).id$K == vec4<u32>(id);
-    known = known | is$K;
+    has_slot = has_slot | is$K;
     (*quad).weight$K += select(vec4<f32>(0.0), w, is$K);
 #end
     let least = min(min((*quad).weight0, (*quad).weight1), min((*quad).weight2, (*quad).weight3));
-    var free = !known & (w > least);
+    var free = !has_slot & (w > least);
 #each K 4
     let take$K = free & ((*quad).weight$K == least);
     (*quad).id$K = select((*quad).id$K, vec4<u32>(id), take$K);

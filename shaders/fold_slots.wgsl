@@ -21,10 +21,10 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     while e < end {
         let g = pair_gaussians[view.slot_first + e];
         let pairs_until = first_pair[g] + touched[g];
-        let kept = e;
+        let first_slot = e;
         e++;
         // Surplus room of emit has no gradient.
-        if view.slot_first + kept >= pairs_until {
+        if view.slot_first + first_slot >= pairs_until {
             continue;
         }
         let stop = min(end, pairs_until - view.slot_first);
@@ -34,7 +34,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 #each K 3
         var sum$K = vec4<f32>(0.0);
 #end
-        for (e = kept; e < stop; e++) {
+        for (e = first_slot; e < stop; e++) {
 #ifdef WITH_COLOR
             sum0 += slots[SLOT * e];
             sum1 += slots[SLOT * e + 1u];
@@ -42,9 +42,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
             sum2 += slots[SLOT * e + SLOT - 1u];
         }
 #ifdef WITH_COLOR
-        slots[SLOT * kept] = sum0;
-        slots[SLOT * kept + 1u] = sum1;
+        slots[SLOT * first_slot] = sum0;
+        slots[SLOT * first_slot + 1u] = sum1;
 #endif
-        slots[SLOT * kept + SLOT - 1u] = sum2;
+        slots[SLOT * first_slot + SLOT - 1u] = sum2;
     }
 }

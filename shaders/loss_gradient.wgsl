@@ -27,8 +27,8 @@ fn add(totals: ptr<function, Totals>, quad: u32, row: u32, by_mean: vec4<f32>, b
     let at = plane.channel * plane.rows * plane.quads + place;
     let rendered = frame[at];
     let x = exposed(rendered, quad, row);
-    let t = wanted(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
-    let weight = select(vec4<f32>(0.0), shown(quad, row), t.counts);
+    let t = unpack_target(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
+    let weight = select(vec4<f32>(0.0), inside_image(quad, row), t.counts);
     let y = select(x, t.value, t.counts);
     let d_ssim = by_mean + 2.0 * x * by_square + y * by_product;
     let value = weight * plane.scale * ((1.0 - plane.lambda) * sign(x - y) - plane.lambda * d_ssim);

@@ -2,7 +2,7 @@
 #import chunks
 #import flat
 
-@group(0) @binding(0) var<uniform> job: Job;
+@group(0) @binding(0) var<uniform> job: ChunkJob;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read_write> histogram: array<u32>;
 
@@ -11,10 +11,10 @@
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let chunk = chunk_of(id.x, job);
     for (var d = 0u; d < 256u; d++) {
-        histogram[d * job.chunks + chunk.number] = 0u;
+        histogram[d * job.chunks + chunk.plane_index] = 0u;
     }
     for (var i = chunk.start; i < chunk.end; i++) {
-        histogram[digit_of(keys[i], job) * job.chunks + chunk.number] += 1u;
+        histogram[digit_of(keys[i], job) * job.chunks + chunk.plane_index] += 1u;
     }
 }
 #else
@@ -29,8 +29,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         atomicAdd(&counts[digit_of(keys[i], job)], 1u);
     }
     workgroupBarrier();
-    if chunk.number < job.chunks {
-        histogram[lane * job.chunks + chunk.number] = atomicLoad(&counts[lane]);
+    if chunk.plane_index < job.chunks {
+        histogram[lane * job.chunks + chunk.plane_index] = atomicLoad(&counts[lane]);
     }
 }
 #endif

@@ -3,16 +3,16 @@
 #import chunks
 #import flat
 
-@group(0) @binding(0) var<uniform> job: Job;
+@group(0) @binding(0) var<uniform> job: ChunkJob;
 @group(0) @binding(1) var<storage, read> keys: array<u32>;
 @group(0) @binding(2) var<storage, read> values: array<u32>;
 @group(0) @binding(3) var<storage, read_write> histogram: array<u32>;
 @group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(5) var<storage, read_write> values_out: array<u32>;
 
-fn move_item(i: u32, key: u32, to: u32) {
-    keys_out[to] = key;
-    values_out[to] = select(values[i], i, job.first == 1u);
+fn move_item(i: u32, key: u32, position: u32) {
+    keys_out[position] = key;
+    values_out[position] = select(values[i], i, job.first == 1u);
 }
 
 #ifdef WIDE
@@ -21,15 +21,15 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let chunk = chunk_of(id.x, job);
     for (var i = chunk.start; i < chunk.end; i++) {
         let key = keys[i];
-        let slot = digit_of(key, job) * job.chunks + chunk.number;
-        let to = histogram[slot];
-        histogram[slot] = to + 1u;
-        move_item(i, key, to);
+        let slot = digit_of(key, job) * job.chunks + chunk.plane_index;
+        let position = histogram[slot];
+        histogram[slot] = position + 1u;
+        move_item(i, key, position);
     }
 }
 #else
 // Position of the next key of each digit.
-var<workgroup> next: array<u32, 256>;
+var<workgroup> next_position: array<u32, 256>;
 // Bit mask of 256 bits for each digit: the invocations that hold a key with it.
 var<workgroup> holders: array<atomic<u32>, 2048>;
 
@@ -38,10 +38,10 @@ var<workgroup> holders: array<atomic<u32>, 2048>;
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let chunk = chunk_of(flat_group(group, groups), job);
-    if chunk.number >= job.chunks {
+    if chunk.plane_index >= job.chunks {
         return;
     }
-    next[lane] = histogram[lane * job.chunks + chunk.number];
+    next_position[lane] = histogram[lane * job.chunks + chunk.plane_index];
     for (var word = 0u; word < 8u; word++) {
         atomicStore(&holders[8u * lane + word], 0u);
     }
@@ -59,19 +59,19 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         workgroupBarrier();
         let digit = digit_of(key, job);
         var before = 0u;
-        var all = 0u;
+        var digit_count = 0u;
         for (var word = 0u; word < 8u; word++) {
             let bits = atomicLoad(&holders[8u * digit + word]);
             before += countOneBits(select(select(0u, bits & (own_bit - 1u), word == own_word), bits, word < own_word));
-            all += countOneBits(bits);
+            digit_count += countOneBits(bits);
         }
         if holds {
-            move_item(i, key, next[digit] + before);
+            move_item(i, key, next_position[digit] + before);
         }
         workgroupBarrier();
         // The last invocation of a digit prepares the next round.
-        if holds && before + 1u == all {
-            next[digit] += all;
+        if holds && before + 1u == digit_count {
+            next_position[digit] += digit_count;
             for (var word = 0u; word < 8u; word++) {
                 atomicStore(&holders[8u * digit + word], 0u);
             }

@@ -3,7 +3,7 @@
 #import prefix
 #import flat
 
-@group(0) @binding(0) var<uniform> job: Job;
+@group(0) @binding(0) var<uniform> job: ChunkJob;
 @group(0) @binding(1) var<storage, read_write> items: array<u32>;
 @group(0) @binding(2) var<storage, read_write> totals: array<u32>;
 
@@ -24,11 +24,11 @@ fn replace(start: u32, end: u32, sum: u32) -> u32 {
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     let chunk = chunk_of(id.x, job);
     var sum = 0u;
-    for (var t = 0u; t < chunk.number; t++) {
+    for (var t = 0u; t < chunk.plane_index; t++) {
         sum = saturating(sum, totals[t]);
     }
     sum = replace(chunk.start, chunk.end, sum);
-    if chunk.number == job.chunks - 1u {
+    if chunk.plane_index == job.chunks - 1u {
         totals[job.chunks] = sum;
     }
 }
@@ -36,11 +36,11 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
 @compute @workgroup_size(256)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
     let chunk = chunk_of(flat_group(group, groups), job);
-    if chunk.number >= job.chunks {
+    if chunk.plane_index >= job.chunks {
         return;
     }
     var sum = 0u;
-    for (var t = lane; t < chunk.number; t += 256u) {
+    for (var t = lane; t < chunk.plane_index; t += 256u) {
         sum = saturating(sum, totals[t]);
     }
     let before = group_sum(sum, lane);
@@ -52,14 +52,14 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     for (var i = start; i < end; i++) {
         own = saturating(own, items[i]);
     }
-    add_up(own, lane);
+    inclusive_scan(own, lane);
     // The sum before a part is the inclusive prefix sum of the previous invocation.
     var earlier = 0u;
     if lane > 0u {
         earlier = prefix_sums[lane - 1u];
     }
     let after = replace(start, end, saturating(before, earlier));
-    if lane == 255u && chunk.number == job.chunks - 1u {
+    if lane == 255u && chunk.plane_index == job.chunks - 1u {
         totals[job.chunks] = after;
     }
 }

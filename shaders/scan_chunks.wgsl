@@ -2,7 +2,7 @@
 #import prefix
 #import flat
 
-@group(0) @binding(0) var<uniform> job: Job;
+@group(0) @binding(0) var<uniform> job: ChunkJob;
 @group(0) @binding(1) var<storage, read> items: array<u32>;
 @group(0) @binding(2) var<storage, read_write> totals: array<u32>;
 
@@ -14,7 +14,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     for (var i = chunk.start; i < chunk.end; i++) {
         sum = saturating(sum, items[i]);
     }
-    totals[chunk.number] = sum;
+    totals[chunk.plane_index] = sum;
 }
 #else
 @compute @workgroup_size(256)
@@ -25,8 +25,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         sum = saturating(sum, items[i]);
     }
     let all = group_sum(sum, lane);
-    if lane == 0u && chunk.number < job.chunks {
-        totals[chunk.number] = all;
+    if lane == 0u && chunk.plane_index < job.chunks {
+        totals[chunk.plane_index] = all;
     }
 }
 #endif

@@ -22,13 +22,13 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let row = id / runs;
     let quad = 2u * (id % runs);
     for (var map = 0u; map < 3u; map++) {
-        let base = ((3u * number + map) * plane.rows + row) * plane.quads;
+        let base = ((3u * plane_index + map) * plane.rows + row) * plane.quads;
         let out = blurred_row(array<vec4<f32>, 6>(
 #each K 6
             load(base, i32(quad) + $K - 2),
 #end
         ));
-        let place = ((4u * number + map) * plane.rows + row) * plane.quads + quad;
+        let place = ((4u * plane_index + map) * plane.rows + row) * plane.quads + quad;
         rows[place] = out[0];
         rows[place + 1u] = out[1];
     }

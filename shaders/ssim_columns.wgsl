@@ -19,11 +19,11 @@ fn ssim(quad: u32, row: u32, mx: vec4<f32>, my: vec4<f32>, squares: vec4<f32>, x
     let of_means = mx * mx + my * my;
     let c = of_means + 0.0001;
     let d = squares - of_means + 0.0009;
-    let weight = shown(quad, row);
+    let weight = inside_image(quad, row);
     let inverse = 1.0 / (c * d);
     let value = a * b * inverse;
     let size = plane.rows * plane.quads;
-    let place = 3u * number * size + row * plane.quads + quad;
+    let place = 3u * plane_index * size + row * plane.quads + quad;
     // The sigma terms also depend on the mean: b contains -2 mx my and d contains -mx^2.
     partials[place] = weight * (2.0 * my * (b - a) * inverse - 2.0 * mx * value * (d - c) * inverse);
     partials[size + place] = -weight * value / d;

@@ -21,7 +21,7 @@ fn load(quad: i32, row: u32) -> Pair {
     let q = u32(clamp(quad, 0, i32(plane.quads) - 1));
     let place = row * plane.quads + q;
     let x = exposed(frame[plane.channel * plane.rows * plane.quads + place], q, row);
-    let y = wanted(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
+    let y = unpack_target(targets[(plane.channel / 3u) * plane.rows * plane.quads + place], plane.channel);
     let in_picture = quad >= 0 && quad < i32(plane.quads);
     return Pair(select(vec4<f32>(0.0), x, in_picture), select(vec4<f32>(0.0), select(x, y.value, y.counts), in_picture));
 }
@@ -31,7 +31,7 @@ fn squares(pair: Pair) -> vec4<f32> {
 }
 
 fn store(map: u32, quad: u32, row: u32, values: array<vec4<f32>, 2>) {
-    let place = ((4u * number + map) * plane.rows + row) * plane.quads + quad;
+    let place = ((4u * plane_index + map) * plane.rows + row) * plane.quads + quad;
     rows[place] = values[0];
     rows[place + 1u] = values[1];
 }

@@ -10,8 +10,16 @@ use std::process::Command;
 /// Runs `fastlgs-bench` on the CPU backend and returns its figures.
 fn bench(args: &[&str]) -> Value {
     let program = env!("CARGO_BIN_EXE_fastlgs-bench");
-    let output = Command::new(program).args(args).args(["--device", "cpu", "--json", "-"]).output().expect("the binary starts");
-    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    let output = Command::new(program)
+        .args(args)
+        .args(["--device", "cpu", "--json", "-"])
+        .output()
+        .expect("the binary starts");
+    assert!(
+        output.status.success(),
+        "{args:?}: {}",
+        String::from_utf8_lossy(&output.stderr)
+    );
     serde_json::from_slice(&output.stdout).expect("JSON")
 }
 
@@ -19,12 +27,26 @@ fn bench(args: &[&str]) -> Value {
 fn table(folder: &Path) -> PathBuf {
     let (photos, scene) = (folder.join("photos"), folder.join("table"));
     let run = Run::silent("cpu", 0);
-    let kind = synth::Config { kind: "table".into(), output: photos.clone(), views: Some(32), size: (240, 180), ..Default::default() };
+    let kind = synth::Config {
+        kind: "table".into(),
+        output: photos.clone(),
+        views: Some(32),
+        size: (240, 180),
+        ..Default::default()
+    };
     fastlgs::synth(&kind, &run).expect("generated photos");
-    let mut config = preprocess::Config { photos, output: scene.clone(), ..Default::default() };
+    let mut config = preprocess::Config {
+        photos,
+        output: scene.clone(),
+        ..Default::default()
+    };
     config.eyes.segmenter = SegmenterKind::Import;
     fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
-    let config = train::Config { scene: scene.clone(), iterations: Some(1000), ..Default::default() };
+    let config = train::Config {
+        scene: scene.clone(),
+        iterations: Some(1000),
+        ..Default::default()
+    };
     fastlgs::train(&config, &run).expect("a trained scene");
     scene
 }
@@ -34,7 +56,9 @@ fn text(path: &Path) -> &str {
 }
 
 fn number(row: &Value, name: &str) -> f64 {
-    row[name].as_f64().unwrap_or_else(|| panic!("no {name} in {row}"))
+    row[name]
+        .as_f64()
+        .unwrap_or_else(|| panic!("no {name} in {row}"))
 }
 
 fn rows(figures: &Value) -> &[Value] {
@@ -42,12 +66,17 @@ fn rows(figures: &Value) -> &[Value] {
 }
 
 fn row<'a>(figures: &'a Value, column: &str, value: &str) -> &'a Value {
-    rows(figures).iter().find(|row| row[column] == value).unwrap_or_else(|| panic!("no row {value} in {figures}"))
+    rows(figures)
+        .iter()
+        .find(|row| row[column] == value)
+        .unwrap_or_else(|| panic!("no row {value} in {figures}"))
 }
 
 fn assert_written(folder: &Path, files: &[&str]) {
     for file in files {
-        let length = std::fs::metadata(folder.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")).len();
+        let length = std::fs::metadata(folder.join(file))
+            .unwrap_or_else(|e| panic!("{file}: {e}"))
+            .len();
         assert!(length > 100, "{file} has {length} bytes");
     }
     assert!(!folder.join(".trials").exists(), "trials are removed");
@@ -57,17 +86,43 @@ fn assert_written(folder: &Path, files: &[&str]) {
 fn speed() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let out = text(folder.path());
-    let devices = if fastlgs_raster::adapters().is_empty() { "cpu" } else { "0,cpu" };
-    let settings = ["--gaussians", "500,2000", "--size", "64x48,96x64", "--steps", "2", "--devices", devices];
+    let devices = if fastlgs_raster::adapters().is_empty() {
+        "cpu"
+    } else {
+        "0,cpu"
+    };
+    let settings = [
+        "--gaussians",
+        "500,2000",
+        "--size",
+        "64x48,96x64",
+        "--steps",
+        "2",
+        "--devices",
+        devices,
+    ];
     let figures = bench(&[&["speed", "-o", out], &settings[..]].concat());
     let tables = figures["devices"].as_array().expect("devices");
     assert_eq!(tables.len(), devices.split(',').count());
     for table in tables {
         let settings = table["settings"].as_array().expect("settings");
         assert_eq!(settings.len(), 4);
-        assert!(settings.iter().all(|row| number(row, "train_iterations_per_second") > 0.0 && number(row, "render_ms") > 0.0));
-        assert!(table["growth"]["train_ms"]["gaussians"].is_number() && table["growth"]["render_ms"]["pixels"].is_number(), "{table}");
-        assert!(settings[0]["train_pass_ms"]["blend"].is_number() && settings[0]["memory"]["state"].is_number(), "{table}");
+        assert!(
+            settings
+                .iter()
+                .all(|row| number(row, "train_iterations_per_second") > 0.0
+                    && number(row, "render_ms") > 0.0)
+        );
+        assert!(
+            table["growth"]["train_ms"]["gaussians"].is_number()
+                && table["growth"]["render_ms"]["pixels"].is_number(),
+            "{table}"
+        );
+        assert!(
+            settings[0]["train_pass_ms"]["blend"].is_number()
+                && settings[0]["memory"]["state"].is_number(),
+            "{table}"
+        );
     }
     assert_written(folder.path(), &["speed.json", "speed.svg"]);
 }
@@ -79,15 +134,50 @@ fn chart_and_paper() {
     let (out, scene) = (folder.path(), table(folder.path()));
     let chart = bench(&["chart", text(&scene), "--quick", "-o", text(out)]);
     let oracle = |way: &str| number(row(&chart, "way", way), "oracle_miou");
-    assert!(oracle("global") > 0.75 && oracle("global") > oracle("embeddings") && oracle("global") > oracle("no grid"), "{chart}");
-    assert!(rows(&chart).iter().any(|r| r["pareto"] == true) && rows(&chart).iter().all(|r| number(r, "seconds") > 0.0));
-    assert_written(out, &["chart.svg", "chart.png", "chart-query.svg", "chart.md", "chart.csv", "chart.json"]);
-    let paper = bench(&["paper", text(&scene), "--iterations", "500", "-o", text(out)]);
+    assert!(
+        oracle("global") > 0.75
+            && oracle("global") > oracle("embeddings")
+            && oracle("global") > oracle("no grid"),
+        "{chart}"
+    );
+    assert!(
+        rows(&chart).iter().any(|r| r["pareto"] == true)
+            && rows(&chart).iter().all(|r| number(r, "seconds") > 0.0)
+    );
+    assert_written(
+        out,
+        &[
+            "chart.svg",
+            "chart.png",
+            "chart-query.svg",
+            "chart.md",
+            "chart.csv",
+            "chart.json",
+        ],
+    );
+    let paper = bench(&[
+        "paper",
+        text(&scene),
+        "--iterations",
+        "500",
+        "-o",
+        text(out),
+    ]);
     let way = |way: &str| row(&paper, "way", way);
     let oracle = |name: &str| number(way(name), "oracle_miou");
-    let (embeddings, matching, all) = (oracle("matching: embeddings"), oracle("matching: + colour"), oracle("all: as the paper"));
-    assert!(matching > embeddings && matching > 0.8 && all > 0.45, "{paper}");
-    assert!(number(way("all: as the paper"), "large_ms") > 0.0, "{paper}");
+    let (embeddings, matching, all) = (
+        oracle("matching: embeddings"),
+        oracle("matching: + colour"),
+        oracle("all: as the paper"),
+    );
+    assert!(
+        matching > embeddings && matching > 0.8 && all > 0.45,
+        "{paper}"
+    );
+    assert!(
+        number(way("all: as the paper"), "large_ms") > 0.0,
+        "{paper}"
+    );
     assert_written(out, &["paper.md", "paper.csv", "paper.json"]);
 }
 
@@ -95,13 +185,26 @@ fn chart_and_paper() {
 #[ignore = "minutes; ./test.sh --all runs it"]
 fn size() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let figures = bench(&["size", "--quick", "--iterations", "400", "-o", text(folder.path())]);
+    let figures = bench(&[
+        "size",
+        "--quick",
+        "--iterations",
+        "400",
+        "-o",
+        text(folder.path()),
+    ]);
     let verdict = &figures["auto"][0];
     // So short a training differs by 1.5 dB from seed to seed.
-    assert!(number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 4.0, "{verdict}");
+    assert!(
+        number(verdict, "gaussians") < 1.0 && number(verdict, "lost_db") < 4.0,
+        "{verdict}"
+    );
     let bytes = |model: &str| number(row(&figures, "model", model), "scene_bytes");
     assert!(bytes("auto, compact") < bytes("auto") && bytes("degree 0") < bytes("full"));
-    assert_written(folder.path(), &["size.json", "size-psnr.svg", "size-oracle-miou.png"]);
+    assert_written(
+        folder.path(),
+        &["size.json", "size-psnr.svg", "size-oracle-miou.png"],
+    );
 }
 
 #[test]
@@ -116,7 +219,10 @@ fn stability() {
     }
     let twins = row(&figures, "scene", "twins");
     assert!(number(twins, "apart") >= 0.95, "{twins}");
-    assert_written(out, &["stability.md", "stability-table.svg", "stability-table.png"]);
+    assert_written(
+        out,
+        &["stability.md", "stability-table.svg", "stability-table.png"],
+    );
 }
 
 #[test]
@@ -125,7 +231,13 @@ fn names() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let scene = table(folder.path());
     let labels = text(&folder.path().join("photos/labels")).to_owned();
-    let figures = bench(&["names", text(&scene), text(&scene), "--labels", &format!("{labels},{labels}")]);
+    let figures = bench(&[
+        "names",
+        text(&scene),
+        text(&scene),
+        "--labels",
+        &format!("{labels},{labels}"),
+    ]);
     // What was measured on a scene holds on the left-out one, where both are the same.
     assert_eq!(figures["gap"], 0.0, "{figures}");
     assert!(number(&figures, "auroc_pooled") > 0.6, "{figures}");

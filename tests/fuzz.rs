@@ -1,13 +1,18 @@
-//! Every parser gets damaged files: it may refuse them, in one sentence that names the file, but must neither panic nor hang.
+//! Fuzz tests of all parsers. A parser may reject a damaged file in one sentence, but must neither
+//! panic nor hang.
 //!
-//! Inputs are mutations of valid files and of earlier finds: an input that makes a parser say something new joins the corpus in
-//! `target/fuzz/PARSER`, from which later runs go on. `FASTLGS_FUZZ_SECONDS` sets the time for each parser (default 0.5; `./test.sh --all` gives each 5).
+//! Inputs are mutations of valid files and of earlier finds. An input with a new message joins the
+//! corpus in `target/fuzz/PARSER`, where later runs start. `FASTLGS_FUZZ_SECONDS` sets the seconds
+//! per parser: 0.5 by default, 5 in `./test.sh --all`.
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::mask_list::annotations;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};
-use fastlgs_core::{Camera, Gaussians, WorldFrame, camera_path, dataset, fs, glb, image_io, labels, npy, ply, sog, splat, spz};
+use fastlgs_core::{
+    Camera, Gaussians, WorldFrame, camera_path, dataset, fs, glb, image_io, labels, npy, ply, sog,
+    splat, spz,
+};
 use glam::Vec3;
 use image::{GrayImage, Luma, RgbImage};
 use std::collections::BTreeSet;
@@ -15,20 +20,20 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// A parser under test, and the file that is damaged.
+/// A parser under test, with its valid file.
 struct Target {
     name: &'static str,
-    /// Path of the damaged file below the folder.
+    /// Path of the damaged file within the folder.
     file: &'static str,
-    /// Makes the other files of the folder.
+    /// Writes the other files of the folder.
     prepare: fn(&Path),
     seed: Vec<u8>,
     parse: fn(&Path) -> fastlgs_core::Result<()>,
 }
 
-/// Inputs kept beside the seed.
+/// Largest number of inputs in a corpus.
 const CORPUS: usize = 400;
-/// A parser that takes longer over a few kilobytes hangs.
+/// Time limit for one input of a few kilobytes. A slower parser counts as hanging.
 const SLOW: Duration = Duration::from_secs(5);
 
 fn scene() -> Gaussians {
@@ -39,7 +44,7 @@ fn scene() -> Gaussians {
     scene.with_sh_degree(1)
 }
 
-/// The bytes that a writer makes.
+/// Returns the bytes that a writer produces.
 fn written(write: impl FnOnce(&Path)) -> Vec<u8> {
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("file");
@@ -55,7 +60,8 @@ fn colmap_text(folder: &Path) {
     photo(folder);
     let write = |name: &str, text: &str| {
         let path = folder.join("sparse/0").join(name);
-        fs::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes())).expect("a model");
+        fs::write_atomic(&path, |f| std::io::Write::write_all(f, text.as_bytes()))
+            .expect("a model");
     };
     write("cameras.txt", CAMERAS);
     write("images.txt", IMAGES);
@@ -76,63 +82,133 @@ fn doubles(values: &[f64]) -> Vec<u8> {
 
 fn cameras_bin() -> Vec<u8> {
     let (one, id, model) = (1u64.to_le_bytes(), 1u32.to_le_bytes(), 1i32.to_le_bytes());
-    bytes(&[&one, &id, &model, &8u64.to_le_bytes(), &6u64.to_le_bytes(), &doubles(&[7.0, 7.0, 4.0, 3.0])])
+    bytes(&[
+        &one,
+        &id,
+        &model,
+        &8u64.to_le_bytes(),
+        &6u64.to_le_bytes(),
+        &doubles(&[7.0, 7.0, 4.0, 3.0]),
+    ])
 }
 
 fn images_bin() -> Vec<u8> {
     let (one, id) = (1u64.to_le_bytes(), 1u32.to_le_bytes());
     let pose = doubles(&[0.9, 0.1, 0.2, 0.3, 1.0, 2.0, 3.0]);
-    bytes(&[&one, &id, &pose, &id, b"a.png\0", &one, &doubles(&[1.5, 2.5]), &7i64.to_le_bytes()])
+    bytes(&[
+        &one,
+        &id,
+        &pose,
+        &id,
+        b"a.png\0",
+        &one,
+        &doubles(&[1.5, 2.5]),
+        &7i64.to_le_bytes(),
+    ])
 }
 
 fn points_bin() -> Vec<u8> {
     let one = 1u64.to_le_bytes();
-    bytes(&[&one, &7u64.to_le_bytes(), &doubles(&[0.1, 0.2, 0.3]), &[200, 100, 50], &doubles(&[0.5]), &one, &[1, 0, 0, 0, 0, 0, 0, 0]])
+    bytes(&[
+        &one,
+        &7u64.to_le_bytes(),
+        &doubles(&[0.1, 0.2, 0.3]),
+        &[200, 100, 50],
+        &doubles(&[0.5]),
+        &one,
+        &[1, 0, 0, 0, 0, 0, 0, 0],
+    ])
 }
 
 fn colmap_binary(folder: &Path) {
     photo(folder);
-    for (name, data) in [("cameras.bin", cameras_bin()), ("images.bin", images_bin()), ("points3D.bin", points_bin())] {
-        fs::write_atomic(&folder.join("sparse/0").join(name), |f| std::io::Write::write_all(f, &data)).expect("a model");
+    for (name, data) in [
+        ("cameras.bin", cameras_bin()),
+        ("images.bin", images_bin()),
+        ("points3D.bin", points_bin()),
+    ] {
+        fs::write_atomic(&folder.join("sparse/0").join(name), |f| {
+            std::io::Write::write_all(f, &data)
+        })
+        .expect("a model");
     }
 }
 
 fn class_mask(folder: &Path) {
-    image_io::save_png(&folder.join("00/camera.png"), GrayImage::from_pixel(3, 2, Luma([255]))).expect("a mask");
+    image_io::save_png(
+        &folder.join("00/camera.png"),
+        GrayImage::from_pixel(3, 2, Luma([255])),
+    )
+    .expect("a mask");
 }
 
 fn nothing(_: &Path) {}
 
-/// A float array as numpy writes it.
+/// Returns a float array in numpy's format.
 fn npy_file(shape: &str, values: &[f64]) -> Vec<u8> {
     let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
     while (header.len() + 11) % 64 != 0 {
         header.push(' ');
     }
     header.push('\n');
-    bytes(&[b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes(), header.as_bytes(), &doubles(values)])
+    bytes(&[
+        b"\x93NUMPY\x01\x00",
+        &(header.len() as u16).to_le_bytes(),
+        header.as_bytes(),
+        &doubles(values),
+    ])
 }
 
 fn some_camera() -> Camera {
-    Camera::look_at("a.png", Vec3::new(0.0, 0.0, -3.0), Vec3::ZERO, Vec3::Y, 8, 6, 0.8)
+    Camera::look_at(
+        "a.png",
+        Vec3::new(0.0, 0.0, -3.0),
+        Vec3::ZERO,
+        Vec3::Y,
+        8,
+        6,
+        0.8,
+    )
 }
 
-/// One chunk with one Gaussian.
+/// Returns a compressed PLY file with one chunk and one Gaussian.
 fn compressed_ply() -> Vec<u8> {
-    let bounds =
-        ["x", "y", "z", "scale_x", "scale_y", "scale_z"].map(|name| ["min", "max"].map(|side| format!("property float {side}_{name}\n")));
-    let packed = ["position", "rotation", "scale", "color"].map(|name| format!("property uint packed_{name}\n"));
-    let elements = format!("element chunk 1\n{}element vertex 1\n{}", bounds.as_flattened().concat(), packed.concat());
-    [format!("ply\nformat binary_little_endian 1.0\n{elements}end_header\n").into_bytes(), vec![0; 12 * 4 + 4 * 4]].concat()
+    let bounds = ["x", "y", "z", "scale_x", "scale_y", "scale_z"]
+        .map(|name| ["min", "max"].map(|side| format!("property float {side}_{name}\n")));
+    let packed = ["position", "rotation", "scale", "color"]
+        .map(|name| format!("property uint packed_{name}\n"));
+    let elements = format!(
+        "element chunk 1\n{}element vertex 1\n{}",
+        bounds.as_flattened().concat(),
+        packed.concat()
+    );
+    [
+        format!("ply\nformat binary_little_endian 1.0\n{elements}end_header\n").into_bytes(),
+        vec![0; 12 * 4 + 4 * 4],
+    ]
+    .concat()
 }
 
-/// Version 4 with one Gaussian: a header, a table of five streams, and each stream as one raw block of Zstandard.
+/// Returns an SPZ file of version 4 with one Gaussian: a header, a table of five streams, and each
+/// stream as one raw block of Zstandard.
 fn spz_4() -> Vec<u8> {
     let lengths = [9u8, 1, 3, 3, 4];
-    let mut data = [0x5053_474e_u32.to_le_bytes(), 4u32.to_le_bytes(), 1u32.to_le_bytes(), [0, 12, 0, 5], 32u32.to_le_bytes()].concat();
+    let mut data = [
+        0x5053_474e_u32.to_le_bytes(),
+        4u32.to_le_bytes(),
+        1u32.to_le_bytes(),
+        [0, 12, 0, 5],
+        32u32.to_le_bytes(),
+    ]
+    .concat();
     data.resize(32, 0);
     let frame = |length: u8| {
-        [&[0x28, 0xb5, 0x2f, 0xfd, 0x20, length], [length << 3 | 1, 0, 0].as_slice(), &vec![128; usize::from(length)]].concat()
+        [
+            &[0x28, 0xb5, 0x2f, 0xfd, 0x20, length],
+            [length << 3 | 1, 0, 0].as_slice(),
+            &vec![128; usize::from(length)],
+        ]
+        .concat()
     };
     for length in lengths {
         data.extend((frame(length).len() as u64).to_le_bytes());
@@ -144,9 +220,17 @@ fn spz_4() -> Vec<u8> {
 
 fn targets() -> Vec<Target> {
     let camera = some_camera();
-    let target = |name, file, prepare, seed, parse| Target { name, file, prepare, seed, parse };
+    let target = |name, file, prepare, seed, parse| Target {
+        name,
+        file,
+        prepare,
+        seed,
+        parse,
+    };
     let photos = |folder: &Path| dataset::load(folder).map(|_| ());
-    let llff = [1.0, 0.0, 0.0, 0.1, 6.0, 0.0, 1.0, 0.0, 0.2, 8.0, 0.0, 0.0, 1.0, 0.3, 7.0, 1.0, 10.0];
+    let llff = [
+        1.0, 0.0, 0.0, 0.1, 6.0, 0.0, 1.0, 0.0, 0.2, 8.0, 0.0, 0.0, 1.0, 0.3, 7.0, 1.0, 10.0,
+    ];
     vec![
         target("ply", "a.ply", nothing, written(|p| ply::write(p, &scene()).expect("a file")), |f| ply::read(&f.join("a.ply")).map(|_| ())),
         target("spz", "a.spz", nothing, written(|p| spz::write(p, &scene()).expect("a file")), |f| spz::read(&f.join("a.spz")).map(|_| ())),
@@ -210,7 +294,7 @@ fn targets() -> Vec<Target> {
     ]
 }
 
-/// One to four random changes.
+/// Applies one to four random changes to a random input of the corpus.
 fn mutated(corpus: &[Vec<u8>], rng: &mut Rng) -> Vec<u8> {
     let mut data = corpus[rng.below(corpus.len())].clone();
     for _ in 0..1 + rng.below(4) {
@@ -226,12 +310,23 @@ fn mutated(corpus: &[Vec<u8>], rng: &mut Rng) -> Vec<u8> {
                 data.splice(at..at, copy);
             }
             5 => {
-                // Counts and sizes that no file can hold.
+                // Counts and sizes too large for any file.
                 let huge = [u64::MAX, 1 << 62, 1 << 32, 0x7fff_ffff, 0][rng.below(5)].to_le_bytes();
                 data[at..end].copy_from_slice(&huge[..end - at]);
             }
             6 => {
-                let word: &[u8] = [&b"-1"[..], b"NaN", b"1e999", b"99999999999", b"\0", b"\"", b" ", b"\n", b"[[", b"null"][rng.below(10)];
+                let word: &[u8] = [
+                    &b"-1"[..],
+                    b"NaN",
+                    b"1e999",
+                    b"99999999999",
+                    b"\0",
+                    b"\"",
+                    b" ",
+                    b"\n",
+                    b"[[",
+                    b"null",
+                ][rng.below(10)];
                 data.splice(at..at, word.iter().copied());
             }
             _ => {
@@ -245,21 +340,33 @@ fn mutated(corpus: &[Vec<u8>], rng: &mut Rng) -> Vec<u8> {
     data
 }
 
-/// What a parser said, without numbers and without what it quotes.
+/// Returns the message of a parser without numbers and quoted parts.
 fn outcome(result: &fastlgs_core::Result<()>) -> String {
-    let Err(error) = result else { return "ok".to_owned() };
+    let Err(error) = result else {
+        return "ok".to_owned();
+    };
     let text = error.to_string();
     let own: String = text.split(['\'', '"', '`']).step_by(2).collect();
-    own.chars().filter(|c| c.is_ascii_alphabetic() || *c == ' ').take(160).collect()
+    own.chars()
+        .filter(|c| c.is_ascii_alphabetic() || *c == ' ')
+        .take(160)
+        .collect()
 }
 
 fn corpus_folder(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).parent().expect("the target folder").join("fuzz").join(name)
+    Path::new(env!("CARGO_TARGET_TMPDIR"))
+        .parent()
+        .expect("the target folder")
+        .join("fuzz")
+        .join(name)
 }
 
 #[test]
 fn parsers_survive_damaged_files() {
-    let seconds = std::env::var("FASTLGS_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok()).unwrap_or(0.5);
+    let seconds = std::env::var("FASTLGS_FUZZ_SECONDS")
+        .ok()
+        .and_then(|s| s.parse().ok())
+        .unwrap_or(0.5);
     let (mut total, mut failures) = (0, Vec::new());
     for target in targets() {
         let dir = tempfile::tempdir().expect("a folder");
@@ -272,19 +379,26 @@ fn parsers_survive_damaged_files() {
         };
         assert!(
             matches!(parse(&target.seed), Ok(Ok(()))),
-            "{}: the undamaged file is refused: {:?}",
+            "{}: the valid file is rejected: {:?}",
             target.name,
             (target.parse)(dir.path())
         );
         let kept = corpus_folder(target.name);
         std::fs::create_dir_all(&kept).expect("the corpus");
-        let mut earlier: Vec<PathBuf> = std::fs::read_dir(&kept).expect("the corpus").flatten().map(|e| e.path()).collect();
+        let mut earlier: Vec<PathBuf> = std::fs::read_dir(&kept)
+            .expect("the corpus")
+            .flatten()
+            .map(|e| e.path())
+            .collect();
         earlier.sort();
         let mut corpus: Vec<Vec<u8>> = vec![target.seed.clone()];
         corpus.extend(earlier.iter().filter_map(|p| std::fs::read(p).ok()));
-        let mut said: BTreeSet<String> = corpus.iter().filter_map(|data| Some(outcome(&parse(data).ok()?))).collect();
+        let mut said: BTreeSet<String> = corpus
+            .iter()
+            .filter_map(|data| Some(outcome(&parse(data).ok()?)))
+            .collect();
         let before = corpus.len();
-        // Other inputs than in the run that found the corpus.
+        // The seed depends on the corpus size, so that each run tries new inputs.
         let mut rng = Rng::new(corpus.len() as u64, target.name);
         let (started, mut runs) = (Instant::now(), 0);
         while started.elapsed().as_secs_f64() < seconds {
@@ -299,21 +413,35 @@ fn parsers_survive_damaged_files() {
             if result.is_err() || began.elapsed() > SLOW {
                 let path = kept.join("failure");
                 std::fs::write(&path, &data).expect("the failure");
-                failures.push(format!("{}: panics or hangs on {}", target.name, path.display()));
+                failures.push(format!(
+                    "{}: panics or hangs; the input is in {}",
+                    target.name,
+                    path.display()
+                ));
                 break;
             }
             if let Ok(Err(error)) = &result {
                 let text = error.to_string();
-                assert!(text.len() > 20 && !text.contains(char::is_control), "{}: not one clear sentence: {text:?}", target.name);
+                assert!(
+                    text.len() > 20 && !text.contains(char::is_control),
+                    "{}: the message is too short or has control characters: {text:?}",
+                    target.name
+                );
             }
             if new && corpus.len() < CORPUS {
-                std::fs::write(kept.join(format!("{:03}", corpus.len())), &data).expect("the corpus");
+                std::fs::write(kept.join(format!("{:03}", corpus.len())), &data)
+                    .expect("the corpus");
                 corpus.push(data);
             }
         }
-        println!("fuzz {:20} {runs:6} inputs, {} answers, corpus {before} -> {}", target.name, said.len(), corpus.len());
+        println!(
+            "fuzz {:20} {runs:6} inputs, {} different results, corpus {before} -> {}",
+            target.name,
+            said.len(),
+            corpus.len()
+        );
         total += runs;
     }
-    println!("fuzz: {total} inputs in all");
+    println!("fuzz: {total} inputs in total");
     assert!(failures.is_empty(), "{failures:#?}");
 }

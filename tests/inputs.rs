@@ -1,7 +1,9 @@
-//! Inputs as people really have them: albums that lie where the scene should, masks of other programs, poses in other conventions and places, cut-off
-//! photos, and scenes that another editor saved. Nothing of the user's is lost, and nothing is silently wrong.
+//! Inputs of real users: output folders within the album, masks of other programs, other
+//! conventions and origins of poses, truncated photos, and scenes saved by other editors. No file
+//! of the user is lost, and no error is silent.
 //!
-//! Needs the offline models and any Vulkan device; skips loudly without them unless FASTLGS_REQUIRE_GPU is set.
+//! Needs the offline models and a Vulkan device. Without them the tests are skipped with a message,
+//! or fail if FASTLGS_REQUIRE_GPU is set.
 
 #[path = "support/run.rs"]
 mod run;
@@ -15,23 +17,40 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// An album of 24 generated photos with exact poses; nothing where models or device are missing. Tests change copies of it.
+/// Returns an album of 24 generated photos with exact poses. `None` without models or device. Tests
+/// change copies of it.
 fn album() -> Option<&'static Path> {
     static ALBUM: OnceLock<Option<tempfile::TempDir>> = OnceLock::new();
     let make = || {
         let dir = run::ready().then(|| tempfile::tempdir().expect("a folder"))?;
-        json(&["synth", "table", "-o", text(&dir.path().join("album")), "--views", "24", "--size", "160x120"]);
+        json(&[
+            "synth",
+            "table",
+            "-o",
+            text(&dir.path().join("album")),
+            "--views",
+            "24",
+            "--size",
+            "160x120",
+        ]);
         Some(dir)
     };
-    ALBUM.get_or_init(make).as_ref().map(tempfile::TempDir::path)
+    ALBUM
+        .get_or_init(make)
+        .as_ref()
+        .map(tempfile::TempDir::path)
 }
 
-/// A copy of the album in a folder of its own, with its exact masks.
+/// Copies the album with its exact masks into a new folder. Returns that folder and the copy's
+/// path.
 fn copy() -> Option<(tempfile::TempDir, PathBuf)> {
     let from = album()?.join("album");
     let dir = tempfile::tempdir().expect("a folder");
     let to = dir.path().join("album");
-    for (path, data) in contents(&from).into_iter().filter(|(path, _)| !path.starts_with(from.join("depth"))) {
+    for (path, data) in contents(&from)
+        .into_iter()
+        .filter(|(path, _)| !path.starts_with(from.join("depth")))
+    {
         let place = to.join(path.strip_prefix(&from).expect("below it"));
         std::fs::create_dir_all(place.parent().expect("a folder")).expect("a folder");
         std::fs::write(place, data).expect("a file");
@@ -39,12 +58,16 @@ fn copy() -> Option<(tempfile::TempDir, PathBuf)> {
     Some((dir, to))
 }
 
-/// All files below a folder with their contents.
+/// Returns all files below a folder with their contents.
 fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
-        for path in std::fs::read_dir(&folder).expect("a folder").flatten().map(|entry| entry.path()) {
+        for path in std::fs::read_dir(&folder)
+            .expect("a folder")
+            .flatten()
+            .map(|entry| entry.path())
+        {
             if path.is_dir() {
                 folders.push(path);
             } else {
@@ -66,11 +89,18 @@ fn albums_are_never_written() {
     let (inside, above) = (photos.join("scene"), dir.path().to_owned());
     for output in [&photos, &inside, &above, &raw] {
         for command in ["preprocess", "make"] {
-            let why = if output == &raw { "not a scene" } else { "nothing was written" };
+            let why = if output == &raw {
+                "not a scene"
+            } else {
+                "nothing was written"
+            };
             fails(&[command, text(&photos), "-o", text(output)], &[why]);
         }
     }
-    fails(&["synth", "table", "-o", text(&raw), "--views", "8"], &["not empty"]);
+    fails(
+        &["synth", "table", "-o", text(&raw), "--views", "8"],
+        &["not empty"],
+    );
     assert_eq!(contents(dir.path()), before);
 }
 
@@ -78,37 +108,80 @@ fn albums_are_never_written() {
 fn of_two_runs_the_second_says_who_holds_the_scene() {
     let Some((dir, photos)) = copy() else { return };
     let scene = dir.path().join("scene");
-    let args = ["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--quiet"];
+    let args = [
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--quiet",
+    ];
     let (one, two) = std::thread::scope(|scope| {
         let other = scope.spawn(|| run::fastlgs(&args));
         (run::fastlgs(&args), other.join().expect("the other run"))
     });
-    let refused: Vec<_> = [&one, &two].into_iter().filter(|output| !output.status.success()).collect();
+    let refused: Vec<_> = [&one, &two]
+        .into_iter()
+        .filter(|output| !output.status.success())
+        .collect();
     assert_eq!(refused.len(), 1, "{one:?} {two:?}");
     let said = String::from_utf8_lossy(&refused[0].stderr);
     assert!(said.contains("is writing this scene"), "{said}");
-    SceneFolder::open(&scene).and_then(|folder| folder.manifest()).expect("the scene of the first run");
-    // Files of the user's within the scene stay, and a second run replaces only its own.
+    SceneFolder::open(&scene)
+        .and_then(|folder| folder.manifest())
+        .expect("the scene of the first run");
+    // Other files of the user in the scene folder stay. A second run replaces only its own files.
     std::fs::write(scene.join("photos/IMG_1.CR3"), "raw").expect("a file");
-    json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--max-side", "96"]);
-    assert_eq!(std::fs::read(scene.join("photos/IMG_1.CR3")).expect("the user's file"), b"raw");
+    json(&[
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--max-side",
+        "96",
+    ]);
+    assert_eq!(
+        std::fs::read(scene.join("photos/IMG_1.CR3")).expect("the user's file"),
+        b"raw"
+    );
 }
 
-/// The share of a scene's pixels that are trained on, after `ignore` was drawn for every photo.
+/// Preprocesses a copy of the album with `mask` drawn as ignore mask of every photo. Returns the
+/// fraction of pixels to train on, or the error message.
 fn trained_share(mask: impl Fn(u32, u32, &Path)) -> Option<Result<f64, String>> {
     let (dir, photos) = copy()?;
     let scene = dir.path().join("scene");
     std::fs::create_dir_all(photos.join("ignore")).expect("a folder");
-    for entry in std::fs::read_dir(photos.join("images")).expect("photos").flatten() {
+    for entry in std::fs::read_dir(photos.join("images"))
+        .expect("photos")
+        .flatten()
+    {
         mask(160, 120, &photos.join("ignore").join(entry.file_name()));
     }
-    let args = ["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--holdout", "0", "--quiet"];
+    let args = [
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--holdout",
+        "0",
+        "--quiet",
+    ];
     let output = run::fastlgs(&args);
     if !output.status.success() {
         return Some(Err(run::complaint(&args, &output)));
     }
-    let mask = image::open(scene.join("ignore/003.png.png")).expect("a mask").into_luma8();
-    Some(Ok(mask.pixels().filter(|p| p[0] >= 128).count() as f64 / mask.pixels().len() as f64))
+    let mask = image::open(scene.join("ignore/003.png.png"))
+        .expect("a mask")
+        .into_luma8();
+    Some(Ok(
+        mask.pixels().filter(|p| p[0] >= 128).count() as f64 / mask.pixels().len() as f64
+    ))
 }
 
 #[test]
@@ -119,38 +192,94 @@ fn masks_mean_the_same_however_they_are_saved() {
     let save = |picture: image::DynamicImage, path: &Path| picture.save(path).expect("a mask");
     type Draw<'a> = &'a dyn Fn(u32, u32, &Path);
     let ways: [(&str, Draw<'_>); 3] = [
-        ("0 and 1", &|w, h, path| save(GrayImage::from_fn(w, h, |x, y| Luma([one(x, y)])).into(), path)),
-        ("alpha", &|w, h, path| save(RgbaImage::from_fn(w, h, |x, y| Rgba([0, 0, 0, 255 * one(x, y)])).into(), path)),
-        ("0 and 255", &|w, h, path| save(GrayImage::from_fn(w, h, |x, y| Luma([255 * one(x, y)])).into(), path)),
+        ("0 and 1", &|w, h, path| {
+            save(
+                GrayImage::from_fn(w, h, |x, y| Luma([one(x, y)])).into(),
+                path,
+            )
+        }),
+        ("alpha", &|w, h, path| {
+            save(
+                RgbaImage::from_fn(w, h, |x, y| Rgba([0, 0, 0, 255 * one(x, y)])).into(),
+                path,
+            )
+        }),
+        ("0 and 255", &|w, h, path| {
+            save(
+                GrayImage::from_fn(w, h, |x, y| Luma([255 * one(x, y)])).into(),
+                path,
+            )
+        }),
     ];
     for (name, draw) in ways {
-        let Some(share) = trained_share(draw) else { return };
-        assert!((share.clone().expect("a scene") - expected).abs() < 0.01, "{name}: {share:?}");
+        let Some(share) = trained_share(draw) else {
+            return;
+        };
+        assert!(
+            (share.clone().expect("a scene") - expected).abs() < 0.01,
+            "{name}: {share:?}"
+        );
     }
-    // Masks that leave nothing are no masks.
+    // Masks that ignore all pixels are an error.
     let black = trained_share(|w, h, path| save(GrayImage::new(w, h).into(), path)).expect("ready");
-    assert!(black.as_ref().is_err_and(|said| said.contains("leave nothing")), "{black:?}");
+    assert!(
+        black
+            .as_ref()
+            .is_err_and(|said| said.contains("leave nothing")),
+        "{black:?}"
+    );
 }
 
-/// A scene of the album with its poses changed, trained for a moment; what was said, and the PSNR of held-out views.
+/// Preprocesses and briefly trains a copy of the album with changed poses. Returns the messages,
+/// and the PSNR of held-out views in dB.
 fn with_poses(change: impl Fn(usize, DMat4) -> DMat4) -> Option<(String, f64, tempfile::TempDir)> {
     let (dir, photos) = copy()?;
     let scene = dir.path().join("scene");
     let path = photos.join("transforms.json");
-    let mut poses: Value = serde_json::from_slice(&std::fs::read(&path).expect("poses")).expect("JSON");
-    for (k, frame) in poses["frames"].as_array_mut().expect("frames").iter_mut().enumerate() {
-        let rows: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).expect("a matrix");
-        frame["transform_matrix"] = value!(change(k, DMat4::from_cols_array_2d(&rows).transpose()).transpose().to_cols_array_2d());
+    let mut poses: Value =
+        serde_json::from_slice(&std::fs::read(&path).expect("poses")).expect("JSON");
+    for (k, frame) in poses["frames"]
+        .as_array_mut()
+        .expect("frames")
+        .iter_mut()
+        .enumerate()
+    {
+        let rows: [[f64; 4]; 4] =
+            serde_json::from_value(frame["transform_matrix"].clone()).expect("a matrix");
+        frame["transform_matrix"] = value!(
+            change(k, DMat4::from_cols_array_2d(&rows).transpose())
+                .transpose()
+                .to_cols_array_2d()
+        );
     }
     std::fs::write(&path, poses.to_string()).expect("poses");
-    let output = run::fastlgs(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import"]);
+    let output = run::fastlgs(&[
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+    ]);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{said}");
-    let report = json(&["train", text(&scene), "--iterations", "200", "--device", "cpu"]);
-    Some((said, report["psnr_held_out"].as_f64().expect("held-out views"), dir))
+    let report = json(&[
+        "train",
+        text(&scene),
+        "--iterations",
+        "200",
+        "--device",
+        "cpu",
+    ]);
+    Some((
+        said,
+        report["psnr_held_out"].as_f64().expect("held-out views"),
+        dir,
+    ))
 }
 
-/// PSNR that a moment of training reaches with right poses (26 to 27 dB), less what seeds differ by; with wrong ones it is 15 to 20.
+/// Smallest PSNR of a brief training with correct poses, in dB. Correct poses reach 26 to 27 dB,
+/// wrong poses 15 to 20.
 const RIGHT: f64 = 24.5;
 
 #[test]
@@ -160,27 +289,71 @@ fn poses_far_from_the_origin_keep_their_digits() {
         pose.w_axis += utm.extend(0.0);
         pose
     };
-    let Some((_, psnr, dir)) = with_poses(moved) else { return };
+    let Some((_, psnr, dir)) = with_poses(moved) else {
+        return;
+    };
     assert!(psnr > RIGHT, "{psnr}");
     let (scene, at) = (dir.path().join("scene"), |name: &str| dir.path().join(name));
-    // What is exported lies in the world again, and comes back.
+    // Exports are in world coordinates, and can be imported again.
     json(&["export", text(&scene), text(&at("world.ply"))]);
     json(&["export", text(&scene), text(&at("cameras.json"))]);
     let world = ply::read(&at("world.ply")).expect("an export");
     let local = ply::read(&scene.join("scene.ply")).expect("the scene");
-    assert!(world.means.iter().all(|mean| mean.as_dvec3().distance(utm) < 1e3) && local.means[0].length() < 1e3);
-    let again = json(&["train", text(&scene), "--init", text(&at("world.ply")), "--iterations", "0", "--device", "cpu"]);
-    assert!((again["psnr_held_out"].as_f64().expect("a number") - psnr).abs() < 0.1, "{again}");
-    let path: Value = serde_json::from_slice(&std::fs::read(at("cameras.json")).expect("an export")).expect("JSON");
-    let easting = path["camera_path"][0]["camera_to_world"][3].as_f64().expect("a number");
+    assert!(
+        world
+            .means
+            .iter()
+            .all(|mean| mean.as_dvec3().distance(utm) < 1e3)
+            && local.means[0].length() < 1e3
+    );
+    let again = json(&[
+        "train",
+        text(&scene),
+        "--init",
+        text(&at("world.ply")),
+        "--iterations",
+        "0",
+        "--device",
+        "cpu",
+    ]);
+    assert!(
+        (again["psnr_held_out"].as_f64().expect("a number") - psnr).abs() < 0.1,
+        "{again}"
+    );
+    let path: Value =
+        serde_json::from_slice(&std::fs::read(at("cameras.json")).expect("an export"))
+            .expect("JSON");
+    let easting = path["camera_path"][0]["camera_to_world"][3]
+        .as_f64()
+        .expect("a number");
     assert!((easting - utm.x).abs() < 10.0, "{easting}");
-    // A camera in the world shows what the view shows.
-    json(&["render", text(&scene), "--path", text(&at("cameras.json")), "-o", text(&at("there"))]);
-    json(&["render", text(&scene), "--view", "000.png", "-o", text(&at("here"))]);
-    let [there, here] =
-        ["there", "here"].map(|folder| fastlgs_core::image_io::load_rgb(&at(folder).join("000.png.color.png")).expect("a picture"));
-    let difference =
-        there.as_raw().iter().zip(here.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / here.as_raw().len() as f64;
+    // A camera in world coordinates renders the same picture as the view.
+    json(&[
+        "render",
+        text(&scene),
+        "--path",
+        text(&at("cameras.json")),
+        "-o",
+        text(&at("there")),
+    ]);
+    json(&[
+        "render",
+        text(&scene),
+        "--view",
+        "000.png",
+        "-o",
+        text(&at("here")),
+    ]);
+    let [there, here] = ["there", "here"].map(|folder| {
+        fastlgs_core::image_io::load_rgb(&at(folder).join("000.png.color.png")).expect("a picture")
+    });
+    let difference = there
+        .as_raw()
+        .iter()
+        .zip(here.as_raw())
+        .map(|(a, b)| f64::from(a.abs_diff(*b)))
+        .sum::<f64>()
+        / here.as_raw().len() as f64;
     assert!(difference < 1.0, "{difference}");
 }
 
@@ -191,14 +364,22 @@ fn units_and_one_wrong_pose_do_not_matter() {
             pose.w_axis = (unit * pose.w_axis.truncate()).extend(1.0);
             pose
         };
-        let Some((_, psnr, _)) = with_poses(scaled) else { return };
+        let Some((_, psnr, _)) = with_poses(scaled) else {
+            return;
+        };
         assert!(psnr > RIGHT, "unit {unit}: {psnr}");
     }
     let wrong = |k: usize, mut pose: DMat4| {
-        pose.w_axis += if k == 5 { DVec4::new(1e4, 1e4, 1e4, 0.0) } else { DVec4::ZERO };
+        pose.w_axis += if k == 5 {
+            DVec4::new(1e4, 1e4, 1e4, 0.0)
+        } else {
+            DVec4::ZERO
+        };
         pose
     };
-    let Some((said, psnr, _)) = with_poses(wrong) else { return };
+    let Some((said, psnr, _)) = with_poses(wrong) else {
+        return;
+    };
     assert!(said.contains("005.png") && psnr > RIGHT, "{psnr}: {said}");
 }
 
@@ -206,11 +387,19 @@ fn units_and_one_wrong_pose_do_not_matter() {
 fn the_photos_tell_the_convention_of_their_poses() {
     let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
     type Write<'a> = &'a dyn Fn(usize, DMat4) -> DMat4;
-    let conventions: [(&str, Write<'_>); 3] =
-        [("c2w-opencv", &|_, pose| pose * flip), ("w2c-opengl", &|_, pose| pose.inverse()), ("transposed", &|_, pose| pose.transpose())];
+    let conventions: [(&str, Write<'_>); 3] = [
+        ("c2w-opencv", &|_, pose| pose * flip),
+        ("w2c-opengl", &|_, pose| pose.inverse()),
+        ("transposed", &|_, pose| pose.transpose()),
+    ];
     for (name, write) in conventions {
-        let Some((said, psnr, _)) = with_poses(write) else { return };
-        assert!(said.contains(name) && psnr > RIGHT, "{name}, {psnr}: {said}");
+        let Some((said, psnr, _)) = with_poses(write) else {
+            return;
+        };
+        assert!(
+            said.contains(name) && psnr > RIGHT,
+            "{name}, {psnr}: {said}"
+        );
     }
 }
 
@@ -219,10 +408,22 @@ fn photos_that_were_cut_off_are_refused() {
     let Some((dir, photos)) = copy() else { return };
     let path = photos.join("images/003.png");
     let mut jpeg = std::io::Cursor::new(Vec::new());
-    image::open(&path).expect("a photo").into_rgb8().write_to(&mut jpeg, image::ImageFormat::Jpeg).expect("a JPEG");
+    image::open(&path)
+        .expect("a photo")
+        .into_rgb8()
+        .write_to(&mut jpeg, image::ImageFormat::Jpeg)
+        .expect("a JPEG");
     let whole = jpeg.into_inner();
     std::fs::write(&path, &whole[..whole.len() / 2]).expect("half of it");
-    fails(&["preprocess", text(&photos), "-o", text(&dir.path().join("scene"))], &["003.png", "cut off"]);
+    fails(
+        &[
+            "preprocess",
+            text(&photos),
+            "-o",
+            text(&dir.path().join("scene")),
+        ],
+        &["003.png", "cut off"],
+    );
 }
 
 #[test]
@@ -237,12 +438,26 @@ fn what_another_editor_saved_without_objects_is_said_to_have_none() {
     }
     let path = scene.join("scene.ply");
     let data = std::fs::read(&path).expect("the scene");
-    let at = data.windows(9).position(|w| w == b"object_id").expect("the column");
-    std::fs::write(&path, [&data[..at], b"something", &data[at + 9..]].concat()).expect("the scene");
+    let at = data
+        .windows(9)
+        .position(|w| w == b"object_id")
+        .expect("the column");
+    std::fs::write(&path, [&data[..at], b"something", &data[at + 9..]].concat())
+        .expect("the scene");
     let mend = ["object_id", "--iterations 0"];
     fails(&["query", text(&scene), "coffee"], &mend);
-    fails(&["remove", text(&scene), "--object", "1", "-o", text(&dir.path().join("rest"))], &mend);
-    // Texts as they are typed and pasted.
+    fails(
+        &[
+            "remove",
+            text(&scene),
+            "--object",
+            "1",
+            "-o",
+            text(&dir.path().join("rest")),
+        ],
+        &mend,
+    );
+    // Texts with articles, typographic quotes and a byte order mark.
     let ask = |words: &str| json(&["query", text(&room.scene), words, "--view", "008.png"]);
     let plain = ask("coffee");
     for words in ["a coffee", "\u{201c}the coffee\u{201d}", "\u{feff}coffee"] {

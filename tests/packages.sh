@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# `cargo install` gives a working binary, and the recipes in packaging/ make packages of it that hold what they should.
+# Tests that `cargo install` gives a working binary, and that packaging/ makes complete packages of
+# it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 work=$(mktemp -d)
@@ -11,7 +12,7 @@ deb=$(packaging/debian.sh "$work/deb")
 dpkg-deb -x "$deb" "$work/root"
 "$work/root/usr/bin/fastlgs" --version
 for file in usr/share/man/man1/fastlgs-query.1.gz usr/share/bash-completion/completions/fastlgs usr/share/doc/fastlgs/LICENSE-MIT; do
-    [ -s "$work/root/$file" ] || { echo "packages: $file is missing in the Debian package" >&2; exit 1; }
+    [ -s "$work/root/$file" ] || { echo "packages: the Debian package lacks $file" >&2; exit 1; }
 done
 tarball=$(packaging/tarball.sh "$work/tar")
 tar -C "$work/tar" -xzf "$tarball"

@@ -1,4 +1,5 @@
-//! What must hold for any input: round trips, identities of the measures, invariants of label maps and of objects.
+//! Property tests: round trips of file formats, identities of metrics, invariants of label maps and
+//! objects.
 
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::gaussians::rest_len;
@@ -23,22 +24,31 @@ prop_compose! {
 }
 
 fn scene() -> impl Strategy<Value = Gaussians> {
-    (0u32..=3).prop_flat_map(|degree| (Just(degree), prop::collection::vec(gaussian(degree), 1..12))).prop_map(|(sh_degree, all)| {
-        let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
-        for (mean, log_scale, rotation, opacity, dc, rest, feature, id) in all {
-            // A quaternion of no length has no direction.
-            let rotation = if rotation.iter().map(|v| v * v).sum::<f32>() < 0.01 { [1.0, 0.0, 0.0, 0.0] } else { rotation };
-            scene.means.push(mean);
-            scene.log_scales.push(log_scale);
-            scene.rotations.push(rotation);
-            scene.opacity_logits.push(opacity);
-            scene.sh_dc.push(dc);
-            scene.sh_rest.extend(rest);
-            scene.features.push(feature);
-            scene.object_ids.push(id);
-        }
-        scene
-    })
+    (0u32..=3)
+        .prop_flat_map(|degree| (Just(degree), prop::collection::vec(gaussian(degree), 1..12)))
+        .prop_map(|(sh_degree, all)| {
+            let mut scene = Gaussians {
+                sh_degree,
+                ..Gaussians::default()
+            };
+            for (mean, log_scale, rotation, opacity, dc, rest, feature, id) in all {
+                // A zero quaternion has no direction.
+                let rotation = if rotation.iter().map(|v| v * v).sum::<f32>() < 0.01 {
+                    [1.0, 0.0, 0.0, 0.0]
+                } else {
+                    rotation
+                };
+                scene.means.push(mean);
+                scene.log_scales.push(log_scale);
+                scene.rotations.push(rotation);
+                scene.opacity_logits.push(opacity);
+                scene.sh_dc.push(dc);
+                scene.sh_rest.extend(rest);
+                scene.features.push(feature);
+                scene.object_ids.push(id);
+            }
+            scene
+        })
 }
 
 fn mask(pixels: usize) -> impl Strategy<Value = Vec<bool>> {
@@ -47,14 +57,26 @@ fn mask(pixels: usize) -> impl Strategy<Value = Vec<bool>> {
 
 fn map() -> impl Strategy<Value = LabelMap> {
     (1u32..9, 1u32..9).prop_flat_map(|(width, height)| {
-        let labels = prop::collection::vec(prop_oneof![Just(0u16), 1u16..6, any::<u16>()], (width * height) as usize);
-        labels.prop_map(move |labels| LabelMap { width, height, labels })
+        let labels = prop::collection::vec(
+            prop_oneof![Just(0u16), 1u16..6, any::<u16>()],
+            (width * height) as usize,
+        );
+        labels.prop_map(move |labels| LabelMap {
+            width,
+            height,
+            labels,
+        })
     })
 }
 
-/// Parents of objects 1, 2, ...: each earlier than its child, or 0.
+/// Returns the parents of objects 1, 2, ...: a smaller id, or 0 for none.
 fn tree() -> impl Strategy<Value = Vec<u16>> {
-    prop::collection::vec(any::<u16>(), 1..20).prop_map(|raw| raw.iter().enumerate().map(|(k, r)| r % (k as u16 + 1)).collect())
+    prop::collection::vec(any::<u16>(), 1..20).prop_map(|raw| {
+        raw.iter()
+            .enumerate()
+            .map(|(k, r)| r % (k as u16 + 1))
+            .collect()
+    })
 }
 
 fn grid(parents: &[u16]) -> Grid {
@@ -67,7 +89,10 @@ fn grid(parents: &[u16]) -> Grid {
         areas: Vec::new(),
         views: 3,
     };
-    Grid { objects: parents.iter().enumerate().map(object).collect(), ..Grid::default() }
+    Grid {
+        objects: parents.iter().enumerate().map(object).collect(),
+        ..Grid::default()
+    }
 }
 
 fn through<T>(write: impl FnOnce(&Path), read: impl FnOnce(&Path) -> T) -> T {
@@ -88,7 +113,8 @@ proptest! {
     fn compact_files_keep_what_their_bytes_can(scene in scene()) {
         let back = through(|p| compact::write(p, &scene, &Precision::default()).expect("written"), |p| compact::read(p).expect("read"));
         prop_assert_eq!(&back.object_ids, &scene.object_ids);
-        // Three bytes over at most 100 units, two over the others' ranges.
+        // Positions have three bytes over at most 100 units. Other values have two bytes over their
+        // range.
         for (a, b) in back.means.iter().zip(&scene.means) {
             prop_assert!((*a - *b).abs().max_element() <= 100.0 / (1u32 << 24) as f32 + 1e-5);
         }
@@ -105,7 +131,7 @@ proptest! {
             prop_assert!((back.means[i] - scene.means[i]).abs().max_element() <= 1.0 / 4096.0);
             prop_assert!((back.log_scales[i] - scene.log_scales[i]).abs().max_element() <= 1.0 / 16.0);
             let turn: Quat = back.rotation(i) * scene.rotation(i).inverse();
-            prop_assert!(turn.w.abs() > 0.98, "a rotation turned by {} rad", 2.0 * turn.w.abs().min(1.0).acos());
+            prop_assert!(turn.w.abs() > 0.98, "the rotation differs by {} rad", 2.0 * turn.w.abs().min(1.0).acos());
         }
     }
 
@@ -113,7 +139,7 @@ proptest! {
     fn sog_keeps_what_eyes_see(scene in scene()) {
         let back = through(|p| sog::write(p, &scene).expect("written"), |p| sog::read(p).expect("read"));
         prop_assert_eq!(back.len(), scene.len());
-        // They come in another order.
+        // SOG reorders the Gaussians.
         for (mean, i) in back.means.iter().zip(0..) {
             let near = |k: &usize| (*mean - scene.means[*k]).abs().max_element() <= 0.01 * (1.0 + mean.abs().max_element());
             let same = |k: &usize| (back.log_scales[i] - scene.log_scales[*k]).abs().max_element() <= 0.2 && back.rotation(i).dot(scene.rotation(*k)).abs() > 0.999;
@@ -145,12 +171,12 @@ proptest! {
         prop_assert!((0.0..=1.0).contains(&iou));
         prop_assert_eq!(iou, metrics::iou(&b, &a));
         prop_assert_eq!(metrics::iou(&a, &a), 1.0);
-        // Both are counted over the same pixels: IoU is never above recall or accuracy of the other.
+        // IoU never exceeds recall, because both count the same pixels.
         prop_assert!(iou <= metrics::recall(&a, &b) + 1e-12);
         let not = |m: &[bool]| m.iter().map(|v| !v).collect::<Vec<_>>();
         prop_assert_eq!(metrics::accuracy(&a, &b), metrics::accuracy(&not(&a), &not(&b)));
         prop_assert_eq!(metrics::boundary_iou(&a, &a, 8, 6, 1), 1.0);
-        // What is eroded was there, and what was there is in what is dilated.
+        // The eroded mask lies in the mask, and the mask in the dilated one.
         let (eroded, dilated) = (metrics::erode(&a, 8, 6, 1), metrics::dilate(&a, 8, 6, [1, 1]));
         prop_assert!(eroded.iter().zip(&a).all(|(e, a)| !e || *a) && a.iter().zip(&dilated).all(|(a, d)| !a || *d));
     }
@@ -186,8 +212,8 @@ proptest! {
         let weights: Vec<f32> = raw.iter().map(|r| f32::from(r.1)).collect();
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &weights, 1.0);
         let mut grid = Grid { overlaps, ..grid(&parents) };
-        grid.shown = vec![0.0; usize::from(grid.highest()) + 1];
-        ids.iter().zip(&weights).for_each(|(id, weight)| grid.shown[usize::from(*id)] += weight);
+        grid.id_areas = vec![0.0; usize::from(grid.highest()) + 1];
+        ids.iter().zip(&weights).for_each(|(id, weight)| grid.id_areas[usize::from(*id)] += weight);
         for (id, list) in ids.iter().zip(&lists) {
             prop_assert_eq!(&grid.chain(*id).collect::<Vec<_>>(), list);
         }
@@ -211,13 +237,13 @@ proptest! {
             let after: Vec<u16> = left.chain(new[usize::from(*id)]).map(|id| stay[usize::from(id) - 1]).collect();
             prop_assert_eq!(after, list.iter().copied().filter(|id| stay.contains(id)).collect::<Vec<_>>());
         }
-        prop_assert_eq!(left.shown.iter().sum::<f32>(), grid.shown.iter().sum::<f32>());
+        prop_assert_eq!(left.id_areas.iter().sum::<f32>(), grid.id_areas.iter().sum::<f32>());
     }
 
     #[test]
     fn codes_are_apart_by_the_lattice(count in 1usize..400, seed in any::<u64>()) {
         let codes = codes::lattice(count, seed);
-        // K^(-1/3) of the paper, with the side rounded up.
+        // Spacing K^(-1/3) (paper), with the side of the lattice rounded up.
         let side = (1..).find(|s: &usize| s.pow(3) >= count).expect("a side") as f32;
         prop_assert_eq!(codes.len(), count);
         for (i, a) in codes.iter().enumerate() {

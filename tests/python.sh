@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# The Python module that `cargo build --workspace` has left, beside its Python files; with FASTLGS_TEST_ALL installed by pip as a user would, which
-# compiles most of it once more.
+# Tests the Python module, with the library that `cargo build --workspace` has left.
+# With FASTLGS_TEST_ALL, pip installs the module as for a user, which compiles most crates again.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 [ -x target/python/bin/python ] || python3 -m venv target/python

@@ -1,7 +1,10 @@
 #!/usr/bin/env bash
-# SAM, CLIP and SigLIP with random weights against their authors' programs: makes ONNX exports and what the originals answer, and compares. Needs PyPI, a
-# gigabyte for PyTorch, and some minutes; test.sh --all runs it. Python 3.8 to 3.10, which that PyTorch takes, by name or whole path as REFERENCE_PYTHON.
-# SAM 2 takes another five gigabytes, for a later PyTorch and all that this brings: only where REFERENCE_SAM2 names a Python 3.10 to 3.12 for it.
+# Compares SAM, CLIP and SigLIP with their authors' programs, on random weights.
+# Makes ONNX exports and the originals' outputs, and runs the tests `reference::` on them.
+# Needs PyPI, a gigabyte for PyTorch, and a few minutes. `test.sh --all` runs it.
+# REFERENCE_PYTHON names a Python 3.8 to 3.10, which that PyTorch needs, by name or path.
+# SAM 2 needs five more gigabytes for a later PyTorch and its dependencies.
+# It is tested only if REFERENCE_SAM2 names a Python 3.10 to 3.12.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${REFERENCE_PYTHON:-}
@@ -9,7 +12,7 @@ for version in 3.10 3.9 3.8; do
     [ "$python" ] || ! "python$version" -c 'import venv, ensurepip' 2>/dev/null || python=python$version
 done
 if [ -z "$python" ]; then
-    echo "SKIPPED: no Python 3.8 to 3.10 for the originals of SAM, CLIP and SigLIP; name one: REFERENCE_PYTHON=FILE tests/reference.sh"
+    echo "SKIPPED: no Python 3.8 to 3.10 for the originals of SAM, CLIP and SigLIP; set it: REFERENCE_PYTHON=FILE tests/reference.sh"
     exit 0
 fi
 venv=target/reference/venv out=$PWD/target/reference/out
@@ -38,6 +41,6 @@ if [ -n "${REFERENCE_SAM2:-}" ]; then
     "$venv/bin/python" -W ignore tests/reference/sam_two.py "$out" > /dev/null
 else
     rm -rf "$out/sam2"
-    echo "SKIPPED: SAM 2; name a Python 3.10 to 3.12 for it: REFERENCE_SAM2=FILE tests/reference.sh"
+    echo "SKIPPED: SAM 2 needs a Python 3.10 to 3.12; set it: REFERENCE_SAM2=FILE tests/reference.sh"
 fi
 FASTLGS_REFERENCE=$out cargo test --release --locked -p fastlgs-vision --no-default-features --features load-ort,opencv reference:: -- --nocapture

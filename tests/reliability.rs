@@ -1,4 +1,5 @@
-//! What must hold when things go wrong from outside: kills, full disks, places that cannot be written, many users at once.
+//! Reliability under external faults: killed processes, full disks, unwritable folders, many
+//! simultaneous users.
 
 #[path = "support/run.rs"]
 mod run;
@@ -12,14 +13,21 @@ use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// A small preprocessed scene, and how long its training takes.
+/// A small preprocessed and trained scene, with the duration of its training.
 struct Fixture {
     dir: tempfile::TempDir,
     trained: PathBuf,
     training: Duration,
 }
 
-const TRAINING: [&str; 6] = ["--iterations", "1200", "--budget", "2500", "--device", "cpu"];
+const TRAINING: [&str; 6] = [
+    "--iterations",
+    "1200",
+    "--budget",
+    "2500",
+    "--device",
+    "cpu",
+];
 
 fn fixture() -> Option<&'static Fixture> {
     static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
@@ -30,19 +38,40 @@ fn fixture() -> Option<&'static Fixture> {
             }
             let dir = tempfile::tempdir().expect("a temporary folder");
             let (photos, trained) = (dir.path().join("photos"), dir.path().join("trained"));
-            json(&["synth", "table", "-o", text(&photos), "--views", "14", "--size", "128x96"]);
-            json(&["preprocess", text(&photos), "-o", text(&trained), "--segmenter", "import"]);
+            json(&[
+                "synth",
+                "table",
+                "-o",
+                text(&photos),
+                "--views",
+                "14",
+                "--size",
+                "128x96",
+            ]);
+            json(&[
+                "preprocess",
+                text(&photos),
+                "-o",
+                text(&trained),
+                "--segmenter",
+                "import",
+            ]);
             copy_folder(&trained, &dir.path().join("untrained"));
             let started = Instant::now();
             json(&[&["train", text(&trained)], &TRAINING[..]].concat());
-            Some(Fixture { dir, trained, training: started.elapsed() })
+            Some(Fixture {
+                dir,
+                trained,
+                training: started.elapsed(),
+            })
         })
         .as_ref()
 }
 
-/// The files that training makes.
+/// Returns the files that training writes.
 fn results(scene: &Path) -> [Vec<u8>; 3] {
-    ["scene.ply", "grid.json", "grid.safetensors"].map(|f| std::fs::read(scene.join(f)).expect("a file"))
+    ["scene.ply", "grid.json", "grid.safetensors"]
+        .map(|f| std::fs::read(scene.join(f)).expect("a file"))
 }
 
 #[test]
@@ -52,7 +81,7 @@ fn training_survives_kills() {
     copy_folder(&f.dir.path().join("untrained"), &scene);
     let mut rng = Rng::new(20, "kills");
     let (mut kills, mut resumed, mut finished) = (0, 0, 0);
-    // Later kills find a checkpoint more often: a run that was killed late goes on from its middle.
+    // Later runs find a checkpoint more often, because resumed runs start in the middle.
     let wanted = if run::all() { 20 } else { 5 };
     while kills < wanted {
         resumed += usize::from(scene.join("checkpoints/train.json").is_file());
@@ -65,7 +94,10 @@ fn training_survives_kills() {
         std::thread::sleep(f.training.mul_f32(rng.range(0.05, 0.8)));
         match child.try_wait().expect("a child") {
             Some(status) => {
-                assert!(status.success(), "after {kills} kills: {status}");
+                assert!(
+                    status.success(),
+                    "the run after {kills} kills failed: {status}"
+                );
                 finished += 1;
             }
             None => {
@@ -76,10 +108,21 @@ fn training_survives_kills() {
         }
     }
     json(&[&["train", text(&scene), "--resume"], &TRAINING[..]].concat());
-    println!("kills: {kills}, runs that found a checkpoint: {resumed}, runs that ended before their kill: {finished}");
-    assert!(resumed > wanted / 7, "kills at random moments leave checkpoints: {resumed}");
-    assert!(results(&scene) == results(&f.trained), "a run that was killed and resumed ends in the same bytes");
-    let left = std::fs::read_dir(&scene).expect("the scene").flatten().filter(|e| e.file_name().to_string_lossy().contains(".partial"));
+    println!(
+        "kills: {kills}, runs with a checkpoint: {resumed}, runs that finished before their kill: {finished}"
+    );
+    assert!(
+        resumed > wanted / 7,
+        "too few runs found a checkpoint: {resumed}"
+    );
+    assert!(
+        results(&scene) == results(&f.trained),
+        "a killed and resumed run must give the same bytes"
+    );
+    let left = std::fs::read_dir(&scene)
+        .expect("the scene")
+        .flatten()
+        .filter(|e| e.file_name().to_string_lossy().contains(".partial"));
     println!("partial files left by kills: {}", left.count());
 }
 
@@ -87,13 +130,29 @@ fn training_survives_kills() {
 fn a_killed_make_goes_on() {
     let Some(f) = fixture() else { return };
     let (photos, scene) = (f.dir.path().join("photos"), f.dir.path().join("made"));
-    let make = ["make", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"];
+    let make = [
+        "make",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--device",
+        "cpu",
+    ];
     let begun = scene.join("checkpoints/train.json");
-    let mut child =
-        Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(make).arg("-q").stdout(Stdio::null()).spawn().expect("the binary starts");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+        .args(make)
+        .arg("-q")
+        .stdout(Stdio::null())
+        .spawn()
+        .expect("the binary starts");
     while !begun.is_file() {
         let ended = child.try_wait().expect("a child");
-        assert!(ended.is_none(), "it ended before its first checkpoint: {ended:?}");
+        assert!(
+            ended.is_none(),
+            "the run ended before its first checkpoint: {ended:?}"
+        );
         std::thread::sleep(Duration::from_millis(5));
     }
     child.kill().expect("a child");
@@ -101,11 +160,26 @@ fn a_killed_make_goes_on() {
     let output = run::fastlgs(&[&make[..], &["-v"]].concat());
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("training continues from its checkpoint"), "{said}");
+    assert!(
+        said.contains("training continues from its checkpoint"),
+        "{said}"
+    );
     assert_eq!(json(&[&make[..], &["-q"]].concat())["state"], "kept");
     let anew = f.dir.path().join("anew");
-    json(&["make", text(&photos), "-o", text(&anew), "--segmenter", "import", "--device", "cpu"]);
-    assert!(results(&scene) == results(&anew), "a broken make ends in the same bytes");
+    json(&[
+        "make",
+        text(&photos),
+        "-o",
+        text(&anew),
+        "--segmenter",
+        "import",
+        "--device",
+        "cpu",
+    ]);
+    assert!(
+        results(&scene) == results(&anew),
+        "a killed and resumed make must give the same bytes"
+    );
 }
 
 #[test]
@@ -114,12 +188,26 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     let scene = f.dir.path().join("begun");
     copy_folder(&f.trained, &scene);
     let photos = f.dir.path().join("photos");
-    // Without the manifest, in which seconds stand, so that what two runs made can be compared.
+    // Reads the scene's files without the manifest. The manifest holds seconds, which differ
+    // between runs.
     let made = |root: &Path| {
         let folders = ["photos", "cameras", "masks"].map(|folder| root.join(folder));
-        let entries = folders.iter().flat_map(std::fs::read_dir).flat_map(Iterator::flatten).map(|entry| entry.path());
-        let file = |path: PathBuf| (path.strip_prefix(root).expect("within").to_owned(), std::fs::read(&path).expect("a file"));
-        entries.filter(|path| path.is_file()).chain([root.join("scene.ply")]).map(file).collect::<BTreeMap<_, _>>()
+        let entries = folders
+            .iter()
+            .flat_map(std::fs::read_dir)
+            .flat_map(Iterator::flatten)
+            .map(|entry| entry.path());
+        let file = |path: PathBuf| {
+            (
+                path.strip_prefix(root).expect("within").to_owned(),
+                std::fs::read(&path).expect("a file"),
+            )
+        };
+        entries
+            .filter(|path| path.is_file())
+            .chain([root.join("scene.ply")])
+            .map(file)
+            .collect::<BTreeMap<_, _>>()
     };
     let manifest = |root: &Path| std::fs::read(root.join("scene.json")).ok();
     let all = |root: &Path| (made(root), manifest(root));
@@ -128,15 +216,49 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     std::fs::create_dir_all(&labels).expect("a folder");
     let label = std::fs::read_to_string(photos.join("labels/000.json")).expect("a label");
     std::fs::write(labels.join("999.json"), label.replace("000", "999")).expect("a label");
-    let smaller = ["preprocess", text(&photos), "-o", text(&scene), "--max-side", "96", "--segmenter", "import", "--device", "cpu"];
-    run::fails(&[&smaller[..], &["--holdout-labels", text(&labels)]].concat(), &["999", "none of the photos"]);
-    assert!(all(&scene) == before, "labels of other photos");
+    let smaller = [
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--max-side",
+        "96",
+        "--segmenter",
+        "import",
+        "--device",
+        "cpu",
+    ];
+    run::fails(
+        &[&smaller[..], &["--holdout-labels", text(&labels)]].concat(),
+        &["999", "none of the photos"],
+    );
+    assert!(
+        all(&scene) == before,
+        "a run that fails for labels of other photos must not change the scene"
+    );
     let anew = f.dir.path().join("begun-anew");
     copy_folder(&f.trained, &anew);
-    json(&["preprocess", text(&photos), "-o", text(&anew), "--max-side", "96", "--segmenter", "import", "--device", "cpu"]);
+    json(&[
+        "preprocess",
+        text(&photos),
+        "-o",
+        text(&anew),
+        "--max-side",
+        "96",
+        "--segmenter",
+        "import",
+        "--device",
+        "cpu",
+    ]);
     let after = made(&anew);
     assert!(after != before.0);
-    let begin = || Command::new(env!("CARGO_BIN_EXE_fastlgs")).args(smaller).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let begin = || {
+        Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+            .args(smaller)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+    };
     let end = |mut run: Child| {
         let was_running = run.try_wait().expect("a child").is_none();
         let _ = run.kill();
@@ -147,14 +269,19 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     for wait in [20, 60, 120, 200, 400] {
         let run = begin().expect("the binary starts");
         std::thread::sleep(Duration::from_millis(wait));
-        // One that moves what it made to its place, or clears up after that, is the next loop's matter.
+        // A run that already moves its output into the scene, or has finished, is tested in the
+        // next loop.
         if !end(run) || manifest(&scene) != before.1 {
             break;
         }
-        assert!(all(&scene) == before, "killed after {wait} ms");
+        assert!(
+            all(&scene) == before,
+            "a run killed after {wait} ms must not change the scene"
+        );
         kills += 1;
     }
-    // Killed while it moves what it made to its place, or soon after: a scene without a manifest is put back by the next run.
+    // Kills runs while or after they move their output into the scene. If the manifest is missing,
+    // the next run must restore the earlier scene.
     let mut moving = 0;
     for _ in 0..3 {
         std::fs::remove_dir_all(&scene).expect("a scene");
@@ -167,15 +294,26 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
             let run = begin().expect("the binary starts");
             let started = Instant::now();
             while manifest(&scene).is_none() {
-                assert!(started.elapsed() < Duration::from_secs(60), "the earlier scene is not put back");
+                assert!(
+                    started.elapsed() < Duration::from_secs(60),
+                    "the next run does not restore the earlier scene"
+                );
             }
             let had_time = !end(run) || made(&scene) == after;
-            assert!(had_time || all(&scene) == before, "put back");
+            assert!(
+                had_time || all(&scene) == before,
+                "the earlier scene must be restored"
+            );
         } else {
-            assert!(made(&scene) == after, "killed after its manifest was in its place");
+            assert!(
+                made(&scene) == after,
+                "a run killed after moving its manifest must leave a complete scene"
+            );
         }
     }
-    println!("preprocess: {kills} kills before and {moving} of 3 amid its last moves, no scene is a mixture");
+    println!(
+        "preprocess: {kills} kills before and {moving} of 3 during the final moves, no scene is mixed"
+    );
     json(&smaller);
     assert!(kills > 0 && made(&scene) == after && !scene.join("preprocess.partial").exists());
 }
@@ -186,10 +324,15 @@ fn a_full_disk_leaves_earlier_results_whole() {
     let scene = f.dir.path().join("full");
     copy_folder(&f.trained, &scene);
     let before = results(&scene);
-    // Files may have 64 blocks of 512 or 1024 bytes, whoever runs this; the signal that usually goes with it is ignored.
+    // Limits files to 64 blocks of 512 or 1024 bytes, also for root. The shell ignores the signal
+    // XFSZ that goes with the limit.
     let limited = |args: &[&str]| {
         let script = "trap '' XFSZ; ulimit -f 64; exec \"$0\" \"$@\"";
-        Command::new("sh").args(["-c", script, env!("CARGO_BIN_EXE_fastlgs")]).args(args).output().expect("a shell")
+        Command::new("sh")
+            .args(["-c", script, env!("CARGO_BIN_EXE_fastlgs")])
+            .args(args)
+            .output()
+            .expect("a shell")
     };
     let (small, ply) = (f.dir.path().join("small"), f.dir.path().join("out.ply"));
     std::fs::write(&ply, "earlier").expect("a file");
@@ -201,36 +344,76 @@ fn a_full_disk_leaves_earlier_results_whole() {
         (&["export", text(&scene), text(&small)], "small"),
     ] {
         let line = complaint(args, &limited(args));
-        assert!(line.contains("too large") || line.contains("No space"), "{line}");
-        assert!(line.contains(word) || line.contains(text(&scene)), "the message names the file: {line}");
+        assert!(
+            line.contains("too large") || line.contains("No space"),
+            "{line}"
+        );
+        assert!(
+            line.contains(word) || line.contains(text(&scene)),
+            "the message names the file: {line}"
+        );
         tried += 1;
     }
-    assert!(results(&scene) == before, "the earlier scene is whole");
+    assert!(results(&scene) == before, "the earlier scene is unchanged");
     assert_eq!(std::fs::read(&ply).expect("the earlier file"), b"earlier");
-    json(&["query", text(&scene), "table", "--false-alarms", "1", "--device", "cpu"]);
-    println!("full disk: {tried} commands refused, earlier results whole");
+    json(&[
+        "query",
+        text(&scene),
+        "table",
+        "--false-alarms",
+        "1",
+        "--device",
+        "cpu",
+    ]);
+    println!("full disk: {tried} commands failed, earlier results unchanged");
 }
 
 #[test]
 fn places_that_cannot_be_written_are_named() {
     let Some(f) = fixture() else { return };
     let scene = text(&f.trained);
-    // No user may write there, not even root.
+    // Nobody can write there, not even root.
     let nowhere = "/proc/fastlgs";
     let mut tried = 0;
     for args in [
-        vec!["synth", "twins", "-o", nowhere, "--views", "4", "--size", "16x12"],
-        vec!["preprocess", text(&f.dir.path().join("photos")), "-o", nowhere, "--segmenter", "import"],
+        vec![
+            "synth", "twins", "-o", nowhere, "--views", "4", "--size", "16x12",
+        ],
+        vec![
+            "preprocess",
+            text(&f.dir.path().join("photos")),
+            "-o",
+            nowhere,
+            "--segmenter",
+            "import",
+        ],
         vec!["render", scene, "-o", nowhere, "--device", "cpu"],
-        vec!["query", scene, "table", "--false-alarms", "1", "-o", nowhere, "--device", "cpu"],
+        vec![
+            "query",
+            scene,
+            "table",
+            "--false-alarms",
+            "1",
+            "-o",
+            nowhere,
+            "--device",
+            "cpu",
+        ],
         vec!["export", scene, "/proc/fastlgs/out.ply", "--device", "cpu"],
-        vec!["eval", scene, "--json", "/proc/fastlgs/report.json", "--device", "cpu"],
+        vec![
+            "eval",
+            scene,
+            "--json",
+            "/proc/fastlgs/report.json",
+            "--device",
+            "cpu",
+        ],
     ] {
         let line = complaint(&args, &run::fastlgs(&args));
         assert!(line.contains(nowhere), "{args:?}: {line}");
         tried += 1;
     }
-    println!("read-only output: {tried} commands refused");
+    println!("unwritable output: {tried} commands failed");
 }
 
 #[test]
@@ -240,7 +423,19 @@ fn many_queries_at_once_agree() {
     let out = |user: usize| f.dir.path().join(format!("user-{user}"));
     let ask = |user: usize| {
         Command::new(env!("CARGO_BIN_EXE_fastlgs"))
-            .args(["query", text(&f.trained), "table", "--false-alarms", "1", "--device", "cpu", "--json", "-", "-o", text(&out(user))])
+            .args([
+                "query",
+                text(&f.trained),
+                "table",
+                "--false-alarms",
+                "1",
+                "--device",
+                "cpu",
+                "--json",
+                "-",
+                "-o",
+                text(&out(user)),
+            ])
             .stdout(Stdio::piped())
             .spawn()
             .expect("the binary starts")
@@ -253,11 +448,17 @@ fn many_queries_at_once_agree() {
             assert!(output.status.success());
             let mut answer: Value = serde_json::from_slice(&output.stdout).expect("JSON");
             let mask = std::fs::read(answer["mask"].as_str().expect("a path")).expect("the mask");
-            // Times and places differ.
-            ["ms", "mask", "overlay", "heatmap"].iter().for_each(|k| drop(answer.as_object_mut().expect("an object").remove(*k)));
+            // Times and paths differ.
+            ["ms", "mask", "overlay", "heatmap"]
+                .iter()
+                .for_each(|k| drop(answer.as_object_mut().expect("an object").remove(*k)));
             (answer, mask)
         })
         .collect();
-    assert!(answers.iter().all(|a| *a == answers[0]), "{:?}", answers[0].0);
-    println!("{USERS} queries at once agree");
+    assert!(
+        answers.iter().all(|a| *a == answers[0]),
+        "{:?}",
+        answers[0].0
+    );
+    println!("{USERS} simultaneous queries agree");
 }

@@ -1,12 +1,12 @@
-"""Runs the tests, passes on what they print, and adds the ten that took longest. Usage: slowest.py COMMAND..."""
+"""Runs the tests, prints their output, and lists the ten slowest. Usage: slowest.py COMMAND..."""
 
 import os
 import re
 import subprocess
 import sys
 
-# The test programs tell times only where they take unstable options, which they do with this variable; cargo must not see it, or it would build
-# everything anew.
+# Test programs report times only with unstable options, which this variable allows.
+# Cargo must not see the variable, because it would rebuild everything.
 command = sys.argv[1:]
 built = subprocess.run([*command[: command.index("--")], "--no-run"])
 if built.returncode != 0:

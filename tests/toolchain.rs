@@ -1,6 +1,7 @@
-//! What lies around a scene: libraries, exchange with other programs, scripts, manual pages.
+//! Tools around a scene: libraries, exchange with other programs, scripts, manual pages.
 //!
-//! Needs the offline models and any Vulkan device; skips loudly without them unless FASTLGS_REQUIRE_GPU is set.
+//! Needs the offline models and a Vulkan device. Without them the tests are skipped with a message,
+//! or fail if FASTLGS_REQUIRE_GPU is set.
 
 #[path = "support/run.rs"]
 mod run;
@@ -19,7 +20,7 @@ struct Library {
     scenes: PathBuf,
 }
 
-/// Two generated and trained scenes.
+/// Returns two generated and trained scenes. `None` without models or device.
 fn library() -> Option<&'static Library> {
     static LIBRARY: OnceLock<Option<Library>> = OnceLock::new();
     let make = || {
@@ -30,11 +31,42 @@ fn library() -> Option<&'static Library> {
         let (photos, scenes) = (dir.path().join("photos"), dir.path().join("scenes"));
         for kind in ["room", "table"] {
             let (photos, scene) = (photos.join(kind), scenes.join(kind));
-            json(&["synth", kind, "-o", text(&photos), "--views", "20", "--size", "200x150"]);
-            json(&["preprocess", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"]);
-            json(&["train", text(&scene), "--iterations", "500", "--budget", "8000", "--device", "cpu"]);
+            json(&[
+                "synth",
+                kind,
+                "-o",
+                text(&photos),
+                "--views",
+                "20",
+                "--size",
+                "200x150",
+            ]);
+            json(&[
+                "preprocess",
+                text(&photos),
+                "-o",
+                text(&scene),
+                "--segmenter",
+                "import",
+                "--device",
+                "cpu",
+            ]);
+            json(&[
+                "train",
+                text(&scene),
+                "--iterations",
+                "500",
+                "--budget",
+                "8000",
+                "--device",
+                "cpu",
+            ]);
         }
-        Some(Library { dir, photos, scenes })
+        Some(Library {
+            dir,
+            photos,
+            scenes,
+        })
     };
     LIBRARY.get_or_init(make).as_ref()
 }
@@ -42,24 +74,60 @@ fn library() -> Option<&'static Library> {
 #[test]
 fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
     let Some(l) = library() else { return };
-    let (photos, scene) = (l.dir.path().join("made photos"), l.dir.path().join("made scene"));
-    json(&["synth", "table", "-o", text(&photos), "--views", "8", "--size", "96x72"]);
-    let args = ["make", text(&photos), "-o", text(&scene), "--segmenter", "import", "--device", "cpu"];
+    let (photos, scene) = (
+        l.dir.path().join("made photos"),
+        l.dir.path().join("made scene"),
+    );
+    json(&[
+        "synth",
+        "table",
+        "-o",
+        text(&photos),
+        "--views",
+        "8",
+        "--size",
+        "96x72",
+    ]);
+    let args = [
+        "make",
+        text(&photos),
+        "-o",
+        text(&scene),
+        "--segmenter",
+        "import",
+        "--device",
+        "cpu",
+    ];
     let made = json(&args);
     assert_eq!(
-        (made["state"].as_str(), made["photos"][0].as_u64(), made["photos"][1].as_u64()),
+        (
+            made["state"].as_str(),
+            made["photos"][0].as_u64(),
+            made["photos"][1].as_u64()
+        ),
         (Some("made"), Some(7), Some(1)),
         "{made}"
     );
-    let stamp = || std::fs::metadata(scene.join("scene.ply")).expect("a scene").modified().expect("a time");
+    let stamp = || {
+        std::fs::metadata(scene.join("scene.ply"))
+            .expect("a scene")
+            .modified()
+            .expect("a time")
+    };
     let before = stamp();
     let said = String::from_utf8(fastlgs(&args).stdout).expect("words");
-    assert!(said.contains("was there already") && said.contains("fastlgs serve '"), "{said}");
+    assert!(
+        said.contains("is up to date") && said.contains("fastlgs serve '"),
+        "{said}"
+    );
     assert_eq!(before, stamp());
-    // Another photo takes the first one's place.
+    // Replaces the first photo by another one.
     std::fs::copy(photos.join("images/001.png"), photos.join("images/000.png")).expect("a photo");
     assert_eq!(json(&args)["state"], "made");
-    fails(&["make", text(&photos.join("none")), "-o", text(&scene)], &["none", "cannot be opened"]);
+    fails(
+        &["make", text(&photos.join("none")), "-o", text(&scene)],
+        &["none", "cannot be opened"],
+    );
 }
 
 #[test]
@@ -69,27 +137,74 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
     copy_folder(&l.scenes, &scenes);
     let library = text(&scenes);
     let found = json(&["query", "--library", library, "cat"]);
-    assert_eq!((found["found"].as_bool(), found["scenes"][0]["scene"].as_str()), (Some(true), Some("room")), "{found}");
+    assert_eq!(
+        (
+            found["found"].as_bool(),
+            found["scenes"][0]["scene"].as_str()
+        ),
+        (Some(true), Some("room")),
+        "{found}"
+    );
     assert_eq!(found["searched"]["scenes"], 2);
-    // The scene itself says the same of that object.
-    let own = json(&["query", text(&scenes.join("room")), "cat", "--device", "cpu"]);
-    let same = own["candidates"].as_array().expect("hits").iter().find(|c| c["id"] == found["scenes"][0]["object"]).expect("the object");
+    // The scene itself gives the same score to that object.
+    let own = json(&[
+        "query",
+        text(&scenes.join("room")),
+        "cat",
+        "--device",
+        "cpu",
+    ]);
+    let same = own["candidates"]
+        .as_array()
+        .expect("hits")
+        .iter()
+        .find(|c| c["id"] == found["scenes"][0]["object"])
+        .expect("the object");
     assert!(
-        (same["score"].as_f64().expect("a score") - found["scenes"][0]["score"].as_f64().expect("a score")).abs() < 0.01,
+        (same["score"].as_f64().expect("a score")
+            - found["scenes"][0]["score"].as_f64().expect("a score"))
+        .abs()
+            < 0.01,
         "{own} {found}"
     );
 
-    // And so it does of a part of something.
+    // The same holds for a part of an object.
     let part = json(&["query", "--library", library, "nose of the cat"]);
-    let own = json(&["query", text(&scenes.join("room")), "nose of the cat", "--device", "cpu"]);
-    let row = part["scenes"].as_array().expect("rows").iter().find(|row| row["scene"] == "room").expect("the room");
+    let own = json(&[
+        "query",
+        text(&scenes.join("room")),
+        "nose of the cat",
+        "--device",
+        "cpu",
+    ]);
+    let row = part["scenes"]
+        .as_array()
+        .expect("rows")
+        .iter()
+        .find(|row| row["scene"] == "room")
+        .expect("the room");
     let score = |answer: &Value| answer["score"].as_f64().expect("a score");
-    assert!((score(&own) - score(row)).abs() < 0.01 && row["found"] == own["found"], "{own} {part}");
+    assert!(
+        (score(&own) - score(row)).abs() < 0.01 && row["found"] == own["found"],
+        "{own} {part}"
+    );
 
-    let absent = fastlgs(&["query", "--library", library, "aircraft carrier", "--json", "-"]);
-    assert_eq!(absent.status.code(), Some(3), "{}", String::from_utf8_lossy(&absent.stdout));
+    let absent = fastlgs(&[
+        "query",
+        "--library",
+        library,
+        "aircraft carrier",
+        "--json",
+        "-",
+    ]);
+    assert_eq!(
+        absent.status.code(),
+        Some(3),
+        "{}",
+        String::from_utf8_lossy(&absent.stdout)
+    );
 
-    // A new scene is found; a folder that is no scene is reported.
+    // A new scene is found. A damaged scene folder is reported.
     copy_folder(&scenes.join("room"), &scenes.join("more/room again"));
     std::fs::create_dir(scenes.join("broken")).expect("a folder");
     std::fs::write(scenes.join("broken/scene.json"), "{").expect("a file");
@@ -100,17 +215,35 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
         .stderr(Stdio::null())
         .spawn()
         .expect("the binary starts");
-    std::io::Write::write_all(&mut lines.stdin.take().expect("piped"), b"cat\n\ncoffee\n").expect("written");
+    std::io::Write::write_all(&mut lines.stdin.take().expect("piped"), b"cat\n\ncoffee\n")
+        .expect("written");
     let output = lines.wait_with_output().expect("it ends");
-    let answers: Vec<Value> = String::from_utf8_lossy(&output.stdout).lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
+    let answers: Vec<Value> = String::from_utf8_lossy(&output.stdout)
+        .lines()
+        .map(|l| serde_json::from_str(l).expect("JSON"))
+        .collect();
     assert_eq!(answers.len(), 2);
-    let names: Vec<&str> = answers[0]["scenes"].as_array().expect("rows").iter().filter_map(|r| r["scene"].as_str()).collect();
-    assert!(names.contains(&"room") && names.contains(&"more/room again"), "{names:?}");
+    let names: Vec<&str> = answers[0]["scenes"]
+        .as_array()
+        .expect("rows")
+        .iter()
+        .filter_map(|r| r["scene"].as_str())
+        .collect();
+    assert!(
+        names.contains(&"room") && names.contains(&"more/room again"),
+        "{names:?}"
+    );
     assert_eq!(answers[0]["skipped"][0]["scene"], "broken");
 
-    fails(&["query", "--library", text(&l.photos), "cat"], &["no trained scenes"]);
-    fails(&["query", "--library", library], &["say what to look for"]);
-    fails(&["query", "--library", library, "cat", "--point", "1,1"], &["--library"]);
+    fails(
+        &["query", "--library", text(&l.photos), "cat"],
+        &["no trained scenes"],
+    );
+    fails(&["query", "--library", library], &["give a text to find"]);
+    fails(
+        &["query", "--library", library, "cat", "--point", "1,1"],
+        &["--library"],
+    );
 }
 
 #[test]
@@ -119,33 +252,80 @@ fn scenes_of_other_programs_get_objects() {
     let scene = l.dir.path().join("foreign");
     copy_folder(&l.scenes.join("room"), &scene);
     let gaussians = ply::read(&scene.join("scene.ply")).expect("a scene");
-    let own = json(&["info", text(&scene)])["objects"].as_u64().expect("objects");
+    let own = json(&["info", text(&scene)])["objects"]
+        .as_u64()
+        .expect("objects");
 
-    // As Brush and gsplat write it: other order, no normals, no features; quaternions that are not of unit length.
-    let (dc, rest) = (["f_dc_0", "f_dc_1", "f_dc_2"], gaussians.sh_rest.len() / gaussians.len() * 3);
-    let mut names: Vec<String> =
-        ["rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2"].map(str::to_owned).to_vec();
+    // A PLY file as Brush and gsplat write it: other column order, no normals, no features,
+    // quaternions that are not normalised.
+    let (dc, rest) = (
+        ["f_dc_0", "f_dc_1", "f_dc_2"],
+        gaussians.sh_rest.len() / gaussians.len() * 3,
+    );
+    let mut names: Vec<String> = [
+        "rot_0", "rot_1", "rot_2", "rot_3", "x", "y", "z", "opacity", "scale_0", "scale_1",
+        "scale_2",
+    ]
+    .map(str::to_owned)
+    .to_vec();
     names.extend(dc.map(str::to_owned));
     names.extend((0..rest).map(|k| format!("f_rest_{k}")));
-    let header: String = names.iter().map(|n| format!("property float {n}\n")).collect();
+    let header: String = names
+        .iter()
+        .map(|n| format!("property float {n}\n"))
+        .collect();
     let mut data = format!(
         "ply\nformat binary_little_endian 1.0\ncomment Exported from elsewhere\nelement vertex {}\n{header}end_header\n",
         gaussians.len()
     )
     .into_bytes();
     for i in 0..gaussians.len() {
-        let (q, m, s, c) = (gaussians.rotations[i], gaussians.means[i], gaussians.log_scales[i], gaussians.sh_dc[i]);
-        let mut row =
-            vec![2.0 * q[0], 2.0 * q[1], 2.0 * q[2], 2.0 * q[3], m.x, m.y, m.z, gaussians.opacity_logits[i], s.x, s.y, s.z, c.x, c.y, c.z];
+        let (q, m, s, c) = (
+            gaussians.rotations[i],
+            gaussians.means[i],
+            gaussians.log_scales[i],
+            gaussians.sh_dc[i],
+        );
+        let mut row = vec![
+            2.0 * q[0],
+            2.0 * q[1],
+            2.0 * q[2],
+            2.0 * q[3],
+            m.x,
+            m.y,
+            m.z,
+            gaussians.opacity_logits[i],
+            s.x,
+            s.y,
+            s.z,
+            c.x,
+            c.y,
+            c.z,
+        ];
         row.extend((0..3).flat_map(|color| gaussians.rest(i).iter().map(move |v| v[color])));
         data.extend(row.iter().flat_map(|v| v.to_le_bytes()));
     }
     let path = l.dir.path().join("other.ply");
     std::fs::write(&path, data).expect("a file");
-    let report = json(&["train", text(&scene), "--init-ply", text(&path), "--iterations", "0", "--device", "cpu"]);
+    let report = json(&[
+        "train",
+        text(&scene),
+        "--init-ply",
+        text(&path),
+        "--iterations",
+        "0",
+        "--device",
+        "cpu",
+    ]);
     let lifted = report["objects"].as_u64().expect("objects");
-    assert!(lifted.abs_diff(own) <= own / 5 + 1, "{lifted} objects, {own} before");
-    assert_eq!(json(&["query", text(&scene), "cat", "--device", "cpu"])["found"], true);
+    assert!(
+        lifted.abs_diff(own) <= own / 5 + 1,
+        "{lifted} objects, {own} before"
+    );
+    assert_eq!(
+        json(&["query", text(&scene), "cat", "--device", "cpu"])["found"],
+        true
+    );
 }
 
 #[test]
@@ -155,7 +335,15 @@ fn selections_and_camera_paths_go_out_and_in() {
     let out = l.dir.path().join("exchange");
     for ending in fastlgs::session::selection::ENDINGS {
         let file = out.join(format!("cat.{ending}"));
-        let answer = json(&["query", text(&room), "cat", "--export", text(&file), "--device", "cpu"]);
+        let answer = json(&[
+            "query",
+            text(&room),
+            "cat",
+            "--export",
+            text(&file),
+            "--device",
+            "cpu",
+        ]);
         assert_eq!(answer["found"], true);
         let magic: &[u8] = match ending {
             "ply" => b"ply\n",
@@ -163,75 +351,169 @@ fn selections_and_camera_paths_go_out_and_in() {
             "sog" => b"PK",
             _ => b"glTF",
         };
-        assert!(std::fs::read(&file).expect("the selection").starts_with(magic), "{ending}");
+        assert!(
+            std::fs::read(&file)
+                .expect("the selection")
+                .starts_with(magic),
+            "{ending}"
+        );
     }
     let selected = ply::read(&out.join("cat.ply")).expect("a scene").len();
-    json(&["query", text(&room), "cat", "--export-rest", text(&out.join("rest.ply")), "--device", "cpu"]);
+    json(&[
+        "query",
+        text(&room),
+        "cat",
+        "--export-rest",
+        text(&out.join("rest.ply")),
+        "--device",
+        "cpu",
+    ]);
     let rest = ply::read(&out.join("rest.ply")).expect("a scene").len();
-    assert_eq!(selected + rest, ply::read(&room.join("scene.ply")).expect("a scene").len());
-    fails(&["query", text(&room), "cat", "--export", text(&out.join("cat.obj")), "--device", "cpu"], &["cat.obj", ".glb"]);
+    assert_eq!(
+        selected + rest,
+        ply::read(&room.join("scene.ply")).expect("a scene").len()
+    );
+    fails(
+        &[
+            "query",
+            text(&room),
+            "cat",
+            "--export",
+            text(&out.join("cat.obj")),
+            "--device",
+            "cpu",
+        ],
+        &["cat.obj", ".glb"],
+    );
     let whole = out.join("room.glb");
-    assert!(json(&["export", text(&room), text(&whole), "--device", "cpu"])["bytes"].as_u64() > Some(100_000));
+    assert!(
+        json(&["export", text(&room), text(&whole), "--device", "cpu"])["bytes"].as_u64()
+            > Some(100_000)
+    );
 
     let path = out.join("cameras.json");
     let report = json(&["export", text(&room), text(&path)]);
-    let cameras: Vec<Camera> = camera_path::read(&path, &fastlgs_core::WorldFrame::default()).expect("a path");
+    let cameras: Vec<Camera> =
+        camera_path::read(&path, &fastlgs_core::WorldFrame::default()).expect("a path");
     assert_eq!(report["frames"].as_u64(), Some(cameras.len() as u64));
-    // Two frames of it, as nerfstudio writes them: without names.
-    let mut file: Value = serde_json::from_slice(&std::fs::read(&path).expect("the path")).expect("JSON");
+    // Two frames without names, as nerfstudio writes them.
+    let mut file: Value =
+        serde_json::from_slice(&std::fs::read(&path).expect("the path")).expect("JSON");
     let frames = file["camera_path"].as_array_mut().expect("frames");
     frames.truncate(2);
-    frames.iter_mut().for_each(|f| drop(f.as_object_mut().expect("a frame").remove("name")));
+    frames
+        .iter_mut()
+        .for_each(|f| drop(f.as_object_mut().expect("a frame").remove("name")));
     std::fs::write(&path, file.to_string()).expect("a file");
     let pictures = out.join("pictures");
-    json(&["render", text(&room), "--path", text(&path), "-o", text(&pictures), "--device", "cpu"]);
-    json(&["render", text(&room), "--view", "001", "-o", text(&pictures), "--device", "cpu"]);
-    let own = fastlgs_core::image_io::load_rgb(&pictures.join("001.png.color.png")).expect("a picture");
-    let by_path = fastlgs_core::image_io::load_rgb(&pictures.join("frame_00001.color.png")).expect("a picture");
-    let far = own.as_raw().iter().zip(by_path.as_raw()).filter(|(a, b)| a.abs_diff(**b) > 2).count();
+    json(&[
+        "render",
+        text(&room),
+        "--path",
+        text(&path),
+        "-o",
+        text(&pictures),
+        "--device",
+        "cpu",
+    ]);
+    json(&[
+        "render",
+        text(&room),
+        "--view",
+        "001",
+        "-o",
+        text(&pictures),
+        "--device",
+        "cpu",
+    ]);
+    let own =
+        fastlgs_core::image_io::load_rgb(&pictures.join("001.png.color.png")).expect("a picture");
+    let by_path = fastlgs_core::image_io::load_rgb(&pictures.join("frame_00001.color.png"))
+        .expect("a picture");
+    let far = own
+        .as_raw()
+        .iter()
+        .zip(by_path.as_raw())
+        .filter(|(a, b)| a.abs_diff(**b) > 2)
+        .count();
     assert!(far * 1000 < own.as_raw().len(), "{far} values differ");
 }
 
-/// Programs of others, installed once by npm; nothing where there is no npm.
+/// Installs programs of others by npm once, and returns their folder. `None` without npm.
 fn others() -> Option<PathBuf> {
     let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("npm");
     let npm = |args: &[&str]| Command::new("npm").args(args).current_dir(&root).output();
     std::fs::create_dir_all(&root).expect("a folder");
     if npm(&["--version"]).is_err() {
-        assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "npm is missing: ./setup.sh --tests brings it");
-        eprintln!("SKIPPED: npm is not installed, which brings the programs that our files are tried with");
+        assert!(
+            std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(),
+            "npm is missing; run ./setup.sh --tests to install it"
+        );
+        eprintln!("SKIPPED: npm is not installed; it installs the programs that read our exports");
         return None;
     }
     let bin = root.join("node_modules");
     if !bin.join("gltf-validator").is_dir() {
         std::fs::write(root.join("package.json"), "{}").expect("a file");
-        let packages = ["install", "--silent", "@playcanvas/splat-transform@2.7.1", "gltf-validator@2.0.0-dev.3.10"];
+        let packages = [
+            "install",
+            "--silent",
+            "@playcanvas/splat-transform@2.7.1",
+            "gltf-validator@2.0.0-dev.3.10",
+        ];
         let done = npm(&packages).expect("npm starts");
-        assert!(done.status.success(), "npm: {}", String::from_utf8_lossy(&done.stderr));
+        assert!(
+            done.status.success(),
+            "npm: {}",
+            String::from_utf8_lossy(&done.stderr)
+        );
     }
     Some(bin)
 }
 
 #[test]
 fn programs_of_others_read_what_is_exported() {
-    let (Some(l), Some(others)) = (library(), others()) else { return };
+    let (Some(l), Some(others)) = (library(), others()) else {
+        return;
+    };
     let room = l.scenes.join("room");
     let out = l.dir.path().join("others");
     let node = |args: &[&str]| {
-        let done = Command::new("node").args(args).output().expect("node starts");
-        assert!(done.status.success(), "{args:?}: {}", String::from_utf8_lossy(&done.stderr));
+        let done = Command::new("node")
+            .args(args)
+            .output()
+            .expect("node starts");
+        assert!(
+            done.status.success(),
+            "{args:?}: {}",
+            String::from_utf8_lossy(&done.stderr)
+        );
         done.stdout
     };
     let transform = others.join("@playcanvas/splat-transform/bin/cli.mjs");
-    let convert = |from: &Path, to: &Path| drop(node(&[text(&transform), "-q", "-w", "-g", "cpu", text(from), text(to)]));
+    let convert = |from: &Path, to: &Path| {
+        drop(node(&[
+            text(&transform),
+            "-q",
+            "-w",
+            "-g",
+            "cpu",
+            text(from),
+            text(to),
+        ]))
+    };
     let own = |path: &Path| match path.extension().and_then(|e| e.to_str()) {
         Some("spz") => spz::read(path).expect("an SPZ file"),
         Some("sog") => sog::read(path).expect("a SOG file"),
         _ => ply::read(path).expect("a PLY file"),
     };
-    // Both ways: what we write they read, and what they write we read, as the same Gaussians. Programs may put them in another order.
+    // Other programs must read our files, and we theirs, as the same Gaussians. The order may
+    // differ.
     let same = |ours: Gaussians, theirs: Gaussians, close: f32| {
-        assert_eq!((ours.len(), ours.sh_degree), (theirs.len(), theirs.sh_degree));
+        assert_eq!(
+            (ours.len(), ours.sh_degree),
+            (theirs.len(), theirs.sh_degree)
+        );
         let sorted = |g: Gaussians| {
             let mut places: Vec<usize> = (0..g.len()).collect();
             let key = |i: &usize| g.means[*i].to_array().map(|v| (v * 1e4).round() as i64);
@@ -240,22 +522,42 @@ fn programs_of_others_read_what_is_exported() {
         };
         let (ours, theirs) = (sorted(ours), sorted(theirs));
         let off = (0..ours.len()).filter(|&i| {
-            let apart = |a: [f32; 3], b: [f32; 3]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let apart = |a: [f32; 3], b: [f32; 3]| {
+                a.iter()
+                    .zip(b)
+                    .map(|(a, b)| (a - b).abs())
+                    .fold(0.0, f32::max)
+            };
             let opacity = sigmoid(ours.opacity_logits[i]) - sigmoid(theirs.opacity_logits[i]);
-            let rest = ours.rest(i).iter().zip(theirs.rest(i)).map(|(a, b)| apart(a.to_array(), b.to_array())).fold(0.0, f32::max);
+            let rest = ours
+                .rest(i)
+                .iter()
+                .zip(theirs.rest(i))
+                .map(|(a, b)| apart(a.to_array(), b.to_array()))
+                .fold(0.0, f32::max);
             apart(ours.means[i].to_array(), theirs.means[i].to_array()) > close
-                || apart(ours.log_scales[i].to_array(), theirs.log_scales[i].to_array()) > close
+                || apart(
+                    ours.log_scales[i].to_array(),
+                    theirs.log_scales[i].to_array(),
+                ) > close
                 || apart(ours.sh_dc[i].to_array(), theirs.sh_dc[i].to_array()) > close
                 || rest > close
                 || opacity.abs() > close.max(2e-3)
                 || ours.rotation(i).dot(theirs.rotation(i)).abs() < 1.0 - close
         });
-        // Equal places may be sorted either way.
+        // Gaussians with the same position may be sorted in any order.
         let off = off.count();
-        assert!(off * 100 <= ours.len(), "{off} of {} Gaussians differ", ours.len());
+        assert!(
+            off * 100 <= ours.len(),
+            "{off} of {} Gaussians differ",
+            ours.len()
+        );
     };
     for ending in ["ply", "spz", "sog"] {
-        let (file, back) = (out.join(format!("room.{ending}")), out.join(format!("{ending}.ply")));
+        let (file, back) = (
+            out.join(format!("room.{ending}")),
+            out.join(format!("{ending}.ply")),
+        );
         json(&["export", text(&room), text(&file), "--device", "cpu"]);
         convert(&file, &back);
         same(own(&file), own(&back), 1e-3);
@@ -265,22 +567,45 @@ fn programs_of_others_read_what_is_exported() {
     let back = out.join("theirs.ply");
     convert(&theirs, &back);
     same(own(&theirs), own(&back), 1e-3);
-    println!("SOG: {} bytes by us, {} by splat-transform", bytes(&out.join("room.sog")), bytes(&theirs));
+    println!(
+        "SOG: {} bytes by fastlgs, {} bytes by splat-transform",
+        bytes(&out.join("room.sog")),
+        bytes(&theirs)
+    );
 
     let glb = out.join("room.glb");
     json(&["export", text(&room), text(&glb), "--device", "cpu"]);
-    let validate = "const v = require(process.argv[1]); const f = require('fs').readFileSync(process.argv[2]);
+    let validate =
+        "const v = require(process.argv[1]); const f = require('fs').readFileSync(process.argv[2]);
         v.validateBytes(new Uint8Array(f)).then((r) => console.log(JSON.stringify(r)));";
-    let report = node(&["-e", validate, text(&others.join("gltf-validator")), text(&glb)]);
+    let report = node(&[
+        "-e",
+        validate,
+        text(&others.join("gltf-validator")),
+        text(&glb),
+    ]);
     let report: Value = serde_json::from_slice(&report).expect("JSON");
-    // The validator does not know the extension, nor that names of its attributes have a colon.
+    // The validator knows neither the extension nor attribute names with a colon.
     let known = |m: &&Value| {
-        let own = m["pointer"].as_str().is_some_and(|p| p.contains("/attributes/KHR_gaussian_splatting:") || p == "/extensionsUsed/0");
-        !(own && ["MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"].iter().any(|code| m["code"] == *code))
+        let own = m["pointer"].as_str().is_some_and(|p| {
+            p.contains("/attributes/KHR_gaussian_splatting:") || p == "/extensionsUsed/0"
+        });
+        !(own
+            && ["MESH_PRIMITIVE_INVALID_ATTRIBUTE", "UNSUPPORTED_EXTENSION"]
+                .iter()
+                .any(|code| m["code"] == *code))
     };
-    let messages: Vec<&Value> = report["issues"]["messages"].as_array().expect("messages").iter().filter(known).collect();
+    let messages: Vec<&Value> = report["issues"]["messages"]
+        .as_array()
+        .expect("messages")
+        .iter()
+        .filter(known)
+        .collect();
     assert!(messages.is_empty(), "{messages:?}");
-    assert_eq!(report["info"]["extensionsUsed"], serde_json::json!(["KHR_gaussian_splatting"]));
+    assert_eq!(
+        report["info"]["extensionsUsed"],
+        serde_json::json!(["KHR_gaussian_splatting"])
+    );
 }
 
 fn bytes(path: &Path) -> u64 {
@@ -289,10 +614,17 @@ fn bytes(path: &Path) -> u64 {
 
 #[test]
 fn shells_and_manuals() {
-    for (shell, word) in [("bash", "complete"), ("zsh", "#compdef"), ("fish", "complete -c fastlgs")] {
+    for (shell, word) in [
+        ("bash", "complete"),
+        ("zsh", "#compdef"),
+        ("fish", "complete -c fastlgs"),
+    ] {
         let output = fastlgs(&["completions", shell]);
         let script = String::from_utf8_lossy(&output.stdout).into_owned();
-        assert!(output.status.success() && script.contains(word) && script.contains("preprocess"), "{shell}");
+        assert!(
+            output.status.success() && script.contains(word) && script.contains("preprocess"),
+            "{shell}"
+        );
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     assert!(fastlgs(&["man", "-o", text(dir.path())]).status.success());
@@ -300,7 +632,7 @@ fn shells_and_manuals() {
     assert!(page.contains("tau\\-ac") && dir.path().join("fastlgs.1").is_file());
 }
 
-/// The examples that `cargo test` has built, on a trained scene; and the one in Python.
+/// Runs the examples that `cargo test` has built, and the Python example, on a trained scene.
 #[test]
 fn examples_run() {
     let Some(l) = library() else { return };
@@ -318,37 +650,83 @@ fn examples_run() {
             eprintln!("SKIPPED: {} is not built", program.display());
             return String::new();
         }
-        let output = Command::new(program).args(args).output().expect("it starts");
-        assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+        let output = Command::new(program)
+            .args(args)
+            .output()
+            .expect("it starts");
+        assert!(
+            output.status.success(),
+            "{name}: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
         String::from_utf8_lossy(&output.stdout).into_owned()
     };
     let picture = l.photos.join("room/images/000.png");
-    let (scene, rendered, labelled) = (room.join("scene.ply"), out.join("p.png"), out.join("l.ply"));
+    let (scene, rendered, labelled) =
+        (room.join("scene.ply"), out.join("p.png"), out.join("l.ply"));
     for (name, args, word) in [
-        ("read_dataset", vec![text(&l.photos.join("room")).to_owned()], "20 photos"),
-        ("render_ply", vec![text(&scene).to_owned(), text(&rendered).to_owned(), "cpu".to_owned()], "Gaussians"),
-        ("lift_labels", vec![text(&room).to_owned(), text(&labelled).to_owned()], "have a label"),
+        (
+            "read_dataset",
+            vec![text(&l.photos.join("room")).to_owned()],
+            "20 photos",
+        ),
+        (
+            "render_ply",
+            vec![
+                text(&scene).to_owned(),
+                text(&rendered).to_owned(),
+                "cpu".to_owned(),
+            ],
+            "Gaussians",
+        ),
+        (
+            "lift_labels",
+            vec![text(&room).to_owned(), text(&labelled).to_owned()],
+            "have a label",
+        ),
         ("map_masks", vec![], "object 2"),
-        ("query", vec![text(&room).to_owned(), "1".to_owned()], "the answer"),
-        ("name_photo", vec![text(&picture).to_owned(), "cat".to_owned(), "coffee".to_owned()], "region"),
+        (
+            "query",
+            vec![text(&room).to_owned(), "1".to_owned()],
+            "the answer",
+        ),
+        (
+            "name_photo",
+            vec![
+                text(&picture).to_owned(),
+                "cat".to_owned(),
+                "coffee".to_owned(),
+            ],
+            "region",
+        ),
     ] {
         let said = run(name, &args.iter().map(String::as_str).collect::<Vec<_>>());
         assert!(said.is_empty() || said.contains(word), "{name}: {said}");
     }
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/find.py");
-    let python =
-        Command::new("python3").arg(script).args([text(&room), "cat", "pizza"]).env("FASTLGS", env!("CARGO_BIN_EXE_fastlgs")).output();
+    let python = Command::new("python3")
+        .arg(script)
+        .args([text(&room), "cat", "pizza"])
+        .env("FASTLGS", env!("CARGO_BIN_EXE_fastlgs"))
+        .output();
     let python = python.expect("python3");
     let said = String::from_utf8_lossy(&python.stdout).into_owned();
-    assert!(python.status.success(), "{}", String::from_utf8_lossy(&python.stderr));
-    assert!(said.contains("cat: object") && said.contains("pizza: not found"), "{said}");
+    assert!(
+        python.status.success(),
+        "{}",
+        String::from_utf8_lossy(&python.stderr)
+    );
+    assert!(
+        said.contains("cat: object") && said.contains("pizza: not found"),
+        "{said}"
+    );
 }
 
-/// The workflow over two scenes. FASTLGS_SNAKEMAKE names the program.
+/// Runs the workflow on two scenes. FASTLGS_SNAKEMAKE names the program.
 #[test]
 fn a_workflow_engine_spreads_scenes() {
     let Some(snakemake) = std::env::var_os("FASTLGS_SNAKEMAKE") else {
-        eprintln!("SKIPPED: FASTLGS_SNAKEMAKE does not name snakemake");
+        eprintln!("SKIPPED: FASTLGS_SNAKEMAKE is not set to the path of snakemake");
         return;
     };
     if !run::ready() {
@@ -356,7 +734,16 @@ fn a_workflow_engine_spreads_scenes() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     for kind in ["room", "table"] {
-        json(&["synth", kind, "-o", text(&dir.path().join("photos").join(kind)), "--views", "16", "--size", "160x120"]);
+        json(&[
+            "synth",
+            kind,
+            "-o",
+            text(&dir.path().join("photos").join(kind)),
+            "--views",
+            "16",
+            "--size",
+            "160x120",
+        ]);
     }
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../workflows/Snakefile");
     let snake = |more: &[&str]| {
@@ -364,20 +751,43 @@ fn a_workflow_engine_spreads_scenes() {
             .current_dir(dir.path())
             .args(["-s", text(&file), "--cores", "2", "--quiet", "all"])
             .args(more)
-            .args(["--config", &format!("fastlgs={}", env!("CARGO_BIN_EXE_fastlgs")), "device=cpu"])
-            .args(["preprocess=--segmenter import", "train=--iterations 300 --budget 6000"])
+            .args([
+                "--config",
+                &format!("fastlgs={}", env!("CARGO_BIN_EXE_fastlgs")),
+                "device=cpu",
+            ])
+            .args([
+                "preprocess=--segmenter import",
+                "train=--iterations 300 --budget 6000",
+            ])
             .output()
             .expect("snakemake starts");
-        assert!(output.status.success(), "{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        assert!(
+            output.status.success(),
+            "{}{}",
+            String::from_utf8_lossy(&output.stdout),
+            String::from_utf8_lossy(&output.stderr)
+        );
     };
     snake(&[]);
     let reports = dir.path().join("scenes/reports");
-    let report = |name: &str| -> Value { serde_json::from_slice(&std::fs::read(reports.join(name)).expect("a report")).expect("JSON") };
+    let report = |name: &str| -> Value {
+        serde_json::from_slice(&std::fs::read(reports.join(name)).expect("a report")).expect("JSON")
+    };
     assert!(report("room.train.json")["objects"].as_u64() > Some(0));
     assert!(report("table.eval.json").is_object());
     assert_eq!(report("library.json")["searched"]["scenes"], 2);
     // A second run has nothing to do.
-    let stamp = std::fs::metadata(reports.join("room.train.json")).expect("a report").modified().expect("a time");
+    let stamp = std::fs::metadata(reports.join("room.train.json"))
+        .expect("a report")
+        .modified()
+        .expect("a time");
     snake(&[]);
-    assert_eq!(stamp, std::fs::metadata(reports.join("room.train.json")).expect("a report").modified().expect("a time"));
+    assert_eq!(
+        stamp,
+        std::fs::metadata(reports.join("room.train.json"))
+            .expect("a report")
+            .modified()
+            .expect("a time")
+    );
 }

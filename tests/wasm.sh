@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
-# fastlgs-core and fastlgs-grid build for browsers: with rustup's target, else with Debian's compiler and its library's source.
+# Checks that fastlgs-core and fastlgs-grid build for browsers (wasm32).
+# Uses rustup's target, or else Debian's compiler and the source of its standard library.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-# Nothing runs here: code that is built quickly will do.
+# The result is never run, so fast compilation matters more than fast code.
 export CARGO_PROFILE_RELEASE_OPT_LEVEL=0 CARGO_TARGET_DIR=target/wasm
 build="cargo build --release --locked --quiet -p fastlgs-core -p fastlgs-grid --target wasm32-unknown-unknown"
 if [ -d "$(rustc --print sysroot)/lib/rustlib/wasm32-unknown-unknown" ]; then

@@ -6,19 +6,28 @@ fn main() {
         return;
     }
     let mut build = cc::Build::new();
-    build.cpp(true).std("c++14").warnings(false).files(["src/opencv/sift.cpp", "src/opencv/inpaint.cpp"]);
+    build
+        .cpp(true)
+        .std("c++14")
+        .warnings(false)
+        .files(["src/opencv/sift.cpp", "src/opencv/inpaint.cpp"]);
     // Debian's packages of single modules have no pkg-config file: use their usual header folder.
-    match pkg_config::Config::new().cargo_metadata(false).probe("opencv4") {
+    match pkg_config::Config::new()
+        .cargo_metadata(false)
+        .probe("opencv4")
+    {
         Ok(library) => {
             build.includes(&library.include_paths);
-            library.link_paths.iter().for_each(|path| println!("cargo::rustc-link-search=native={}", path.display()));
+            library
+                .link_paths
+                .iter()
+                .for_each(|path| println!("cargo::rustc-link-search=native={}", path.display()));
         }
         Err(_) => drop(build.include("/usr/include/opencv4")),
     }
     if let Err(error) = build.try_compile("fastlgs_opencv") {
-        let mend =
-            "install OpenCV 4.4 or newer (on Debian: libopencv-features2d-dev, libopencv-photo-dev), or build without the feature 'opencv'";
-        println!("cargo::error={error}; {mend}");
+        let hint = "install OpenCV 4.4 or newer (on Debian: libopencv-features2d-dev, libopencv-photo-dev), or build without the feature 'opencv'";
+        println!("cargo::error={error}; {hint}");
         return;
     }
     for module in ["features2d", "photo", "core"] {

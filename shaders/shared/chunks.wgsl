@@ -4,7 +4,7 @@
 // A software adapter runs invocations as vector lanes and has slow atomics and barriers. There
 // (WIDE) an invocation processes a chunk item by item. On real GPUs a workgroup of 256 shares a
 // chunk of at most 2,048 items.
-struct Job {
+struct ChunkJob {
     // Number of items.
     n: u32,
     // Right shift in bits of the radix digit.
@@ -16,18 +16,18 @@ struct Job {
 }
 
 struct Chunk {
-    number: u32,
+    plane_index: u32,
     // First item and end (excluded).
     start: u32,
     end: u32,
 }
 
-fn chunk_of(number: u32, job: Job) -> Chunk {
+fn chunk_of(plane_index: u32, job: ChunkJob) -> Chunk {
     let length = (job.n + job.chunks - 1u) / job.chunks;
-    return Chunk(number, min(job.n, number * length), min(job.n, (number + 1u) * length));
+    return Chunk(plane_index, min(job.n, plane_index * length), min(job.n, (plane_index + 1u) * length));
 }
 
-fn digit_of(key: u32, job: Job) -> u32 {
+fn digit_of(key: u32, job: ChunkJob) -> u32 {
     return (key >> job.shift) & 255u;
 }
 

@@ -4,7 +4,7 @@
 
 fn at(map: u32, quad: u32, j: i32) -> vec4<f32> {
     let row = u32(clamp(j, 0, i32(plane.rows) - 1));
-    let value = rows[((4u * number + map) * plane.rows + row) * plane.quads + quad];
+    let value = rows[((4u * plane_index + map) * plane.rows + row) * plane.quads + quad];
     return select(vec4<f32>(0.0), value, j >= 0 && j < i32(plane.rows));
 }
 

@@ -5,9 +5,9 @@
 // each side. The affine approximation diverges beyond.
 fn clamped_slope(t: vec3<f32>, view: View) -> vec2<f32> {
     let size = vec2<f32>(view.size);
-    let beside = 0.15 * size;
-    let low = -(view.centre + beside) / view.focal;
-    let high = (size - view.centre + beside) / view.focal;
+    let margin = 0.15 * size;
+    let low = -(view.centre + margin) / view.focal;
+    let high = (size - view.centre + margin) / view.focal;
     return clamp(t.xy / t.z, low, high);
 }
 

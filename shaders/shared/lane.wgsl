@@ -23,7 +23,7 @@ const TILES: u32 = LANES / TILE_LANES;
 struct Lane {
     // Index of the tile in the workgroup, and of the invocation in the tile.
     tile: u32,
-    number: u32,
+    plane_index: u32,
     // Whether the tile exists. If not, its list is empty.
     exists: bool,
     // First and end pair of the tile's list.
@@ -39,16 +39,16 @@ struct Lane {
 fn lane_of(group: u32, index: u32) -> Lane {
     var lane: Lane;
     lane.tile = index / TILE_LANES;
-    lane.number = index % TILE_LANES;
-    let place = group * TILES + lane.tile;
-    lane.exists = place < view.tiles.x * view.tiles.y;
+    lane.plane_index = index % TILE_LANES;
+    let order_index = group * TILES + lane.tile;
+    lane.exists = order_index < view.tiles.x * view.tiles.y;
     var tile = 0u;
     if lane.exists {
-        tile = tile_order[place];
+        tile = tile_order[order_index];
         lane.start = ranges[2u * tile];
         lane.end = ranges[2u * tile + 1u];
     }
-    lane.x = (tile % view.tiles.x) * TILE + (lane.number & 1u) * 4u;
-    lane.y = (tile / view.tiles.x) * TILE + (lane.number >> 1u);
+    lane.x = (tile % view.tiles.x) * TILE + (lane.plane_index & 1u) * 4u;
+    lane.y = (tile / view.tiles.x) * TILE + (lane.plane_index >> 1u);
     return lane;
 }

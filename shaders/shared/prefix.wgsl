@@ -6,7 +6,7 @@ var<workgroup> prefix_sums: array<u32, 512>;
 
 // Writes the sum of the values of the first k + 1 invocations to prefix_sums[k] (Hillis & Steele
 // 1986).
-fn add_up(value: u32, lane: u32) {
+fn inclusive_scan(value: u32, lane: u32) {
     var side = 0u;
     prefix_sums[lane] = value;
     workgroupBarrier();
@@ -23,7 +23,7 @@ fn add_up(value: u32, lane: u32) {
 
 // Returns the sum of the values of all invocations.
 fn group_sum(value: u32, lane: u32) -> u32 {
-    add_up(value, lane);
+    inclusive_scan(value, lane);
     let all = prefix_sums[255];
     workgroupBarrier();
     return all;

@@ -37,7 +37,7 @@ fn staged_pair_at(tile: u32, k: u32) -> u32 {
     return (k / TILE_LANES % 2u) * LANES + staged_at(tile, k);
 }
 
-fn put_down(fetched: Staged, tile: u32, k: u32) {
+fn stage(fetched: Staged, tile: u32, k: u32) {
     staged_pairs[staged_pair_at(tile, k)] = fetched.pair;
     staged_splats[staged_at(tile, k)] = array<vec4<f32>, 3>(fetched.s0, fetched.s1, fetched.s2);
 }

@@ -32,11 +32,11 @@ struct Plane {
 // The invocation's plane, and its index among the planes processed at once. Each of them has its
 // own maps.
 var<private> plane: Plane;
-var<private> number: u32;
+var<private> plane_index: u32;
 
 fn take_plane(group: vec3<u32>) {
-    number = group.z;
-    plane = planes.each[number];
+    plane_index = group.z;
+    plane = planes.each[plane_index];
 }
 
 // Returns one output from the middle input and the sums of the pairs beside it, from near to far.
@@ -45,7 +45,7 @@ fn window(a0: vec4<f32>, a1: vec4<f32>, a2: vec4<f32>, a3: vec4<f32>, a4: vec4<f
 }
 
 // Returns 1 for pixels of a quad that lie in the image, else 0.
-fn shown(quad: u32, row: u32) -> vec4<f32> {
+fn inside_image(quad: u32, row: u32) -> vec4<f32> {
     let in_row = vec4<u32>(4u * quad) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(plane.size.x);
     return select(vec4<f32>(0.0), vec4<f32>(1.0), in_row & vec4<bool>(row < plane.size.y));
 }
@@ -56,12 +56,12 @@ struct Wanted {
 }
 
 // Unpacks a quad of an 8-bit target: three channels, then 255 for pixels that enter the loss.
-fn wanted(packed: vec4<u32>, channel: u32) -> Wanted {
+fn unpack_target(packed: vec4<u32>, channel: u32) -> Wanted {
     let value = vec4<f32>((packed >> vec4<u32>(8u * (channel % 3u))) & vec4<u32>(255u)) / 255.0;
     return Wanted(value, packed >= vec4<u32>(0x80000000u));
 }
 
 // Returns a rendered quad with exposure applied, and 0 outside the image.
 fn exposed(rendered: vec4<f32>, quad: u32, row: u32) -> vec4<f32> {
-    return shown(quad, row) * (plane.gain * rendered + plane.offset);
+    return inside_image(quad, row) * (plane.gain * rendered + plane.offset);
 }

@@ -1,9 +1,9 @@
-"""CLIP as transformers has it, with random weights: exports, and what the original makes of texts and of a picture.
+"""Exports CLIP of transformers with random weights, and its embeddings of texts and a picture.
 
     python clip.py OUT MERGES
 
-MERGES is the list of merges that OpenAI published. Writes OUT/clip/image.onnx, text.onnx, preprocessor_config.json, photo.png, picture.npy (1, d),
-texts.json and texts.npy (n, d).
+MERGES is OpenAI's published list of merges. Writes to OUT/clip: image.onnx, text.onnx,
+preprocessor_config.json, photo.png, picture.npy (1, d), texts.json and texts.npy (n, d).
 """
 
 import gzip
@@ -23,7 +23,10 @@ TEXTS = ["fox", "a photo of a red bottle.", "Café & crème, 42 pieces!", "the w
 
 
 def tokenizer(merges):
-    """The published one: bytes, bytes that end a word, merged pairs, and two special tokens."""
+    """Returns the published tokenizer.
+
+    Its tokens are bytes, bytes that end a word, merged pairs, and two special tokens.
+    """
     from transformers.models.clip.tokenization_clip import bytes_to_unicode
 
     pairs = gzip.open(merges, "rt", encoding="utf-8").read().split("\n")[1 : 49152 - 256 - 2 + 1]
@@ -44,7 +47,7 @@ def main():
     vision = CLIPVisionConfig(hidden_size=64, intermediate_size=128, num_hidden_layers=2, num_attention_heads=2, patch_size=16)
     clip = CLIPModel(CLIPConfig(text_config=text.to_dict(), vision_config=vision.to_dict(), projection_dim=32)).eval()
     with torch.no_grad():
-        # So that embeddings follow what they are made of.
+        # Larger weights make the embeddings depend on their input.
         for parameter in clip.parameters():
             parameter.mul_(2)
 

@@ -1,10 +1,11 @@
-"""Segment Anything as its authors and as transformers have it, with random weights: exports, and what the originals answer.
+"""Exports Segment Anything of its authors and of transformers with random weights, and its masks.
 
     python sam.py OUT
 
-writes for each of both OUT/<which>/encoder.onnx, decoder.onnx, photo.png, points.npy (n, 2; pixels), low.npy (n, masks, 256, 256; logits) and
-scores.npy (n, masks); for the authors' also what their generator of masks makes of the photo: masks.npy (m, rows, columns) and told.npy (m, 2;
-predicted IoU, stability), with filters.json.
+Writes to OUT/authors and OUT/transformers: encoder.onnx, decoder.onnx, photo.png,
+points.npy (n, 2; pixels), low.npy (n, masks, 256, 256; logits) and scores.npy (n, masks).
+OUT/authors also gets the masks of the authors' mask generator: masks.npy (m, rows, columns),
+told.npy (m, 2; predicted IoU and stability) and filters.json.
 """
 
 import pathlib
@@ -96,7 +97,7 @@ def transformers(folder, picture, points):
         given = (asked, torch.ones(1, len(points), 1, dtype=torch.int64), features, positions)
         scores, low = Decoder()(*given)
     names = ["input_points", "input_labels", *embeddings]
-    # As many prompts as are asked: this exporter cannot leave their number open.
+    # The number of prompts is fixed, because this exporter does not support a dynamic one.
     torch.onnx.export(Decoder(), given, folder / "decoder.onnx", input_names=names, output_names=["iou_scores", "pred_masks"], opset_version=16)
     save(folder, picture, points, low[0], scores[0])
 

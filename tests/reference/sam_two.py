@@ -1,8 +1,9 @@
-"""Segment Anything 2 as its authors have it, with random weights: an export, and what the original answers.
+"""Exports Segment Anything 2 of its authors with random weights, and its masks.
 
     python sam_two.py OUT
 
-writes OUT/sam2/ with the files that sam.py writes for the first one; masks are those of prompts that may mean several things.
+Writes to OUT/sam2 the same files as sam.py to OUT/authors. The masks are those of ambiguous
+prompts (multimask output).
 """
 
 import pathlib
@@ -16,7 +17,7 @@ from sam2.automatic_mask_generator import SAM2AutomaticMaskGenerator
 from sam2.build_sam import build_sam2
 from sam2.sam2_image_predictor import SAM2ImagePredictor
 
-# Its scores are shares, and random ones lie near a half.
+# SAM 2 predicts scores between 0 and 1. With random weights they are near 0.5.
 FILTERS = {**FILTERS, "predicted_iou": 0.57, "stability": 0.85}
 
 
@@ -33,7 +34,7 @@ class Encoder(torch.nn.Module):
 
 
 class Decoder(torch.nn.Module):
-    """Points with their padding, as exports take them: the original pads by itself."""
+    """Decoder of points that are already padded, as in exports. The original pads them itself."""
 
     def __init__(self, sam):
         super().__init__()

@@ -1,4 +1,4 @@
-"""What several originals are asked about, and how random weights are made to answer."""
+"""Inputs of the reference programs, and scaling of random weights for useful outputs."""
 
 import json
 
@@ -11,7 +11,7 @@ POINTS = np.array([[250.0, 300.0], [770.0, 510.0], [50.0, 50.0], [970.0, 710.0],
 
 
 def photo():
-    """Waves of colour, and two things with borders; as long as SAM takes them, so that nothing is rounded on the way."""
+    """Returns colour waves with two rectangles. 1024 pixels wide, so that SAM does not resize it."""
     y, x = np.mgrid[0:768, 0:1024]
     waves = [127 + 100 * np.sin(x / 100), 127 + 100 * np.sin(y / 90 + 1), 127 + 100 * np.sin((x + y) / 150)]
     picture = np.stack(waves, -1).astype(np.uint8)
@@ -21,20 +21,23 @@ def photo():
 
 
 def detailed():
-    """A square whose details are finer than what CLIP and SigLIP see: how it is made smaller matters."""
+    """Returns a square with details finer than the input of CLIP and SigLIP, to test resizing."""
     y, x = np.mgrid[0:420, 0:420]
     return np.stack([127 + 60 * np.sin(x * x / 900), 127 + 60 * np.sin(y / 3), np.where((x // 7 + y // 5) % 2, 160, 90)], -1).astype(np.uint8)
 
 
 def framed(picture):
-    """A mask's box is shown with a twentieth of its side around it, in grey."""
+    """Returns the picture with a grey margin on each side, 1/20 of its size in total."""
     cut = np.full((441, 441, 3), 127, np.uint8)
     cut[11:431, 11:431] = picture
     return cut
 
 
 def lively(points, hyper, upscaling, score):
-    """Random weights give masks that no logit decides and that all prompts share: makes them larger, and smooth."""
+    """Scales random weights, which otherwise give logits near zero and equal masks for all prompts.
+
+    Makes the upscaling layers smooth.
+    """
     with torch.no_grad():
         for layer in hyper:
             layer.weight.mul_(150)
@@ -55,7 +58,10 @@ def save(folder, picture, points, low, scores):
 
 
 def save_found(folder, picture, generator_with, filters):
-    """What an original's generator of masks finds. Suppression is left out: of boxes that are all alike it would leave what small differences decide."""
+    """Saves the masks of an original's mask generator, with `filters`.
+
+    Non-maximum suppression is off: for similar boxes, tiny differences would decide its result.
+    """
     generator = generator_with(
         points_per_side=filters["points_per_side"],
         pred_iou_thresh=filters["predicted_iou"],

@@ -1,9 +1,10 @@
-"""SigLIP as transformers has it, with random weights: exports in the layout that is on offer for it, and what the original makes of texts and of a picture.
+"""Exports SigLIP of transformers with random weights, and its embeddings of texts and a picture.
 
     python siglip.py OUT
 
-Writes OUT/siglip/config.json, preprocessor_config.json, tokenizer.json, onnx/vision_model.onnx, onnx/text_model.onnx, photo.png, picture.npy (1, d), texts.json and
-texts.npy (n, d).
+Writes to OUT/siglip, in the layout of published exports: config.json, preprocessor_config.json,
+tokenizer.json, onnx/vision_model.onnx, onnx/text_model.onnx, photo.png, picture.npy (1, d),
+texts.json and texts.npy (n, d).
 """
 
 import json
@@ -23,7 +24,7 @@ LENGTH = 64
 
 
 def tokenizer(path):
-    """Pieces of words in small letters, as SentencePiece has them, and one token that ends and fills texts."""
+    """Returns a tokenizer of lower-case word pieces, like SentencePiece. One token ends and pads texts."""
     words = Tokenizer(models.Unigram())
     words.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
     words.pre_tokenizer = pre_tokenizers.Metaspace()
@@ -44,7 +45,7 @@ def main():
     vision = SiglipVisionConfig(image_size=224, patch_size=16, **size)
     siglip = SiglipModel(SiglipConfig(text_config=text.to_dict(), vision_config=vision.to_dict())).eval()
     siglip.config.save_pretrained(out)
-    # The same in numbers: its name for them cannot be exported.
+    # Equal to "valid" padding, which the exporter does not support by name.
     siglip.vision_model.embeddings.patch_embedding.padding = (0, 0)
 
     class Tower(torch.nn.Module):

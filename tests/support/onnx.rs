@@ -1,11 +1,12 @@
-//! Writes small ONNX models, so that tests check whole algorithms with a known answer and without foreign weights.
+//! Writes small ONNX models, so that tests can check whole algorithms with known answers and
+//! without downloaded weights.
 //!
-//! Only as much of the format (protobuf) as those models need: nodes, float and integer constants, tensors as inputs and
-//! outputs, opset 17.
+//! Supports the parts of the format (protobuf) that these models need: nodes, float and integer
+//! constants, tensors as inputs and outputs, opset 17.
 
 use std::path::Path;
 
-/// Type of a tensor's values.
+/// Element type of a tensor. The numbers are those of ONNX.
 #[derive(Clone, Copy)]
 pub enum Kind {
     /// 32-bit floats.
@@ -20,13 +21,13 @@ pub enum Kind {
 pub enum Attribute<'a> {
     /// One integer.
     Int(&'a str, i64),
-    /// Several integers.
+    /// A list of integers.
     Ints(&'a str, &'a [i64]),
-    /// A word.
+    /// A string.
     Text(&'a str, &'a str),
 }
 
-/// A model in the making.
+/// A model under construction, as encoded protobuf fields.
 #[derive(Default)]
 pub struct Graph {
     fields: Vec<u8>,
@@ -75,18 +76,18 @@ fn value_info(name: &str, kind: Kind, shape: &[i64]) -> Vec<u8> {
 }
 
 impl Graph {
-    /// Declares an input; lengths of -1 are free.
+    /// Declares an input. Lengths of -1 are dynamic.
     pub fn input(&mut self, name: &str, kind: Kind, shape: &[i64]) -> String {
         bytes(&mut self.inputs, 11, &value_info(name, kind, shape));
         name.to_owned()
     }
 
-    /// Declares that a value is an output, under another name.
+    /// Declares a float value as an output with the name `name`.
     pub fn output(&mut self, value: &str, name: &str, shape: &[i64]) {
         self.output_as(value, name, Kind::Float, shape);
     }
 
-    /// Makes a value of another type than 32-bit floats an output.
+    /// Declares a value of the type `kind` as an output with the name `name`.
     pub fn output_as(&mut self, value: &str, name: &str, kind: Kind, shape: &[i64]) {
         self.node("Identity", &[value], &[], name);
         bytes(&mut self.outputs, 12, &value_info(name, kind, shape));
@@ -108,17 +109,31 @@ impl Graph {
         name
     }
 
-    /// A constant of floats.
+    /// Adds a float constant and returns its name.
     pub fn floats(&mut self, shape: &[i64], values: &[f32]) -> String {
-        self.constant(Kind::Float, shape, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())
+        self.constant(
+            Kind::Float,
+            shape,
+            &values
+                .iter()
+                .flat_map(|v| v.to_le_bytes())
+                .collect::<Vec<_>>(),
+        )
     }
 
-    /// A constant row of integers.
+    /// Adds a one-dimensional integer constant and returns its name.
     pub fn ints(&mut self, values: &[i64]) -> String {
-        self.constant(Kind::Int, &[values.len() as i64], &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<_>>())
+        self.constant(
+            Kind::Int,
+            &[values.len() as i64],
+            &values
+                .iter()
+                .flat_map(|v| v.to_le_bytes())
+                .collect::<Vec<_>>(),
+        )
     }
 
-    /// An operation; returns its result.
+    /// Adds a node and returns the name of its result.
     pub fn op(&mut self, kind: &str, inputs: &[&str], attributes: &[Attribute]) -> String {
         let name = self.fresh();
         self.node(kind, inputs, attributes, &name);
@@ -127,7 +142,9 @@ impl Graph {
 
     fn node(&mut self, kind: &str, inputs: &[&str], attributes: &[Attribute], output: &str) {
         let mut node = Vec::new();
-        inputs.iter().for_each(|i| bytes(&mut node, 1, i.as_bytes()));
+        inputs
+            .iter()
+            .for_each(|i| bytes(&mut node, 1, i.as_bytes()));
         bytes(&mut node, 2, output.as_bytes());
         bytes(&mut node, 4, kind.as_bytes());
         for attribute in attributes {
@@ -154,7 +171,7 @@ impl Graph {
         bytes(&mut self.fields, 1, &node);
     }
 
-    /// Writes the model.
+    /// Writes the model to a file.
     pub fn save(self, path: &Path) {
         let (mut graph, mut opset, mut model) = (self.fields, Vec::new(), Vec::new());
         bytes(&mut graph, 2, b"test");

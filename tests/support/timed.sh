@@ -1,5 +1,5 @@
 #!/bin/sh
-# Runs a test program so that it tells how long each test took; other programs as they are.
+# Runs a test program that reports the seconds of each test. Runs other programs unchanged.
 program=$1
 shift
 case "$program" in

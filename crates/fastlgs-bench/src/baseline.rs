@@ -1,6 +1,7 @@
-//! `fastlgs-bench baseline`: other ways to a field of language, on the same Gaussians, masks and embeddings.
+//! `fastlgs-bench baseline`: other language fields on the same Gaussians, masks and embeddings.
 //!
-//! Each gives every Gaussian a vector by the views' votes, renders the vectors three numbers at a time, and decides pixel by pixel.
+//! A field gives each Gaussian a vector by lifting. The vectors are rendered three numbers at a
+//! time, and each pixel is classified on its own.
 
 use crate::autoencoder::Autoencoder;
 use anyhow::{Context, Result, bail};
@@ -26,25 +27,29 @@ use std::time::Instant;
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench baseline scenes/fox --method raw --device cpu")]
 pub struct Args {
-    /// Trained scene whose photos have labels/ beside them.
+    /// Trained scene with a labels/ folder beside its photos.
     scene: PathBuf,
-    /// `raw`: the mean embedding of the masks that each Gaussian is seen in, without a grid (the paper's ablation). `lerf`: embeddings of
-    /// tiles at three scales, the most relevant scale of each pixel. `langsplat`: embeddings of whole and part masks through a
-    /// scene-wise autoencoder with three numbers. `code1` to `code4`: the grid with codes of this dimension, decided by the nearest one.
+    /// Field to evaluate.
+    ///
+    /// `raw`: mean embedding of the whole masks that show a Gaussian, without a grid (the paper's
+    /// ablation). `lerf`: embeddings of tiles at three scales; each pixel uses its most relevant
+    /// scale. `langsplat`: embeddings of whole and part masks, compressed to three numbers by a
+    /// scene-wise autoencoder. `code1` to `code4`: the grid with codes of 1 to 4 numbers; each
+    /// pixel belongs to the object with the nearest code.
     #[arg(long, value_parser = ["raw", "lerf", "langsplat", "code1", "code2", "code3", "code4"])]
     method: String,
 }
 
-/// What vectors of all Gaussians may take.
+/// Largest size of the vectors of all Gaussians, in bytes.
 const MOST_BYTES: usize = 4 << 30;
 
-/// Relevancy from which a pixel is nearer to the text than to anything.
+/// Relevancy threshold. From 0.5 on, a pixel is closer to the text than to every canonical phrase.
 const NEARER: f32 = 0.5;
 
-/// Sides of LERF's tiles, as shares of the photo's shorter side.
+/// Sides of LERF's tiles, as fractions of the photo's shorter side.
 const TILES: [f32; 3] = [0.5, 0.25, 0.125];
 
-/// One vector a Gaussian, row by row.
+/// One row per Gaussian, pixel or object.
 type Vectors = Array2<f32>;
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
@@ -56,15 +61,28 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         "raw" => PerPixel::raw(&scene, run)?,
         "lerf" => PerPixel::lerf(&scene, run)?,
         "langsplat" => PerPixel::langsplat(&scene, run)?,
-        code => PerPixel::of_codes(&scene, &grid, lattice(grid.objects.len(), code[4..].parse().context("a dimension")?, run.seed)),
+        code => PerPixel::of_codes(
+            &scene,
+            &grid,
+            lattice(
+                grid.objects.len(),
+                code[4..].parse().context("a dimension")?,
+                run.seed,
+            ),
+        ),
     };
     let seconds = started.elapsed().as_secs_f64();
     let bytes: usize = field.layers.iter().map(|v| 4 * v.len()).sum();
-    let (mut oracle, mut text, mut localised, mut milliseconds, mut wrong) = (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let (mut oracle, mut text, mut localised, mut milliseconds, mut wrong) =
+        (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for view in &views {
         let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
         let started = Instant::now();
-        let pictures = field.layers.iter().map(|v| rendered(&mut scene, &camera, v)).collect::<Result<Vec<_>>>()?;
+        let pictures = field
+            .layers
+            .iter()
+            .map(|v| rendered(&mut scene, &camera, v))
+            .collect::<Result<Vec<_>>>()?;
         milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
         wrong.extend(field.wrong(&mut scene, &grid, &camera, &pictures[0])?);
         for score in field.score(&scene, &grid, view, &camera, pictures)? {
@@ -94,50 +112,77 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
-/// How rendered vectors answer a text.
+/// What a rendered vector stands for.
 enum Meaning {
-    /// Each is an embedding.
+    /// An embedding.
     Embedding,
-    /// Each is an autoencoder's code of one.
+    /// The autoencoder's code of an embedding.
     Encoded(Autoencoder),
-    /// Each is an object's code.
+    /// The code of an object. Holds the codes of all objects, one per row.
     Object(Vectors),
 }
 
-/// A field that is decided pixel by pixel.
+/// A field whose pixels are classified independently.
 struct PerPixel {
-    /// One for each scale or level.
+    /// Vectors of all Gaussians, one array for each scale or level.
     layers: Vec<Vectors>,
     meaning: Meaning,
 }
 
 impl PerPixel {
     fn raw(scene: &Session, run: &Run) -> Result<Self> {
-        let masks = fastlgs::masks::evidence(&scene.folder, &scene.manifest.training(&scene.cameras), run)?;
+        let masks = fastlgs::masks::training_descriptors(
+            &scene.folder,
+            &scene.manifest.training(&scene.cameras),
+            run,
+        )?;
         let lifted = lifted(scene, |view, camera| {
             let map = scene.folder.masks(camera)?.painted(Level::Whole);
             let own = masks.iter().filter(|m| m.view == view);
-            Ok((map, own.map(|m| (m.label, eyes::for_words(&scene.manifest, m.embedding.clone()))).collect()))
+            Ok((
+                map,
+                own.map(|m| {
+                    (
+                        m.label,
+                        eyes::for_texts(&scene.manifest, m.embedding.clone()),
+                    )
+                })
+                .collect(),
+            ))
         })?;
-        Ok(Self { layers: vec![lifted], meaning: Meaning::Embedding })
+        Ok(Self {
+            layers: vec![lifted],
+            meaning: Meaning::Embedding,
+        })
     }
 
     fn lerf(scene: &Session, run: &Run) -> Result<Self> {
         let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
-        let progress = run.work("tiles", (TILES.len() * scene.manifest.training(&scene.cameras).len()) as u64);
+        let progress = run.work(
+            "tiles",
+            (TILES.len() * scene.manifest.training(&scene.cameras).len()) as u64,
+        );
         let of_scale = |share: &f32| {
             lifted(scene, |_, camera| {
                 let side = ((share * camera.width.min(camera.height) as f32) as u32).max(8);
                 let columns = camera.width.div_ceil(side);
-                let labels =
-                    (0..camera.width * camera.height).map(|p| (p / camera.width / side * columns + p % camera.width / side + 1) as u16);
-                let map = LabelMap { width: camera.width, height: camera.height, labels: labels.collect() };
+                let labels = (0..camera.width * camera.height).map(|p| {
+                    (p / camera.width / side * columns + p % camera.width / side + 1) as u16
+                });
+                let map = LabelMap {
+                    width: camera.width,
+                    height: camera.height,
+                    labels: labels.collect(),
+                };
                 progress.advance()?;
                 embedded(scene, encoder.as_ref(), camera, map)
             })
         };
         let layers = TILES.iter().map(of_scale).collect::<Result<_>>()?;
-        Ok(Self { layers, meaning: Meaning::Embedding })
+        Ok(Self {
+            layers,
+            meaning: Meaning::Embedding,
+        })
     }
 
     fn langsplat(scene: &Session, run: &Run) -> Result<Self> {
@@ -148,55 +193,133 @@ impl PerPixel {
         for (level, found) in [Level::Whole, Level::Part].into_iter().zip(&mut levels) {
             for camera in &training {
                 let masks = scene.folder.masks(camera)?;
-                // Scenes of one level have no parts.
-                let level = if masks.count(level) > 0 { level } else { Level::Whole };
-                found.push(embedded(scene, encoder.as_ref(), camera, masks.painted(level))?);
+                // A scene without part masks uses its whole masks twice.
+                let level = if masks.count(level) > 0 {
+                    level
+                } else {
+                    Level::Whole
+                };
+                found.push(embedded(
+                    scene,
+                    encoder.as_ref(),
+                    camera,
+                    masks.painted(level),
+                )?);
                 progress.advance()?;
             }
         }
-        let all: Vec<&Vec<f32>> = levels.iter().flatten().flat_map(|l| &l.1).map(|e| &e.1).collect();
+        let all: Vec<&Vec<f32>> = levels
+            .iter()
+            .flatten()
+            .flat_map(|l| &l.1)
+            .map(|e| &e.1)
+            .collect();
         let coder = Autoencoder::learn(&rows(&all)?, run.seed);
         let layers = levels.iter().map(|views| {
             lifted(scene, |view, _| {
                 let (map, embeddings) = &views[view];
-                let encoded = coder.encode(rows(&embeddings.iter().map(|e| &e.1).collect::<Vec<_>>())?);
-                Ok((map.clone(), embeddings.iter().zip(encoded.rows()).map(|(e, code)| (e.0, code.to_vec())).collect()))
+                let encoded =
+                    coder.encode(rows(&embeddings.iter().map(|e| &e.1).collect::<Vec<_>>())?);
+                Ok((
+                    map.clone(),
+                    embeddings
+                        .iter()
+                        .zip(encoded.rows())
+                        .map(|(e, code)| (e.0, code.to_vec()))
+                        .collect(),
+                ))
             })
         });
-        Ok(Self { layers: layers.collect::<Result<_>>()?, meaning: Meaning::Encoded(coder) })
+        Ok(Self {
+            layers: layers.collect::<Result<_>>()?,
+            meaning: Meaning::Encoded(coder),
+        })
     }
 
-    /// Each Gaussian has its object's code; those of none the origin, which is no code.
+    /// Gives each Gaussian the code of its object. Gaussians without an object get the origin,
+    /// which is not a code.
     fn of_codes(scene: &Session, grid: &Grid, codes: Vectors) -> Self {
-        let own =
-            |g: usize, axis: usize| grid.chain(scene.gaussians.object_ids[g]).next().map_or(0.0, |id| codes[[usize::from(id) - 1, axis]]);
-        let layer = Vectors::from_shape_fn((scene.gaussians.len(), codes.ncols()), |(g, axis)| own(g, axis));
-        Self { layers: vec![layer], meaning: Meaning::Object(codes) }
+        let own = |g: usize, axis: usize| {
+            grid.chain(scene.gaussians.object_ids[g])
+                .next()
+                .map_or(0.0, |id| codes[[usize::from(id) - 1, axis]])
+        };
+        let layer = Vectors::from_shape_fn((scene.gaussians.len(), codes.ncols()), |(g, axis)| {
+            own(g, axis)
+        });
+        Self {
+            layers: vec![layer],
+            meaning: Meaning::Object(codes),
+        }
     }
 
-    /// Share of the pixels of a view whose code is that of an object which is not there: neither among the ids that were blended, nor
-    /// around one of them. A blend of two codes can come near a third.
-    fn wrong(&self, scene: &mut Session, grid: &Grid, camera: &Camera, picture: &Vectors) -> Result<Option<f64>> {
-        let (Meaning::Object(codes), Field::Shares(shares)) = (&self.meaning, scene.field(camera, None)?) else { return Ok(None) };
-        let there = |ids: &[u32; 4], id: u16| ids.iter().any(|s| grid.chain(unpack(*s).0).any(|a| a == id));
-        let decided = picture.rows().into_iter().map(|p| nearest(&p.to_vec(), codes));
-        let wrong = decided.zip(&shares.pixels).filter(|(id, ids)| *id > 0 && !there(ids, *id)).count();
+    /// Returns the fraction of a view's pixels that are classified as an object that is not there.
+    /// An object is there if it is one of the pixel's blended ids or contains one. A blend of two
+    /// codes can come near a third code, which causes such errors. `None` for fields without codes.
+    fn wrong(
+        &self,
+        scene: &mut Session,
+        grid: &Grid,
+        camera: &Camera,
+        picture: &Vectors,
+    ) -> Result<Option<f64>> {
+        let (Meaning::Object(codes), Field::Shares(shares)) =
+            (&self.meaning, scene.field(camera, None)?)
+        else {
+            return Ok(None);
+        };
+        let there = |ids: &[u32; 4], id: u16| {
+            ids.iter()
+                .any(|s| grid.chain(unpack(*s).0).any(|a| a == id))
+        };
+        let decided = picture
+            .rows()
+            .into_iter()
+            .map(|p| nearest(&p.to_vec(), codes));
+        let wrong = decided
+            .zip(&shares.pixels)
+            .filter(|(id, ids)| *id > 0 && !there(ids, *id))
+            .count();
         Ok(Some(wrong as f64 / shares.pixels.len() as f64))
     }
 
-    /// Oracle IoU, IoU of the text's mask, and whether the peak is right, of each label.
-    fn score(&self, scene: &Session, grid: &Grid, view: &LabelledView, camera: &Camera, pictures: Vec<Vectors>) -> Result<Vec<[f64; 3]>> {
+    /// Returns for each label: oracle IoU, IoU of the text's mask, and 1 or 0 for the localisation.
+    fn score(
+        &self,
+        scene: &Session,
+        grid: &Grid,
+        view: &LabelledView,
+        camera: &Camera,
+        pictures: Vec<Vectors>,
+    ) -> Result<Vec<[f64; 3]>> {
         let (w, h) = (camera.width, camera.height);
-        let localised =
-            |relevancy: &[f32], label: &labels::Label| f64::from(u8::from(metrics::localised(relevancy, w, h, &view.boxes(label, w, h))));
+        let localised = |relevancy: &[f32], label: &labels::Label| {
+            f64::from(u8::from(metrics::peak_in_box(
+                relevancy,
+                w,
+                h,
+                &view.boxes(label, w, h),
+            )))
+        };
         if let Meaning::Object(codes) = &self.meaning {
-            let pixels = pictures[0].rows().into_iter().map(|p| [pack(nearest(&p.to_vec(), codes), 1.0), 0, 0, 0]).collect();
-            let field = Field::Shares(Shares { width: w, height: h, pixels });
+            let pixels = pictures[0]
+                .rows()
+                .into_iter()
+                .map(|p| [pack(nearest(&p.to_vec(), codes), 1.0), 0, 0, 0])
+                .collect();
+            let field = Field::Shares(Shares {
+                width: w,
+                height: h,
+                pixels,
+            });
             let score = |label: &labels::Label| -> Result<[f64; 3]> {
                 let truth = view.mask(label, w, h);
                 let text = scene.text_query(&label.category)?;
                 let ranked = query::rank(grid, &text);
-                let mask = field.mask(grid, &query::select(grid, &ranked, &text, &QueryConfig::default()));
+                let mask = field.mask(
+                    grid,
+                    &query::select(grid, &ranked, &text, &QueryConfig::default()),
+                );
                 Ok([
                     eval::best_object(grid, &field, &truth).0,
                     metrics::iou(&mask, &truth),
@@ -214,37 +337,74 @@ impl PerPixel {
             let truth = view.mask(label, w, h);
             let text = scene.text_query(&label.category)?;
             let relevancy = relevancy(&embeddings, &text);
-            let above = |threshold: f32| metrics::iou(&relevancy.iter().map(|r| *r >= threshold).collect::<Vec<_>>(), &truth);
-            Ok([thresholds(&relevancy).into_iter().map(above).fold(0.0, f64::max), above(NEARER), localised(&relevancy, label)])
+            let above = |threshold: f32| {
+                metrics::iou(
+                    &relevancy
+                        .iter()
+                        .map(|r| *r >= threshold)
+                        .collect::<Vec<_>>(),
+                    &truth,
+                )
+            };
+            Ok([
+                thresholds(&relevancy)
+                    .into_iter()
+                    .map(above)
+                    .fold(0.0, f64::max),
+                above(NEARER),
+                localised(&relevancy, label),
+            ])
         };
         view.labels.iter().map(score).collect()
     }
 }
 
-/// Objects' codes on the lattice of side K^(-1/d) in d dimensions (paper, semantic feature grid), dealt out at random.
+/// Returns `count` codes on a lattice with spacing K^(-1/d) in d dimensions (paper, semantic
+/// feature grid). K is the number of objects. Their order is random.
 fn lattice(count: usize, dimension: u32, seed: u64) -> Vectors {
     let side = (1usize..).find(|s| s.pow(dimension) >= count).unwrap_or(1);
     let mut cells: Vec<usize> = (0..side.pow(dimension)).collect();
     Rng::new(seed, "codes of any dimension").shuffle(&mut cells);
-    Vectors::from_shape_fn((count, dimension as usize), |(k, axis)| ((cells[k] / side.pow(axis as u32) % side) as f32 + 0.5) / side as f32)
+    Vectors::from_shape_fn((count, dimension as usize), |(k, axis)| {
+        ((cells[k] / side.pow(axis as u32) % side) as f32 + 0.5) / side as f32
+    })
 }
 
-/// A label map, and the vectors of its labels.
+/// A label map with the vectors of its labels.
 type Labelled = (LabelMap, Vec<(u16, Vec<f32>)>);
 
-/// The embeddings of a map's labels; those that show nothing are left out.
-fn embedded(scene: &Session, encoder: &dyn Encoder, camera: &Camera, map: LabelMap) -> Result<Labelled> {
+/// Embeds the masks of a label map. Labels whose embedding is zero are left out.
+fn embedded(
+    scene: &Session,
+    encoder: &dyn Encoder,
+    camera: &Camera,
+    map: LabelMap,
+) -> Result<Labelled> {
     let found = encoder.embed_masks(&camera.name, &scene.folder.photo(&camera.name)?, &map)?;
-    let own = found.into_iter().enumerate().filter(|(_, e)| e.iter().any(|v| *v != 0.0));
-    Ok((map, own.map(|(k, e)| (k as u16 + 1, eyes::for_words(&scene.manifest, e))).collect()))
+    let own = found
+        .into_iter()
+        .enumerate()
+        .filter(|(_, e)| e.iter().any(|v| *v != 0.0));
+    Ok((
+        map,
+        own.map(|(k, e)| (k as u16 + 1, eyes::for_texts(&scene.manifest, e)))
+            .collect(),
+    ))
 }
 
 fn rows(vectors: &[&Vec<f32>]) -> Result<Vectors> {
     let width = vectors.first().map_or(0, |v| v.len());
-    Ok(Vectors::from_shape_vec((vectors.len(), width), vectors.iter().flat_map(|v| v.iter().copied()).collect())?)
+    Ok(Vectors::from_shape_vec(
+        (vectors.len(), width),
+        vectors.iter().flat_map(|v| v.iter().copied()).collect(),
+    )?)
 }
 
-/// The mean vector of each Gaussian over what the training views show it in, by blending weights. `shown` gives a view's labels.
+/// Returns the mean vector of each Gaussian over all training views, weighted by blending weights.
+/// `shown` returns the label map of a view and the vectors of its labels.
+///
+/// # Errors
+/// The vectors need more than 4 GiB.
 fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -> Result<Vectors> {
     let mut sums = Vectors::zeros((0, 0));
     let mut weights = vec![0.0f32; scene.gaussians.len()];
@@ -255,7 +415,7 @@ fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -
             let bytes = 4 * width * scene.gaussians.len();
             if bytes > MOST_BYTES {
                 bail!(
-                    "vectors of {width} numbers for {} Gaussians take {} MB, more than the {} MB that are allowed",
+                    "vectors of {width} numbers for {} Gaussians need {} MB, but the limit is {} MB; use a smaller scene",
                     scene.gaussians.len(),
                     bytes >> 20,
                     MOST_BYTES >> 20
@@ -272,34 +432,48 @@ fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -
         for vote in lift::votes(&scene.gaussians, &scene.view(camera), &map) {
             if let Some(k) = place[usize::from(vote.label)] {
                 let mut row = sums.row_mut(vote.gaussian as usize);
-                row.iter_mut().zip(&vectors[k].1).for_each(|(sum, v)| *sum += vote.weight * v);
+                row.iter_mut()
+                    .zip(&vectors[k].1)
+                    .for_each(|(sum, v)| *sum += vote.weight * v);
                 weights[vote.gaussian as usize] += vote.weight;
             }
         }
     }
-    sums.rows_mut().into_iter().zip(weights).filter(|(_, w)| *w > 0.0).for_each(|(mut row, w)| row /= w);
+    sums.rows_mut()
+        .into_iter()
+        .zip(weights)
+        .filter(|(_, w)| *w > 0.0)
+        .for_each(|(mut row, w)| row /= w);
     Ok(sums)
 }
 
-/// Blended vectors of a view, one a pixel: three numbers a pass.
+/// Renders the vectors into a view, three numbers per pass. Returns one row per pixel.
 fn rendered(scene: &mut Session, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
     let (pixels, width) = ((camera.width * camera.height) as usize, vectors.ncols());
     let mut out = Vectors::zeros((pixels, width));
     let before = scene.gaussians.features.clone();
     for first in (0..width).step_by(3) {
-        let at = |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
-        scene.gaussians.features = vectors.rows().into_iter().map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2))).collect();
+        let at =
+            |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
+        scene.gaussians.features = vectors
+            .rows()
+            .into_iter()
+            .map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2)))
+            .collect();
         scene.engine.set_state(&State::of(&scene.gaussians))?;
         let frame = scene.engine.render(scene.view(camera), Channels::Feature)?;
         for (k, channel) in covered(&frame).into_iter().enumerate().take(width - first) {
-            out.column_mut(first + k).iter_mut().zip(channel).for_each(|(o, v)| *o = v);
+            out.column_mut(first + k)
+                .iter_mut()
+                .zip(channel)
+                .for_each(|(o, v)| *o = v);
         }
     }
     scene.gaussians.features = before;
     Ok(out)
 }
 
-/// Rows of length 1; those of length 0 stay.
+/// Scales all rows to length 1. Rows of length 0 stay as they are.
 fn normalised(mut vectors: Vectors) -> Vectors {
     for mut row in vectors.axis_iter_mut(Axis(0)) {
         let length = row.dot(&row).sqrt();
@@ -310,26 +484,46 @@ fn normalised(mut vectors: Vectors) -> Vectors {
     vectors
 }
 
-/// Relevancy of each pixel: that of the layer where it is highest.
+/// Returns the relevancy of each pixel: the maximum over all layers.
 fn relevancy(layers: &[Vectors], text: &TextQuery) -> Vec<f32> {
     let pixels = layers[0].nrows();
-    let of = |p: usize| layers.iter().map(|l| text.relevancy(&l.row(p).to_vec())).fold(0.0, f32::max);
+    let of = |p: usize| {
+        layers
+            .iter()
+            .map(|l| text.relevancy(&l.row(p).to_vec()))
+            .fold(0.0, f32::max)
+    };
     (0..pixels).map(of).collect()
 }
 
-/// Thresholds that an oracle may choose from: 64 values between the lowest and the highest.
+/// Returns the thresholds that the oracle tries: 64 equal steps from the smallest value to the
+/// largest.
 fn thresholds(values: &[f32]) -> Vec<f32> {
-    let (low, high) = values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
-    (0..64).map(|k| low + (high - low) * k as f32 / 64.0).collect()
+    let (low, high) = values
+        .iter()
+        .fold((f32::INFINITY, f32::NEG_INFINITY), |(l, h), v| {
+            (l.min(*v), h.max(*v))
+        });
+    (0..64)
+        .map(|k| low + (high - low) * k as f32 / 64.0)
+        .collect()
 }
 
-/// The object whose code lies nearest; 0 where the origin does, the code of no object. A bound on the distance, as the paper has it for
-/// codes that were trained, leaves hardly a pixel: what shines through moves every blend.
+/// Returns the id of the object with the nearest code, or 0 if the origin is nearer. The paper
+/// limits the distance to trained codes. Here such a limit would drop almost every pixel, because
+/// translucent Gaussians shift each blended code.
 fn nearest(rendered: &[f32], codes: &Vectors) -> u16 {
-    let distance = |code: ndarray::ArrayView1<f32>| code.iter().zip(rendered).map(|(c, r)| (c - r).powi(2)).sum::<f32>();
+    let distance = |code: ndarray::ArrayView1<f32>| {
+        code.iter()
+            .zip(rendered)
+            .map(|(c, r)| (c - r).powi(2))
+            .sum::<f32>()
+    };
     let none = rendered.iter().map(|r| r * r).sum::<f32>();
     let all = codes.rows().into_iter().map(distance).enumerate();
-    all.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, d)| *d < none).map_or(0, |(k, _)| k as u16 + 1)
+    all.min_by(|a, b| a.1.total_cmp(&b.1))
+        .filter(|(_, d)| *d < none)
+        .map_or(0, |(k, _)| k as u16 + 1)
 }
 
 #[cfg(test)]
@@ -340,14 +534,25 @@ mod tests {
     #[test]
     fn the_nearest_code_decides() {
         let codes = Vectors::from_shape_vec((2, 1), vec![0.25, 0.75]).expect("a shape");
-        assert_eq!((nearest(&[0.26], &codes), nearest(&[0.6], &codes), nearest(&[0.1], &codes)), (1, 2, 0));
+        assert_eq!(
+            (
+                nearest(&[0.26], &codes),
+                nearest(&[0.6], &codes),
+                nearest(&[0.1], &codes)
+            ),
+            (1, 2, 0)
+        );
     }
 
     #[test]
     fn the_most_relevant_layer_counts() {
-        let layer = |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
+        let layer =
+            |v: [f32; 4]| normalised(Vectors::from_shape_vec((2, 2), v.to_vec()).expect("a shape"));
         let layers = [layer([1.0, 0.0, 0.0, 2.0]), layer([0.0, 1.0, 3.0, 0.0])];
-        let text = TextQuery { anything: 0.5, ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::OFFLINE) };
+        let text = TextQuery {
+            min_canonical: 0.5,
+            ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::OFFLINE)
+        };
         let found = relevancy(&layers, &text);
         assert!(found[0] > 0.9 && found[1] > 0.9);
         assert_eq!(thresholds(&found).len(), 64);

@@ -1,4 +1,5 @@
-//! `fastlgs-bench chart`: accuracy against time, for the ways from masks to a field that answers.
+//! `fastlgs-bench chart`: accuracy against time, for several methods of making a language field
+//! from masks.
 
 use crate::plot::{self, Axes, Scatter, Spot};
 use crate::table::{self, number};
@@ -13,55 +14,144 @@ use std::path::PathBuf;
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench chart scenes/fox scenes/bonsai -o out")]
 pub struct Args {
-    /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
+    /// Trained scenes with a labels/ folder beside their photos. Default: a generated table.
     scenes: Vec<PathBuf>,
-    /// Only what takes seconds: no long descents, no training of geometry.
+    /// Run only methods that take seconds: no long training of codes, no training of geometry.
     #[arg(long)]
     quick: bool,
-    /// Also what takes long: the paper's number of steps, and the presets, which train geometry anew.
+    /// Run the slow methods as well: many training steps of the paper's codes, and presets that
+    /// train the geometry again.
     #[arg(long, conflicts_with = "quick")]
     long: bool,
-    /// Ways that are tried, as the table calls them, separated by commas; all by default.
+    /// Methods to run, by their names in the table, separated by commas. Default: all.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     ways: Vec<String>,
-    /// Folder for chart.md, .csv, .json, and two charts as SVG and PNG.
+    /// Folder for chart.md, chart.csv, chart.json, and two charts as SVG and PNG.
     #[arg(short, long)]
     output: PathBuf,
 }
 
 const WAYS: [Way; 20] = [
-    Way { name: "embeddings", how: How::Remap(&["--mapping", "paper", "--cues", "none"]), cost: 0 },
-    Way { name: "+ key points", how: How::Remap(&["--mapping", "paper", "--cues", "keypoints"]), cost: 0 },
-    Way { name: "+ colour (paper)", how: How::Remap(&["--mapping", "paper"]), cost: 0 },
-    Way { name: "global", how: How::Remap(&[]), cost: 0 },
-    Way { name: "code of 1 number", how: How::Baseline("code1"), cost: 0 },
-    Way { name: "code of 2 numbers", how: How::Baseline("code2"), cost: 0 },
-    Way { name: "code of 3 numbers", how: How::Baseline("code3"), cost: 0 },
-    Way { name: "code of 4 numbers", how: How::Baseline("code4"), cost: 0 },
-    Way { name: "no grid", how: How::Baseline("raw"), cost: 0 },
-    Way { name: "like LangSplat", how: How::Baseline("langsplat"), cost: 1 },
-    Way { name: "like LERF", how: How::Baseline("lerf"), cost: 1 },
-    Way { name: "paper 300 steps", how: How::Descent("300"), cost: 0 },
-    Way { name: "paper 1000 steps", how: How::Descent("1000"), cost: 1 },
-    Way { name: "paper 3000 steps", how: How::Descent("3000"), cost: 1 },
-    Way { name: "paper 7000 steps", how: How::Descent("7000"), cost: 2 },
-    Way { name: "paper 30000 steps", how: How::Descent("30000"), cost: 2 },
-    Way { name: "preset quick", how: How::Train(&["--preset", "quick"]), cost: 2 },
-    Way { name: "preset standard", how: How::Train(&["--preset", "standard"]), cost: 2 },
-    Way { name: "preset paper", how: How::Train(&["--preset", "paper"]), cost: 2 },
-    Way { name: "preset like-paper", how: How::Train(&["--preset", "like-paper"]), cost: 2 },
+    Way {
+        name: "embeddings",
+        how: How::Remap(&["--mapping", "paper", "--cues", "none"]),
+        cost: 0,
+    },
+    Way {
+        name: "+ key points",
+        how: How::Remap(&["--mapping", "paper", "--cues", "keypoints"]),
+        cost: 0,
+    },
+    Way {
+        name: "+ colour (paper)",
+        how: How::Remap(&["--mapping", "paper"]),
+        cost: 0,
+    },
+    Way {
+        name: "global",
+        how: How::Remap(&[]),
+        cost: 0,
+    },
+    Way {
+        name: "code of 1 number",
+        how: How::Baseline("code1"),
+        cost: 0,
+    },
+    Way {
+        name: "code of 2 numbers",
+        how: How::Baseline("code2"),
+        cost: 0,
+    },
+    Way {
+        name: "code of 3 numbers",
+        how: How::Baseline("code3"),
+        cost: 0,
+    },
+    Way {
+        name: "code of 4 numbers",
+        how: How::Baseline("code4"),
+        cost: 0,
+    },
+    Way {
+        name: "no grid",
+        how: How::Baseline("raw"),
+        cost: 0,
+    },
+    Way {
+        name: "like LangSplat",
+        how: How::Baseline("langsplat"),
+        cost: 1,
+    },
+    Way {
+        name: "like LERF",
+        how: How::Baseline("lerf"),
+        cost: 1,
+    },
+    Way {
+        name: "paper 300 steps",
+        how: How::Descent("300"),
+        cost: 0,
+    },
+    Way {
+        name: "paper 1000 steps",
+        how: How::Descent("1000"),
+        cost: 1,
+    },
+    Way {
+        name: "paper 3000 steps",
+        how: How::Descent("3000"),
+        cost: 1,
+    },
+    Way {
+        name: "paper 7000 steps",
+        how: How::Descent("7000"),
+        cost: 2,
+    },
+    Way {
+        name: "paper 30000 steps",
+        how: How::Descent("30000"),
+        cost: 2,
+    },
+    Way {
+        name: "preset quick",
+        how: How::Train(&["--preset", "quick"]),
+        cost: 2,
+    },
+    Way {
+        name: "preset standard",
+        how: How::Train(&["--preset", "standard"]),
+        cost: 2,
+    },
+    Way {
+        name: "preset paper",
+        how: How::Train(&["--preset", "paper"]),
+        cost: 2,
+    },
+    Way {
+        name: "preset like-paper",
+        how: How::Train(&["--preset", "like-paper"]),
+        cost: 2,
+    },
 ];
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let most = if args.long { 2 } else { u8::from(!args.quick) };
-    let ways: Vec<&Way> = wanted(&WAYS, &args.ways)?.into_iter().filter(|w| w.cost <= most).collect();
+    let ways: Vec<&Way> = wanted(&WAYS, &args.ways)?
+        .into_iter()
+        .filter(|w| w.cost <= most)
+        .collect();
     let work = trial::workshop(&args.output)?;
     let scenes = trial::or_generated(&args.scenes, &work, run)?;
     let progress = run.work("ways", (scenes.len() * ways.len()) as u64);
     let mut rows = Vec::new();
     for scene in &scenes {
-        let before: f64 =
-            SceneFolder::open(scene)?.manifest()?.seconds.iter().filter(|s| s.0.starts_with("preprocess.")).map(|s| s.1).sum();
+        let before: f64 = SceneFolder::open(scene)?
+            .manifest()?
+            .seconds
+            .iter()
+            .filter(|s| s.0.starts_with("preprocess."))
+            .map(|s| s.1)
+            .sum();
         for way in &ways {
             let trial = Trial::new(scene, &work, run)?;
             let mut row = way.row(&trial, &way.how.command(), scene, run)?;
@@ -74,28 +164,55 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     mark_front(&mut rows);
     let value = table::write(&args.output, "chart", &COLUMNS, &rows, "")?;
     for (file, x, title, label) in [
-        ("chart", "seconds", "Accuracy against time: from masks to a field", "seconds after preprocessing"),
-        ("chart-query", "query_ms", "Accuracy against time: the first answer in a view", "milliseconds"),
+        (
+            "chart",
+            "seconds",
+            "Accuracy against time: from masks to a language field",
+            "seconds after preprocessing",
+        ),
+        (
+            "chart-query",
+            "query_ms",
+            "Accuracy against time: first query in a view",
+            "milliseconds",
+        ),
     ] {
         let spots: Vec<Spot> = rows.iter().map(|row| spot(row, x)).collect();
-        let axes = Axes { title, x: label, y: "oracle mIoU of held-out labels" };
-        plot::save(&args.output, file, &Scatter { axes, spots: &spots })?;
+        let axes = Axes {
+            title,
+            x: label,
+            y: "oracle mIoU of held-out labels",
+        };
+        plot::save(
+            &args.output,
+            file,
+            &Scatter {
+                axes,
+                spots: &spots,
+            },
+        )?;
     }
     Ok(value)
 }
 
-/// Marks the rows of each scene that no other one beats in time and accuracy both.
+/// Marks the Pareto-optimal rows of each scene: no other row is at least as fast and as accurate,
+/// and better in one of the two.
 fn mark_front(rows: &mut [Value]) {
     let beaten = |row: &Value, rows: &[Value]| {
         rows.iter().any(|other| {
-            let [faster, better] =
-                [number(other, "seconds") <= number(row, "seconds"), number(other, "oracle_miou") >= number(row, "oracle_miou")];
-            let same = number(other, "seconds") == number(row, "seconds") && number(other, "oracle_miou") == number(row, "oracle_miou");
+            let [faster, better] = [
+                number(other, "seconds") <= number(row, "seconds"),
+                number(other, "oracle_miou") >= number(row, "oracle_miou"),
+            ];
+            let same = number(other, "seconds") == number(row, "seconds")
+                && number(other, "oracle_miou") == number(row, "oracle_miou");
             other["scene"] == row["scene"] && faster && better && !same
         })
     };
     let front: Vec<bool> = rows.iter().map(|row| !beaten(row, rows)).collect();
-    rows.iter_mut().zip(front).for_each(|(row, front)| row["pareto"] = json!(front));
+    rows.iter_mut()
+        .zip(front)
+        .for_each(|(row, front)| row["pareto"] = json!(front));
 }
 
 const COLUMNS: [&str; 14] = [
@@ -118,8 +235,14 @@ const COLUMNS: [&str; 14] = [
 fn spot(row: &Value, x: &str) -> Spot {
     let name = row["way"].as_str().unwrap_or_default().to_owned();
     let series = row["scene"].as_str().unwrap_or_default().to_owned();
-    // The front is one in seconds.
-    Spot { series, name, x: number(row, x), y: number(row, "oracle_miou"), front: row["pareto"] == true && x == "seconds" }
+    // The Pareto front is computed for the column `seconds` only.
+    Spot {
+        series,
+        name,
+        x: number(row, x),
+        y: number(row, "oracle_miou"),
+        front: row["pareto"] == true && x == "seconds",
+    }
 }
 
 #[cfg(test)]
@@ -129,8 +252,17 @@ mod tests {
     #[test]
     fn the_front_holds_what_nothing_beats() {
         let row = |scene: &str, seconds: f64, miou: f64| json!({ "scene": scene, "seconds": seconds, "oracle_miou": miou });
-        let mut rows = [row("a", 1.0, 0.5), row("a", 2.0, 0.4), row("a", 3.0, 0.6), row("b", 9.0, 0.1), row("a", 1.0, 0.5)];
+        let mut rows = [
+            row("a", 1.0, 0.5),
+            row("a", 2.0, 0.4),
+            row("a", 3.0, 0.6),
+            row("b", 9.0, 0.1),
+            row("a", 1.0, 0.5),
+        ];
         mark_front(&mut rows);
-        assert_eq!(rows.iter().map(|r| r["pareto"] == true).collect::<Vec<_>>(), [true, false, true, true, true]);
+        assert_eq!(
+            rows.iter().map(|r| r["pareto"] == true).collect::<Vec<_>>(),
+            [true, false, true, true, true]
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! The program's own commands, so that every figure can be had again by hand: words as a user would type them, run here.
+//! Runs commands of `fastlgs` in this process, from the words that a user would type. Each figure
+//! can thus be reproduced by hand.
 
 use crate::baseline;
 use anyhow::{Context, Result, bail};
@@ -7,7 +8,7 @@ use fastlgs::progress::{Message, Sink};
 use fastlgs::{Run, eval, export, preprocess, synth, train};
 use serde_json::Value;
 
-/// `fastlgs COMMAND ARGUMENTS`, as far as benches need it.
+/// The commands of `fastlgs` that benches run.
 #[derive(Parser)]
 #[command(name = "fastlgs", no_binary_name = true)]
 enum Command {
@@ -25,7 +26,8 @@ enum Bench {
     Baseline(baseline::Args),
 }
 
-/// Is as patient as the bench's own watcher, and says nothing: a trial's bars would cover the bench's.
+/// A muted progress sink, so that the bars of a trial do not hide those of the bench. It passes on
+/// cancellation only.
 struct Quiet<'a>(&'a dyn Sink);
 
 impl Sink for Quiet<'_> {
@@ -40,12 +42,21 @@ impl Sink for Quiet<'_> {
     }
 }
 
-/// Runs `fastlgs COMMAND ARGS` on the same device, with `seed`; returns its report.
+/// Runs `fastlgs COMMAND ARGS` on the device of `run` with `seed`, and returns the report.
 pub fn call(run: &Run, seed: u64, command: &str, args: &[&str]) -> Result<Value> {
     let words = std::iter::once(&command).chain(args);
-    let Ok(parsed) = Command::try_parse_from(words) else { bail!("fastlgs {command} {}: not a command", args.join(" ")) };
+    let Ok(parsed) = Command::try_parse_from(words) else {
+        bail!(
+            "fastlgs {command} {}: this command is unknown or its arguments are wrong",
+            args.join(" ")
+        )
+    };
     let quiet = Quiet(run.progress);
-    let run = &Run { seed, progress: &quiet, ..*run };
+    let run = &Run {
+        seed,
+        progress: &quiet,
+        ..*run
+    };
     let report = match parsed {
         Command::Synth(config) => to_value(fastlgs::synth(&config, run)),
         Command::Preprocess(config) => to_value(fastlgs::preprocess(&config, run)),

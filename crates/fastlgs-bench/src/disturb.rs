@@ -1,11 +1,11 @@
-//! What goes wrong with photos, masks and embeddings, done on purpose.
+//! Disturbances of photos, masks and embeddings, for `fastlgs-bench stability`.
 
 use anyhow::{Context, Result};
 use fastlgs::eyes;
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::mask_list::{Mask, RunLengths};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::scene_folder::view_of;
+use fastlgs_core::scene_folder::find_view;
 use fastlgs_core::{Camera, MaskList, SceneFolder, fs, image_io};
 use fastlgs_grid::Grid;
 use glam::{Mat4, Quat, Vec2, Vec3, Vec4};
@@ -16,73 +16,94 @@ use std::collections::BTreeSet;
 use std::io::Cursor;
 use std::path::Path;
 
-/// A change of photos or poses. Labelled views keep their poses and photos: they are what is measured with.
+/// A change of photos or poses. Labelled views keep their photo and pose, because accuracy is
+/// measured on them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Photos {
-    /// Nothing: what the others are compared with.
+    /// No change: the reference.
     Unchanged,
-    /// Each camera turns so that the image moves by this many pixels in the mean.
+    /// A random rotation of each camera, with this mean shift of the image in pixels.
     Pose(f32),
-    /// This share of the photos is missing.
+    /// A random fraction of the photos is missing.
     Missing(f32),
-    /// Photos come in another order.
+    /// The photos are in random order.
     Shuffled,
-    /// Brightness varies from photo to photo, by this standard deviation in stops.
+    /// Random brightness of each photo, with this standard deviation in stops.
     Exposure(f32),
-    /// Red and blue vary from photo to photo, by this standard deviation.
+    /// Random gains of red and blue of each photo, with this standard deviation around 1.
     WhiteBalance(f32),
-    /// A Gaussian blur of this many pixels.
+    /// A Gaussian blur with this standard deviation in pixels.
     Blur(f32),
-    /// JPEG of this quality.
+    /// JPEG compression of this quality, 1 to 100.
     Jpeg(u8),
-    /// The focal length is wrong by this share.
+    /// The focal length is too long by this fraction.
     Focal(f32),
 }
 
-/// A change of the masks of every level.
+/// A change of the masks of all levels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Masks {
-    /// Borders move inwards by this many pixels.
+    /// Erosion by this many pixels.
     Eroded(u32),
-    /// This share of the masks is cut in two by a line.
+    /// A random fraction of the masks is split in two along a line.
     Split(f32),
-    /// This share of the masks is joined with one that it touches.
+    /// A random fraction of the masks is merged with an adjacent mask.
     Merged(f32),
-    /// This share of the masks is missing.
+    /// A random fraction of the masks is missing.
     Dropped(f32),
 }
 
-/// A photo of a scene with all that belongs to it.
+/// A prepared photo with its camera and masks.
 struct Shot {
     camera: Camera,
     pixels: RgbImage,
-    /// Black where nothing counts.
+    /// Ignored pixels are black.
     ignore: Option<GrayImage>,
-    /// Masks by level, where they are not made by a segmenter.
+    /// Imported masks. `None` if a segmenter makes the masks.
     masks: Option<MaskList>,
     labelled: bool,
 }
 
-/// The photos of a scene as `preprocess` left them: undistorted and small.
+/// The prepared photos of a scene, with its labels.
 pub struct Album {
     shots: Vec<Shot>,
     labels: Vec<LabelledView>,
-    /// Names of the shots that each label belongs to.
+    /// Name of the shot of each labelled view, in the order of `labels`.
     labelled: Vec<String>,
 }
 
 impl Album {
-    /// Training views and labelled views of a scene, with its masks where those were imported.
+    /// Loads the training views and labelled views of a scene. Masks are loaded if the scene
+    /// imported them.
+    ///
+    /// # Errors
+    /// Unreadable files, or a label without a photo.
     pub fn of(scene: &SceneFolder, label_folder: &Path) -> Result<Self> {
         let manifest = scene.manifest()?;
         let cameras = scene.cameras()?;
         let labels = labels::load(label_folder, None)?;
-        let named = |view: &LabelledView| view_of(cameras.iter().map(|c| c.name.as_str()), &view.name).map(|i| cameras[i].name.clone());
-        let labelled: Vec<String> =
-            labels.iter().map(|v| named(v).with_context(|| format!("no photo '{}'", v.name))).collect::<Result<_>>()?;
-        let training: BTreeSet<String> = manifest.training(&cameras).into_iter().map(|c| c.name).collect();
+        let named = |view: &LabelledView| {
+            find_view(cameras.iter().map(|c| c.name.as_str()), &view.name)
+                .map(|i| cameras[i].name.clone())
+        };
+        let labelled: Vec<String> = labels
+            .iter()
+            .map(|v| {
+                named(v).with_context(|| {
+                    format!("{}: the labels name a photo that the scene lacks", v.name)
+                })
+            })
+            .collect::<Result<_>>()?;
+        let training: BTreeSet<String> = manifest
+            .training(&cameras)
+            .into_iter()
+            .map(|c| c.name)
+            .collect();
         let mut shots = Vec::new();
-        for camera in cameras.into_iter().filter(|c| training.contains(&c.name) || labelled.contains(&c.name)) {
+        for camera in cameras
+            .into_iter()
+            .filter(|c| training.contains(&c.name) || labelled.contains(&c.name))
+        {
             let name = &camera.name;
             let ignored: Vec<GrayImage> = [scene.ignore_path(name), scene.alpha_path(name)]
                 .into_iter()
@@ -90,21 +111,36 @@ impl Album {
                 .map(|p| image_io::load_gray(&p))
                 .collect::<Result<_, _>>()?;
             let darker = |a: GrayImage, b: GrayImage| {
-                GrayImage::from_fn(a.width(), a.height(), |x, y| Luma([a.get_pixel(x, y)[0].min(b.get_pixel(x, y)[0])]))
+                GrayImage::from_fn(a.width(), a.height(), |x, y| {
+                    Luma([a.get_pixel(x, y)[0].min(b.get_pixel(x, y)[0])])
+                })
             };
             let own = manifest.segmenter == "import" && scene.masks_path(name).is_file();
             let masks = own.then(|| scene.masks(&camera)).transpose()?;
             let (pixels, labelled) = (scene.photo(name)?, labelled.contains(name));
-            shots.push(Shot { ignore: ignored.into_iter().reduce(darker), pixels, masks, labelled, camera });
+            shots.push(Shot {
+                ignore: ignored.into_iter().reduce(darker),
+                pixels,
+                masks,
+                labelled,
+                camera,
+            });
         }
-        Ok(Self { shots, labels, labelled })
+        Ok(Self {
+            shots,
+            labels,
+            labelled,
+        })
     }
 
-    /// Writes the photos with a change: `images/`, `transforms.json`, `masks/`, `ignore/`, and `labels/` in 3D-OVS's layout.
+    /// Writes a dataset with the changed photos into `to`: `images/`, `transforms.json`, `masks/`,
+    /// `ignore/`, and `labels/` in the layout of 3D-OVS.
     pub fn write(&self, to: &Path, change: Photos, seed: u64) -> Result<()> {
         let mut rng = Rng::new(seed, "disturbed photos");
         let missing = match change {
-            Photos::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| !self.shots[k].labelled),
+            Photos::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| {
+                !self.shots[k].labelled
+            }),
             _ => BTreeSet::new(),
         };
         let mut places: Vec<usize> = (0..self.shots.len()).collect();
@@ -112,18 +148,34 @@ impl Album {
             rng.shuffle(&mut places);
         }
         let mut frames = Vec::new();
-        for (shot, place) in self.shots.iter().zip(&places).enumerate().filter(|(k, _)| !missing.contains(k)).map(|(_, s)| s) {
-            let (camera, pixels) = if shot.labelled { (shot.camera.clone(), shot.pixels.clone()) } else { shot.changed(change, &mut rng)? };
+        for (shot, place) in self
+            .shots
+            .iter()
+            .zip(&places)
+            .enumerate()
+            .filter(|(k, _)| !missing.contains(k))
+            .map(|(_, s)| s)
+        {
+            let (camera, pixels) = if shot.labelled {
+                (shot.camera.clone(), shot.pixels.clone())
+            } else {
+                shot.changed(change, &mut rng)?
+            };
             let name = format!("{place:05}.png");
             image_io::save_png(&to.join("images").join(&name), pixels)?;
             if let Some(ignore) = &shot.ignore {
-                image_io::save_png(&to.join("ignore").join(format!("{name}.png")), ignore.clone())?;
+                image_io::save_png(
+                    &to.join("ignore").join(format!("{name}.png")),
+                    ignore.clone(),
+                )?;
             }
             if let Some(masks) = &shot.masks {
                 masks.save(&to.join("masks").join(format!("{name}.json")))?;
             }
             let flip = Mat4::from_diagonal(Vec4::new(1.0, -1.0, -1.0, 1.0));
-            let camera_to_world = (camera.world_to_camera.inverse() * flip).transpose().to_cols_array_2d();
+            let camera_to_world = (camera.world_to_camera.inverse() * flip)
+                .transpose()
+                .to_cols_array_2d();
             frames.push(json!({
                 "file_path": format!("images/{name}"), "transform_matrix": camera_to_world,
                 "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
@@ -131,25 +183,40 @@ impl Album {
         }
         let mut classes = BTreeSet::new();
         for (view, name) in self.labels.iter().zip(&self.labelled) {
-            let place = places[self.shots.iter().position(|s| s.camera.name == *name).context("a labelled shot")?];
+            let place = places[self
+                .shots
+                .iter()
+                .position(|s| s.camera.name == *name)
+                .context("a labelled shot")?];
             for label in &view.labels {
                 let mask = view.mask(label, view.width, view.height);
-                let picture =
-                    GrayImage::from_fn(view.width, view.height, |x, y| Luma([255 * u8::from(mask[(y * view.width + x) as usize])]));
-                // A slash would be a folder.
+                let picture = GrayImage::from_fn(view.width, view.height, |x, y| {
+                    Luma([255 * u8::from(mask[(y * view.width + x) as usize])])
+                });
+                // The category becomes a file name, which cannot have a slash.
                 let class = label.category.replace('/', " ");
                 image_io::save_png(&to.join(format!("labels/{place:05}/{class}.png")), picture)?;
                 classes.insert(class);
             }
         }
         let list: String = classes.iter().map(|c| format!("{c}\n")).collect();
-        fs::write_atomic(&to.join("labels/classes.txt"), |file| std::io::Write::write_all(file, list.as_bytes()))?;
-        Ok(fs::write_json(&to.join("transforms.json"), &json!({ "frames": frames }))?)
+        fs::write_atomic(&to.join("labels/classes.txt"), |file| {
+            std::io::Write::write_all(file, list.as_bytes())
+        })?;
+        Ok(fs::write_json(
+            &to.join("transforms.json"),
+            &json!({ "frames": frames }),
+        )?)
     }
 }
 
-/// A random `share` of those of `count` that may be taken.
-fn some_of(count: usize, share: f32, rng: &mut Rng, may: impl Fn(usize) -> bool) -> BTreeSet<usize> {
+/// Returns a random `share` (0 to 1) of the indices below `count` that `may` accepts.
+fn some_of(
+    count: usize,
+    share: f32,
+    rng: &mut Rng,
+    may: impl Fn(usize) -> bool,
+) -> BTreeSet<usize> {
     let mut all: Vec<usize> = (0..count).filter(|k| may(*k)).collect();
     rng.shuffle(&mut all);
     all.truncate((share * all.len() as f32).round() as usize);
@@ -162,26 +229,34 @@ impl Shot {
         match change {
             Photos::Unchanged | Photos::Missing(_) | Photos::Shuffled => {}
             Photos::Pose(moved) => {
-                // The mean length of two normal numbers is sqrt(pi / 2).
+                // A vector of two standard normal numbers has the mean length sqrt(pi / 2).
                 let deviation = moved / (camera.fx * std::f32::consts::FRAC_PI_2.sqrt());
                 let axis = Vec3::new(rng.normal(), rng.normal(), 0.0) * deviation;
-                camera.world_to_camera = Mat4::from_quat(Quat::from_scaled_axis(axis)) * camera.world_to_camera;
+                camera.world_to_camera =
+                    Mat4::from_quat(Quat::from_scaled_axis(axis)) * camera.world_to_camera;
             }
             Photos::Exposure(stops) => {
                 let gain = (stops * rng.normal()).exp2();
                 scale_channels(&mut pixels, [gain; 3]);
             }
             Photos::WhiteBalance(deviation) => {
-                let gains = [1.0 + deviation * rng.normal(), 1.0, 1.0 + deviation * rng.normal()];
+                let gains = [
+                    1.0 + deviation * rng.normal(),
+                    1.0,
+                    1.0 + deviation * rng.normal(),
+                ];
                 scale_channels(&mut pixels, gains);
             }
             Photos::Blur(sigma) => pixels = imageops::blur(&pixels, sigma),
             Photos::Jpeg(quality) => {
                 let mut file = Vec::new();
-                JpegEncoder::new_with_quality(Cursor::new(&mut file), quality).encode_image(&pixels)?;
+                JpegEncoder::new_with_quality(Cursor::new(&mut file), quality)
+                    .encode_image(&pixels)?;
                 pixels = image::load_from_memory(&file)?.into_rgb8();
             }
-            Photos::Focal(share) => (camera.fx, camera.fy) = (camera.fx * (1.0 + share), camera.fy * (1.0 + share)),
+            Photos::Focal(share) => {
+                (camera.fx, camera.fy) = (camera.fx * (1.0 + share), camera.fy * (1.0 + share))
+            }
         }
         Ok((camera, pixels))
     }
@@ -195,49 +270,76 @@ fn scale_channels(pixels: &mut RgbImage, gains: [f32; 3]) {
     }
 }
 
-/// Changes all masks of a scene folder in place.
+/// Changes the masks of all training views of a scene in place.
 pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed masks");
     for camera in scene.manifest()?.training(&scene.cameras()?) {
-        changed_masks(&scene.masks(&camera)?, change, &mut rng).save(&scene.masks_path(&camera.name))?;
+        changed_masks(&scene.masks(&camera)?, change, &mut rng)
+            .save(&scene.masks_path(&camera.name))?;
     }
     Ok(())
 }
 
-/// The changed masks, which may overlap as before; those of which nothing is left go.
+/// Returns the changed masks. They may overlap, as the given ones. Empty masks are removed.
 fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
     let (w, h) = (list.width as usize, list.height as usize);
     let drawn = |runs: &RunLengths| {
         let mut inside = vec![false; w * h];
-        runs.places(list.width, list.height).for_each(|p| inside[p] = true);
+        runs.places(list.width, list.height)
+            .for_each(|p| inside[p] = true);
         inside
     };
-    let runs = |inside: &[bool]| RunLengths::of(list.width, list.height, |x, y| inside[y as usize * w + x as usize]);
+    let runs = |inside: &[bool]| {
+        RunLengths::from_fn(list.width, list.height, |x, y| {
+            inside[y as usize * w + x as usize]
+        })
+    };
     let some = |share: f32, rng: &mut Rng| some_of(list.masks.len(), share, rng, |_| true);
     let mut out = list.clone();
     match change {
         Masks::Eroded(pixels) => out.masks.iter_mut().for_each(|mask| {
             let inside = drawn(&mask.runs);
-            mask.runs = runs(&(0..w * h).map(|p| reach(p, w, h, pixels as isize).all(|q| inside[q])).collect::<Vec<_>>());
+            mask.runs = runs(
+                &(0..w * h)
+                    .map(|p| reach(p, w, h, pixels as isize).all(|q| inside[q]))
+                    .collect::<Vec<_>>(),
+            );
         }),
         Masks::Dropped(share) => {
             let dropped = some(share, rng);
-            out.masks = out.masks.into_iter().enumerate().filter(|(k, _)| !dropped.contains(k)).map(|m| m.1).collect();
+            out.masks = out
+                .masks
+                .into_iter()
+                .enumerate()
+                .filter(|(k, _)| !dropped.contains(k))
+                .map(|m| m.1)
+                .collect();
         }
         Masks::Merged(share) => {
             for own in some(share, rng) {
                 let mut inside = drawn(&out.masks[own].runs);
-                let around: Vec<bool> = (0..w * h).map(|p| reach(p, w, h, 1).any(|q| inside[q])).collect();
+                let around: Vec<bool> = (0..w * h)
+                    .map(|p| reach(p, w, h, 1).any(|q| inside[q]))
+                    .collect();
                 let lies_beside = |other: &&Mask| {
                     let both = other.runs.places(list.width, list.height);
-                    let (touching, common) = both.fold((false, false), |(t, c), p| (t || around[p], c || inside[p]));
+                    let (touching, common) =
+                        both.fold((false, false), |(t, c), p| (t || around[p], c || inside[p]));
                     other.level == list.masks[own].level && touching && !common
                 };
-                let beside: Vec<usize> = (0..list.masks.len()).filter(|k| lies_beside(&&out.masks[*k])).collect();
+                let beside: Vec<usize> = (0..list.masks.len())
+                    .filter(|k| lies_beside(&&out.masks[*k]))
+                    .collect();
                 if !beside.is_empty() {
                     let other = &mut out.masks[beside[rng.below(beside.len())]];
-                    std::mem::take(&mut other.runs).places(list.width, list.height).for_each(|p| inside[p] = true);
-                    out.masks[own] = Mask { runs: runs(&inside), track: None, ..out.masks[own].clone() };
+                    std::mem::take(&mut other.runs)
+                        .places(list.width, list.height)
+                        .for_each(|p| inside[p] = true);
+                    out.masks[own] = Mask {
+                        runs: runs(&inside),
+                        track: None,
+                        ..out.masks[own].clone()
+                    };
                 }
             }
         }
@@ -245,12 +347,28 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
             for own in some(share, rng) {
                 let inside = drawn(&list.masks[own].runs);
                 let place = |p: usize| Vec2::new((p % w) as f32, (p / w) as f32);
-                let middle = list.places(&list.masks[own]).map(place).sum::<Vec2>() / list.masks[own].runs.area() as f32;
+                let middle = list
+                    .pixel_indices(&list.masks[own])
+                    .map(place)
+                    .sum::<Vec2>()
+                    / list.masks[own].runs.area() as f32;
                 let across = Vec2::from_angle(std::f32::consts::TAU * rng.uniform());
-                let half =
-                    |side: bool| runs(&(0..w * h).map(|p| inside[p] && (across.dot(place(p) - middle) > 0.0) == side).collect::<Vec<_>>());
-                out.masks[own] = Mask { runs: half(false), track: None, ..list.masks[own].clone() };
-                out.masks.push(Mask { runs: half(true), ..out.masks[own].clone() });
+                let half = |side: bool| {
+                    runs(
+                        &(0..w * h)
+                            .map(|p| inside[p] && (across.dot(place(p) - middle) > 0.0) == side)
+                            .collect::<Vec<_>>(),
+                    )
+                };
+                out.masks[own] = Mask {
+                    runs: half(false),
+                    track: None,
+                    ..list.masks[own].clone()
+                };
+                out.masks.push(Mask {
+                    runs: half(true),
+                    ..out.masks[own].clone()
+                });
             }
         }
     }
@@ -258,23 +376,34 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
     out
 }
 
-/// The places that lie in the same row or column, so many pixels away at most.
+/// Returns the indices of the pixels in the same row or column, up to `pixels` away. At the image
+/// border, indices are clamped.
 fn reach(place: usize, w: usize, h: usize, pixels: isize) -> impl Iterator<Item = usize> {
     let (x, y) = ((place % w) as isize, (place / w) as isize);
-    let at = move |x: isize, y: isize| y.clamp(0, h as isize - 1) as usize * w + x.clamp(0, w as isize - 1) as usize;
+    let at = move |x: isize, y: isize| {
+        y.clamp(0, h as isize - 1) as usize * w + x.clamp(0, w as isize - 1) as usize
+    };
     (-pixels..=pixels).flat_map(move |d| [at(x + d, y), at(x, y + d)])
 }
 
-/// Adds noise of this length to what texts are compared by in all embeddings of a scene's objects.
+/// Adds noise to the part of each object's embeddings that texts are compared with, and normalises
+/// that part. `noise` is the root mean square length of the added vector.
 pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed embeddings");
     let mut grid = Grid::load(scene)?;
     let manifest = scene.manifest()?;
     for embedding in grid.objects.iter_mut().flat_map(|o| &mut o.embeddings) {
-        let words = eyes::words(&manifest, embedding);
+        let words = eyes::text_components(&manifest, embedding);
         let deviation = noise / (words.len() as f32).sqrt();
-        words.iter_mut().for_each(|v| *v += deviation * rng.normal());
-        let length = words.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
+        words
+            .iter_mut()
+            .for_each(|v| *v += deviation * rng.normal());
+        let length = words
+            .iter()
+            .map(|v| v * v)
+            .sum::<f32>()
+            .sqrt()
+            .max(f32::MIN_POSITIVE);
         words.iter_mut().for_each(|v| *v /= length);
     }
     Ok(grid.save(scene)?)
@@ -285,24 +414,47 @@ mod tests {
     use super::*;
     use fastlgs_core::Level;
 
-    /// Columns 2..4, 4..6 and 6..8 of eight, and the first two of these in one.
+    /// Whole masks of columns 2..4, 4..6 and 6..8 of eight, and a part mask of columns 2..6.
     fn list() -> MaskList {
-        let columns = |from: u32, to: u32| Mask::new(Level::Whole, RunLengths::of(8, 4, |x, _| (from..to).contains(&x)));
-        let both = Mask { level: Level::Part, ..columns(2, 6) };
-        MaskList { masks: vec![columns(2, 4), columns(4, 6), columns(6, 8), both], ..MaskList::new(8, 4) }
+        let columns = |from: u32, to: u32| {
+            Mask::new(
+                Level::Whole,
+                RunLengths::from_fn(8, 4, |x, _| (from..to).contains(&x)),
+            )
+        };
+        let both = Mask {
+            level: Level::Part,
+            ..columns(2, 6)
+        };
+        MaskList {
+            masks: vec![columns(2, 4), columns(4, 6), columns(6, 8), both],
+            ..MaskList::new(8, 4)
+        }
     }
 
     fn areas(change: Masks) -> Vec<usize> {
-        changed_masks(&list(), change, &mut Rng::new(0, "test")).masks.iter().map(|m| m.runs.area()).collect()
+        changed_masks(&list(), change, &mut Rng::new(0, "test"))
+            .masks
+            .iter()
+            .map(|m| m.runs.area())
+            .collect()
     }
 
     #[test]
     fn masks_are_changed_as_their_names_say() {
-        assert_eq!(areas(Masks::Eroded(1)), [4, 8], "only the last column has a side at the border, and the wide one a middle");
+        assert_eq!(
+            areas(Masks::Eroded(1)),
+            [4, 8],
+            "the image border protects the last mask, and the wide mask keeps its middle columns"
+        );
         assert_eq!(areas(Masks::Dropped(0.5)).len(), 2);
         let split = areas(Masks::Split(1.0));
         assert_eq!((split.len(), split.iter().sum::<usize>()), (8, 40));
         let merged = areas(Masks::Merged(1.0));
-        assert_eq!(merged, [24, 16], "all three of a level in one; nothing of the other's level lies beside it");
+        assert_eq!(
+            merged,
+            [24, 16],
+            "the three whole masks become one; the part mask has no adjacent mask of its level"
+        );
     }
 }

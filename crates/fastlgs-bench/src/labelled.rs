@@ -1,28 +1,37 @@
-//! Trained scenes with their labels, as benches of texts take them.
+//! Command-line arguments for scenes with labels.
 
 use anyhow::{Result, bail};
 use std::path::{Path, PathBuf};
 
-/// Scenes with their labels.
+/// Trained scenes with their labels.
 #[derive(clap::Args)]
 pub struct Labelled {
-    /// Trained scene folders of one encoder.
+    /// Trained scene folders, all with the same encoder.
     #[arg(required = true)]
     scenes: Vec<PathBuf>,
-    /// Their folders of labels, in the same order.
+    /// Label folders of the scenes, in the same order, separated by commas.
     #[arg(long, required = true, value_delimiter = ',')]
     labels: Vec<PathBuf>,
 }
 
 impl Labelled {
-    /// Each scene with its folder of labels.
+    /// Returns each scene with its label folder.
     ///
     /// # Errors
-    /// Another number of folders than of scenes.
+    /// The number of label folders differs from the number of scenes.
     pub fn pairs(&self) -> Result<Vec<(&Path, &Path)>> {
         if self.scenes.len() != self.labels.len() {
-            bail!("{} scenes and {} folders of labels: name one for each scene", self.scenes.len(), self.labels.len());
+            bail!(
+                "{} scenes but {} label folders; give --labels one folder for each scene",
+                self.scenes.len(),
+                self.labels.len()
+            );
         }
-        Ok(self.scenes.iter().zip(&self.labels).map(|(scene, labels)| (scene.as_path(), labels.as_path())).collect())
+        Ok(self
+            .scenes
+            .iter()
+            .zip(&self.labels)
+            .map(|(scene, labels)| (scene.as_path(), labels.as_path()))
+            .collect())
     }
 }

@@ -1,6 +1,6 @@
-//! `fastlgs-bench`: speed, accuracy, stability and size of the program.
+//! `fastlgs-bench`: measures speed, accuracy, stability and size of FastLGS.
 //!
-//! Each bench writes its files into a folder and returns its figures.
+//! Each bench writes its files into a folder and returns its figures as JSON.
 
 mod autoencoder;
 mod baseline;
@@ -25,9 +25,13 @@ use fastlgs_cli::{console::Console, report, ui};
 use serde_json::Value;
 use std::process::ExitCode;
 
-/// Measures FastLGS.
+/// Measures speed, accuracy, stability and size of FastLGS.
 #[derive(Parser)]
-#[command(name = "fastlgs-bench", version, after_help = "Example: fastlgs-bench speed scenes/fox --gaussians 50000 --size 270x480")]
+#[command(
+    name = "fastlgs-bench",
+    version,
+    after_help = "Example: fastlgs-bench speed scenes/fox --gaussians 50000 --size 270x480"
+)]
 struct Cli {
     #[command(subcommand)]
     what: What,
@@ -37,19 +41,19 @@ struct Cli {
 
 #[derive(clap::Subcommand)]
 enum What {
-    /// Milliseconds of every pass, frames and training iterations a second.
+    /// Time every pass, rendering and training.
     Speed(speed::Args),
-    /// Other ways to a field of language on the same Gaussians and masks, to compare with.
+    /// Evaluate another kind of language field on the same Gaussians and masks.
     Baseline(baseline::Args),
-    /// Accuracy against time, for the ways from masks to a field that answers.
+    /// Plot accuracy against time for several methods of making a language field.
     Chart(chart::Args),
-    /// What accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
+    /// Measure accuracy and PSNR of smaller models, and check `--budget auto`.
     Size(size::Args),
-    /// What remains of accuracy when the input is disturbed, and on scenes that methods fail at.
+    /// Measure how accuracy changes when the input is disturbed, and on difficult generated scenes.
     Stability(stability::Args),
-    /// The paper's ablations, with its own figures beside ours.
+    /// Repeat the paper's ablations and list the paper's figures for comparison.
     Paper(paper::Args),
-    /// What texts give on scenes that nothing was chosen on, and how much more where they were seen.
+    /// Evaluate text queries with a calibration from other scenes, and from all scenes.
     Names(names::Args),
 }
 

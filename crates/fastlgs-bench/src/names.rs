@@ -1,7 +1,7 @@
-//! `fastlgs-bench names`: what texts give on scenes that nothing was chosen on.
+//! `fastlgs-bench names`: accuracy of text queries on scenes that the calibration has not seen.
 //!
-//! What a cosine is worth and how high absent names score is measured on all scenes but one and applied to that one; and, to compare, measured on
-//! all of them. The gap between the two says how much the figures owe to having seen the scene.
+//! For each scene, the text calibration is measured on all other scenes (left out) and on all
+//! scenes (seen). The gap in mIoU shows how much the calibration depends on the tested scene.
 
 use crate::labelled::Labelled;
 use crate::table;
@@ -15,11 +15,13 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs-bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out")]
+#[command(
+    after_help = "Example: fastlgs-bench names scenes/fox scenes/office --labels photos/fox/labels,photos/office/labels -o out"
+)]
 pub struct Args {
     #[command(flatten)]
     labelled: Labelled,
-    /// Folder for the table (names.md, names.csv, names.json).
+    /// Folder for names.md, names.csv and names.json.
     #[arg(short, long)]
     output: Option<PathBuf>,
 }
@@ -27,25 +29,38 @@ pub struct Args {
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let scenes = args.labelled.pairs()?;
     if scenes.len() < 2 {
-        bail!("one scene leaves none to measure on: name two at least");
+        bail!("one scene leaves no other scene for the calibration; name at least two");
     }
     let work = run.work("names", 3 * scenes.len() as u64);
     let mut samples = Vec::new();
     for (root, folder) in &scenes {
-        samples.push(calibrate::samples_of(&mut Session::open(root, run.device)?, &labels::load(folder, None)?)?);
+        samples.push(calibrate::samples_of(
+            &mut Session::open(root, run.device)?,
+            &labels::load(folder, None)?,
+        )?);
         work.advance()?;
     }
     let mut rows = Vec::new();
     let (mut present, mut absent) = (Vec::new(), Vec::new());
     for (place, (root, folder)) in scenes.iter().copied().enumerate() {
-        let others = |left_out: Option<usize>| samples.iter().enumerate().filter(move |(k, _)| Some(*k) != left_out).map(|s| s.1);
+        let others = |left_out: Option<usize>| {
+            samples
+                .iter()
+                .enumerate()
+                .filter(move |(k, _)| Some(*k) != left_out)
+                .map(|s| s.1)
+        };
         let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
             let mut scene = Session::open(root, run.device)?;
             let own = Calibrations::of(&scene.manifest);
             let measured = measured(others(left_out), own.texts.anything);
-            let texts = measured.with_context(|| format!("{}: the other scenes tell nothing", root.display()))?;
+            let texts = measured.with_context(|| format!("{}: the labels of the other scenes are too few or do not separate objects; add scenes", root.display()))?;
             scene.calibrations = Some(Calibrations { texts, ..own });
-            let config = eval::Config { scene: root.into(), labels: Some(folder.into()), ..eval::Config::default() };
+            let config = eval::Config {
+                scene: root.into(),
+                labels: Some(folder.into()),
+                ..eval::Config::default()
+            };
             let report = eval::eval_session(scene, &config)?;
             work.advance()?;
             Ok((texts, report))
@@ -71,7 +86,12 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             "calibration_seen": of_all,
         }));
     }
-    let mean = |column: &str| rows.iter().map(|row| table::number(row, column)).sum::<f64>() / rows.len() as f64;
+    let mean = |column: &str| {
+        rows.iter()
+            .map(|row| table::number(row, column))
+            .sum::<f64>()
+            / rows.len() as f64
+    };
     let (left_out, seen) = (mean("miou_left_out"), mean("miou_seen"));
     if let Some(folder) = &args.output {
         table::write(folder, "names", &COLUMNS, &rows, "")?;
@@ -86,7 +106,8 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     }))
 }
 
-/// Share of the names of what is there that score higher than all but a share of the absent ones.
+/// Returns the fraction of present names that score above the threshold. The threshold lets the
+/// fraction `false_alarms` of the absent names pass.
 fn found_at(false_alarms: f64, present: &[f64], mut absent: Vec<f64>) -> f64 {
     absent.sort_by(f64::total_cmp);
     let allowed = (false_alarms * absent.len() as f64) as usize;
@@ -94,7 +115,6 @@ fn found_at(false_alarms: f64, present: &[f64], mut absent: Vec<f64>) -> f64 {
     present.iter().filter(|score| **score > threshold).count() as f64 / present.len().max(1) as f64
 }
 
-/// Columns of the table.
 const COLUMNS: [&str; 9] = [
     "scene",
     "labels",
@@ -111,7 +131,7 @@ fn rejected(report: &eval::Report) -> f64 {
     report.absent_rejected as f64 / report.absent_texts.max(1) as f64
 }
 
-/// What follows from the samples of some scenes.
+/// Measures a calibration on the samples of all given scenes. `None` if they are too few.
 fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>, anything: f32) -> Option<Calibration> {
     let mut all = Samples::default();
     scenes.for_each(|scene| all.extend(scene));

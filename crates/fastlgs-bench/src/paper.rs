@@ -1,4 +1,4 @@
-//! `fastlgs-bench paper`: the paper's ablations, with its own figures beside ours.
+//! `fastlgs-bench paper`: repeats the paper's ablations and lists the paper's figures.
 
 use crate::table;
 use crate::trial::{self, Trial};
@@ -13,26 +13,33 @@ use std::time::Instant;
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench paper scenes/table scenes/fox -o out --device cpu")]
 pub struct Args {
-    /// Trained scenes whose photos have labels/ beside them; without any, a generated table.
+    /// Trained scenes with a labels/ folder beside their photos. Default: a generated table.
     scenes: Vec<PathBuf>,
-    /// Iterations of the rows that train the scene anew.
+    /// Iterations of the rows that train the whole scene.
     #[arg(long, default_value_t = 2000)]
     iterations: u32,
-    /// Rows that are made, as the table calls them, separated by commas; all by default.
+    /// Rows to run, by their names in the table, separated by commas. Default: all.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     ways: Vec<String>,
-    /// Folder for paper.md, .csv and .json.
+    /// Folder for paper.md, paper.csv and paper.json.
     #[arg(short, long)]
     output: PathBuf,
 }
 
-/// Pictures of the paper's last row of speed.
+/// Image size of the last row of the paper's speed table, in pixels.
 const SIZE: (u32, u32) = (1440, 1080);
 
-/// The paper's tables of ablations, each row as we make it again. The first two tables keep the scene's Gaussians.
+/// The rows of the paper's ablation tables. Rows for matching, field and codes keep the Gaussians
+/// of the scene.
 const WAYS: [Way; 11] = [
-    Way::new("matching: embeddings", How::Remap(&["--mapping", "paper", "--cues", "none"])),
-    Way::new("matching: + key points", How::Remap(&["--mapping", "paper", "--cues", "keypoints"])),
+    Way::new(
+        "matching: embeddings",
+        How::Remap(&["--mapping", "paper", "--cues", "none"]),
+    ),
+    Way::new(
+        "matching: + key points",
+        How::Remap(&["--mapping", "paper", "--cues", "keypoints"]),
+    ),
     Way::new("matching: + colour", How::Remap(&["--mapping", "paper"])),
     Way::new("field: embeddings", How::Baseline("raw")),
     Way::new("field: codes of embeddings", How::Baseline("langsplat")),
@@ -44,9 +51,9 @@ const WAYS: [Way; 11] = [
     Way::new("all: by default", How::Train(&[])),
 ];
 
-/// What the paper says of its data, on a TITAN RTX.
+/// The paper's own figures, measured on a TITAN RTX.
 const SAID: &str = "
-What the paper says, of other scenes (SPIn-NeRF's and its own), CLIP, SAM, and a TITAN RTX:
+Figures of the paper, on other scenes (SPIn-NeRF's and its own), with CLIP, SAM and a TITAN RTX:
 
 | | mIoU | mAcc | seconds a query | MB |
 | --- | --- | --- | --- | --- |
@@ -85,12 +92,22 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     table::write(&args.output, "paper", &COLUMNS, &rows, SAID)
 }
 
-/// Milliseconds to the mask of the object of most views in a new view of 1440x1080.
+/// Returns the milliseconds for the mask of one object in a new view of 1440x1080. The object is
+/// the one that most views show.
 fn large_query(scene: &Path, run: &Run) -> Result<f64> {
     let mut session = Session::open(scene, run.device)?;
     session.warm_up()?;
     let grid = session.grid()?;
-    let target: Vec<Hit> = grid.objects.iter().max_by_key(|o| o.views).map(|o| Hit { id: o.id, score: 1.0 }).into_iter().collect();
+    let target: Vec<Hit> = grid
+        .objects
+        .iter()
+        .max_by_key(|o| o.views)
+        .map(|o| Hit {
+            id: o.id,
+            score: 1.0,
+        })
+        .into_iter()
+        .collect();
     let camera = session.cameras[0].resized(SIZE.0, SIZE.1);
     let started = Instant::now();
     session.field(&camera, None)?.mask(&grid, &target);

@@ -1,4 +1,4 @@
-//! `fastlgs-bench size`: what accuracy and colour lose as a model gets smaller, and where `--budget auto` ends.
+//! `fastlgs-bench size`: accuracy and PSNR against model size, and a check of `--budget auto`.
 
 use crate::command::call;
 use crate::plot::{self, Axes, Scatter, Spot};
@@ -14,32 +14,41 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench size scenes/fox scenes/bonsai -o out --device cpu")]
 pub struct Args {
-    /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table.
+    /// Preprocessed scenes with a labels/ folder beside their photos. Default: a generated table.
     scenes: Vec<PathBuf>,
-    /// Preset of both trainings.
+    /// Preset of both training runs (automatic and unlimited budget).
     #[arg(long, default_value = "quick")]
     preset: String,
-    /// Iterations, instead of the preset's.
+    /// Iterations of both training runs. Default: those of the preset.
     #[arg(long)]
     iterations: Option<u32>,
-    /// Fewer sizes and a short training.
+    /// Test fewer sizes with a short training.
     #[arg(long)]
     quick: bool,
-    /// Folder for size.md, .csv, .json, and two charts as SVG and PNG.
+    /// Folder for size.md, size.csv, size.json, and two charts as SVG and PNG.
     #[arg(short, long)]
     output: PathBuf,
 }
 
-/// Shares of the Gaussians that are kept, those first without which the photos would change most.
+/// Fractions of the Gaussians to keep. Those that change the photos most are kept.
 const KEPT: [f64; 7] = [0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05];
 
-/// What `--budget auto` may lose against the full model: dB, and points of oracle mIoU.
+/// Accepted loss of `--budget auto` against the full model: dB of PSNR, and points of oracle mIoU.
 const LOSS: (f64, f64) = (0.1, 0.5);
 
-/// More Gaussians than any of these trainings makes.
+/// A budget that no training here reaches.
 const UNLIMITED: &str = "1000000";
 
-const COLUMNS: [&str; 8] = ["scene", "model", "gaussians", "scene_bytes", "psnr", "oracle_miou", "miou", "seconds"];
+const COLUMNS: [&str; 8] = [
+    "scene",
+    "model",
+    "gaussians",
+    "scene_bytes",
+    "psnr",
+    "oracle_miou",
+    "miou",
+    "seconds",
+];
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let work = trial::workshop(&args.output)?;
@@ -53,7 +62,12 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         training.extend(["--iterations".to_owned(), iterations.to_string()]);
     }
     let training: Vec<&str> = training.iter().map(String::as_str).collect();
-    let kept: Vec<f64> = KEPT.into_iter().enumerate().filter(|(k, _)| !args.quick || k % 3 == 1).map(|(_, share)| share).collect();
+    let kept: Vec<f64> = KEPT
+        .into_iter()
+        .enumerate()
+        .filter(|(k, _)| !args.quick || k % 3 == 1)
+        .map(|(_, share)| share)
+        .collect();
     let progress = run.work("models", (scenes.len() * (kept.len() + 6)) as u64);
     let (mut rows, mut verdicts) = (Vec::new(), Vec::new());
     for scene in &scenes {
@@ -69,14 +83,25 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         };
         let made = |args: &[&str]| -> Result<(Value, f64)> {
             let [trained, scored] = trial.train_and_eval(&[&training, args].concat())?;
-            Ok((scored, number(&trained, "seconds") + number(&trained, "mapping_seconds")))
+            Ok((
+                scored,
+                number(&trained, "seconds") + number(&trained, "mapping_seconds"),
+            ))
         };
         let (auto, seconds) = made(&[])?;
         add("auto".to_owned(), &auto, seconds)?;
-        add("auto, compact".to_owned(), &compact(run, &work, &trial)?, 0.0)?;
+        add(
+            "auto, compact".to_owned(),
+            &compact(run, &work, &trial)?,
+            0.0,
+        )?;
         let (full, seconds) = made(&["--budget", UNLIMITED])?;
         add("full".to_owned(), &full, seconds)?;
-        add("full, compact".to_owned(), &compact(run, &work, &trial)?, 0.0)?;
+        add(
+            "full, compact".to_owned(),
+            &compact(run, &work, &trial)?,
+            0.0,
+        )?;
         let folder = trial.scene();
         let whole = folder.gaussians()?;
         for degree in (0..whole.sh_degree).rev() {
@@ -89,9 +114,16 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             let mut keep = order[..most].to_vec();
             keep.sort_unstable();
             ply::write(&folder.ply_path(), &whole.select(&keep))?;
-            add(format!("{:.0} % kept", 100.0 * share), &trial.eval(&[])?, 0.0)?;
+            add(
+                format!("{:.0} % kept", 100.0 * share),
+                &trial.eval(&[])?,
+                0.0,
+            )?;
         }
-        let lost = [number(&full, "psnr") - number(&auto, "psnr"), 100.0 * (number(&full, "oracle_miou") - number(&auto, "oracle_miou"))];
+        let lost = [
+            number(&full, "psnr") - number(&auto, "psnr"),
+            100.0 * (number(&full, "oracle_miou") - number(&auto, "oracle_miou")),
+        ];
         let ratio = |what: &str| number(&auto, what) / number(&full, what);
         verdicts.push(json!({
             "scene": name, "lost_db": lost[0], "lost_points": lost[1], "bound": LOSS, "gaussians": ratio("gaussians"), "bytes": ratio("scene_bytes"),
@@ -100,12 +132,31 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     }
     std::fs::remove_dir_all(&work)?;
     for (what, label, title) in [
-        ("psnr", "PSNR of held-out views, dB", "Colour against size: filled is --budget auto"),
-        ("oracle_miou", "oracle mIoU of held-out labels", "Accuracy against size: filled is --budget auto"),
+        (
+            "psnr",
+            "PSNR of held-out views, dB",
+            "PSNR against size: filled points are --budget auto",
+        ),
+        (
+            "oracle_miou",
+            "oracle mIoU of held-out labels",
+            "Accuracy against size: filled points are --budget auto",
+        ),
     ] {
         let spots: Vec<Spot> = rows.iter().map(|row| spot(row, what)).collect();
-        let axes = Axes { title, x: "megabytes of everything that a query needs", y: label };
-        plot::save(&args.output, &format!("size-{}", what.replace('_', "-")), &Scatter { axes, spots: &spots })?;
+        let axes = Axes {
+            title,
+            x: "megabytes of all files that a query needs",
+            y: label,
+        };
+        plot::save(
+            &args.output,
+            &format!("size-{}", what.replace('_', "-")),
+            &Scatter {
+                axes,
+                spots: &spots,
+            },
+        )?;
     }
     let mut value = table::write(&args.output, "size", &COLUMNS, &rows, "")?;
     value["auto"] = json!(verdicts);
@@ -113,23 +164,32 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
-/// Gaussians by how much the training views would change without them, most first.
+/// Returns the indices of all Gaussians, sorted in descending order by the change of the training
+/// views without them.
 fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
-    let trained = fastlgs::train::Report::of(&manifest, &folder.root)?.unwrap_or_default();
+    let trained =
+        fastlgs::train::Report::from_manifest(&manifest, &folder.root)?.unwrap_or_default();
     let mut changes = Changes::of(scene);
-    manifest.training(&folder.cameras()?).iter().for_each(|camera| changes.see(&trained.view(camera, scene), None));
+    manifest
+        .training(&folder.cameras()?)
+        .iter()
+        .for_each(|camera| changes.add_view(&trained.view(camera, scene), None));
     let mut order: Vec<usize> = (0..scene.len()).collect();
-    order.sort_by(|a, b| changes.each[*b].total_cmp(&changes.each[*a]).then(a.cmp(b)));
+    order.sort_by(|a, b| {
+        changes.scores[*b]
+            .total_cmp(&changes.scores[*a])
+            .then(a.cmp(b))
+    });
     Ok(order)
 }
 
-/// The trial's scene in as few bytes as its views allow, evaluated.
+/// Exports the trial's scene as a compact scene folder and evaluates that.
 fn compact(run: &Run, work: &Path, trial: &Trial) -> Result<Value> {
     let folder = tempfile::tempdir_in(work)?;
     let (scene, small) = (trial.scene(), folder.path().join("small"));
     call(run, run.seed, "export", &[text(&scene.root), text(&small)])?;
-    // Held-out photos, to measure colour with.
+    // The export has no photos. PSNR needs the held-out ones.
     for camera in scene.manifest()?.held_out(&scene.cameras()?) {
         let photo = SceneFolder::new(&small).photo_path(&camera.name);
         std::fs::create_dir_all(photo.parent().unwrap_or(&small))?;

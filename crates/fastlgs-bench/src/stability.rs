@@ -1,4 +1,5 @@
-//! `fastlgs-bench stability`: what remains of accuracy when the input is disturbed, and on scenes that methods fail at.
+//! `fastlgs-bench stability`: how accuracy changes when the input is disturbed, and on difficult
+//! generated scenes.
 
 use crate::command::call;
 use crate::disturb::{self, Album, Masks, Photos};
@@ -18,42 +19,49 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs-bench stability scenes/fox -o out --device cpu")]
 pub struct Args {
-    /// Preprocessed scenes whose photos have labels/ beside them; without any, a generated table is disturbed.
+    /// Preprocessed scenes to disturb, with a labels/ folder beside their photos. Default: a
+    /// generated table.
     scenes: Vec<PathBuf>,
-    /// Kinds of generated scenes that are tried as they are, separated by commas; `none` for none.
-    #[arg(long, value_delimiter = ',', default_value = "table,twins,nested,containers,thin,mirror,glass,dark,sparse,long,big")]
+    /// Kinds of generated scenes to test undisturbed, separated by commas; `none` for none.
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "table,twins,nested,containers,thin,mirror,glass,dark,sparse,long,big"
+    )]
     kinds: Vec<String>,
-    /// Disturbances that are tried, as the table calls them, separated by commas; all by default.
+    /// Disturbances to test, by their names in the table, separated by commas. Default: all.
     #[arg(long, value_delimiter = ',', value_name = "NAMES")]
     cases: Vec<String>,
-    /// Runs of each random disturbance, and of the row "seed" at least five.
+    /// Runs of each random disturbance. The row "seed" has at least five.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..))]
     seeds: u64,
-    /// Iterations of each training: 3,000 by default, 1,000 with --quick.
+    /// Iterations of each training. Default: 3,000, or 1,000 with --quick.
     #[arg(long)]
     iterations: Option<u32>,
-    /// One strength of each disturbance on a small table and twins: minutes instead of an hour.
+    /// Test one strength of each disturbance on a small table, and the twins: minutes instead of an
+    /// hour.
     #[arg(long)]
     quick: bool,
-    /// Folder for stability.md, .csv, .json, and a heat map of each scene as SVG and PNG.
+    /// Folder for stability.md, stability.csv, stability.json, and a heat map of each scene as SVG
+    /// and PNG.
     #[arg(short, long)]
     output: PathBuf,
 }
 
-/// What is done to a scene.
+/// A disturbance.
 #[derive(Clone)]
 enum Change {
-    /// The whole way from disturbed photos.
+    /// All stages, from disturbed photos.
     Photos(Photos),
-    /// The whole way with other seeds.
+    /// Training with other seeds, on the same prepared scene.
     Seed,
-    /// Other masks, the same Gaussians.
+    /// Disturbed masks, mapped to the same Gaussians.
     Masks(Masks),
-    /// Noise on the objects' embeddings.
+    /// Noise on the objects' embeddings. The value is its length.
     Embeddings(f32),
-    /// Mapped with other options, the same Gaussians.
+    /// Other mapping options, on the same Gaussians.
     Map(&'static [&'static str]),
-    /// Evaluated with other options, where Algorithm 1's codes were trained with the scene.
+    /// Other options of `eval`, on a scene with Algorithm 1's mapping and trained codes.
     Eval(&'static [&'static str]),
 }
 
@@ -62,22 +70,44 @@ struct Case {
     disturbance: &'static str,
     strength: &'static str,
     change: Change,
-    /// Which figure the bound is for: `oracle_miou` where masks and mapping are disturbed, `miou` where texts are.
+    /// The bounded figure: `oracle_miou` for disturbed photos, masks and mapping, `miou` for
+    /// embedding noise.
     measure: &'static str,
-    /// Points that may be lost.
+    /// Accepted loss in points (hundredths of mIoU).
     bound: f64,
-    /// Whether the quick suite tries it.
+    /// Whether `--quick` runs this case.
     quick: bool,
 }
 
-/// All disturbances, three strengths each. Bounds: those of poses, views, exposure, blur, focal length and seeds are the project's goals;
-/// else 5 points for what happens to careful users, 15 for what is plainly bad input.
+/// Returns all disturbances, most of them with three strengths. The bounds of poses, views,
+/// exposure, blur, focal length and seeds are goals of the project. The other bounds are 5 points
+/// for common faults and 15 points for poor input.
 fn cases() -> Vec<Case> {
-    let case = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "oracle_miou", bound, quick };
-    let text = |disturbance, strength, change, bound, quick| Case { disturbance, strength, change, measure: "miou", bound, quick };
-    let photos = |disturbance, strength, change, bound, quick| case(disturbance, strength, Change::Photos(change), bound, quick);
-    let masks = |disturbance, strength, change, bound, quick| case(disturbance, strength, Change::Masks(change), bound, quick);
-    let map = |disturbance, strength, args, quick| case(disturbance, strength, Change::Map(args), 10.0, quick);
+    let case = |disturbance, strength, change, bound, quick| Case {
+        disturbance,
+        strength,
+        change,
+        measure: "oracle_miou",
+        bound,
+        quick,
+    };
+    let text = |disturbance, strength, change, bound, quick| Case {
+        disturbance,
+        strength,
+        change,
+        measure: "miou",
+        bound,
+        quick,
+    };
+    let photos = |disturbance, strength, change, bound, quick| {
+        case(disturbance, strength, Change::Photos(change), bound, quick)
+    };
+    let masks = |disturbance, strength, change, bound, quick| {
+        case(disturbance, strength, Change::Masks(change), bound, quick)
+    };
+    let map = |disturbance, strength, args, quick| {
+        case(disturbance, strength, Change::Map(args), 10.0, quick)
+    };
     vec![
         photos("photos shuffled", "", Photos::Shuffled, 3.0, true),
         photos("pose noise", "1 px", Photos::Pose(1.0), 1.0, false),
@@ -89,9 +119,27 @@ fn cases() -> Vec<Case> {
         photos("exposure", "0.25 stops", Photos::Exposure(0.25), 5.0, false),
         photos("exposure", "0.5 stops", Photos::Exposure(0.5), 2.0, true),
         photos("exposure", "1 stop", Photos::Exposure(1.0), 8.0, false),
-        photos("white balance", "5 %", Photos::WhiteBalance(0.05), 5.0, false),
-        photos("white balance", "10 %", Photos::WhiteBalance(0.1), 5.0, true),
-        photos("white balance", "20 %", Photos::WhiteBalance(0.2), 15.0, false),
+        photos(
+            "white balance",
+            "5 %",
+            Photos::WhiteBalance(0.05),
+            5.0,
+            false,
+        ),
+        photos(
+            "white balance",
+            "10 %",
+            Photos::WhiteBalance(0.1),
+            5.0,
+            true,
+        ),
+        photos(
+            "white balance",
+            "20 %",
+            Photos::WhiteBalance(0.2),
+            15.0,
+            false,
+        ),
         photos("blur", "0.5 px", Photos::Blur(0.5), 5.0, false),
         photos("blur", "1 px", Photos::Blur(1.0), 5.0, true),
         photos("blur", "2 px", Photos::Blur(2.0), 3.0, false),
@@ -114,41 +162,136 @@ fn cases() -> Vec<Case> {
         masks("masks dropped", "10 %", Masks::Dropped(0.1), 5.0, false),
         masks("masks dropped", "20 %", Masks::Dropped(0.2), 5.0, true),
         masks("masks dropped", "40 %", Masks::Dropped(0.4), 15.0, false),
-        text("embedding noise", "25 %", Change::Embeddings(0.25), 5.0, false),
-        text("embedding noise", "50 %", Change::Embeddings(0.5), 5.0, true),
-        text("embedding noise", "100 %", Change::Embeddings(1.0), 15.0, false),
+        text(
+            "embedding noise",
+            "25 %",
+            Change::Embeddings(0.25),
+            5.0,
+            false,
+        ),
+        text(
+            "embedding noise",
+            "50 %",
+            Change::Embeddings(0.5),
+            5.0,
+            true,
+        ),
+        text(
+            "embedding noise",
+            "100 %",
+            Change::Embeddings(1.0),
+            15.0,
+            false,
+        ),
         map("support", "0.1", &["--support", "0.1"], false),
         map("support", "0.7", &["--support", "0.7"], false),
-        map("paper: tau", "1", &["--mapping", "paper", "--tau", "1"], false),
-        map("paper: tau", "10", &["--mapping", "paper", "--tau", "10"], true),
-        map("paper: tau", "30", &["--mapping", "paper", "--tau", "30"], false),
-        map("paper: theta", "0.3", &["--mapping", "paper", "--theta", "0.3"], false),
-        map("paper: theta", "0.8", &["--mapping", "paper", "--theta", "0.8"], true),
-        map("paper: theta", "0.98", &["--mapping", "paper", "--theta", "0.98"], false),
-        map("paper: alpha", "0.05", &["--mapping", "paper", "--alpha", "0.05"], false),
-        map("paper: alpha", "0.2", &["--mapping", "paper", "--alpha", "0.2"], true),
-        map("paper: alpha", "0.5", &["--mapping", "paper", "--alpha", "0.5"], false),
-        case("paper: tau_ac", "1", Change::Eval(&["--tau-ac", "1"]), 10.0, false),
-        case("paper: tau_ac", "3", Change::Eval(&["--tau-ac", "3"]), 10.0, true),
-        case("paper: tau_ac", "5", Change::Eval(&["--tau-ac", "5"]), 10.0, false),
-        case("paper: tau_ac", "10", Change::Eval(&["--tau-ac", "10"]), 10.0, false),
-        case("paper: tau_ac", "20", Change::Eval(&["--tau-ac", "20"]), 10.0, false),
+        map(
+            "paper: tau",
+            "1",
+            &["--mapping", "paper", "--tau", "1"],
+            false,
+        ),
+        map(
+            "paper: tau",
+            "10",
+            &["--mapping", "paper", "--tau", "10"],
+            true,
+        ),
+        map(
+            "paper: tau",
+            "30",
+            &["--mapping", "paper", "--tau", "30"],
+            false,
+        ),
+        map(
+            "paper: theta",
+            "0.3",
+            &["--mapping", "paper", "--theta", "0.3"],
+            false,
+        ),
+        map(
+            "paper: theta",
+            "0.8",
+            &["--mapping", "paper", "--theta", "0.8"],
+            true,
+        ),
+        map(
+            "paper: theta",
+            "0.98",
+            &["--mapping", "paper", "--theta", "0.98"],
+            false,
+        ),
+        map(
+            "paper: alpha",
+            "0.05",
+            &["--mapping", "paper", "--alpha", "0.05"],
+            false,
+        ),
+        map(
+            "paper: alpha",
+            "0.2",
+            &["--mapping", "paper", "--alpha", "0.2"],
+            true,
+        ),
+        map(
+            "paper: alpha",
+            "0.5",
+            &["--mapping", "paper", "--alpha", "0.5"],
+            false,
+        ),
+        case(
+            "paper: tau_ac",
+            "1",
+            Change::Eval(&["--tau-ac", "1"]),
+            10.0,
+            false,
+        ),
+        case(
+            "paper: tau_ac",
+            "3",
+            Change::Eval(&["--tau-ac", "3"]),
+            10.0,
+            true,
+        ),
+        case(
+            "paper: tau_ac",
+            "5",
+            Change::Eval(&["--tau-ac", "5"]),
+            10.0,
+            false,
+        ),
+        case(
+            "paper: tau_ac",
+            "10",
+            Change::Eval(&["--tau-ac", "10"]),
+            10.0,
+            false,
+        ),
+        case(
+            "paper: tau_ac",
+            "20",
+            Change::Eval(&["--tau-ac", "20"]),
+            10.0,
+            false,
+        ),
     ]
 }
 
-/// Least oracle mIoU of a generated scene: the project's goals, else what a user would call good.
+/// Returns the smallest accepted oracle mIoU of a generated scene. It is a goal of the project, or
+/// else a value that users would call good.
 fn kind_bound(kind: Kind) -> f64 {
     match kind {
         Kind::Dark => 0.9,
         Kind::Thin | Kind::Glass | Kind::Long | Kind::Nested => 0.85,
         Kind::Containers => 0.9,
-        // Things of 15 pixels.
+        // Its objects are only 15 pixels large.
         Kind::Big => 0.5,
         _ => 0.8,
     }
 }
 
-/// Least share of pixels of the right one of two twins.
+/// Smallest accepted value of `apart` on the twins: the fraction of a label's pixels that no other
+/// label's best object claims.
 const TWINS_APART: f64 = 0.95;
 
 const COLUMNS: [&str; 14] = [
@@ -173,17 +316,38 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         .kinds
         .iter()
         .filter(|k| *k != "none")
-        .map(|k| Kind::of(k).with_context(|| format!("--kinds: '{k}' is none")))
+        .map(|k| {
+            Kind::of(k).with_context(|| format!("--kinds: '{k}' is not a kind of generated scene"))
+        })
         .collect::<Result<_>>()?;
     let kinds: Vec<Kind> = if args.quick { vec![Kind::Twins] } else { kinds };
     let work = trial::workshop(&args.output)?;
-    let bench = Bench { args, run, work: &work, iterations: args.iterations.unwrap_or(if args.quick { 1000 } else { 3000 }) };
-    if let Some(unknown) = args.cases.iter().find(|name| !cases().iter().any(|c| c.disturbance == **name)) {
+    let bench = Bench {
+        args,
+        run,
+        work: &work,
+        iterations: args
+            .iterations
+            .unwrap_or(if args.quick { 1000 } else { 3000 }),
+    };
+    if let Some(unknown) = args
+        .cases
+        .iter()
+        .find(|name| !cases().iter().any(|c| c.disturbance == **name))
+    {
         let known: BTreeSet<&str> = cases().iter().map(|c| c.disturbance).collect();
-        bail!("--cases: '{unknown}' is none of {}", known.into_iter().collect::<Vec<_>>().join(", "));
+        bail!(
+            "--cases: '{unknown}' is not a disturbance; choose from {}",
+            known.into_iter().collect::<Vec<_>>().join(", ")
+        );
     }
-    let wanted = |case: &Case| args.cases.is_empty() || args.cases.iter().any(|name| name == case.disturbance);
-    let cases: Vec<Case> = cases().into_iter().filter(|c| (c.quick || !args.quick) && wanted(c)).collect();
+    let wanted = |case: &Case| {
+        args.cases.is_empty() || args.cases.iter().any(|name| name == case.disturbance)
+    };
+    let cases: Vec<Case> = cases()
+        .into_iter()
+        .filter(|c| (c.quick || !args.quick) && wanted(c))
+        .collect();
     let count = cases.len() * args.scenes.len().max(1) + kinds.len();
     let progress = run.work("trials", count as u64);
     let mut rows = Vec::new();
@@ -197,7 +361,11 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         plot::save(
             &args.output,
             &format!("stability-{name}"),
-            &Heat { title: &format!("Stability: {name}"), columns: &HEAT, rows: &heat(&own) },
+            &Heat {
+                title: &format!("Stability: {name}"),
+                columns: &HEAT,
+                rows: &heat(&own),
+            },
         )?;
         rows.extend(own);
     }
@@ -221,19 +389,28 @@ struct Bench<'a> {
 }
 
 impl Bench<'_> {
-    /// A generated scene, preprocessed.
+    /// Generates and preprocesses a scene. Returns its folder.
     fn generated(&self, kind: Kind, name: &str) -> Result<PathBuf> {
-        let (views, size) = if self.args.quick { trial::QUICK } else { (kind.views(), "480x360") };
+        let (views, size) = if self.args.quick {
+            trial::QUICK
+        } else {
+            (kind.views(), "480x360")
+        };
         trial::generated(self.run, self.work, name, views, size)
     }
 
-    /// A generated scene as it is.
+    /// Trains and evaluates a generated scene without a disturbance. Returns its row.
     fn kind(&self, kind: Kind) -> Result<Value> {
         let name = KINDS.iter().find(|k| k.1 == kind).map_or("", |k| k.0);
         let scene = self.generated(kind, name)?;
         let trial = Trial::new(&scene, self.work, self.run)?;
-        let [trained, scored] = trial.train_and_eval(&["--iterations", &self.iterations.to_string()])?;
-        let (measure, bound) = if kind == Kind::Twins { ("apart", TWINS_APART) } else { ("oracle_miou", kind_bound(kind)) };
+        let [trained, scored] =
+            trial.train_and_eval(&["--iterations", &self.iterations.to_string()])?;
+        let (measure, bound) = if kind == Kind::Twins {
+            ("apart", TWINS_APART)
+        } else {
+            ("oracle_miou", kind_bound(kind))
+        };
         let reached = number(&scored, measure);
         Ok(json!({
             "scene": name, "disturbance": "none", "strength": "", "runs": 1, "measure": measure, "change": reached, "worst": reached, "bound": bound,
@@ -244,55 +421,118 @@ impl Bench<'_> {
         }))
     }
 
-    /// The whole way from photos with a change to a scene; returns what `eval` says, with the seconds of all.
-    fn whole(&self, album: &Album, like: &Manifest, change: Photos, seed: u64, photos: &Path, scene: &Path) -> Result<Value> {
+    /// Runs all stages, from changed photos to the evaluation. Returns the report of `eval`, with
+    /// the seconds of all stages.
+    fn whole(
+        &self,
+        album: &Album,
+        like: &Manifest,
+        change: Photos,
+        seed: u64,
+        photos: &Path,
+        scene: &Path,
+    ) -> Result<Value> {
         album.write(photos, change, seed)?;
         let (labels, iterations) = (photos.join("labels"), self.iterations.to_string());
-        let mut args = vec![text(photos), "-o", text(scene), "--holdout-labels", text(&labels)];
+        let mut args = vec![
+            text(photos),
+            "-o",
+            text(scene),
+            "--holdout-labels",
+            text(&labels),
+        ];
         args.extend(["--segmenter", &like.segmenter, "--encoder", &like.encoder]);
-        like.models.iter().for_each(|(role, file)| args.extend([option_of(role), text(&file.path)]));
+        like.models
+            .iter()
+            .for_each(|(role, file)| args.extend([option_of(role), text(&file.path)]));
         let before = call(self.run, seed, "preprocess", &args)?;
-        let trained = call(self.run, seed, "train", &[text(scene), "--iterations", &iterations])?;
-        let mut scored = call(self.run, seed, "eval", &[text(scene), "--labels", text(&labels)])?;
-        scored["seconds"] = json!(number(&before, "seconds_total") + number(&trained, "seconds") + number(&trained, "mapping_seconds"));
+        let trained = call(
+            self.run,
+            seed,
+            "train",
+            &[text(scene), "--iterations", &iterations],
+        )?;
+        let mut scored = call(
+            self.run,
+            seed,
+            "eval",
+            &[text(scene), "--labels", text(&labels)],
+        )?;
+        scored["seconds"] = json!(
+            number(&before, "seconds_total")
+                + number(&trained, "seconds")
+                + number(&trained, "mapping_seconds")
+        );
         Ok(scored)
     }
 
-    /// All cases on a scene.
-    fn disturb(&self, scene: &Path, name: &str, cases: &[Case], progress: &Work) -> Result<Vec<Value>> {
+    /// Runs all cases on a scene and returns their rows.
+    fn disturb(
+        &self,
+        scene: &Path,
+        name: &str,
+        cases: &[Case],
+        progress: &Work,
+    ) -> Result<Vec<Value>> {
         let folder = SceneFolder::open(scene)?;
         let manifest = folder.manifest()?;
         if manifest.encoder == "import" {
-            bail!("{}: embeddings of disturbed photos cannot be imported; preprocess with another encoder", scene.display());
+            bail!(
+                "{}: this scene has imported embeddings, which do not exist for disturbed photos; preprocess it with another encoder",
+                scene.display()
+            );
         }
         let album = Album::of(&folder, &Path::new(&manifest.photos).join("labels"))?;
         let seed = self.run.seed;
-        // What everything is compared with goes the same way as the disturbed photos.
+        // The reference runs through the same stages as the disturbed photos.
         let [base, photos] = ["base", "undisturbed"].map(|n| self.work.join(name).join(n));
         let undisturbed = self.whole(&album, &manifest, Photos::Unchanged, seed, &photos, &base)?;
         const REMAP: [&str; 4] = ["--init-ply", "SCENE/scene.ply", "--iterations", "0"];
         let paper = Trial::new(&base, self.work, self.run)?;
-        let [_, paper_scored] = paper.train_and_eval(&[&REMAP[..], &["--mapping", "paper"]].concat())?;
-        // Thresholds of codes ask for codes that were trained: those that were lifted are decided by what covers a pixel.
+        let [_, paper_scored] =
+            paper.train_and_eval(&[&REMAP[..], &["--mapping", "paper"]].concat())?;
+        // tau_ac applies only to trained codes. Lifted codes are classified by id weights.
         let codes = Trial::new(&base, self.work, self.run)?;
         let mut codes_scored = Value::Null;
-        if cases.iter().any(|case| matches!(case.change, Change::Eval(_))) {
-            let way = ["--mapping", "paper", "--feature-mode", "train", "--iterations", &self.iterations.to_string()];
+        if cases
+            .iter()
+            .any(|case| matches!(case.change, Change::Eval(_)))
+        {
+            let way = [
+                "--mapping",
+                "paper",
+                "--feature-mode",
+                "train",
+                "--iterations",
+                &self.iterations.to_string(),
+            ];
             codes_scored = codes.train_and_eval(&way)?[1].clone();
         }
         let mut rows = Vec::new();
         for case in cases {
             let mut reference = &undisturbed;
             let mut runs = Vec::new();
-            let count = if matches!(case.change, Change::Seed) { self.args.seeds.max(5) } else { self.args.seeds };
+            let count = if matches!(case.change, Change::Seed) {
+                self.args.seeds.max(5)
+            } else {
+                self.args.seeds
+            };
             for run in 0..count {
                 let seed = seed + 1 + run;
                 let same_gaussians = || Trial::new(&base, self.work, self.run);
                 let scored = match &case.change {
                     Change::Photos(change) => {
-                        // A copy of the base, so that what did not change is there already.
+                        // Starts from a copy of the base scene, so that unchanged results come from
+                        // its cache.
                         let (trial, photos) = (same_gaussians()?, tempfile::tempdir_in(self.work)?);
-                        self.whole(&album, &manifest, *change, seed, photos.path(), &trial.scene().root)?
+                        self.whole(
+                            &album,
+                            &manifest,
+                            *change,
+                            seed,
+                            photos.path(),
+                            &trial.scene().root,
+                        )?
                     }
                     Change::Seed => {
                         let trial = same_gaussians()?;
@@ -321,7 +561,7 @@ impl Bench<'_> {
                     }
                 };
                 runs.push(scored);
-                // Options know no chance.
+                // Options are not random: one run is enough.
                 if matches!(case.change, Change::Map(_) | Change::Eval(_)) {
                     break;
                 }
@@ -335,7 +575,7 @@ impl Bench<'_> {
     }
 }
 
-/// The option of `preprocess` that names a model file.
+/// Returns the option of `preprocess` for a model role of the manifest.
 fn option_of(role: &str) -> &'static str {
     match role {
         "clip_image" => "--clip-image",
@@ -349,14 +589,19 @@ fn mean(runs: &[Value], name: &str) -> f64 {
     runs.iter().map(|r| number(r, name)).sum::<f64>() / runs.len() as f64
 }
 
-/// Mean and worst of the runs against the reference. For seeds, the spread between the best and the worst run.
+/// Returns the row of a case: mean and worst change of the runs against the reference. For seeds,
+/// the change is the worst run minus the best run.
 fn row(scene: &str, case: &Case, reference: &Value, runs: &[Value]) -> Value {
-    let points = |run: &Value| 100.0 * (number(run, case.measure) - number(reference, case.measure));
+    let points =
+        |run: &Value| 100.0 * (number(run, case.measure) - number(reference, case.measure));
     let worst = runs.iter().map(points).fold(f64::INFINITY, f64::min);
     let best = runs.iter().map(points).fold(f64::NEG_INFINITY, f64::max);
     let (change, worst) = match case.change {
         Change::Seed => (worst - best, worst - best),
-        _ => (100.0 * (mean(runs, case.measure) - number(reference, case.measure)), worst),
+        _ => (
+            100.0 * (mean(runs, case.measure) - number(reference, case.measure)),
+            worst,
+        ),
     };
     let relative = |name: &str| mean(runs, name) - number(reference, name);
     json!({
@@ -374,30 +619,54 @@ fn row(scene: &str, case: &Case, reference: &Value, runs: &[Value]) -> Value {
 }
 
 /// Columns of the heat map.
-const HEAT: [&str; 7] = ["oracle, points", "text, points", "PSNR, dB", "objects", "Gaussians", "seconds", "verdict"];
+const HEAT: [&str; 7] = [
+    "oracle, points",
+    "mIoU, points",
+    "PSNR, dB",
+    "objects",
+    "Gaussians",
+    "seconds",
+    "verdict",
+];
 
 fn heat(rows: &[Value]) -> Vec<(String, Vec<Cell>)> {
     let cells = |row: &Value| {
         let changes = &row["changes"];
-        // What counts as fully red or green.
+        // Changes with the full colour.
         let full = [("oracle_miou", 20.0), ("miou", 20.0), ("psnr", 4.0)];
         let mut cells: Vec<Cell> = full
             .iter()
-            .map(|(name, full)| Cell { text: format!("{:+.1}", number(changes, name)), shade: number(changes, name) / full })
+            .map(|(name, full)| Cell {
+                text: format!("{:+.1}", number(changes, name)),
+                shade: number(changes, name) / full,
+            })
             .collect();
         for name in ["objects", "gaussians", "seconds"] {
-            let text = if changes[name].is_null() { String::new() } else { format!("{:+.0}", number(changes, name)) };
+            let text = if changes[name].is_null() {
+                String::new()
+            } else {
+                format!("{:+.0}", number(changes, name))
+            };
             cells.push(Cell { text, shade: 0.0 });
         }
         let holds = row["verdict"] == "holds";
         cells.push(Cell {
-            text: format!("{} {:+.0}", if holds { "holds" } else { "fails" }, number(row, "bound")),
+            text: format!(
+                "{} {:+.0}",
+                if holds { "holds" } else { "fails" },
+                number(row, "bound")
+            ),
             shade: if holds { 0.6 } else { -0.8 },
         });
         cells
     };
-    let name =
-        |row: &Value| format!("{} {}", row["disturbance"].as_str().unwrap_or_default(), row["strength"].as_str().unwrap_or_default());
+    let name = |row: &Value| {
+        format!(
+            "{} {}",
+            row["disturbance"].as_str().unwrap_or_default(),
+            row["strength"].as_str().unwrap_or_default()
+        )
+    };
     rows.iter().map(|row| (name(row), cells(row))).collect()
 }
 
@@ -407,14 +676,36 @@ mod tests {
 
     #[test]
     fn verdicts_follow_the_mean_and_seeds_their_spread() {
-        let case = |change, bound| Case { disturbance: "d", strength: "s", change, measure: "oracle_miou", bound, quick: true };
+        let case = |change, bound| Case {
+            disturbance: "d",
+            strength: "s",
+            change,
+            measure: "oracle_miou",
+            bound,
+            quick: true,
+        };
         let run = |iou: f64| json!({ "oracle_miou": iou, "miou": 0.5, "psnr": 30.0, "objects": 3, "gaussians": 10 });
         let reference = run(0.9);
-        let of =
-            |change, bound, runs: &[f64]| row("x", &case(change, bound), &reference, &runs.iter().map(|r| run(*r)).collect::<Vec<_>>());
+        let of = |change, bound, runs: &[f64]| {
+            row(
+                "x",
+                &case(change, bound),
+                &reference,
+                &runs.iter().map(|r| run(*r)).collect::<Vec<_>>(),
+            )
+        };
         let blurred = of(Change::Photos(Photos::Blur(1.0)), 5.0, &[0.88, 0.84]);
-        assert!((number(&blurred, "change") + 4.0).abs() < 1e-9 && (number(&blurred, "worst") + 6.0).abs() < 1e-9);
-        assert_eq!((blurred["verdict"].as_str(), of(Change::Seed, 1.0, &[0.9, 0.92])["verdict"].as_str()), (Some("holds"), Some("fails")));
+        assert!(
+            (number(&blurred, "change") + 4.0).abs() < 1e-9
+                && (number(&blurred, "worst") + 6.0).abs() < 1e-9
+        );
+        assert_eq!(
+            (
+                blurred["verdict"].as_str(),
+                of(Change::Seed, 1.0, &[0.9, 0.92])["verdict"].as_str()
+            ),
+            (Some("holds"), Some("fails"))
+        );
         assert_eq!(heat(&[blurred])[0].1.len(), HEAT.len());
     }
 }

@@ -1,25 +1,40 @@
-//! Rows of figures as JSON, CSV and Markdown.
+//! Writes tables as JSON, CSV and Markdown.
 
 use anyhow::Result;
 use fastlgs_core::fs;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Writes `NAME.json`, `NAME.csv` and `NAME.md`, with these columns of the rows, into `folder`; returns what the JSON holds. `remarks` stand below
-/// the table for people.
-pub fn write(folder: &Path, name: &str, columns: &[&str], rows: &[Value], remarks: &str) -> Result<Value> {
+/// Writes `NAME.json`, `NAME.csv` and `NAME.md` into `folder`. CSV and Markdown hold the given
+/// columns, JSON holds all values. `remarks` follow the Markdown table. Returns the content of the
+/// JSON file.
+pub fn write(
+    folder: &Path,
+    name: &str,
+    columns: &[&str],
+    rows: &[Value],
+    remarks: &str,
+) -> Result<Value> {
     for (ending, framed, remarks) in [("md", true, remarks), ("csv", false, "")] {
         let text = text(rows, columns, framed) + remarks;
-        fs::write_atomic(&folder.join(format!("{name}.{ending}")), |out| std::io::Write::write_all(out, text.as_bytes()))?;
+        fs::write_atomic(&folder.join(format!("{name}.{ending}")), |out| {
+            std::io::Write::write_all(out, text.as_bytes())
+        })?;
     }
     let value = json!({ "rows": rows, "chart": folder.join(format!("{name}.svg")) });
     fs::write_json(&folder.join(format!("{name}.json")), &value)?;
     Ok(value)
 }
 
-/// The rows as Markdown (`framed`) or CSV.
+/// Returns the rows as Markdown (`framed`) or CSV.
 fn text(rows: &[Value], columns: &[&str], framed: bool) -> String {
-    let line = |cells: Vec<String>| if framed { format!("| {} |\n", cells.join(" | ")) } else { format!("{}\n", cells.join(",")) };
+    let line = |cells: Vec<String>| {
+        if framed {
+            format!("| {} |\n", cells.join(" | "))
+        } else {
+            format!("{}\n", cells.join(","))
+        }
+    };
     let cell = |row: &Value, name: &str| match &row[name] {
         Value::String(text) if framed => text.clone(),
         Value::String(text) => format!("\"{}\"", text.replace('"', "\"\"")),
@@ -31,11 +46,12 @@ fn text(rows: &[Value], columns: &[&str], framed: bool) -> String {
     if framed {
         out += &line(columns.iter().map(|_| "---".to_owned()).collect());
     }
-    rows.iter().for_each(|row| out += &line(columns.iter().map(|c| cell(row, c)).collect()));
+    rows.iter()
+        .for_each(|row| out += &line(columns.iter().map(|c| cell(row, c)).collect()));
     out
 }
 
-/// A row's number; 0 where there is none.
+/// Returns a number of a row, or 0 if it is missing.
 pub fn number(row: &Value, name: &str) -> f64 {
     row[name].as_f64().unwrap_or(0.0)
 }
@@ -47,7 +63,10 @@ mod tests {
     #[test]
     fn cells_are_rounded_and_quoted() {
         let rows = [json!({ "a": 1.23456, "b": "x \"y\"", "c": 3, "d": null })];
-        assert_eq!(text(&rows, &["a", "b", "c", "d"], false), "a,b,c,d\n1.235,\"x \"\"y\"\"\",3,\n");
+        assert_eq!(
+            text(&rows, &["a", "b", "c", "d"], false),
+            "a,b,c,d\n1.235,\"x \"\"y\"\"\",3,\n"
+        );
         assert_eq!(text(&rows, &["b"], true), "| b |\n| --- |\n| x \"y\" |\n");
     }
 }

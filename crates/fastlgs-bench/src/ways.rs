@@ -1,4 +1,4 @@
-//! Ways from masks to a field that answers, and what each costs and gives.
+//! Methods of making a language field from masks: their commands, cost and accuracy.
 
 use crate::command::call;
 use crate::table::number;
@@ -8,34 +8,42 @@ use fastlgs::Run;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// A way from masks to a field.
+/// A method of making a language field from masks.
 pub struct Way {
     pub name: &'static str,
     pub how: How,
-    /// How long it takes: 0 seconds, 1 minutes, 2 much longer.
+    /// Cost class: 0 takes seconds, 1 minutes, 2 much longer.
     pub cost: u8,
 }
 
-/// What a way runs.
+/// The command of a method.
 pub enum How {
-    /// `train` with options on the scene's Gaussians, whose geometry and colour stay.
+    /// `train` with these options. Geometry and colour of the scene's Gaussians stay.
     Remap(&'static [&'static str]),
-    /// Descent on the paper's codes alone, for so many iterations.
+    /// Gradient descent on the paper's codes alone, for this number of iterations.
     Descent(&'static str),
-    /// `train` from the photos on.
+    /// `train` with these options, from the photos.
     Train(&'static [&'static str]),
-    /// `fastlgs-bench baseline` on the scene as it is.
+    /// `fastlgs-bench baseline` with this method, on the unchanged scene.
     Baseline(&'static str),
 }
 
 impl How {
-    /// The command and its arguments; SCENE stands for the scene.
+    /// Returns the command and its arguments. SCENE stands for the scene folder.
     pub fn command(&self) -> Vec<&'static str> {
         const START: [&str; 3] = ["SCENE", "--init-ply", "SCENE/scene.ply"];
         match self {
             Self::Remap(args) => [&["train"], &START[..], &["--iterations", "0"], args].concat(),
             Self::Descent(steps) => {
-                let descent = ["--freeze", "--feature-mode", "train", "--mapping", "paper", "--iterations", steps];
+                let descent = [
+                    "--freeze",
+                    "--feature-mode",
+                    "train",
+                    "--mapping",
+                    "paper",
+                    "--iterations",
+                    steps,
+                ];
                 [&["train"], &START[..], &descent].concat()
             }
             Self::Train(args) => [&["train", "SCENE"], *args].concat(),
@@ -44,12 +52,27 @@ impl How {
     }
 }
 
-/// The ways of these names; without any, all.
+/// Returns the methods with the given names, or all if there are none.
+///
+/// # Errors
+/// A name is unknown.
 pub fn wanted<'a>(ways: &'a [Way], names: &[String]) -> Result<Vec<&'a Way>> {
-    if let Some(unknown) = names.iter().find(|name| !ways.iter().any(|way| way.name == **name)) {
-        bail!("--ways: '{unknown}' is none of {}", ways.iter().map(|way| way.name).collect::<Vec<_>>().join("; "));
+    if let Some(unknown) = names
+        .iter()
+        .find(|name| !ways.iter().any(|way| way.name == **name))
+    {
+        bail!(
+            "--ways: '{unknown}' is unknown; choose from {}",
+            ways.iter()
+                .map(|way| way.name)
+                .collect::<Vec<_>>()
+                .join("; ")
+        );
     }
-    Ok(ways.iter().filter(|way| names.is_empty() || names.iter().any(|name| name == way.name)).collect())
+    Ok(ways
+        .iter()
+        .filter(|way| names.is_empty() || names.iter().any(|name| name == way.name))
+        .collect())
 }
 
 impl Way {
@@ -57,17 +80,26 @@ impl Way {
         Self { name, how, cost: 0 }
     }
 
-    /// Runs `command` on a copy of `scene`; its figures.
+    /// Runs `command` on a copy of `scene`, and returns its row.
     pub fn row(&self, trial: &Trial, command: &[&str], scene: &Path, run: &Run) -> Result<Value> {
-        let mut row = if let How::Baseline(_) = self.how { baseline(trial, command, run)? } else { trained(trial, command)? };
+        let mut row = if let How::Baseline(_) = self.how {
+            baseline(trial, command, run)?
+        } else {
+            trained(trial, command)?
+        };
         row["scene"] = json!(trial::name(scene));
         row["way"] = json!(self.name);
-        row["command"] = json!(format!("fastlgs {}", command.join(" ").replace("SCENE", &scene.display().to_string())));
+        row["command"] = json!(format!(
+            "fastlgs {}",
+            command
+                .join(" ")
+                .replace("SCENE", &scene.display().to_string())
+        ));
         Ok(row)
     }
 }
 
-/// Trains and evaluates.
+/// Trains and evaluates. The seconds include the mapping.
 fn trained(trial: &Trial, command: &[&str]) -> Result<Value> {
     let [trained, scored] = trial.train_and_eval(&command[2..])?;
     Ok(json!({
@@ -87,15 +119,30 @@ fn trained(trial: &Trial, command: &[&str]) -> Result<Value> {
     }))
 }
 
-/// Makes another field. Its oracle is the best threshold of each label, where it knows no objects; where it does, they are those of the
-/// scene, whose mapping took its time.
+/// Runs `fastlgs-bench baseline`. For fields without objects, the oracle is the best threshold of
+/// each label. Fields with codes use the scene's objects, so their seconds include the scene's
+/// mapping.
 fn baseline(trial: &Trial, command: &[&str], run: &Run) -> Result<Value> {
     let scene = trial.scene();
-    let args: Vec<&str> = command[1..].iter().map(|a| if *a == "SCENE" { trial::text(&scene.root) } else { *a }).collect();
+    let args: Vec<&str> = command[1..]
+        .iter()
+        .map(|a| {
+            if *a == "SCENE" {
+                trial::text(&scene.root)
+            } else {
+                *a
+            }
+        })
+        .collect();
     let mut found = call(run, run.seed, command[0], &args)?;
-    (found["query_ms"], found["bytes"]) = (found["render_ms"].clone(), found["field_bytes"].clone());
+    (found["query_ms"], found["bytes"]) =
+        (found["render_ms"].clone(), found["field_bytes"].clone());
     if !found["wrong_pixels"].is_null() {
-        let mapping = scene.manifest()?.notes.get("train").map_or(0.0, |train| number(train, "mapping_seconds"));
+        let mapping = scene
+            .manifest()?
+            .notes
+            .get("train")
+            .map_or(0.0, |train| number(train, "mapping_seconds"));
         found["seconds"] = json!(number(&found, "seconds") + mapping);
     }
     Ok(found)

@@ -1,4 +1,4 @@
-//! Progress for people: bars on a terminal, now and then a line elsewhere.
+//! Progress on stderr: bars on a terminal, occasional lines elsewhere.
 
 use crate::ui::Common;
 use fastlgs::progress::{Message, Sink};
@@ -8,10 +8,11 @@ use std::io::IsTerminal;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// Where no terminal listens, a stage says where it stands when a tenth more of it is done, but not more often than this.
+/// Shortest time between two progress lines of a stage. A line also needs another tenth of the
+/// stage to be done.
 const LINE_EVERY: Duration = Duration::from_secs(15);
 
-/// Tells of progress on stderr.
+/// Prints progress to stderr.
 pub struct Console {
     medium: Medium,
     stages: Mutex<BTreeMap<&'static str, Stage>>,
@@ -24,42 +25,60 @@ enum Medium {
     Nothing,
 }
 
-/// A stage that is being done.
+/// A running stage.
 struct Stage {
     bar: ProgressBar,
     started: Instant,
-    /// When the last line was written, and how much was done then.
+    /// Time of the last printed line, and the number of steps done by then.
     told: (Instant, u64),
 }
 
 impl Console {
-    /// Bars on a terminal, lines elsewhere, nothing with `--quiet`.
+    /// Creates a console: bars on a terminal, lines elsewhere, nothing with `--quiet`.
     pub fn new(common: &Common) -> Self {
         let medium = match (common.quiet, std::io::stderr().is_terminal()) {
             (true, _) => Medium::Nothing,
             (false, true) => Medium::Bars,
             (false, false) => Medium::Lines,
         };
-        Self { medium, stages: Mutex::default() }
+        Self {
+            medium,
+            stages: Mutex::default(),
+        }
     }
 
     fn stages(&self) -> std::sync::MutexGuard<'_, BTreeMap<&'static str, Stage>> {
-        self.stages.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.stages
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
     fn start(&self, stage: &'static str, total: u64) {
-        let bar = if self.medium == Medium::Bars { ProgressBar::new(total) } else { ProgressBar::hidden() };
+        let bar = if self.medium == Medium::Bars {
+            ProgressBar::new(total)
+        } else {
+            ProgressBar::hidden()
+        };
         let template = "{msg:44!} {bar:30} {pos}/{len} {per_sec} {elapsed} (eta {eta})";
         bar.set_style(ProgressStyle::with_template(template).expect("a fixed template"));
         bar.set_message(stage);
         let now = Instant::now();
-        self.stages().insert(stage, Stage { bar, started: now, told: (now, 0) });
+        self.stages().insert(
+            stage,
+            Stage {
+                bar,
+                started: now,
+                told: (now, 0),
+            },
+        );
     }
 
-    /// `facts` are told beside how much is done.
+    /// Shows that `done` of `total` steps are done. `facts` is additional text.
     fn advance(&self, name: &'static str, done: u64, total: u64, facts: &str) {
         let mut stages = self.stages();
-        let Some(stage) = stages.get_mut(name) else { return };
+        let Some(stage) = stages.get_mut(name) else {
+            return;
+        };
         match self.medium {
             Medium::Nothing => {}
             Medium::Bars => {
@@ -70,9 +89,13 @@ impl Console {
                 }
             }
             Medium::Lines => {
-                if stage.told.0.elapsed() >= LINE_EVERY && is_tenth_more(stage.told.1, done, total) {
+                if stage.told.0.elapsed() >= LINE_EVERY && is_tenth_more(stage.told.1, done, total)
+                {
                     stage.told = (Instant::now(), done);
-                    eprintln!("{}", line(name, done, total, facts, stage.started.elapsed()));
+                    eprintln!(
+                        "{}",
+                        line(name, done, total, facts, stage.started.elapsed())
+                    );
                 }
             }
         }
@@ -89,14 +112,24 @@ impl Sink for Console {
     fn tell(&self, message: Message<'_>) {
         match message {
             Message::Started { stage, total } => self.start(stage, total),
-            Message::Advanced { stage, done, total, note } => self.advance(stage, done, total, note),
+            Message::Advanced {
+                stage,
+                done,
+                total,
+                note,
+            } => self.advance(stage, done, total, note),
             Message::Trained { step, total, .. } => {
-                let facts = format!("loss {:.4}, {:.1} dB, {}k Gaussians", step.loss, step.psnr, step.gaussians / 1000);
+                let facts = format!(
+                    "loss {:.4}, {:.1} dB, {}k Gaussians",
+                    step.loss,
+                    step.psnr,
+                    step.gaussians / 1000
+                );
                 self.advance("train", u64::from(step.iteration), u64::from(total), &facts);
             }
             Message::Finished { stage } => self.finish(stage),
             Message::Warning(text) => {
-                // A bar would be written over.
+                // Hides the bar while the warning is printed.
                 let stages = self.stages();
                 match stages.values().next() {
                     Some(stage) => stage.bar.suspend(|| tracing::warn!("{text}")),
@@ -108,25 +141,38 @@ impl Sink for Console {
     }
 }
 
-/// Whether a tenth of the stage was done since a line was written; always where nobody knows how much there is.
+/// Returns whether another tenth of the stage is done since the last printed line. Always true if
+/// the total is unknown (0).
 fn is_tenth_more(told: u64, done: u64, total: u64) -> bool {
     total == 0 || 10 * (done - told.min(done)) >= total
 }
 
-/// "train 400/2,000, loss 0.0410, 22.1 it/s, 62 s left"
+/// Formats a progress line: "train 400/2,000, loss 0.0410, 22.1 it/s, 62 s left".
 fn line(name: &str, done: u64, total: u64, facts: &str, elapsed: Duration) -> String {
     let seconds = elapsed.as_secs_f64().max(1e-9);
-    let facts = if facts.is_empty() { String::new() } else { format!(", {facts}") };
+    let facts = if facts.is_empty() {
+        String::new()
+    } else {
+        format!(", {facts}")
+    };
     if total == 0 {
         return format!("{name}{facts}, {seconds:.0} s so far");
     }
     let rate = done as f64 / seconds;
-    let rate_text = if rate >= 1.0 { format!("{rate:.1} it/s") } else { format!("{:.1} s each", 1.0 / rate.max(1e-9)) };
+    let rate_text = if rate >= 1.0 {
+        format!("{rate:.1} it/s")
+    } else {
+        format!("{:.1} s each", 1.0 / rate.max(1e-9))
+    };
     let left = total.saturating_sub(done) as f64 / rate.max(1e-9);
-    format!("{name} {}/{}{facts}, {rate_text}, {left:.0} s left", grouped(done), grouped(total))
+    format!(
+        "{name} {}/{}{facts}, {rate_text}, {left:.0} s left",
+        grouped(done),
+        grouped(total)
+    )
 }
 
-/// A number with a comma before each three digits.
+/// Formats a number with thousands separators.
 fn grouped(number: u64) -> String {
     let digits = number.to_string();
     let mut out = String::new();
@@ -146,14 +192,27 @@ mod tests {
     #[test]
     fn a_line_says_where_a_stage_stands() {
         let training = line("train", 400, 2_000, "loss 0.0410", Duration::from_secs(20));
-        assert_eq!(training, "train 400/2,000, loss 0.0410, 20.0 it/s, 80 s left");
-        assert_eq!(line("masks", 4, 44, "", Duration::from_secs(8)), "masks 4/44, 2.0 s each, 80 s left");
-        assert_eq!(line("poses", 0, 0, "matching: 12", Duration::from_secs(31)), "poses, matching: 12, 31 s so far");
+        assert_eq!(
+            training,
+            "train 400/2,000, loss 0.0410, 20.0 it/s, 80 s left"
+        );
+        assert_eq!(
+            line("masks", 4, 44, "", Duration::from_secs(8)),
+            "masks 4/44, 2.0 s each, 80 s left"
+        );
+        assert_eq!(
+            line("poses", 0, 0, "matching: 12", Duration::from_secs(31)),
+            "poses, matching: 12, 31 s so far"
+        );
         assert_eq!(grouped(1_234_567), "1,234,567");
     }
 
     #[test]
     fn lines_come_with_every_tenth() {
-        assert!(!is_tenth_more(100, 299, 2_000) && is_tenth_more(100, 300, 2_000) && is_tenth_more(0, 0, 0));
+        assert!(
+            !is_tenth_more(100, 299, 2_000)
+                && is_tenth_more(100, 300, 2_000)
+                && is_tenth_more(0, 0, 0)
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! The `fastlgs` binary.
+//! Entry point of the `fastlgs` binary.
 
 fn main() -> std::process::ExitCode {
     fastlgs_cli::main()

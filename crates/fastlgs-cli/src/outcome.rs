@@ -1,9 +1,9 @@
-//! How a command ended when it did not fail.
+//! Outcome of a command that did not fail.
 
-/// What the exit code tells.
+/// Outcome of a command that did not fail; it determines the exit code.
 pub enum Outcome {
-    /// Done.
+    /// The command is done: exit code 0.
     Done,
-    /// A query that nothing in the scene matches.
+    /// No object matches the query: exit code 3.
     NotFound,
 }

@@ -1,4 +1,4 @@
-//! Reports: a table for people, JSON for programs.
+//! Output of reports: as text, or as JSON with `--json`.
 
 use crate::outcome::Outcome;
 use crate::ui::{self, Common, say};
@@ -7,8 +7,12 @@ use serde::Serialize;
 use serde_json::Value;
 use std::path::Path;
 
-/// Writes a report where `--json` says, else what `words` say of it to standard output.
-pub fn tell<R: Serialize>(common: &Common, report: &R, words: impl FnOnce(&R) -> String) -> Result<Outcome> {
+/// Writes a report as JSON if `--json` is given; otherwise prints its summary by `words`.
+pub fn tell<R: Serialize>(
+    common: &Common,
+    report: &R,
+    words: impl FnOnce(&R) -> String,
+) -> Result<Outcome> {
     if common.json.is_some() {
         return give(common, report);
     }
@@ -18,12 +22,16 @@ pub fn tell<R: Serialize>(common: &Common, report: &R, words: impl FnOnce(&R) ->
     Ok(Outcome::Done)
 }
 
-/// Writes a report where `--json` says, else as `name value` lines to standard output.
+/// Writes a report as JSON if `--json` is given; otherwise prints a table of its fields.
 pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
     let value = &serde_json::to_value(report)?;
     match common.json.as_deref() {
-        Some(path) if path == Path::new("-") => ui::line(format_args!("{}", serde_json::to_string_pretty(value)?))?,
-        Some(path) => fastlgs_core::fs::write_json(path, value).context("writing the report")?,
+        Some(path) if path == Path::new("-") => {
+            ui::line(format_args!("{}", serde_json::to_string_pretty(value)?))?
+        }
+        Some(path) => {
+            fastlgs_core::fs::write_json(path, value).context("cannot write the report")?
+        }
         None if common.quiet => {}
         None => print_table(value, 0),
     }
@@ -31,7 +39,9 @@ pub fn give(common: &Common, report: &impl Serialize) -> Result<Outcome> {
 }
 
 fn print_table(value: &Value, indent: usize) {
-    let Value::Object(map) = value else { return say!("{value}") };
+    let Value::Object(map) = value else {
+        return say!("{value}");
+    };
     let width = map.keys().map(String::len).max().unwrap_or(0);
     for (name, value) in map {
         match value {
@@ -40,7 +50,11 @@ fn print_table(value: &Value, indent: usize) {
                 print_table(value, indent + 2);
             }
             Value::String(text) => say!("{:indent$}{name:width$}  {text}", ""),
-            Value::Number(n) if n.is_f64() => say!("{:indent$}{name:width$}  {:.4}", "", n.as_f64().unwrap_or(f64::NAN)),
+            Value::Number(n) if n.is_f64() => say!(
+                "{:indent$}{name:width$}  {:.4}",
+                "",
+                n.as_f64().unwrap_or(f64::NAN)
+            ),
             other => say!("{:indent$}{name:width$}  {other}", ""),
         }
     }

@@ -1,4 +1,4 @@
-//! Options that every command has, and logging.
+//! Options of all commands, and logging.
 
 use fastlgs::Run;
 use fastlgs::progress::Sink;
@@ -6,35 +6,40 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
 
-/// Options that every command has.
+/// Options of all commands.
 #[derive(clap::Args, Clone)]
 pub struct Common {
-    /// Tell more (twice: everything).
+    /// Print more messages; twice: debug messages.
     #[arg(short, long, action = clap::ArgAction::Count, global = true)]
     pub verbose: u8,
-    /// Tell only errors.
+    /// Print only errors.
     #[arg(short, long, global = true)]
     pub quiet: bool,
     /// Write the report as JSON to FILE, or to standard output with `-`.
     #[arg(long, value_name = "FILE", global = true)]
     pub json: Option<PathBuf>,
-    /// Seed of all randomness.
+    /// Seed of all random numbers.
     #[arg(long, default_value_t = 0, global = true)]
     pub seed: u64,
-    /// `auto` (a graphics card, else the faster of software adapter and `cpu`), `cpu`, or an adapter's name or index (`fastlgs info` lists
-    /// them).
+    /// Device: `auto`, `cpu`, or the name or index of an adapter (`fastlgs info` lists them).
+    /// `auto` prefers a GPU, then the faster of software adapter and `cpu`.
     #[arg(long, default_value = "auto", global = true, env = "FASTLGS_DEVICE")]
     pub device: String,
 }
 
 impl Common {
-    /// A run of a stage that `progress` watches.
+    /// Returns the run settings of a stage that reports to `progress`.
     pub fn run<'a>(&'a self, progress: &'a dyn Sink) -> Run<'a> {
-        Run { device: &self.device, seed: self.seed, progress }
+        Run {
+            device: &self.device,
+            seed: self.seed,
+            progress,
+        }
     }
 }
 
-/// Logs go to stderr; `FASTLGS_LOG` overrides the flags.
+/// Starts logging to stderr. The environment variable `FASTLGS_LOG` overrides `--verbose` and
+/// `--quiet`.
 pub fn start_logging(common: &Common) {
     let level = match (common.quiet, common.verbose) {
         (true, _) => "error",
@@ -42,7 +47,11 @@ pub fn start_logging(common: &Common) {
         (_, 1) => "info,wgpu_core=warn,wgpu_hal=error,ort=warn",
         _ => "debug,wgpu_core=info,wgpu_hal=warn,naga=info",
     };
-    let level = if common.verbose == 0 { format!("{level},wgpu_hal=error,ort=error") } else { level.to_owned() };
+    let level = if common.verbose == 0 {
+        format!("{level},wgpu_hal=error,ort=error")
+    } else {
+        level.to_owned()
+    };
     let filter = EnvFilter::try_from_env("FASTLGS_LOG").unwrap_or_else(|_| EnvFilter::new(level));
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -53,10 +62,10 @@ pub fn start_logging(common: &Common) {
         .init();
 }
 
-/// Writes a line to standard output. Where nobody listens any more, as behind `head`, it is lost without a word.
+/// Writes a line to standard output. A closed pipe, such as after `head`, is not an error.
 ///
 /// # Errors
-/// The system's refusal, as on a full disk.
+/// Any other I/O error, such as a full disk.
 pub fn line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
     use std::io::Write;
     match writeln!(std::io::stdout(), "{words}") {
@@ -65,7 +74,7 @@ pub fn line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
     }
 }
 
-/// Says something on standard output; what cannot be written is lost.
+/// Prints a line to standard output and ignores errors.
 macro_rules! say {
     ($($words:tt)*) => {
         drop($crate::ui::line(format_args!($($words)*)))

@@ -7,7 +7,9 @@ use fastlgs_core::{camera, dataset};
 use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let photos = std::env::args().nth(1).ok_or("usage: read_dataset PHOTOS")?;
+    let photos = std::env::args()
+        .nth(1)
+        .ok_or("usage: read_dataset PHOTOS")?;
     let dataset = dataset::load(Path::new(&photos))?;
     let cameras: Vec<_> = dataset.photos.iter().map(|p| p.camera.clone()).collect();
     for camera in &cameras {
@@ -17,6 +19,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             camera.name, camera.width, camera.height, camera.fx
         );
     }
-    println!("{} photos, {} points, scene extent {:.2}", cameras.len(), dataset.points.len(), camera::scene_extent(&cameras));
+    println!(
+        "{} photos, {} points, scene extent {:.2}",
+        cameras.len(),
+        dataset.points.len(),
+        camera::scene_extent(&cameras)
+    );
     Ok(())
 }

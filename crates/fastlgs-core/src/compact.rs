@@ -18,7 +18,14 @@ use std::ops::Range;
 use std::path::Path;
 
 /// Names of the groups, in the order of their channels.
-const GROUPS: [&str; 6] = ["mean", "log_scale", "rotation", "opacity", "sh_dc", "sh_rest"];
+const GROUPS: [&str; 6] = [
+    "mean",
+    "log_scale",
+    "rotation",
+    "opacity",
+    "sh_dc",
+    "sh_rest",
+];
 /// Largest number of bytes per value.
 const MAX_BYTES: u8 = 3;
 
@@ -51,20 +58,35 @@ impl Precision {
     ///
     /// # Errors
     /// Errors of `quality`.
-    pub fn choose<E>(scene: &Gaussians, loss: f64, mut quality: impl FnMut(&Gaussians) -> Result<f64, E>) -> Result<Self, E> {
+    pub fn choose<E>(
+        scene: &Gaussians,
+        loss: f64,
+        mut quality: impl FnMut(&Gaussians) -> Result<f64, E>,
+    ) -> Result<Self, E> {
         let full = quality(scene)?;
         let mut bytes = [1; GROUPS.len()];
-        for (g, bytes) in bytes.iter_mut().enumerate().filter(|(g, _)| !group(*g, scene.sh_degree).is_empty()) {
+        for (g, bytes) in bytes
+            .iter_mut()
+            .enumerate()
+            .filter(|(g, _)| !group(*g, scene.sh_degree).is_empty())
+        {
             *bytes = MAX_BYTES;
             for fewer in 1..MAX_BYTES {
                 let mut values = scene.to_channels();
                 let n = scene.len();
                 for channel in group(g, scene.sh_degree) {
                     let plane = &mut values[channel * n..(channel + 1) * n];
-                    let fixed = Fixed::of(plane, fewer);
-                    plane.iter_mut().for_each(|v| *v = fixed.value(fixed.steps(*v)));
+                    let fixed = FixedPoint::of(plane, fewer);
+                    plane
+                        .iter_mut()
+                        .for_each(|v| *v = fixed.value(fixed.steps(*v)));
                 }
-                if quality(&Gaussians::from_channels(&values, scene.sh_degree, Some(&scene.object_ids)))? >= full - loss {
+                if quality(&Gaussians::from_channels(
+                    &values,
+                    scene.sh_degree,
+                    Some(&scene.object_ids),
+                ))? >= full - loss
+                {
                     *bytes = fewer;
                     break;
                 }
@@ -80,16 +102,20 @@ impl Precision {
 }
 
 /// Fixed-point encoding of numbers between `low` and `high`.
-struct Fixed {
+struct FixedPoint {
     low: f32,
     high: f32,
     bytes: u8,
 }
 
-impl Fixed {
+impl FixedPoint {
     fn of(values: &[f32], bytes: u8) -> Self {
         let bound = |start: f32, f: fn(f32, f32) -> f32| values.iter().fold(start, |a, &b| f(a, b));
-        Self { low: bound(f32::INFINITY, f32::min), high: bound(f32::NEG_INFINITY, f32::max), bytes }
+        Self {
+            low: bound(f32::INFINITY, f32::min),
+            high: bound(f32::NEG_INFINITY, f32::max),
+            bytes,
+        }
     }
 
     fn last(&self) -> f64 {
@@ -98,7 +124,11 @@ impl Fixed {
 
     fn steps(&self, value: f32) -> u32 {
         let span = f64::from(self.high) - f64::from(self.low);
-        if span > 0.0 { ((f64::from(value) - f64::from(self.low)) / span * self.last()).round() as u32 } else { 0 }
+        if span > 0.0 {
+            ((f64::from(value) - f64::from(self.low)) / span * self.last()).round() as u32
+        } else {
+            0
+        }
     }
 
     fn value(&self, steps: u32) -> f32 {
@@ -126,21 +156,43 @@ pub fn write(path: &Path, scene: &Gaussians, precision: &Precision) -> Result<()
         let (mut planes, mut bounds) = (Vec::new(), Vec::new());
         for channel in range.clone() {
             let plane = &values[channel * n..(channel + 1) * n];
-            let fixed = Fixed::of(plane, bytes);
-            bounds.extend([fixed.low, fixed.high].into_iter().flat_map(f32::to_le_bytes));
+            let fixed = FixedPoint::of(plane, bytes);
+            bounds.extend(
+                [fixed.low, fixed.high]
+                    .into_iter()
+                    .flat_map(f32::to_le_bytes),
+            );
             for place in (0..bytes).rev() {
                 planes.extend(plane.iter().map(|v| (fixed.steps(*v) >> (8 * place)) as u8));
             }
         }
-        tensors.push((name.into(), Dtype::U8, vec![range.len(), bytes.into(), n], planes));
-        tensors.push((format!("{name}.range"), Dtype::F32, vec![range.len(), 2], bounds));
+        tensors.push((
+            name.into(),
+            Dtype::U8,
+            vec![range.len(), bytes.into(), n],
+            planes,
+        ));
+        tensors.push((
+            format!("{name}.range"),
+            Dtype::F32,
+            vec![range.len(), 2],
+            bounds,
+        ));
     }
-    let ids = scene.object_ids.iter().flat_map(|id| id.to_le_bytes()).collect();
+    let ids = scene
+        .object_ids
+        .iter()
+        .flat_map(|id| id.to_le_bytes())
+        .collect();
     tensors.push(("object_id".into(), Dtype::U16, vec![n], ids));
-    let views: Result<Vec<_>, _> =
-        tensors.iter().map(|(name, dtype, shape, data)| Ok((name, TensorView::new(*dtype, shape.clone(), data)?))).collect();
+    let views: Result<Vec<_>, _> = tensors
+        .iter()
+        .map(|(name, dtype, shape, data)| Ok((name, TensorView::new(*dtype, shape.clone(), data)?)))
+        .collect();
     let data = views.and_then(|v| safetensors::serialize(v, None));
-    let data = data.map_err(|e: safetensors::SafeTensorError| Error::format(path, format!("cannot write tensors: {e}")))?;
+    let data = data.map_err(|e: safetensors::SafeTensorError| {
+        Error::format(path, format!("cannot write tensors: {e}"))
+    })?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
@@ -151,34 +203,64 @@ pub fn write(path: &Path, scene: &Gaussians, precision: &Precision) -> Result<()
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let bad = |what: String| Error::format(path, format!("{what}; export the scene again"));
-    let file = SafeTensors::deserialize(&data).map_err(|e| bad(format!("not a complete safetensors file ({e})")))?;
+    let file = SafeTensors::deserialize(&data)
+        .map_err(|e| bad(format!("not a complete safetensors file ({e})")))?;
     let tensor = |name: &str, dtype: Dtype, rank: usize| {
-        let found = file.tensor(name).ok().filter(|t| t.dtype() == dtype && t.shape().len() == rank);
-        found.ok_or_else(|| bad(format!("no tensor '{name}' of type {dtype:?} with {rank} dimensions")))
+        let found = file
+            .tensor(name)
+            .ok()
+            .filter(|t| t.dtype() == dtype && t.shape().len() == rank);
+        found.ok_or_else(|| {
+            bad(format!(
+                "no tensor '{name}' of type {dtype:?} with {rank} dimensions"
+            ))
+        })
     };
     let ids = tensor("object_id", Dtype::U16, 1)?;
     let n = ids.shape()[0];
-    let ids: Vec<u16> = ids.data().chunks_exact(2).map(|b| u16::from_le_bytes([b[0], b[1]])).collect();
+    let ids: Vec<u16> = ids
+        .data()
+        .chunks_exact(2)
+        .map(|b| u16::from_le_bytes([b[0], b[1]]))
+        .collect();
     let rest = tensor("sh_rest", Dtype::U8, 3)?.shape()[0];
     let sh_degree = (0..=MAX_SH_DEGREE).find(|d| 3 * rest_len(*d) == rest);
-    let sh_degree = sh_degree.ok_or_else(|| bad(format!("{rest} SH channels do not match any SH degree")))?;
+    let sh_degree =
+        sh_degree.ok_or_else(|| bad(format!("{rest} SH channels do not match any SH degree")))?;
     let mut values = vec![0.0f32; channels(sh_degree) * n];
     for (g, name) in GROUPS.into_iter().enumerate() {
-        let (planes, bounds) = (tensor(name, Dtype::U8, 3)?, tensor(&format!("{name}.range"), Dtype::F32, 2)?);
+        let (planes, bounds) = (
+            tensor(name, Dtype::U8, 3)?,
+            tensor(&format!("{name}.range"), Dtype::F32, 2)?,
+        );
         let range = group(g, sh_degree);
         let bytes = planes.shape()[1];
         let fits = planes.shape() == [range.len(), bytes, n] && bounds.shape() == [range.len(), 2];
         if !fits || !(1..=usize::from(MAX_BYTES)).contains(&bytes) {
-            return Err(bad(format!("tensor '{name}' has the unexpected shape {:?}", planes.shape())));
+            return Err(bad(format!(
+                "tensor '{name}' has the unexpected shape {:?}",
+                planes.shape()
+            )));
         }
         for (k, channel) in range.enumerate() {
-            let bound = |side: usize| f32::from_le_bytes(std::array::from_fn(|b| bounds.data()[8 * k + 4 * side + b]));
-            let fixed = Fixed { low: bound(0), high: bound(1), bytes: bytes as u8 };
+            let bound = |side: usize| {
+                f32::from_le_bytes(std::array::from_fn(|b| bounds.data()[8 * k + 4 * side + b]))
+            };
+            let fixed = FixedPoint {
+                low: bound(0),
+                high: bound(1),
+                bytes: bytes as u8,
+            };
             if n > 0 && !(fixed.low.is_finite() && fixed.high.is_finite()) {
                 return Err(bad(format!("the range of '{name}' is not finite")));
             }
-            for (i, value) in values[channel * n..(channel + 1) * n].iter_mut().enumerate() {
-                let steps = (0..bytes).fold(0u32, |s, b| s << 8 | u32::from(planes.data()[(k * bytes + b) * n + i]));
+            for (i, value) in values[channel * n..(channel + 1) * n]
+                .iter_mut()
+                .enumerate()
+            {
+                let steps = (0..bytes).fold(0u32, |s, b| {
+                    s << 8 | u32::from(planes.data()[(k * bytes + b) * n + i])
+                });
                 *value = fixed.value(steps);
             }
         }
@@ -194,14 +276,24 @@ mod tests {
 
     fn sample() -> Gaussians {
         let mut rng = Rng::new(1, "compact");
-        let mut g = Gaussians { sh_degree: 2, ..Gaussians::default() };
+        let mut g = Gaussians {
+            sh_degree: 2,
+            ..Gaussians::default()
+        };
         for i in 0..300 {
             let mean = Vec3::new(rng.normal(), rng.normal(), rng.normal());
-            g.push_sphere(mean, rng.range(0.01, 0.5), rng.range(0.1, 0.9), [rng.uniform(), rng.uniform(), rng.uniform()]);
+            g.push_sphere(
+                mean,
+                rng.range(0.01, 0.5),
+                rng.range(0.1, 0.9),
+                [rng.uniform(), rng.uniform(), rng.uniform()],
+            );
             g.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
             g.object_ids[i] = i as u16 * 7;
         }
-        g.sh_rest.iter_mut().for_each(|v| *v = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform()));
+        g.sh_rest
+            .iter_mut()
+            .for_each(|v| *v = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform()));
         g
     }
 
@@ -212,15 +304,25 @@ mod tests {
         let before = sample();
         write(&path, &before, &Precision([3, 2, 2, 2, 1, 1])).unwrap();
         let after = read(&path).unwrap();
-        assert_eq!((after.sh_degree, &after.object_ids), (2, &before.object_ids));
-        let error =
-            |f: fn(&Gaussians) -> &[Vec3]| f(&before).iter().zip(f(&after)).map(|(a, b)| (*a - *b).abs().max_element()).fold(0.0, f32::max);
+        assert_eq!(
+            (after.sh_degree, &after.object_ids),
+            (2, &before.object_ids)
+        );
+        let error = |f: fn(&Gaussians) -> &[Vec3]| {
+            f(&before)
+                .iter()
+                .zip(f(&after))
+                .map(|(a, b)| (*a - *b).abs().max_element())
+                .fold(0.0, f32::max)
+        };
         assert!(error(|g| &g.means) < 8.0 / (1 << 24) as f32);
         assert!(error(|g| &g.log_scales) < 4.0 / 65535.0);
         assert!((1e-4..0.5 / 255.0 + 1e-6).contains(&error(|g| &g.sh_rest)));
         assert!((0..300).all(|i| after.rotation(i).dot(before.rotation(i)).abs() > 0.999_99));
         let bytes = 300 * (3 * 3 + 2 * 3 + 2 * 4 + 2 + 3 + 24 + 2);
-        assert!((bytes..bytes + 2000).contains(&(std::fs::metadata(&path).unwrap().len() as usize)));
+        assert!(
+            (bytes..bytes + 2000).contains(&(std::fs::metadata(&path).unwrap().len() as usize))
+        );
     }
 
     #[test]
@@ -228,10 +330,18 @@ mod tests {
         let scene = sample();
         // Quality depends only on the means, to an accuracy of 0.001.
         let quality = |g: &Gaussians| {
-            let worst = g.means.iter().zip(&scene.means).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+            let worst = g
+                .means
+                .iter()
+                .zip(&scene.means)
+                .map(|(a, b)| a.distance(*b))
+                .fold(0.0, f32::max);
             Ok::<_, ()>(if worst < 1e-3 { 30.0 } else { 20.0 })
         };
-        assert_eq!(Precision::choose(&scene, 0.01, quality).unwrap(), Precision([2, 1, 1, 1, 1, 1]));
+        assert_eq!(
+            Precision::choose(&scene, 0.01, quality).unwrap(),
+            Precision([2, 1, 1, 1, 1, 1])
+        );
     }
 
     #[test]
@@ -243,9 +353,18 @@ mod tests {
         write(&path, &sample(), &Precision([1; 6])).unwrap();
         let data = std::fs::read(&path).unwrap();
         std::fs::write(&path, &data[..data.len() - 9]).unwrap();
-        assert!(read(&path).unwrap_err().to_string().contains("scene.safetensors"));
+        assert!(
+            read(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("scene.safetensors")
+        );
         let one = 1.0f32.to_le_bytes();
-        let other = safetensors::serialize([("x", TensorView::new(Dtype::F32, vec![1], &one).unwrap())], None).unwrap();
+        let other = safetensors::serialize(
+            [("x", TensorView::new(Dtype::F32, vec![1], &one).unwrap())],
+            None,
+        )
+        .unwrap();
         std::fs::write(&path, other).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("object_id"));
     }

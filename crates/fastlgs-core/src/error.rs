@@ -34,9 +34,20 @@ impl Error {
     /// it to 300 characters.
     pub fn format(path: impl AsRef<Path>, reason: impl AsRef<str>) -> Self {
         const LONGEST: usize = 300;
-        let words = reason.as_ref().split(|c: char| c.is_whitespace() || c.is_control()).filter(|w| !w.is_empty());
-        let reason: String = words.collect::<Vec<_>>().join(" ").chars().take(LONGEST).collect();
-        Self::Format { path: path.as_ref().to_owned(), reason }
+        let words = reason
+            .as_ref()
+            .split(|c: char| c.is_whitespace() || c.is_control())
+            .filter(|w| !w.is_empty());
+        let reason: String = words
+            .collect::<Vec<_>>()
+            .join(" ")
+            .chars()
+            .take(LONGEST)
+            .collect();
+        Self::Format {
+            path: path.as_ref().to_owned(),
+            reason,
+        }
     }
 
     /// Wraps an I/O error with the path it happened on; for `map_err`.

@@ -9,7 +9,9 @@ use exr::block::reader::ChunksReader;
 use exr::block::writer::ChunksWriter;
 use exr::compression::Compression;
 use exr::math::{RoundingMode, Vec2};
-use exr::meta::attribute::{ChannelDescription, LevelMode, LineOrder, SampleType, Text, TileDescription};
+use exr::meta::attribute::{
+    ChannelDescription, LevelMode, LineOrder, SampleType, Text, TileDescription,
+};
 use exr::meta::{BlockDescription, header::Header};
 use std::io::Cursor;
 use std::path::Path;
@@ -27,23 +29,42 @@ const TILE: usize = 64;
 pub fn write(path: &Path, width: usize, height: usize, channels: &[(&str, &[f32])]) -> Result<()> {
     let mut sorted = channels.to_vec();
     sorted.sort_by_key(|(name, _)| *name);
-    let list = sorted.iter().map(|(name, _)| ChannelDescription::new(*name, SampleType::F32, false)).collect();
-    let tiles = TileDescription { tile_size: Vec2(TILE, TILE), level_mode: LevelMode::Singular, rounding_mode: RoundingMode::Down };
+    let list = sorted
+        .iter()
+        .map(|(name, _)| ChannelDescription::new(*name, SampleType::F32, false))
+        .collect();
+    let tiles = TileDescription {
+        tile_size: Vec2(TILE, TILE),
+        level_mode: LevelMode::Singular,
+        rounding_mode: RoundingMode::Down,
+    };
     let header = Header::new(Text::from("fastlgs"), (width, height), list);
-    let header = header.with_encoding(Compression::RLE, BlockDescription::Tiles(tiles), LineOrder::Increasing);
+    let header = header.with_encoding(
+        Compression::RLE,
+        BlockDescription::Tiles(tiles),
+        LineOrder::Increasing,
+    );
     let mut data = Vec::new();
     // Parallel compression would order the blocks by thread timing, so that files would differ.
-    let written = exr::block::write(Cursor::new(&mut data), [header].into_iter().collect(), true, |meta, chunks| {
-        let blocks = meta.collect_ordered_blocks(|index| {
-            UncompressedBlock::from_lines(&meta.headers[0].channels, index, |line| {
-                let start = line.location.position.1 * width + line.location.position.0;
-                let values = sorted[line.location.channel].1;
-                line.write_samples(|k| values[start + k]).expect("a line holds its samples");
-            })
-        });
-        let mut compressor = chunks.sequential_blocks_compressor(&meta);
-        blocks.into_iter().try_for_each(|(place, block)| compressor.compress_block(place, block))
-    });
+    let written = exr::block::write(
+        Cursor::new(&mut data),
+        [header].into_iter().collect(),
+        true,
+        |meta, chunks| {
+            let blocks = meta.collect_ordered_blocks(|index| {
+                UncompressedBlock::from_lines(&meta.headers[0].channels, index, |line| {
+                    let start = line.location.position.1 * width + line.location.position.0;
+                    let values = sorted[line.location.channel].1;
+                    line.write_samples(|k| values[start + k])
+                        .expect("a line holds its samples");
+                })
+            });
+            let mut compressor = chunks.sequential_blocks_compressor(&meta);
+            blocks
+                .into_iter()
+                .try_for_each(|(place, block)| compressor.compress_block(place, block))
+        },
+    );
     written.map_err(|e| Error::format(path, format!("cannot encode EXR: {e}")))?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
@@ -58,11 +79,21 @@ pub fn read(path: &Path) -> Result<(usize, usize, Vec<Channel>)> {
     let reader = exr::block::read(Cursor::new(fs::read(path)?), false).map_err(failed)?;
     let header = reader.headers()[0].clone();
     let (width, height) = (header.layer_size.0, header.layer_size.1);
-    let mut channels: Vec<Channel> = header.channels.list.iter().map(|c| (c.name.to_string(), vec![0.0; width * height])).collect();
-    let first = |_: &exr::meta::MetaData, tile: exr::block::chunk::TileCoordinates, block: exr::block::BlockIndex| {
+    let mut channels: Vec<Channel> = header
+        .channels
+        .list
+        .iter()
+        .map(|c| (c.name.to_string(), vec![0.0; width * height]))
+        .collect();
+    let first = |_: &exr::meta::MetaData,
+                 tile: exr::block::chunk::TileCoordinates,
+                 block: exr::block::BlockIndex| {
         block.layer == 0 && tile.is_largest_resolution_level()
     };
-    let mut blocks = reader.filter_chunks(false, first).map_err(failed)?.sequential_decompressor(false);
+    let mut blocks = reader
+        .filter_chunks(false, first)
+        .map_err(failed)?
+        .sequential_decompressor(false);
     while let Some(block) = blocks.decompress_next_block() {
         let block = block.map_err(failed)?;
         for line in block.lines(&header.channels) {
@@ -72,7 +103,8 @@ pub fn read(path: &Path) -> Result<(usize, usize, Vec<Channel>)> {
             match header.channels.list[line.location.channel].sample_type {
                 SampleType::F32 => line.read_samples_into_slice(row).map_err(failed)?,
                 SampleType::F16 => {
-                    for (to, value) in row.iter_mut().zip(line.read_samples::<exr::prelude::f16>()) {
+                    for (to, value) in row.iter_mut().zip(line.read_samples::<exr::prelude::f16>())
+                    {
                         *to = value.map_err(failed)?.to_f32();
                     }
                 }

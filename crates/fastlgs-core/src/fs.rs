@@ -13,7 +13,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 /// # Errors
 /// Errors of `write` and of the operating system, as [`Error::Io`]. The existing file then stays
 /// unchanged.
-pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>) -> Result<()> {
+pub fn write_atomic(
+    path: &Path,
+    write: impl FnOnce(&mut BufWriter<File>) -> std::io::Result<()>,
+) -> Result<()> {
     let path = &path.canonicalize().unwrap_or_else(|_| path.to_owned());
     if path.metadata().is_ok_and(|m| !m.is_file() && !m.is_dir()) {
         let into = |device: File| {
@@ -21,7 +24,11 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std
             write(&mut device)?;
             device.flush()
         };
-        return File::options().write(true).open(path).and_then(into).map_err(Error::io(path));
+        return File::options()
+            .write(true)
+            .open(path)
+            .and_then(into)
+            .map_err(Error::io(path));
     }
     if let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
@@ -35,7 +42,10 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std
     })();
     if let Err(source) = result.and_then(|()| std::fs::rename(&partial, path)) {
         let _ = std::fs::remove_file(&partial);
-        return Err(Error::Io { path: path.to_owned(), source });
+        return Err(Error::Io {
+            path: path.to_owned(),
+            source,
+        });
     }
     Ok(())
 }
@@ -45,7 +55,11 @@ pub fn write_atomic(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> std
 fn partial_name(path: &Path) -> PathBuf {
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let mut name = path.file_name().unwrap_or_default().to_owned();
-    name.push(format!(".{}-{}.partial", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed)));
+    name.push(format!(
+        ".{}-{}.partial",
+        std::process::id(),
+        COUNT.fetch_add(1, Ordering::Relaxed)
+    ));
     path.with_file_name(name)
 }
 
@@ -54,12 +68,16 @@ fn partial_name(path: &Path) -> PathBuf {
 ///
 /// # Errors
 /// [`Error::Io`] with the path of the lock file.
-pub fn locked(path: &Path) -> Result<File> {
+pub fn acquire_lock(path: &Path) -> Result<File> {
     let path = path.with_added_extension("lock");
     if let Some(parent) = path.parent() {
         std::fs::create_dir_all(parent).map_err(Error::io(parent))?;
     }
-    let lock = File::options().create(true).append(true).open(&path).map_err(Error::io(&path))?;
+    let lock = File::options()
+        .create(true)
+        .append(true)
+        .open(&path)
+        .map_err(Error::io(&path))?;
     lock.lock().map_err(Error::io(&path))?;
     Ok(lock)
 }
@@ -67,7 +85,11 @@ pub fn locked(path: &Path) -> Result<File> {
 /// Returns the cache folder: `FASTLGS_CACHE`, else `$XDG_CACHE_HOME/fastlgs`, else
 /// `~/.cache/fastlgs`.
 pub fn cache_dir() -> PathBuf {
-    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let variable = |name: &str| {
+        std::env::var_os(name)
+            .filter(|v| !v.is_empty())
+            .map(PathBuf::from)
+    };
     variable("FASTLGS_CACHE")
         .or_else(|| variable("XDG_CACHE_HOME").map(|p| p.join("fastlgs")))
         .or_else(|| variable("HOME").map(|p| p.join(".cache/fastlgs")))
@@ -77,7 +99,11 @@ pub fn cache_dir() -> PathBuf {
 /// Returns the folder of the user's own data: `FASTLGS_DATA`, else `$XDG_DATA_HOME/fastlgs`, else
 /// `~/.local/share/fastlgs`.
 pub fn data_dir() -> PathBuf {
-    let variable = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+    let variable = |name: &str| {
+        std::env::var_os(name)
+            .filter(|v| !v.is_empty())
+            .map(PathBuf::from)
+    };
     variable("FASTLGS_DATA")
         .or_else(|| variable("XDG_DATA_HOME").map(|p| p.join("fastlgs")))
         .or_else(|| variable("HOME").map(|p| p.join(".local/share/fastlgs")))
@@ -108,17 +134,18 @@ pub fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
 /// # Errors
 /// [`Error::Io`], or [`Error::Format`] with the line and column.
 pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T> {
-    serde_json::from_slice(&read(path)?).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))
+    serde_json::from_slice(&read(path)?)
+        .map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))
 }
 
 /// Little-endian reader of a byte slice. Its errors name the file and the offset.
-pub struct Bytes<'a> {
+pub struct ByteReader<'a> {
     path: &'a Path,
     data: &'a [u8],
     at: usize,
 }
 
-impl<'a> Bytes<'a> {
+impl<'a> ByteReader<'a> {
     /// Creates a reader at the first byte of `data`. `path` is the file that errors name.
     pub fn new(path: &'a Path, data: &'a [u8]) -> Self {
         Self { path, data, at: 0 }
@@ -133,7 +160,11 @@ impl<'a> Bytes<'a> {
         if n > rest.len() {
             return Err(Error::format(
                 self.path,
-                format!("truncated: {n} bytes expected at offset {}, but {} left; copy the file again", self.at, rest.len()),
+                format!(
+                    "truncated: {n} bytes expected at offset {}, but {} left; copy the file again",
+                    self.at,
+                    rest.len()
+                ),
             ));
         }
         self.at += n;
@@ -141,7 +172,7 @@ impl<'a> Bytes<'a> {
     }
 
     /// Returns the number of bytes that are not read yet.
-    pub fn left(&self) -> usize {
+    pub fn remaining(&self) -> usize {
         self.data.len() - self.at
     }
 
@@ -152,8 +183,11 @@ impl<'a> Bytes<'a> {
     /// [`Error::Format`] when they do not.
     pub fn count(&mut self, item: usize) -> Result<usize> {
         let n = self.u64()?;
-        if n > (self.left() / item.max(1)) as u64 {
-            return Err(Error::format(self.path, format!("truncated: it ends before the {n} announced entries; copy the file again")));
+        if n > (self.remaining() / item.max(1)) as u64 {
+            return Err(Error::format(
+                self.path,
+                format!("truncated: it ends before the {n} announced entries; copy the file again"),
+            ));
         }
         Ok(n as usize)
     }
@@ -164,15 +198,18 @@ impl<'a> Bytes<'a> {
     /// [`Error::Format`] without a NUL byte, or for text that is not UTF-8.
     pub fn c_string(&mut self) -> Result<&'a str> {
         let rest = &self.data[self.at..];
-        let end = rest.iter().position(|&b| b == 0).ok_or_else(|| Error::format(self.path, "truncated inside a name; copy the file again"))?;
+        let end = rest.iter().position(|&b| b == 0).ok_or_else(|| {
+            Error::format(self.path, "truncated inside a name; copy the file again")
+        })?;
         self.at += end + 1;
-        std::str::from_utf8(&rest[..end]).map_err(|_| Error::format(self.path, "a name is not UTF-8"))
+        std::str::from_utf8(&rest[..end])
+            .map_err(|_| Error::format(self.path, "a name is not UTF-8"))
     }
 }
 
 macro_rules! number {
     ($($name:ident $type:ty),*) => {
-        impl Bytes<'_> {$(
+        impl ByteReader<'_> {$(
             /// Reads the next little-endian number.
             ///
             /// # Errors
@@ -198,7 +235,13 @@ mod tests {
         use std::os::unix::fs::FileTypeExt;
         let folder = tempfile::tempdir().expect("a folder");
         let pipe = folder.path().join("pipe");
-        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo").success());
+        assert!(
+            std::process::Command::new("mkfifo")
+                .arg(&pipe)
+                .status()
+                .expect("mkfifo")
+                .success()
+        );
         let reader = std::thread::spawn({
             let pipe = pipe.clone();
             move || std::fs::read(pipe).expect("the pipe")
@@ -219,10 +262,13 @@ mod tests {
     fn what_two_change_at_once_is_changed_one_after_the_other() {
         let dir = tempfile::tempdir().expect("a folder");
         let path = dir.path().join("count");
-        let count = || std::fs::read_to_string(&path).map_or(0, |text| text.parse::<usize>().expect("a whole number"));
+        let count = || {
+            std::fs::read_to_string(&path)
+                .map_or(0, |text| text.parse::<usize>().expect("a whole number"))
+        };
         let up = || {
             (0..50).for_each(|_| {
-                let _alone = locked(&path).expect("a lock");
+                let _alone = acquire_lock(&path).expect("a lock");
                 let next = count() + 1;
                 std::fs::write(&path, next.to_string()).expect("a file");
             });

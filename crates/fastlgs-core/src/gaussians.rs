@@ -8,7 +8,7 @@ pub const SH_C0: f32 = 0.282_094_79;
 /// Largest opacity logit of a transparent Gaussian, which adds no colour but marks an object that
 /// photos see through. Trained Gaussians stay far above it: their gradients vanish below -5.5,
 /// which is an opacity of 1/255.
-pub const CLEAR: f32 = -16.0;
+pub const TRANSPARENT_LOGIT: f32 = -16.0;
 
 /// 3-D Gaussians with colour, semantic feature and object id. All vectors have one entry per
 /// Gaussian, except `sh_rest`.
@@ -75,7 +75,8 @@ impl Gaussians {
         self.rotations.push([1.0, 0.0, 0.0, 0.0]);
         self.opacity_logits.push(logit(opacity));
         self.sh_dc.push((Vec3::from(color) - 0.5) / SH_C0);
-        self.sh_rest.extend(std::iter::repeat_n(Vec3::ZERO, rest_len(self.sh_degree)));
+        self.sh_rest
+            .extend(std::iter::repeat_n(Vec3::ZERO, rest_len(self.sh_degree)));
         self.features.push(Vec3::ZERO);
         self.object_ids.push(0);
     }
@@ -85,7 +86,10 @@ impl Gaussians {
     /// # Panics
     /// If the SH degrees differ.
     pub fn append(&mut self, mut other: Self) {
-        assert_eq!(self.sh_degree, other.sh_degree, "both scenes must have the same SH degree");
+        assert_eq!(
+            self.sh_degree, other.sh_degree,
+            "both scenes must have the same SH degree"
+        );
         self.means.append(&mut other.means);
         self.log_scales.append(&mut other.log_scales);
         self.rotations.append(&mut other.rotations);
@@ -105,8 +109,17 @@ impl Gaussians {
     /// Changes the SH degree of colour. Higher coefficients are dropped and missing ones are zero.
     pub fn with_sh_degree(mut self, degree: u32) -> Self {
         let (from, to) = (rest_len(self.sh_degree), rest_len(degree));
-        let value = |i: usize, k: usize| if k < from { self.sh_rest[i * from + k] } else { Vec3::ZERO };
-        let rest = (0..self.len()).flat_map(|i| (0..to).map(move |k| (i, k))).map(|(i, k)| value(i, k)).collect();
+        let value = |i: usize, k: usize| {
+            if k < from {
+                self.sh_rest[i * from + k]
+            } else {
+                Vec3::ZERO
+            }
+        };
+        let rest = (0..self.len())
+            .flat_map(|i| (0..to).map(move |k| (i, k)))
+            .map(|(i, k)| value(i, k))
+            .collect();
         self.sh_rest = rest;
         self.sh_degree = degree;
         self
@@ -129,7 +142,9 @@ impl Gaussians {
         let (m, s, r) = (self.means[i], self.log_scales[i], self.rotations[i]);
         let (c, f) = (self.sh_dc[i], self.features[i]);
         let o = self.opacity_logits[i];
-        [m.x, m.y, m.z, s.x, s.y, s.z, r[0], r[1], r[2], r[3], o, c.x, c.y, c.z, f.x, f.y, f.z]
+        [
+            m.x, m.y, m.z, s.x, s.y, s.z, r[0], r[1], r[2], r[3], o, c.x, c.y, c.z, f.x, f.y, f.z,
+        ]
     }
 
     /// Inverts [`Self::to_channels`]. Without `ids`, all object ids are 0.
@@ -137,7 +152,11 @@ impl Gaussians {
     /// # Panics
     /// If the length of `values` is not a multiple of [`channels`].
     pub fn from_channels(values: &[f32], sh_degree: u32, ids: Option<&[u16]>) -> Self {
-        assert_eq!(values.len() % channels(sh_degree), 0, "the number of values must be a multiple of the channels");
+        assert_eq!(
+            values.len() % channels(sh_degree),
+            0,
+            "the number of values must be a multiple of the channels"
+        );
         let n = values.len() / channels(sh_degree);
         let v = |c: usize, i: usize| values[c * n + i];
         let at = |c: usize, i: usize| Vec3::new(v(c, i), v(c + 1, i), v(c + 2, i));
@@ -145,11 +164,15 @@ impl Gaussians {
         Self {
             means: vec3(0),
             log_scales: vec3(3),
-            rotations: (0..n).map(|i| [v(6, i), v(7, i), v(8, i), v(9, i)]).collect(),
+            rotations: (0..n)
+                .map(|i| [v(6, i), v(7, i), v(8, i), v(9, i)])
+                .collect(),
             opacity_logits: values[10 * n..11 * n].to_vec(),
             sh_dc: vec3(11),
             sh_degree,
-            sh_rest: (0..n).flat_map(|i| (0..rest_len(sh_degree)).map(move |k| at(BASE_CHANNELS + 3 * k, i))).collect(),
+            sh_rest: (0..n)
+                .flat_map(|i| (0..rest_len(sh_degree)).map(move |k| at(BASE_CHANNELS + 3 * k, i)))
+                .collect(),
             features: vec3(14),
             object_ids: ids.map_or_else(|| vec![0; n], <[u16]>::to_vec),
         }
@@ -160,20 +183,24 @@ impl Gaussians {
     ///
     /// # Panics
     /// If an index is out of range.
-    pub fn select(&self, places: &[usize]) -> Self {
+    pub fn select(&self, indices: &[usize]) -> Self {
         fn pick<T: Copy>(items: &[T], places: &[usize]) -> Vec<T> {
             places.iter().map(|&i| items[i]).collect()
         }
         Self {
-            means: pick(&self.means, places),
-            log_scales: pick(&self.log_scales, places),
-            rotations: pick(&self.rotations, places),
-            opacity_logits: pick(&self.opacity_logits, places),
-            sh_dc: pick(&self.sh_dc, places),
+            means: pick(&self.means, indices),
+            log_scales: pick(&self.log_scales, indices),
+            rotations: pick(&self.rotations, indices),
+            opacity_logits: pick(&self.opacity_logits, indices),
+            sh_dc: pick(&self.sh_dc, indices),
             sh_degree: self.sh_degree,
-            sh_rest: places.iter().flat_map(|&i| self.rest(i)).copied().collect(),
-            features: pick(&self.features, places),
-            object_ids: pick(&self.object_ids, places),
+            sh_rest: indices
+                .iter()
+                .flat_map(|&i| self.rest(i))
+                .copied()
+                .collect(),
+            features: pick(&self.features, indices),
+            object_ids: pick(&self.object_ids, indices),
         }
     }
 
@@ -188,8 +215,12 @@ impl Gaussians {
     /// Returns a warning with the number of dropped Gaussians and the PLY columns of their invalid
     /// values.
     pub fn drop_invalid(&mut self) -> Option<String> {
-        for logit in self.opacity_logits.iter_mut().filter(|logit| logit.is_infinite()) {
-            *logit = logit.signum() * SOLID;
+        for logit in self
+            .opacity_logits
+            .iter_mut()
+            .filter(|logit| logit.is_infinite())
+        {
+            *logit = logit.signum() * OPAQUE_LOGIT;
         }
         const NAMES: [&str; BASE_CHANNELS] = [
             "x",
@@ -214,8 +245,14 @@ impl Gaussians {
         let (mut kept, mut infinite, mut unrotated) = (Vec::with_capacity(self.len()), 0, 0);
         for i in 0..self.len() {
             let own = self.values(i);
-            let bad = (0..BASE_CHANNELS).filter(|c| !own[*c].is_finite()).map(|c| NAMES[c]);
-            let rest = self.rest(i).iter().any(|v| !v.is_finite()).then_some("f_rest");
+            let bad = (0..BASE_CHANNELS)
+                .filter(|c| !own[*c].is_finite())
+                .map(|c| NAMES[c]);
+            let rest = self
+                .rest(i)
+                .iter()
+                .any(|v| !v.is_finite())
+                .then_some("f_rest");
             let bad: Vec<&str> = bad.chain(rest).collect();
             if !bad.is_empty() {
                 infinite += 1;
@@ -232,19 +269,34 @@ impl Gaussians {
         }
         *self = self.select(&kept);
         let names: Vec<&str> = columns.into_iter().collect();
-        let infinite = (infinite > 0).then(|| format!("{infinite} with NaN or infinite values in {}", names.join(", ")));
-        let unrotated = (unrotated > 0).then(|| format!("{unrotated} with a zero quaternion in rot_0 to rot_3"));
+        let infinite = (infinite > 0).then(|| {
+            format!(
+                "{infinite} with NaN or infinite values in {}",
+                names.join(", ")
+            )
+        });
+        let unrotated = (unrotated > 0)
+            .then(|| format!("{unrotated} with a zero quaternion in rot_0 to rot_3"));
         let why: Vec<String> = infinite.into_iter().chain(unrotated).collect();
-        Some(format!("{} of {all} Gaussians were dropped: {}", all - kept.len(), why.join("; ")))
+        Some(format!(
+            "{} of {all} Gaussians were dropped: {}",
+            all - kept.len(),
+            why.join("; ")
+        ))
     }
 
     /// Negates y and z: a half turn about x, which converts between OpenCV and OpenGL axes.
     pub fn with_y_and_z_flipped(mut self) -> Self {
         let flip = Vec3::new(1.0, -1.0, -1.0);
         self.means.iter_mut().for_each(|mean| *mean *= flip);
-        self.rotations.iter_mut().for_each(|[_, _, y, z]| (*y, *z) = (-*y, -*z));
+        self.rotations
+            .iter_mut()
+            .for_each(|[_, _, y, z]| (*y, *z) = (-*y, -*z));
         let width = rest_len(self.sh_degree).max(1);
-        self.sh_rest.iter_mut().enumerate().for_each(|(k, value)| *value *= SH_SIGNS[k % width]);
+        self.sh_rest
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, value)| *value *= SH_SIGNS[k % width]);
         self
     }
 
@@ -255,22 +307,34 @@ impl Gaussians {
             values.sort_by(f32::total_cmp);
             values.get(values.len() / 2).copied().unwrap_or(0.0)
         };
-        let middle = Vec3::from_array([0, 1, 2].map(|k| median(self.means.iter().map(|m| m[k]).collect())));
+        let middle =
+            Vec3::from_array([0, 1, 2].map(|k| median(self.means.iter().map(|m| m[k]).collect())));
         let distances: Vec<f32> = self.means.iter().map(|m| m.distance(middle)).collect();
-        let most = FAR_OUTSIDE * median(distances.clone());
-        let kept: Vec<usize> = (0..self.len()).filter(|i| most == 0.0 || distances[*i] <= most).collect();
+        let most = OUTLIER_DISTANCE * median(distances.clone());
+        let kept: Vec<usize> = (0..self.len())
+            .filter(|i| most == 0.0 || distances[*i] <= most)
+            .collect();
         let count = self.len() - kept.len();
-        (if count == 0 { self.clone() } else { self.select(&kept) }, count)
+        (
+            if count == 0 {
+                self.clone()
+            } else {
+                self.select(&kept)
+            },
+            count,
+        )
     }
 }
 
 /// Signs of the SH coefficients above degree 0 after y and z are negated.
-pub(crate) const SH_SIGNS: [f32; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+pub(crate) const SH_SIGNS: [f32; 15] = [
+    -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0,
+];
 /// Logit that replaces an infinite one: an opacity of 0.999, or 0.001 with a negative sign.
-const SOLID: f32 = 7.0;
+const OPAQUE_LOGIT: f32 = 7.0;
 /// Distance from the median mean beyond which a Gaussian is an outlier, in multiples of the median
 /// distance.
-const FAR_OUTSIDE: f32 = 1000.0;
+const OUTLIER_DISTANCE: f32 = 1000.0;
 
 /// Returns ln(p / (1 - p)), the inverse of [`sigmoid`].
 pub fn logit(p: f32) -> f32 {
@@ -289,7 +353,14 @@ mod tests {
     #[test]
     fn one_gaussian_far_outside_does_not_set_the_range() {
         let mut scene = Gaussians::default();
-        (0..50).for_each(|k| scene.push_sphere(Vec3::new((k as f32).sin(), (k as f32).cos(), 0.1 * k as f32), 0.1, 0.5, [0.5; 3]));
+        (0..50).for_each(|k| {
+            scene.push_sphere(
+                Vec3::new((k as f32).sin(), (k as f32).cos(), 0.1 * k as f32),
+                0.1,
+                0.5,
+                [0.5; 3],
+            )
+        });
         assert_eq!(scene.without_far_outliers(), (scene.clone(), 0));
         // A sky at about a hundred times the usual distance is kept.
         scene.push_sphere(Vec3::new(0.0, 200.0, 0.0), 5.0, 0.5, [0.5; 3]);
@@ -300,12 +371,22 @@ mod tests {
 
     #[test]
     fn two_flips_are_none() {
-        let mut scene = Gaussians { sh_degree: 2, ..Gaussians::default() };
+        let mut scene = Gaussians {
+            sh_degree: 2,
+            ..Gaussians::default()
+        };
         scene.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.1, 0.5, [0.5; 3]);
         scene.rotations[0] = [0.5, 0.1, 0.2, 0.3];
-        scene.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        scene
+            .sh_rest
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, v)| *v = Vec3::splat(k as f32));
         let flipped = scene.clone().with_y_and_z_flipped();
-        assert_eq!((flipped.means[0], flipped.rotations[0]), (Vec3::new(1.0, -2.0, -3.0), [0.5, 0.1, -0.2, -0.3]));
+        assert_eq!(
+            (flipped.means[0], flipped.rotations[0]),
+            (Vec3::new(1.0, -2.0, -3.0), [0.5, 0.1, -0.2, -0.3])
+        );
         assert_eq!(flipped.with_y_and_z_flipped(), scene);
     }
 
@@ -315,10 +396,20 @@ mod tests {
         g.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.5, 0.25, [0.1, 0.2, 0.3]);
         g.push_sphere(Vec3::new(-1.0, 0.0, 9.0), 0.1, 0.75, [0.9, 0.8, 0.7]);
         g.object_ids = vec![3, 7];
-        assert_eq!(Gaussians::from_channels(&g.to_channels(), 0, Some(&g.object_ids)), g);
+        assert_eq!(
+            Gaussians::from_channels(&g.to_channels(), 0, Some(&g.object_ids)),
+            g
+        );
         let mut round = g.clone().with_sh_degree(2);
-        round.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
-        assert_eq!(Gaussians::from_channels(&round.to_channels(), 2, Some(&g.object_ids)), round);
+        round
+            .sh_rest
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        assert_eq!(
+            Gaussians::from_channels(&round.to_channels(), 2, Some(&g.object_ids)),
+            round
+        );
         assert_eq!(round.select(&[1]).rest(0)[0], Vec3::splat(8.0));
         assert_eq!(round.with_sh_degree(1).with_sh_degree(0), g);
         assert!((sigmoid(g.opacity_logits[0]) - 0.25).abs() < 1e-6);

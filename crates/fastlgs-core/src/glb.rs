@@ -25,41 +25,97 @@ const VERTICES: u32 = 34962;
 type Attribute = (String, &'static str, Vec<f32>);
 
 fn attributes(scene: &Gaussians) -> Vec<Attribute> {
-    let flat = |values: &[Vec3]| values.iter().flat_map(|v| v.to_array()).collect::<Vec<f32>>();
-    let own = |name: &str| format!("KHR_gaussian_splatting:{name}");
+    let flat = |values: &[Vec3]| {
+        values
+            .iter()
+            .flat_map(|v| v.to_array())
+            .collect::<Vec<f32>>()
+    };
+    let extension_values = |name: &str| format!("KHR_gaussian_splatting:{name}");
     let opacity: Vec<f32> = scene.opacity_logits.iter().map(|o| sigmoid(*o)).collect();
-    let color = |(c, o): (&Vec3, &f32)| (0.5 + SH_C0 * *c).clamp(Vec3::ZERO, Vec3::ONE).extend(*o).to_array();
+    let color = |(c, o): (&Vec3, &f32)| {
+        (0.5 + SH_C0 * *c)
+            .clamp(Vec3::ZERO, Vec3::ONE)
+            .extend(*o)
+            .to_array()
+    };
     let mut out = vec![
         ("POSITION".to_owned(), "VEC3", flat(&scene.means)),
-        ("COLOR_0".to_owned(), "VEC4", scene.sh_dc.iter().zip(&opacity).flat_map(color).collect()),
-        (own("ROTATION"), "VEC4", (0..scene.len()).flat_map(|i| scene.rotation(i).to_array()).collect()),
-        (own("SCALE"), "VEC3", scene.log_scales.iter().flat_map(|s| s.exp().to_array()).collect()),
-        (own("OPACITY"), "SCALAR", opacity),
-        (own("SH_DEGREE_0_COEF_0"), "VEC3", flat(&scene.sh_dc)),
+        (
+            "COLOR_0".to_owned(),
+            "VEC4",
+            scene.sh_dc.iter().zip(&opacity).flat_map(color).collect(),
+        ),
+        (
+            extension_values("ROTATION"),
+            "VEC4",
+            (0..scene.len())
+                .flat_map(|i| scene.rotation(i).to_array())
+                .collect(),
+        ),
+        (
+            extension_values("SCALE"),
+            "VEC3",
+            scene
+                .log_scales
+                .iter()
+                .flat_map(|s| s.exp().to_array())
+                .collect(),
+        ),
+        (extension_values("OPACITY"), "SCALAR", opacity),
+        (
+            extension_values("SH_DEGREE_0_COEF_0"),
+            "VEC3",
+            flat(&scene.sh_dc),
+        ),
     ];
     for degree in 1..=scene.sh_degree {
         let before = rest_len(degree - 1);
         for k in before..rest_len(degree) {
-            let values = (0..scene.len()).flat_map(|i| scene.rest(i)[k].to_array()).collect();
-            out.push((own(&format!("SH_DEGREE_{degree}_COEF_{}", k - before)), "VEC3", values));
+            let values = (0..scene.len())
+                .flat_map(|i| scene.rest(i)[k].to_array())
+                .collect();
+            out.push((
+                extension_values(&format!("SH_DEGREE_{degree}_COEF_{}", k - before)),
+                "VEC3",
+                values,
+            ));
         }
     }
     out
 }
 
 /// Builds the JSON chunk. The attributes are stored one after the other in the binary chunk.
-fn document(scene: &Gaussians, attributes: &[Attribute], up: Vec3, frame: &WorldFrame, bytes: usize) -> Value {
+fn document(
+    scene: &Gaussians,
+    attributes: &[Attribute],
+    up: Vec3,
+    frame: &WorldFrame,
+    bytes: usize,
+) -> Value {
     let (mut views, mut accessors, mut names) = (Vec::new(), Vec::new(), serde_json::Map::new());
     let mut offset = 0;
     for (k, (name, kind, values)) in attributes.iter().enumerate() {
         let length = 4 * values.len();
-        views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": length, "target": VERTICES }));
-        accessors.push(json!({ "bufferView": k, "componentType": FLOAT, "count": scene.len(), "type": kind }));
+        views.push(
+            json!({ "buffer": 0, "byteOffset": offset, "byteLength": length, "target": VERTICES }),
+        );
+        accessors.push(
+            json!({ "bufferView": k, "componentType": FLOAT, "count": scene.len(), "type": kind }),
+        );
         names.insert(name.clone(), json!(k));
         offset += length;
     }
     // glTF requires the bounds of positions.
-    let bound = |by: fn(Vec3, Vec3) -> Vec3| scene.means.iter().copied().reduce(by).unwrap_or(Vec3::ZERO).to_array();
+    let bound = |by: fn(Vec3, Vec3) -> Vec3| {
+        scene
+            .means
+            .iter()
+            .copied()
+            .reduce(by)
+            .unwrap_or(Vec3::ZERO)
+            .to_array()
+    };
     accessors[0]["min"] = json!(bound(Vec3::min));
     accessors[0]["max"] = json!(bound(Vec3::max));
     let turn = Quat::from_rotation_arc(up, Vec3::Y);
@@ -96,10 +152,19 @@ pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Re
     let attributes = attributes(scene);
     let bytes: usize = attributes.iter().map(|a| 4 * a.2.len()).sum();
     let mut text = document(scene, &attributes, up, frame, bytes).to_string();
-    text.extend(std::iter::repeat_n(' ', text.len().next_multiple_of(4) - text.len()));
-    let total = u32::try_from(12 + 8 + text.len() + 8 + bytes).ok().filter(|_| !scene.is_empty());
+    text.extend(std::iter::repeat_n(
+        ' ',
+        text.len().next_multiple_of(4) - text.len(),
+    ));
+    let total = u32::try_from(12 + 8 + text.len() + 8 + bytes)
+        .ok()
+        .filter(|_| !scene.is_empty());
     let Some(total) = total else {
-        let reason = format!("{}: {} Gaussians cannot be written as one glTF file; use .ply", path.display(), scene.len());
+        let reason = format!(
+            "{}: {} Gaussians cannot be written as one glTF file; use .ply",
+            path.display(),
+            scene.len()
+        );
         return Err(crate::Error::Invalid(reason));
     };
     fs::write_atomic(path, |file| {
@@ -110,7 +175,9 @@ pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Re
         file.write_all(&(bytes as u32).to_le_bytes())?;
         file.write_all(&BINARY_CHUNK.to_le_bytes())?;
         for (_, _, values) in &attributes {
-            values.iter().try_for_each(|v| file.write_all(&v.to_le_bytes()))?;
+            values
+                .iter()
+                .try_for_each(|v| file.write_all(&v.to_le_bytes()))?;
         }
         Ok(())
     })
@@ -119,13 +186,21 @@ pub fn write(path: &Path, scene: &Gaussians, up: Vec3, frame: &WorldFrame) -> Re
 /// Returns the JSON document and the binary chunk of a binary glTF file.
 fn chunks<'a>(path: &Path, data: &'a [u8]) -> Result<(Value, &'a [u8])> {
     let bad = |reason: &str| Error::format(path, format!("{reason}; copy or export it again"));
-    let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize);
-    let (Some(magic), Some(length)) = (word(0), word(12)) else { return Err(bad("not a complete glTF file")) };
+    let word = |at: usize| {
+        data.get(at..at + 4)
+            .map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize)
+    };
+    let (Some(magic), Some(length)) = (word(0), word(12)) else {
+        return Err(bad("not a complete glTF file"));
+    };
     if magic != MAGIC as usize {
         return Err(bad("not a binary glTF file"));
     }
-    let text = data.get(20..20usize.saturating_add(length)).ok_or_else(|| bad("its JSON chunk is cut off"))?;
-    let document = serde_json::from_slice(text).map_err(|e| bad(&format!("its JSON chunk cannot be parsed ({e})")))?;
+    let text = data
+        .get(20..20usize.saturating_add(length))
+        .ok_or_else(|| bad("its JSON chunk is cut off"))?;
+    let document = serde_json::from_slice(text)
+        .map_err(|e| bad(&format!("its JSON chunk cannot be parsed ({e})")))?;
     Ok((document, data.get(20 + length + 8..).unwrap_or_default()))
 }
 
@@ -140,65 +215,140 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     let (document, body) = chunks(path, &data)?;
     let bad = |reason: String| Error::format(path, reason);
-    let is_ours = document["asset"]["generator"].as_str().is_some_and(|name| name.starts_with("FastLGS"));
-    let moves = |node: &Value| ["matrix", "rotation", "translation", "scale"].iter().any(|part| !node[*part].is_null());
-    if !is_ours && document["nodes"].as_array().into_iter().flatten().any(moves) {
+    let is_ours = document["asset"]["generator"]
+        .as_str()
+        .is_some_and(|name| name.starts_with("FastLGS"));
+    let moves = |node: &Value| {
+        ["matrix", "rotation", "translation", "scale"]
+            .iter()
+            .any(|part| !node[*part].is_null())
+    };
+    if !is_ours
+        && document["nodes"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .any(moves)
+    {
         return Err(bad(
             "a node transforms its Gaussians; apply the transforms in the program that wrote it and export it again".to_owned()
         ));
     }
-    let primitives = document["meshes"].as_array().into_iter().flatten().flat_map(|mesh| mesh["primitives"].as_array()).flatten();
-    let with_gaussians = |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
-    let names = primitives.into_iter().find(with_gaussians).map(|primitive| &primitive["attributes"]);
-    let names = names.ok_or_else(|| bad("it has no mesh of Gaussians (KHR_gaussian_splatting)".to_owned()))?;
+    let primitives = document["meshes"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .flat_map(|mesh| mesh["primitives"].as_array())
+        .flatten();
+    let with_gaussians =
+        |primitive: &&Value| primitive["extensions"]["KHR_gaussian_splatting"].is_object();
+    let names = primitives
+        .into_iter()
+        .find(with_gaussians)
+        .map(|primitive| &primitive["attributes"]);
+    let names = names
+        .ok_or_else(|| bad("it has no mesh of Gaussians (KHR_gaussian_splatting)".to_owned()))?;
     let values = |name: &str, width: usize| -> Result<Option<Vec<f32>>> {
-        let Some(accessor) = names[name].as_u64() else { return Ok(None) };
+        let Some(accessor) = names[name].as_u64() else {
+            return Ok(None);
+        };
         let accessor = &document["accessors"][accessor as usize];
         if accessor["componentType"] != FLOAT {
-            return Err(bad(format!("{name} is not stored as floats; export it uncompressed")));
+            return Err(bad(format!(
+                "{name} is not stored as floats; export it uncompressed"
+            )));
         }
-        let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
+        let view =
+            &document["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
         let offset = |value: &Value| value["byteOffset"].as_u64().unwrap_or(0) as usize;
-        let (start, count) = (offset(view).saturating_add(offset(accessor)), accessor["count"].as_u64().unwrap_or(0) as usize);
-        let stride = view["byteStride"].as_u64().map_or(4 * width, |stride| stride as usize).max(4 * width);
+        let (start, count) = (
+            offset(view).saturating_add(offset(accessor)),
+            accessor["count"].as_u64().unwrap_or(0) as usize,
+        );
+        let stride = view["byteStride"]
+            .as_u64()
+            .map_or(4 * width, |stride| stride as usize)
+            .max(4 * width);
         let row = |i: usize| {
             let at = i.checked_mul(stride)?.checked_add(start)?;
             body.get(at..at.checked_add(4 * width)?)
         };
         let mut out = Vec::new();
         for i in 0..count {
-            let row = row(i).ok_or_else(|| bad(format!("{name} is cut off; copy the file again")))?;
-            out.extend(row.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])));
+            let row =
+                row(i).ok_or_else(|| bad(format!("{name} is cut off; copy the file again")))?;
+            out.extend(
+                row.chunks_exact(4)
+                    .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])),
+            );
         }
         Ok(Some(out))
     };
     let own = |name: &str, width: usize| values(&format!("KHR_gaussian_splatting:{name}"), width);
-    let need = |found: Option<Vec<f32>>, name: &str| found.ok_or_else(|| bad(format!("its Gaussians have no attribute {name}; export it again")));
-    let vec3 = |values: &[f32]| values.chunks_exact(3).map(Vec3::from_slice).collect::<Vec<_>>();
-    let means = vec3(&need(values("POSITION", 3)?, "POSITION")?);
+    let required = |found: Option<Vec<f32>>, name: &str| {
+        found.ok_or_else(|| {
+            bad(format!(
+                "its Gaussians have no attribute {name}; export it again"
+            ))
+        })
+    };
+    let vec3 = |values: &[f32]| {
+        values
+            .chunks_exact(3)
+            .map(Vec3::from_slice)
+            .collect::<Vec<_>>()
+    };
+    let means = vec3(&required(values("POSITION", 3)?, "POSITION")?);
     let n = means.len();
     let (mut sh_degree, mut coefficients) = (0, Vec::new());
     for degree in 1..=MAX_SH_DEGREE {
         let count = rest_len(degree) - rest_len(degree - 1);
-        let found = (0..count).map(|k| own(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3)).collect::<Result<Option<Vec<_>>>>()?;
+        let found = (0..count)
+            .map(|k| own(&format!("SH_DEGREE_{degree}_COEF_{k}"), 3))
+            .collect::<Result<Option<Vec<_>>>>()?;
         let Some(found) = found else { break };
         coefficients.extend(found.iter().map(|values| vec3(values)));
         sh_degree = degree;
     }
     let scene = Gaussians {
-        log_scales: vec3(&need(own("SCALE", 3)?, "SCALE")?).into_iter().map(|s| s.map(f32::ln)).collect(),
-        rotations: need(own("ROTATION", 4)?, "ROTATION")?.chunks_exact(4).map(|q| [q[3], q[0], q[1], q[2]]).collect(),
-        opacity_logits: need(own("OPACITY", 1)?, "OPACITY")?.into_iter().map(|o| logit(o.clamp(0.001, 0.999))).collect(),
-        sh_dc: vec3(&need(own("SH_DEGREE_0_COEF_0", 3)?, "SH_DEGREE_0_COEF_0")?),
+        log_scales: vec3(&required(own("SCALE", 3)?, "SCALE")?)
+            .into_iter()
+            .map(|s| s.map(f32::ln))
+            .collect(),
+        rotations: required(own("ROTATION", 4)?, "ROTATION")?
+            .chunks_exact(4)
+            .map(|q| [q[3], q[0], q[1], q[2]])
+            .collect(),
+        opacity_logits: required(own("OPACITY", 1)?, "OPACITY")?
+            .into_iter()
+            .map(|o| logit(o.clamp(0.001, 0.999)))
+            .collect(),
+        sh_dc: vec3(&required(
+            own("SH_DEGREE_0_COEF_0", 3)?,
+            "SH_DEGREE_0_COEF_0",
+        )?),
         sh_degree,
-        sh_rest: (0..n).flat_map(|i| coefficients.iter().map(move |values| values.get(i).copied().unwrap_or_default())).collect(),
+        sh_rest: (0..n)
+            .flat_map(|i| {
+                coefficients
+                    .iter()
+                    .map(move |values| values.get(i).copied().unwrap_or_default())
+            })
+            .collect(),
         features: vec![Vec3::ZERO; n],
         object_ids: vec![0; n],
         means,
     };
-    let lengths = [scene.log_scales.len(), scene.rotations.len(), scene.opacity_logits.len(), scene.sh_dc.len()];
+    let lengths = [
+        scene.log_scales.len(),
+        scene.rotations.len(),
+        scene.opacity_logits.len(),
+        scene.sh_dc.len(),
+    ];
     if lengths.iter().any(|length| *length != n) {
-        return Err(bad(format!("its attributes have {lengths:?} values, but it has {n} positions; export it again")));
+        return Err(bad(format!(
+            "its attributes have {lengths:?} values, but it has {n} positions; export it again"
+        )));
     }
     Ok(scene)
 }
@@ -217,12 +367,19 @@ mod tests {
         scene.push_sphere(Vec3::new(1.0, 2.0, 3.0), 0.25, 0.75, [1.0, 0.5, 0.0]);
         scene.push_sphere(Vec3::new(-1.0, 0.0, 5.0), 0.5, 0.5, [0.2; 3]);
         let mut scene = scene.with_sh_degree(2);
-        scene.sh_rest.iter_mut().enumerate().for_each(|(k, v)| *v = Vec3::splat(k as f32));
+        scene
+            .sh_rest
+            .iter_mut()
+            .enumerate()
+            .for_each(|(k, v)| *v = Vec3::splat(k as f32));
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("scene.glb");
         write(&path, &scene, Vec3::NEG_Y, &WorldFrame::default()).unwrap();
         let data = std::fs::read(&path).unwrap();
-        assert_eq!((word(&data, 0), word(&data, 4), word(&data, 8)), (MAGIC as usize, 2, data.len()));
+        assert_eq!(
+            (word(&data, 0), word(&data, 4), word(&data, 8)),
+            (MAGIC as usize, 2, data.len())
+        );
         let length = word(&data, 12);
         assert!(length.is_multiple_of(4));
         let document: Value = serde_json::from_slice(&data[20..20 + length]).unwrap();
@@ -233,12 +390,21 @@ mod tests {
         // Required by the schema of the ratified extension.
         let primitive = &document["meshes"][0]["primitives"][0];
         let extension = &primitive["extensions"]["KHR_gaussian_splatting"];
-        assert_eq!((&primitive["mode"], &extension["kernel"]), (&json!(POINTS), &json!("ellipse")));
-        assert!(["srgb_rec709_display", "lin_rec709_display"].iter().any(|space| extension["colorSpace"] == *space));
+        assert_eq!(
+            (&primitive["mode"], &extension["kernel"]),
+            (&json!(POINTS), &json!("ellipse"))
+        );
+        assert!(
+            ["srgb_rec709_display", "lin_rec709_display"]
+                .iter()
+                .any(|space| extension["colorSpace"] == *space)
+        );
         assert!(
             ["ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0"]
                 .iter()
-                .all(|name| { primitive["attributes"][format!("KHR_gaussian_splatting:{name}")].is_u64() })
+                .all(|name| {
+                    primitive["attributes"][format!("KHR_gaussian_splatting:{name}")].is_u64()
+                })
         );
         let names = &primitive["attributes"];
         let values = |name: &str, width: usize| -> Vec<f32> {
@@ -246,33 +412,82 @@ mod tests {
             let view = &document["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
             let at = view["byteOffset"].as_u64().unwrap() as usize;
             assert_eq!(view["byteLength"], 4 * width * 2);
-            body[at..at + 4 * width * 2].chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
+            body[at..at + 4 * width * 2]
+                .chunks_exact(4)
+                .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+                .collect()
         };
         assert_eq!(values("POSITION", 3), [1.0, 2.0, 3.0, -1.0, 0.0, 5.0]);
         assert_eq!(document["accessors"][0]["min"], json!([-1.0, 0.0, 3.0]));
         let close = |a: &[f32], b: &[f32]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);
-        assert!(close(&values("KHR_gaussian_splatting:SCALE", 3), &[0.25, 0.25, 0.25, 0.5, 0.5, 0.5]));
-        assert!(close(&values("KHR_gaussian_splatting:OPACITY", 1), &[0.75, 0.5]));
-        assert!(close(&values("KHR_gaussian_splatting:ROTATION", 4), &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]));
-        assert!(close(&values("COLOR_0", 4), &[1.0, 0.5, 0.0, 0.75, 0.2, 0.2, 0.2, 0.5]));
+        assert!(close(
+            &values("KHR_gaussian_splatting:SCALE", 3),
+            &[0.25, 0.25, 0.25, 0.5, 0.5, 0.5]
+        ));
+        assert!(close(
+            &values("KHR_gaussian_splatting:OPACITY", 1),
+            &[0.75, 0.5]
+        ));
+        assert!(close(
+            &values("KHR_gaussian_splatting:ROTATION", 4),
+            &[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+        ));
+        assert!(close(
+            &values("COLOR_0", 4),
+            &[1.0, 0.5, 0.0, 0.75, 0.2, 0.2, 0.2, 0.5]
+        ));
         // The last coefficient of degree 2 has index 7 in the first Gaussian and 15 in the second.
-        assert!(close(&values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_4", 3), &[7.0, 7.0, 7.0, 15.0, 15.0, 15.0]));
-        assert!(names.get("KHR_gaussian_splatting:SH_DEGREE_3_COEF_0").is_none());
+        assert!(close(
+            &values("KHR_gaussian_splatting:SH_DEGREE_2_COEF_4", 3),
+            &[7.0, 7.0, 7.0, 15.0, 15.0, 15.0]
+        ));
+        assert!(
+            names
+                .get("KHR_gaussian_splatting:SH_DEGREE_3_COEF_0")
+                .is_none()
+        );
         let back = read(&path).unwrap();
-        assert_eq!((back.sh_degree, &back.sh_rest, &back.means), (2, &scene.sh_rest, &scene.means));
-        assert!(back.log_scales.iter().zip(&scene.log_scales).all(|(a, b)| a.distance(*b) < 1e-5));
-        assert!(back.opacity_logits.iter().zip(&scene.opacity_logits).all(|(a, b)| (a - b).abs() < 1e-4));
+        assert_eq!(
+            (back.sh_degree, &back.sh_rest, &back.means),
+            (2, &scene.sh_rest, &scene.means)
+        );
+        assert!(
+            back.log_scales
+                .iter()
+                .zip(&scene.log_scales)
+                .all(|(a, b)| a.distance(*b) < 1e-5)
+        );
+        assert!(
+            back.opacity_logits
+                .iter()
+                .zip(&scene.opacity_logits)
+                .all(|(a, b)| (a - b).abs() < 1e-4)
+        );
         std::fs::write(&path, &data[..data.len() - 9]).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("cut off"));
         // With a frame, the node moves the scene to its world position.
-        let frame = WorldFrame { origin: glam::DVec3::new(512_345.6, 5_403_210.9, 431.2), scale: 2.0 };
+        let frame = WorldFrame {
+            origin: glam::DVec3::new(512_345.6, 5_403_210.9, 431.2),
+            scale: 2.0,
+        };
         write(&path, &scene, Vec3::Y, &frame).unwrap();
         let data = std::fs::read(&path).unwrap();
         let document: Value = serde_json::from_slice(&data[20..20 + word(&data, 12)]).unwrap();
         assert_eq!(
-            (&document["nodes"][0]["translation"], &document["nodes"][0]["scale"]),
+            (
+                &document["nodes"][0]["translation"],
+                &document["nodes"][0]["scale"]
+            ),
             (&json!(frame.origin.to_array()), &json!([2.0, 2.0, 2.0]))
         );
-        assert!(write(&path, &Gaussians::default(), Vec3::Y, &WorldFrame::default()).is_err());
+        assert!(
+            write(
+                &path,
+                &Gaussians::default(),
+                Vec3::Y,
+                &WorldFrame::default()
+            )
+            .is_err()
+        );
     }
 }

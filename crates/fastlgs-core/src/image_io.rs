@@ -2,7 +2,9 @@
 
 use crate::{Error, Result, fs};
 use image::metadata::Orientation;
-use image::{DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, RgbImage, imageops::FilterType};
+use image::{
+    DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, RgbImage, imageops::FilterType,
+};
 use std::io::Cursor;
 use std::path::Path;
 
@@ -19,21 +21,31 @@ fn decode(path: &Path) -> Result<DynamicImage> {
 }
 
 fn decode_bytes(path: &Path, data: &[u8]) -> Result<DynamicImage> {
-    let (mut picture, way_up) = stored(path, data)?;
+    let (mut picture, way_up) = decode_stored(path, data)?;
     picture.apply_orientation(way_up);
     Ok(picture)
 }
 
 /// Decodes the pixels as stored and the EXIF orientation that makes them upright.
-fn stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)> {
-    let reader = ImageReader::new(Cursor::new(data)).with_guessed_format().map_err(Error::io(path))?;
-    let failed = |e: image::ImageError| Error::format(path, format!("the image cannot be read ({e}); export it again or remove it"));
+fn decode_stored(path: &Path, data: &[u8]) -> Result<(DynamicImage, Orientation)> {
+    let reader = ImageReader::new(Cursor::new(data))
+        .with_guessed_format()
+        .map_err(Error::io(path))?;
+    let failed = |e: image::ImageError| {
+        Error::format(
+            path,
+            format!("the image cannot be read ({e}); export it again or remove it"),
+        )
+    };
     if reader.format() == Some(ImageFormat::Jpeg) && !is_whole_jpeg(data) {
-        return Err(Error::format(path, "the image is cut off: its JPEG data have no end marker; copy it again or remove it"));
+        return Err(Error::format(
+            path,
+            "the image is cut off: its JPEG data have no end marker; copy it again or remove it",
+        ));
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
-    let way_up = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?, way_up))
+    let rule = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok((DynamicImage::from_decoder(decoder).map_err(failed)?, rule))
 }
 
 /// Returns whether JPEG data have an end marker. Decoders fill missing data with grey instead of
@@ -50,7 +62,8 @@ fn is_whole_jpeg(data: &[u8]) -> bool {
     loop {
         // In scan data, 0xff00 is a byte of data and restart markers do not end them. 0xff may be
         // repeated before a code.
-        let marker = (at..data.len().saturating_sub(1)).find(|k| data[*k] == 0xff && !matches!(data[k + 1], 0x00 | 0xff));
+        let marker = (at..data.len().saturating_sub(1))
+            .find(|k| data[*k] == 0xff && !matches!(data[k + 1], 0x00 | 0xff));
         let Some(marker) = marker else { return false };
         let code = data[marker + 1];
         at = marker + 2;
@@ -60,7 +73,12 @@ fn is_whole_jpeg(data: &[u8]) -> bool {
         if stands_alone(code) {
             continue;
         }
-        let Some([high, low]) = data.get(at..at + 2).and_then(|length| <[u8; 2]>::try_from(length).ok()) else { return false };
+        let Some([high, low]) = data
+            .get(at..at + 2)
+            .and_then(|length| <[u8; 2]>::try_from(length).ok())
+        else {
+            return false;
+        };
         at += usize::from(u16::from_be_bytes([high, low]));
         if at > data.len() || (code == SCAN && at == data.len()) {
             return false;
@@ -78,7 +96,7 @@ pub struct Photo {
 
 /// How the EXIF orientation of a photo is applied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum WayUp {
+pub enum OrientationRule {
     /// Always applies it. For photos without poses.
     Upright,
     /// Matches the pixels to a pose that was computed for a photo of this width and height. COLMAP
@@ -92,15 +110,18 @@ pub enum WayUp {
 ///
 /// # Errors
 /// As [`load_rgb`].
-pub fn load_photo(path: &Path, way_up: WayUp) -> Result<Photo> {
-    let (mut decoded, orientation) = stored(path, &fs::read(path)?)?;
+pub fn load_photo(path: &Path, way_up: OrientationRule) -> Result<Photo> {
+    let (mut decoded, orientation) = decode_stored(path, &fs::read(path)?)?;
     let is_tall = |(width, height): (u32, u32)| height > width;
     let sides = (decoded.width(), decoded.height());
     let turns = match way_up {
-        WayUp::Upright => true,
-        WayUp::AsPosed(width, height) => {
+        OrientationRule::Upright => true,
+        OrientationRule::AsPosed(width, height) => {
             use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
-            let on_its_side = matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH);
+            let on_its_side = matches!(
+                orientation,
+                Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH
+            );
             on_its_side && sides.0 != sides.1 && is_tall((width, height)) != is_tall(sides)
         }
     };
@@ -109,10 +130,15 @@ pub fn load_photo(path: &Path, way_up: WayUp) -> Result<Photo> {
     }
     let alpha = decoded.color().has_alpha().then(|| {
         let rgba = decoded.to_rgba8();
-        GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| image::Luma([rgba.get_pixel(x, y)[3]]))
+        GrayImage::from_fn(rgba.width(), rgba.height(), |x, y| {
+            image::Luma([rgba.get_pixel(x, y)[3]])
+        })
     });
     let transparent = |a: &GrayImage| a.pixels().any(|p| p[0] < 255);
-    Ok(Photo { pixels: decoded.into_rgb8(), alpha: alpha.filter(transparent) })
+    Ok(Photo {
+        pixels: decoded.into_rgb8(),
+        alpha: alpha.filter(transparent),
+    })
 }
 
 /// Reads an image as brightness, 0 to 255. [`mask_image`](crate::mask_image) reads masks of other
@@ -137,8 +163,16 @@ pub fn load_any(path: &Path) -> Result<DynamicImage> {
 /// # Errors
 /// As [`load_rgb`].
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
-    let reader = ImageReader::open(path).map_err(Error::io(path))?.with_guessed_format().map_err(Error::io(path))?;
-    reader.into_dimensions().map_err(|e| Error::format(path, format!("the image cannot be read ({e}); copy or export it again")))
+    let reader = ImageReader::open(path)
+        .map_err(Error::io(path))?
+        .with_guessed_format()
+        .map_err(Error::io(path))?;
+    reader.into_dimensions().map_err(|e| {
+        Error::format(
+            path,
+            format!("the image cannot be read ({e}); copy or export it again"),
+        )
+    })
 }
 
 /// Returns channels and bit depth without decoding the pixels.
@@ -146,8 +180,16 @@ pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
 /// # Errors
 /// As [`load_rgb`].
 pub fn color_type(path: &Path) -> Result<image::ColorType> {
-    let reader = ImageReader::open(path).map_err(Error::io(path))?.with_guessed_format().map_err(Error::io(path))?;
-    let decoder = reader.into_decoder().map_err(|e| Error::format(path, format!("the image cannot be read ({e}); copy or export it again")))?;
+    let reader = ImageReader::open(path)
+        .map_err(Error::io(path))?
+        .with_guessed_format()
+        .map_err(Error::io(path))?;
+    let decoder = reader.into_decoder().map_err(|e| {
+        Error::format(
+            path,
+            format!("the image cannot be read ({e}); copy or export it again"),
+        )
+    })?;
     Ok(decoder.color_type())
 }
 
@@ -170,14 +212,16 @@ pub fn resize_gray(mask: &GrayImage, width: u32, height: u32) -> GrayImage {
 /// [`Error::Invalid`] when encoding fails, such as for an image without pixels.
 pub fn encode_png(picture: impl Into<DynamicImage>) -> Result<Vec<u8>> {
     let mut data = Vec::new();
-    let encode = picture.into().write_to(&mut Cursor::new(&mut data), ImageFormat::Png);
+    let encode = picture
+        .into()
+        .write_to(&mut Cursor::new(&mut data), ImageFormat::Png);
     encode.map_err(|e| Error::Invalid(format!("an image cannot be encoded as PNG: {e}")))?;
     Ok(data)
 }
 
 /// Largest image that is decoded from memory, in pixels. A few compressed bytes can expand to a
 /// huge image.
-const MOST_PIXELS: u64 = 100_000_000;
+const MAX_PIXELS: u64 = 100_000_000;
 
 /// Decodes an image in memory as 8-bit RGB. Errors call it `name`.
 ///
@@ -185,9 +229,19 @@ const MOST_PIXELS: u64 = 100_000_000;
 /// [`Error::Format`] when it cannot be decoded or has more than 100 million pixels.
 pub fn decode_rgb(name: &str, data: &[u8]) -> Result<RgbImage> {
     let path = Path::new(name);
-    let sides = ImageReader::new(Cursor::new(data)).with_guessed_format().ok().and_then(|reader| reader.into_dimensions().ok());
-    if let Some((width, height)) = sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MOST_PIXELS) {
-        return Err(Error::format(path, format!("{width}x{height} pixels is too large; at most {} million pixels are accepted", MOST_PIXELS / 1_000_000)));
+    let sides = ImageReader::new(Cursor::new(data))
+        .with_guessed_format()
+        .ok()
+        .and_then(|reader| reader.into_dimensions().ok());
+    if let Some((width, height)) = sides.filter(|(w, h)| u64::from(*w) * u64::from(*h) > MAX_PIXELS)
+    {
+        return Err(Error::format(
+            path,
+            format!(
+                "{width}x{height} pixels is too large; at most {} million pixels are accepted",
+                MAX_PIXELS / 1_000_000
+            ),
+        ));
     }
     Ok(decode_bytes(path, data)?.into_rgb8())
 }
@@ -219,7 +273,11 @@ pub fn from_planar(planar: &[f32], width: u32, height: u32) -> RgbImage {
     let byte = |v: f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
     RgbImage::from_fn(width, height, |i, j| {
         let p = (j * width + i) as usize;
-        image::Rgb([byte(planar[p]), byte(planar[n + p]), byte(planar[2 * n + p])])
+        image::Rgb([
+            byte(planar[p]),
+            byte(planar[n + p]),
+            byte(planar[2 * n + p]),
+        ])
     })
 }
 
@@ -231,12 +289,25 @@ mod tests {
     /// turn.
     fn turned(width: u32, height: u32, orientation: u8) -> (tempfile::TempDir, std::path::PathBuf) {
         // As stored, the left half is red and the right half blue.
-        let picture = RgbImage::from_fn(width, height, |x, _| image::Rgb(if x < width / 2 { [250, 0, 0] } else { [0, 0, 250] }));
+        let picture = RgbImage::from_fn(width, height, |x, _| {
+            image::Rgb(if x < width / 2 {
+                [250, 0, 0]
+            } else {
+                [0, 0, 250]
+            })
+        });
         let mut jpeg = Vec::new();
-        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95).encode_image(&picture).expect("a JPEG");
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95)
+            .encode_image(&picture)
+            .expect("a JPEG");
         let entry = [1, 0x12, 0, 3, 0, 0, 0, 1, 0, orientation, 0, 0, 0, 0, 0, 0];
         let tiff = [b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01".as_slice(), &entry].concat();
-        let segment = [&[0xff, 0xe1], (tiff.len() as u16 + 2).to_be_bytes().as_slice(), &tiff].concat();
+        let segment = [
+            &[0xff, 0xe1],
+            (tiff.len() as u16 + 2).to_be_bytes().as_slice(),
+            &tiff,
+        ]
+        .concat();
         jpeg.splice(2..2, segment);
         let dir = tempfile::tempdir().expect("a folder");
         let path = dir.path().join("photo.jpg");
@@ -248,20 +319,40 @@ mod tests {
     fn photos_stand_upright_unless_their_poses_count_stored_pixels() {
         let (_dir, path) = turned(64, 32, 6);
         assert_eq!(load_rgb(&path).unwrap().dimensions(), (32, 64));
-        let upright = load_photo(&path, WayUp::Upright).unwrap().pixels;
+        let upright = load_photo(&path, OrientationRule::Upright).unwrap().pixels;
         assert_eq!(upright.dimensions(), (32, 64));
         let (top, bottom) = (upright.get_pixel(16, 10), upright.get_pixel(16, 54));
-        assert!(top[0] > 200 && bottom[2] > 200, "the stored left half must be on top: {top:?}, {bottom:?}");
+        assert!(
+            top[0] > 200 && bottom[2] > 200,
+            "the stored left half must be on top: {top:?}, {bottom:?}"
+        );
         for ((w, h), sides) in [((3024, 4032), (32, 64)), ((4032, 3024), (64, 32))] {
-            assert_eq!(load_photo(&path, WayUp::AsPosed(w, h)).unwrap().pixels.dimensions(), sides, "{w}x{h}");
+            assert_eq!(
+                load_photo(&path, OrientationRule::AsPosed(w, h))
+                    .unwrap()
+                    .pixels
+                    .dimensions(),
+                sides,
+                "{w}x{h}"
+            );
         }
         // The sides of square and upside-down photos do not change.
         for (orientation, red) in [(6, (16, 4)), (8, (16, 28)), (3, (28, 16))] {
             let (_dir, square) = turned(32, 32, orientation);
-            let upright = load_photo(&square, WayUp::Upright).unwrap().pixels;
-            assert!(upright.get_pixel(red.0, red.1)[0] > 200, "orientation {orientation}");
-            let stored = load_photo(&square, WayUp::AsPosed(32, 32)).unwrap().pixels;
-            assert!(stored.get_pixel(4, 16)[0] > 200, "poses refer to stored pixels, orientation {orientation}");
+            let upright = load_photo(&square, OrientationRule::Upright)
+                .unwrap()
+                .pixels;
+            assert!(
+                upright.get_pixel(red.0, red.1)[0] > 200,
+                "orientation {orientation}"
+            );
+            let stored = load_photo(&square, OrientationRule::AsPosed(32, 32))
+                .unwrap()
+                .pixels;
+            assert!(
+                stored.get_pixel(4, 16)[0] > 200,
+                "poses refer to stored pixels, orientation {orientation}"
+            );
         }
     }
 
@@ -269,15 +360,30 @@ mod tests {
     fn a_jpeg_that_was_cut_off_is_refused() {
         let (_dir, path) = turned(64, 48, 1);
         let whole = std::fs::read(&path).unwrap();
-        for data in [whole.clone(), [whole.as_slice(), &[0; 100]].concat(), [whole.as_slice(), b"a film behind it"].concat()] {
+        for data in [
+            whole.clone(),
+            [whole.as_slice(), &[0; 100]].concat(),
+            [whole.as_slice(), b"a film behind it"].concat(),
+        ] {
             std::fs::write(&path, data).unwrap();
             load_rgb(&path).unwrap();
         }
         let zeros = [&whole[..whole.len() / 2], &vec![0; whole.len() / 2]].concat();
-        for data in [whole[..whole.len() - 2].to_vec(), whole[..whole.len() * 2 / 3].to_vec(), whole[..300].to_vec(), zeros] {
+        for data in [
+            whole[..whole.len() - 2].to_vec(),
+            whole[..whole.len() * 2 / 3].to_vec(),
+            whole[..300].to_vec(),
+            zeros,
+        ] {
             std::fs::write(&path, data).unwrap();
-            let refused = load_photo(&path, WayUp::Upright).err().expect("refused").to_string();
-            assert!(refused.contains("photo.jpg") && refused.contains("cut off"), "{refused}");
+            let refused = load_photo(&path, OrientationRule::Upright)
+                .err()
+                .expect("refused")
+                .to_string();
+            assert!(
+                refused.contains("photo.jpg") && refused.contains("cut off"),
+                "{refused}"
+            );
         }
     }
 }

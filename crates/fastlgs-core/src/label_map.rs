@@ -8,7 +8,7 @@ use std::io::Cursor;
 use std::path::Path;
 
 /// Largest decoded size of a palette image, in bytes. A damaged header may state any size.
-const MOST_BYTES: usize = 1 << 28;
+const MAX_BYTES: usize = 1 << 28;
 
 /// Labels of one view, such as non-overlapping masks; 0 means none.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -24,7 +24,11 @@ pub struct LabelMap {
 impl LabelMap {
     /// Creates a map without labels.
     pub fn new(width: u32, height: u32) -> Self {
-        Self { width, height, labels: vec![0; (width * height) as usize] }
+        Self {
+            width,
+            height,
+            labels: vec![0; (width * height) as usize],
+        }
     }
 
     /// Returns the label of a pixel.
@@ -75,7 +79,17 @@ impl LabelMap {
             names.push(label as u16);
         }
         number[0] = 0;
-        (Self { labels: self.labels.iter().map(|l| number[usize::from(*l)]).collect(), ..*self }, names)
+        (
+            Self {
+                labels: self
+                    .labels
+                    .iter()
+                    .map(|l| number[usize::from(*l)])
+                    .collect(),
+                ..*self
+            },
+            names,
+        )
     }
 
     /// Combines two maps. Each pair (own label, other label) that occurs gets a number, from 0 in
@@ -84,26 +98,49 @@ impl LabelMap {
     /// # Panics
     /// If the maps differ in size.
     pub fn joint(&self, other: &Self) -> (Self, Vec<(u16, u16)>) {
-        assert_eq!((self.width, self.height), (other.width, other.height), "both maps must have the same size");
+        assert_eq!(
+            (self.width, self.height),
+            (other.width, other.height),
+            "both maps must have the same size"
+        );
         let ((own, names), (theirs, their_names)) = (self.dense(), other.dense());
         let place = |(a, b): (&u16, &u16)| usize::from(*a) * their_names.len() + usize::from(*b);
         let mut number = vec![None; names.len() * their_names.len()];
-        own.labels.iter().zip(&theirs.labels).for_each(|pair| number[place(pair)] = Some(0));
+        own.labels
+            .iter()
+            .zip(&theirs.labels)
+            .for_each(|pair| number[place(pair)] = Some(0));
         let mut pairs = Vec::new();
         for (place, number) in number.iter_mut().enumerate().filter(|n| n.1.is_some()) {
             *number = Some(pairs.len() as u16);
-            pairs.push((names[place / their_names.len()], their_names[place % their_names.len()]));
+            pairs.push((
+                names[place / their_names.len()],
+                their_names[place % their_names.len()],
+            ));
         }
-        let labels = own.labels.iter().zip(&theirs.labels).map(|pair| number[place(pair)].unwrap_or(0)).collect();
+        let labels = own
+            .labels
+            .iter()
+            .zip(&theirs.labels)
+            .map(|pair| number[place(pair)].unwrap_or(0))
+            .collect();
         (Self { labels, ..*self }, pairs)
     }
 
     /// Resizes the map with nearest-neighbour sampling.
     pub fn resized(&self, width: u32, height: u32) -> Self {
-        let pick = |n: u32, from: u32, to: u32| ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32;
+        let pick = |n: u32, from: u32, to: u32| {
+            ((u64::from(n) * 2 + 1) * u64::from(from) / (2 * u64::from(to))) as u32
+        };
         let labels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-        let labels = labels.map(|(x, y)| self.at(pick(x, self.width, width), pick(y, self.height, height))).collect();
-        Self { width, height, labels }
+        let labels = labels
+            .map(|(x, y)| self.at(pick(x, self.width, width), pick(y, self.height, height)))
+            .collect();
+        Self {
+            width,
+            height,
+            labels,
+        }
     }
 
     /// Resamples the map to the ideal pinhole `camera` of the same size, with nearest-neighbour
@@ -112,8 +149,15 @@ impl LabelMap {
         let mut out = Self::new(self.width, self.height);
         for (i, label) in out.labels.iter_mut().enumerate() {
             let (x, y) = (i as u32 % self.width, i as u32 / self.width);
-            let d = distortion.distort(camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)).truncate());
-            let (u, v) = ((camera.fx * d.x + camera.cx).floor(), (camera.fy * d.y + camera.cy).floor());
+            let d = distortion.distort(
+                camera
+                    .ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5))
+                    .truncate(),
+            );
+            let (u, v) = (
+                (camera.fx * d.x + camera.cx).floor(),
+                (camera.fy * d.y + camera.cy).floor(),
+            );
             if u >= 0.0 && v >= 0.0 && u < self.width as f32 && v < self.height as f32 {
                 *label = self.at(u as u32, v as u32);
             }
@@ -127,7 +171,8 @@ impl LabelMap {
     /// [`Error::Io`] with the path.
     pub fn save(&self, path: &Path) -> Result<()> {
         let picture: ImageBuffer<Luma<u16>, _> =
-            ImageBuffer::from_raw(self.width, self.height, self.labels.clone()).expect("there is one label per pixel");
+            ImageBuffer::from_raw(self.width, self.height, self.labels.clone())
+                .expect("there is one label per pixel");
         image_io::save_png(path, DynamicImage::ImageLuma16(picture))
     }
 
@@ -142,10 +187,23 @@ impl LabelMap {
     pub fn load_with_void(path: &Path) -> Result<Self> {
         let mut map = Self::load(path)?;
         let has_16_bits = image_io::color_type(path)? == ColorType::L16;
-        let void = if has_16_bits { u16::MAX } else { u16::from(u8::MAX) };
-        let next = map.labels.iter().copied().filter(|label| *label != void).max().unwrap_or(0);
+        let void = if has_16_bits {
+            u16::MAX
+        } else {
+            u16::from(u8::MAX)
+        };
+        let next = map
+            .labels
+            .iter()
+            .copied()
+            .filter(|label| *label != void)
+            .max()
+            .unwrap_or(0);
         if next > 0 && next + 1 < void {
-            map.labels.iter_mut().filter(|label| **label == void).for_each(|label| *label = 0);
+            map.labels
+                .iter_mut()
+                .filter(|label| **label == void)
+                .for_each(|label| *label = 0);
         }
         Ok(map)
     }
@@ -157,37 +215,69 @@ impl LabelMap {
     /// [`Error::Io`], or [`Error::Format`] for other images.
     pub fn load(path: &Path) -> Result<Self> {
         let bytes = fs::read(path)?;
-        if let Some(indexed) = Self::indexed(&bytes) {
-            return indexed.map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")));
+        if let Some(indexed) = Self::palette_indices(&bytes) {
+            return indexed
+                .map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")));
         }
-        let reader = ImageReader::new(Cursor::new(bytes)).with_guessed_format().map_err(Error::io(path))?;
-        let decoded = reader.decode().map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")))?;
+        let reader = ImageReader::new(Cursor::new(bytes))
+            .with_guessed_format()
+            .map_err(Error::io(path))?;
+        let decoded = reader
+            .decode()
+            .map_err(|e| Error::format(path, format!("the label map cannot be read: {e}")))?;
         let (width, height) = (decoded.width(), decoded.height());
         let labels = match decoded {
             DynamicImage::ImageLuma16(map) => map.into_raw(),
             DynamicImage::ImageLuma8(map) => map.into_raw().into_iter().map(u16::from).collect(),
-            _ => return Err(Error::format(path, "a label map must be a grey PNG of 8 or 16 bits or a PNG with a palette; convert it")),
+            _ => {
+                return Err(Error::format(
+                    path,
+                    "a label map must be a grey PNG of 8 or 16 bits or a PNG with a palette; convert it",
+                ));
+            }
         };
-        Ok(Self { width, height, labels })
+        Ok(Self {
+            width,
+            height,
+            labels,
+        })
     }
 
     /// Decodes the palette indices of a PNG; `None` for a file without a palette. The `image` crate
     /// would return colours.
-    fn indexed(bytes: &[u8]) -> Option<Result<Self, png::DecodingError>> {
+    fn palette_indices(bytes: &[u8]) -> Option<Result<Self, png::DecodingError>> {
         let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().ok()?;
-        let (width, height, bits) = (reader.info().width, reader.info().height, reader.info().bit_depth as usize);
+        let (width, height, bits) = (
+            reader.info().width,
+            reader.info().height,
+            reader.info().bit_depth as usize,
+        );
         if reader.info().color_type != png::ColorType::Indexed {
             return None;
         }
-        let mut packed = vec![0; reader.output_buffer_size().filter(|bytes| *bytes <= MOST_BYTES)?];
+        let mut packed = vec![
+            0;
+            reader
+                .output_buffer_size()
+                .filter(|bytes| *bytes <= MAX_BYTES)?
+        ];
         if let Err(error) = reader.next_frame(&mut packed) {
             return Some(Err(error));
         }
         // Each row starts with a new byte. The highest bits of a byte belong to the leftmost pixel.
         let row = reader.output_line_size(width)?;
-        let label = |x: usize, y: usize| u16::from(packed[y * row + x * bits / 8] << (x * bits % 8) >> (8 - bits));
-        let labels = (0..height as usize).flat_map(|y| (0..width as usize).map(move |x| (x, y))).map(|(x, y)| label(x, y)).collect();
-        Some(Ok(Self { width, height, labels }))
+        let label = |x: usize, y: usize| {
+            u16::from(packed[y * row + x * bits / 8] << (x * bits % 8) >> (8 - bits))
+        };
+        let labels = (0..height as usize)
+            .flat_map(|y| (0..width as usize).map(move |x| (x, y)))
+            .map(|(x, y)| label(x, y))
+            .collect();
+        Some(Ok(Self {
+            width,
+            height,
+            labels,
+        }))
     }
 }
 
@@ -202,19 +292,38 @@ mod tests {
         let read = |labels: &[u16], eight: bool| {
             let (width, height) = (labels.len() as u32, 1);
             if eight {
-                let picture = image::GrayImage::from_raw(width, height, labels.iter().map(|l| *l as u8).collect()).unwrap();
+                let picture = image::GrayImage::from_raw(
+                    width,
+                    height,
+                    labels.iter().map(|l| *l as u8).collect(),
+                )
+                .unwrap();
                 image_io::save_png(&path, picture).unwrap();
             } else {
-                LabelMap { width, height, labels: labels.to_vec() }.save(&path).unwrap();
+                LabelMap {
+                    width,
+                    height,
+                    labels: labels.to_vec(),
+                }
+                .save(&path)
+                .unwrap();
             }
             LabelMap::load_with_void(&path).unwrap().labels
         };
         assert_eq!(read(&[0, 1, 7, 255], true), [0, 1, 7, 0]);
         assert_eq!(read(&[0, 255, 255], true), [0, 255, 255], "a binary mask");
-        assert_eq!(read(&[1, 254, 255], true), [1, 254, 255], "255 follows the largest other label");
+        assert_eq!(
+            read(&[1, 254, 255], true),
+            [1, 254, 255],
+            "255 follows the largest other label"
+        );
         assert_eq!(read(&[3, 300, 65535], false), [3, 300, 0]);
         assert_eq!(read(&[3, 255, 300], false), [3, 255, 300]);
-        assert_eq!(read(&[3, 17, 255], false), [3, 17, 255], "255 is an ordinary label with 16 bits");
+        assert_eq!(
+            read(&[3, 17, 255], false),
+            [3, 17, 255],
+            "255 is an ordinary label with 16 bits"
+        );
     }
 
     #[test]
@@ -227,38 +336,71 @@ mod tests {
         assert_eq!(map.boxes()[2], Some([1, 1, 3, 2]));
         assert_eq!(map.areas()[2], 2);
         let double = map.resized(6, 4);
-        assert_eq!((double.at(4, 1), double.at(0, 2), double.at(2, 3)), (300, 65535, 2));
+        assert_eq!(
+            (double.at(4, 1), double.at(0, 2), double.at(2, 3)),
+            (300, 65535, 2)
+        );
     }
 
     #[test]
     fn a_palette_gives_places_and_not_colours() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("tracked.png");
-        for (depth, packed) in [(png::BitDepth::Eight, vec![0, 3, 1, 2, 2, 0]), (png::BitDepth::Two, vec![0b0011_0100, 0b1010_0000])] {
+        for (depth, packed) in [
+            (png::BitDepth::Eight, vec![0, 3, 1, 2, 2, 0]),
+            (png::BitDepth::Two, vec![0b0011_0100, 0b1010_0000]),
+        ] {
             let mut encoder = png::Encoder::new(std::fs::File::create(&path).unwrap(), 3, 2);
             encoder.set_color(png::ColorType::Indexed);
             encoder.set_depth(depth);
             encoder.set_palette(vec![0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]);
-            encoder.write_header().unwrap().write_image_data(&packed).unwrap();
+            encoder
+                .write_header()
+                .unwrap()
+                .write_image_data(&packed)
+                .unwrap();
             let map = LabelMap::load(&path).unwrap();
-            assert_eq!((map.width, map.height, map.labels), (3, 2, vec![0, 3, 1, 2, 2, 0]), "{depth:?}");
+            assert_eq!(
+                (map.width, map.height, map.labels),
+                (3, 2, vec![0, 3, 1, 2, 2, 0]),
+                "{depth:?}"
+            );
         }
         std::fs::write(&path, &std::fs::read(&path).unwrap()[..60]).unwrap();
-        assert!(LabelMap::load(&path).unwrap_err().to_string().contains("tracked.png"));
+        assert!(
+            LabelMap::load(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("tracked.png")
+        );
     }
 
     #[test]
     fn pairs_of_labels() {
-        let map = |labels: &[u16]| LabelMap { width: 3, height: 2, labels: labels.to_vec() };
+        let map = |labels: &[u16]| LabelMap {
+            width: 3,
+            height: 2,
+            labels: labels.to_vec(),
+        };
         let (joint, pairs) = map(&[9, 9, 0, 9, 4, 4]).joint(&map(&[1, 2, 2, 1, 2, 2]));
-        assert_eq!((joint.labels, pairs), (vec![2, 3, 0, 2, 1, 1], vec![(0, 2), (4, 2), (9, 1), (9, 2)]));
+        assert_eq!(
+            (joint.labels, pairs),
+            (vec![2, 3, 0, 2, 1, 1], vec![(0, 2), (4, 2), (9, 1), (9, 2)])
+        );
     }
 
     #[test]
     fn dense_numbers_have_no_gaps() {
-        let map = LabelMap { width: 5, height: 1, labels: vec![60_000, 0, 7, 60_000, 9] };
+        let map = LabelMap {
+            width: 5,
+            height: 1,
+            labels: vec![60_000, 0, 7, 60_000, 9],
+        };
         let (dense, names) = map.dense();
-        assert_eq!((dense.labels, names), (vec![3, 0, 1, 3, 2], vec![0, 7, 9, 60_000]));
+        assert_eq!(
+            (dense.labels, names),
+            (vec![3, 0, 1, 3, 2], vec![0, 7, 9, 60_000])
+        );
         assert_eq!(LabelMap::new(2, 2).dense().1, [0]);
     }
 }

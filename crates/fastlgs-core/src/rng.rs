@@ -8,7 +8,9 @@ impl Rng {
     /// Creates a generator. Different purposes under one seed give unrelated streams.
     pub fn new(seed: u64, purpose: &str) -> Self {
         // FNV-1a hash of the purpose.
-        let salt = purpose.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3));
+        let salt = purpose.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| {
+            (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)
+        });
         let mut rng = Self(seed ^ salt);
         rng.next_u64();
         rng

@@ -1,7 +1,9 @@
 //! The scene folder: paths, manifest and files that the stages share.
 
 use crate::dataset::SfmPoint;
-use crate::{Camera, Error, Gaussians, LabelMap, MaskList, Result, WorldFrame, compact, fs, image_io, ply};
+use crate::{
+    Camera, Error, Gaussians, LabelMap, MaskList, Result, WorldFrame, compact, fs, image_io, ply,
+};
 use image::RgbImage;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -69,13 +71,25 @@ pub struct Manifest {
 impl Manifest {
     /// Returns the training views in order: neither held out nor excluded.
     pub fn training(&self, cameras: &[Camera]) -> Vec<Camera> {
-        let usable = |(i, c): &(usize, &Camera)| !self.is_held_out(*i, &c.name) && !self.excluded.contains(&c.name);
-        cameras.iter().enumerate().filter(usable).map(|(_, c)| c.clone()).collect()
+        let usable = |(i, c): &(usize, &Camera)| {
+            !self.is_held_out(*i, &c.name) && !self.excluded.contains(&c.name)
+        };
+        cameras
+            .iter()
+            .enumerate()
+            .filter(usable)
+            .map(|(_, c)| c.clone())
+            .collect()
     }
 
     /// Returns the held-out views in order.
     pub fn held_out(&self, cameras: &[Camera]) -> Vec<Camera> {
-        cameras.iter().enumerate().filter(|(i, c)| self.is_held_out(*i, &c.name)).map(|(_, c)| c.clone()).collect()
+        cameras
+            .iter()
+            .enumerate()
+            .filter(|(i, c)| self.is_held_out(*i, &c.name))
+            .map(|(_, c)| c.clone())
+            .collect()
     }
 
     /// Returns whether a view is held out. `index` is its position in sorted order.
@@ -128,11 +142,16 @@ impl SceneFolder {
     /// A missing or damaged file, or a listed file outside the scene folder.
     pub fn manifest(&self) -> Result<Manifest> {
         let manifest: Manifest = fs::read_json(&self.manifest_path())?;
-        let leads_out = |file: &&String| !Path::new(file).components().all(|part| matches!(part, Component::Normal(_)));
+        let leads_out = |file: &&String| {
+            !Path::new(file)
+                .components()
+                .all(|part| matches!(part, Component::Normal(_)))
+        };
         match manifest.files.iter().find(leads_out) {
-            Some(file) => {
-                Err(Error::format(self.manifest_path(), format!("it lists the file '{file}', which is not inside the scene folder")))
-            }
+            Some(file) => Err(Error::format(
+                self.manifest_path(),
+                format!("it lists the file '{file}', which is not inside the scene folder"),
+            )),
             None => Ok(manifest),
         }
     }
@@ -167,7 +186,9 @@ impl SceneFolder {
         let path = self.ply_path();
         if !path.is_file() {
             let root = self.root.display();
-            return Err(Error::Invalid(format!("{root}: this scene was never trained (no scene.ply); run 'fastlgs train {root}' first")));
+            return Err(Error::Invalid(format!(
+                "{root}: this scene was never trained (no scene.ply); run 'fastlgs train {root}' first"
+            )));
         }
         ply::read(&path)
     }
@@ -185,7 +206,7 @@ impl SceneFolder {
     ///
     /// # Errors
     /// A missing or damaged file.
-    pub fn given_cameras(&self) -> Result<Vec<Camera>> {
+    pub fn initial_cameras(&self) -> Result<Vec<Camera>> {
         fs::read_json(&self.root.join("cameras/cameras.json"))
     }
 
@@ -212,7 +233,11 @@ impl SceneFolder {
     /// A missing or damaged file.
     pub fn cameras(&self) -> Result<Vec<Camera>> {
         let trained = self.trained_cameras_path();
-        if trained.is_file() { fs::read_json(&trained) } else { self.given_cameras() }
+        if trained.is_file() {
+            fs::read_json(&trained)
+        } else {
+            self.initial_cameras()
+        }
     }
 
     /// Finds a view by its file name, or by its name without extension if that is unique.
@@ -220,10 +245,12 @@ impl SceneFolder {
     /// # Errors
     /// [`Error::Invalid`] for an unknown name; the message lists the first views.
     pub fn view_index(&self, cameras: &[Camera], name: &str) -> Result<usize> {
-        view_of(cameras.iter().map(|c| c.name.as_str()), name).ok_or_else(|| {
+        find_view(cameras.iter().map(|c| c.name.as_str()), name).ok_or_else(|| {
             let names: Vec<&str> = cameras.iter().take(6).map(|c| c.name.as_str()).collect();
             let (root, n, names) = (self.root.display(), cameras.len(), names.join(", "));
-            Error::Invalid(format!("no view '{name}' in {root}; it has {n} views: {names}, ..."))
+            Error::Invalid(format!(
+                "no view '{name}' in {root}; it has {n} views: {names}, ..."
+            ))
         })
     }
 
@@ -263,13 +290,19 @@ impl SceneFolder {
         let path = self.masks_path(&camera.name);
         let (width, height) = (camera.width, camera.height);
         if !path.is_file() {
-            return Err(Error::Invalid(format!("{} is missing; run 'fastlgs preprocess' again", path.display())));
+            return Err(Error::Invalid(format!(
+                "{} is missing; run 'fastlgs preprocess' again",
+                path.display()
+            )));
         }
         let list = MaskList::load(&path)?;
         match (list.width, list.height) {
             _ if list.masks.is_empty() => Ok(MaskList::new(width, height)),
             size if size == (width, height) => Ok(list),
-            _ => Err(Error::format(&path, "its size differs from that of the view's camera; run 'fastlgs preprocess' again")),
+            _ => Err(Error::format(
+                &path,
+                "its size differs from that of the view's camera; run 'fastlgs preprocess' again",
+            )),
         }
     }
 
@@ -299,11 +332,17 @@ impl SceneFolder {
     pub fn save_points(&self, points: &[SfmPoint]) -> Result<()> {
         let position: Vec<f32> = points.iter().flat_map(|p| p.position.to_array()).collect();
         let color: Vec<f32> = points.iter().flat_map(|p| p.color.map(f32::from)).collect();
-        let seen = points.iter().enumerate().flat_map(|(k, p)| p.seen_by.iter().map(move |view| [k as f32, *view as f32]));
+        let seen = points
+            .iter()
+            .enumerate()
+            .flat_map(|(k, p)| p.seen_by.iter().map(move |view| [k as f32, *view as f32]));
         let seen: Vec<f32> = seen.flatten().collect();
         let (shape, pairs) = (vec![points.len(), 3], vec![seen.len() / 2, 2]);
-        let tensors: [(&str, Vec<usize>, &[f32]); 3] =
-            [("position", shape.clone(), &position), ("color", shape, &color), ("seen", pairs, &seen)];
+        let tensors: [(&str, Vec<usize>, &[f32]); 3] = [
+            ("position", shape.clone(), &position),
+            ("color", shape, &color),
+            ("seen", pairs, &seen),
+        ];
         save_tensors(&self.root.join("points.safetensors"), &tensors)
     }
 
@@ -314,16 +353,30 @@ impl SceneFolder {
     pub fn points(&self) -> Result<Vec<SfmPoint>> {
         let path = self.root.join("points.safetensors");
         let tensors = load_tensors(&path)?;
-        let get = |name: &str| tensors.get(name).map(|t| t.1.as_slice()).unwrap_or_default();
-        let rows = get("position").chunks_exact(3).zip(get("color").chunks_exact(3));
+        let get = |name: &str| {
+            tensors
+                .get(name)
+                .map(|t| t.1.as_slice())
+                .unwrap_or_default()
+        };
+        let rows = get("position")
+            .chunks_exact(3)
+            .zip(get("color").chunks_exact(3));
         let point = |(p, c): (&[f32], &[f32])| {
             let color = [c[0] as u8, c[1] as u8, c[2] as u8];
-            SfmPoint { position: glam::Vec3::from_slice(p), color, seen_by: Vec::new() }
+            SfmPoint {
+                position: glam::Vec3::from_slice(p),
+                color,
+                seen_by: Vec::new(),
+            }
         };
         let mut points: Vec<SfmPoint> = rows.map(point).collect();
         for pair in get("seen").chunks_exact(2) {
             let Some(point) = points.get_mut(pair[0] as usize) else {
-                return Err(Error::format(&path, "a view observes a point that does not exist; run 'fastlgs preprocess' again"));
+                return Err(Error::format(
+                    &path,
+                    "a view observes a point that does not exist; run 'fastlgs preprocess' again",
+                ));
             };
             point.seen_by.push(pair[1] as u32);
         }
@@ -333,12 +386,24 @@ impl SceneFolder {
 
 /// Finds a view by its file name, or by its name without extension if that is unique. A '/' in
 /// `name` matches the '_' that joins folders in view names.
-pub fn view_of<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> Option<usize> {
+pub fn find_view<'a>(names: impl Iterator<Item = &'a str> + Clone, name: &str) -> Option<usize> {
     let joined = name.replace('/', "_");
-    let name = if names.clone().any(|n| n == name) { name } else { joined.as_str() };
+    let name = if names.clone().any(|n| n == name) {
+        name
+    } else {
+        joined.as_str()
+    };
     let bare = |n: &&str| Path::new(n).file_stem().is_some_and(|s| s == name);
-    let mut hits = names.clone().enumerate().filter(|(_, n)| bare(n)).map(|(i, _)| i);
-    names.clone().position(|n| n == name).or_else(|| hits.next().filter(|_| hits.next().is_none()))
+    let mut stem_matches = names
+        .clone()
+        .enumerate()
+        .filter(|(_, n)| bare(n))
+        .map(|(i, _)| i);
+    names.clone().position(|n| n == name).or_else(|| {
+        stem_matches
+            .next()
+            .filter(|_| stem_matches.next().is_none())
+    })
 }
 
 /// Returns whether the view at `index` in sorted order is one of every `holdout` held-out views.
@@ -365,16 +430,33 @@ const ENCODER: &str = "encoder";
 ///
 /// # Errors
 /// As [`save_tensors`].
-pub fn save_embeddings(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], encoder: &str) -> Result<()> {
-    write_tensors(path, tensors, Some([(ENCODER.to_owned(), encoder.to_owned())].into()))
+pub fn save_embeddings(
+    path: &Path,
+    tensors: &[(&str, Vec<usize>, &[f32])],
+    encoder: &str,
+) -> Result<()> {
+    write_tensors(
+        path,
+        tensors,
+        Some([(ENCODER.to_owned(), encoder.to_owned())].into()),
+    )
 }
 
-fn write_tensors(path: &Path, tensors: &[(&str, Vec<usize>, &[f32])], metadata: Option<HashMap<String, String>>) -> Result<()> {
-    let views =
-        tensors.iter().map(|(name, shape, data)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?)));
+fn write_tensors(
+    path: &Path,
+    tensors: &[(&str, Vec<usize>, &[f32])],
+    metadata: Option<HashMap<String, String>>,
+) -> Result<()> {
+    let views = tensors.iter().map(|(name, shape, data)| {
+        Ok((
+            *name,
+            TensorView::new(Dtype::F32, shape.clone(), bytemuck::cast_slice(data))?,
+        ))
+    });
     let views: Result<Vec<_>, safetensors::SafeTensorError> = views.collect();
-    let data =
-        views.and_then(|v| safetensors::serialize(v, metadata)).map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
+    let data = views
+        .and_then(|v| safetensors::serialize(v, metadata))
+        .map_err(|e| Error::format(path, format!("cannot write tensors: {e}")))?;
     fs::write_atomic(path, |file| std::io::Write::write_all(file, &data))
 }
 
@@ -391,14 +473,25 @@ pub fn load_tensors(path: &Path) -> Result<Tensors> {
 /// # Errors
 /// As [`load_tensors`].
 pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
-    let file = SafeTensors::deserialize(data).map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
+    let file = SafeTensors::deserialize(data)
+        .map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
     file.tensors()
         .into_iter()
         .map(|(name, view)| {
             if view.dtype() != Dtype::F32 {
-                return Err(Error::format(path, format!("tensor '{name}' has the type {:?}, but 32-bit floats were expected", view.dtype())));
+                return Err(Error::format(
+                    path,
+                    format!(
+                        "tensor '{name}' has the type {:?}, but 32-bit floats were expected",
+                        view.dtype()
+                    ),
+                ));
             }
-            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let values = view
+                .data()
+                .chunks_exact(4)
+                .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+                .collect();
             Ok((name, (view.shape().to_vec(), values)))
         })
         .collect()
@@ -409,9 +502,15 @@ pub fn parse_tensors(path: &Path, data: &[u8]) -> Result<Tensors> {
 ///
 /// # Errors
 /// As [`load_tensors`].
-pub fn embedded_by(path: &Path, data: &[u8]) -> Result<String> {
-    let (_, head) = SafeTensors::read_metadata(data).map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
-    Ok(head.metadata().as_ref().and_then(|metadata| metadata.get(ENCODER)).cloned().unwrap_or_default())
+pub fn embedding_encoder(path: &Path, data: &[u8]) -> Result<String> {
+    let (_, head) = SafeTensors::read_metadata(data)
+        .map_err(|e| Error::format(path, format!("not a complete safetensors file: {e}")))?;
+    Ok(head
+        .metadata()
+        .as_ref()
+        .and_then(|metadata| metadata.get(ENCODER))
+        .cloned()
+        .unwrap_or_default())
 }
 
 #[cfg(test)]
@@ -423,33 +522,56 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("t.safetensors");
         save_tensors(&path, &[("a", vec![2, 2], &[1.0, 2.0, 3.0, 4.0])]).unwrap();
-        assert_eq!(load_tensors(&path).unwrap()["a"], (vec![2, 2], vec![1.0, 2.0, 3.0, 4.0]));
+        assert_eq!(
+            load_tensors(&path).unwrap()["a"],
+            (vec![2, 2], vec![1.0, 2.0, 3.0, 4.0])
+        );
         let data = std::fs::read(&path).unwrap();
-        assert_eq!(embedded_by(&path, &data).unwrap(), "");
+        assert_eq!(embedding_encoder(&path, &data).unwrap(), "");
         save_embeddings(&path, &[("a", vec![1], &[1.0])], "offline 3").unwrap();
         let noted = std::fs::read(&path).unwrap();
-        assert_eq!(embedded_by(&path, &noted).unwrap(), "offline 3");
-        assert_eq!(load_tensors(&path).unwrap().len(), 1, "metadata are not a tensor");
+        assert_eq!(embedding_encoder(&path, &noted).unwrap(), "offline 3");
+        assert_eq!(
+            load_tensors(&path).unwrap().len(),
+            1,
+            "metadata are not a tensor"
+        );
         std::fs::write(&path, &data[..data.len() - 3]).unwrap();
-        assert!(load_tensors(&path).unwrap_err().to_string().contains("t.safetensors"));
+        assert!(
+            load_tensors(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("t.safetensors")
+        );
     }
 
     #[test]
     fn points_come_back_with_who_sees_them() {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
-        let point = |x: f32, seen_by: &[u32]| SfmPoint { position: glam::Vec3::X * x, color: [1, 2, 255], seen_by: seen_by.to_vec() };
+        let point = |x: f32, seen_by: &[u32]| SfmPoint {
+            position: glam::Vec3::X * x,
+            color: [1, 2, 255],
+            seen_by: seen_by.to_vec(),
+        };
         let points = [point(0.5, &[0, 7, 3]), point(-1.0, &[]), point(2.0, &[12])];
         folder.save_points(&points).unwrap();
         assert_eq!(folder.points().unwrap(), points);
         let path = dir.path().join("points.safetensors");
         let one = [0.0f32; 3];
-        let earlier: [(&str, Vec<usize>, &[f32]); 2] = [("position", vec![1, 3], &one), ("color", vec![1, 3], &one)];
+        let earlier: [(&str, Vec<usize>, &[f32]); 2] =
+            [("position", vec![1, 3], &one), ("color", vec![1, 3], &one)];
         save_tensors(&path, &earlier).unwrap();
-        assert!(folder.points().unwrap()[0].seen_by.is_empty(), "`seen` is optional");
+        assert!(
+            folder.points().unwrap()[0].seen_by.is_empty(),
+            "`seen` is optional"
+        );
         save_tensors(&path, &[("seen", vec![1, 2], &[5.0, 0.0])]).unwrap();
         let message = folder.points().unwrap_err().to_string();
-        assert!(message.contains("points.safetensors") && message.contains("preprocess"), "{message}");
+        assert!(
+            message.contains("points.safetensors") && message.contains("preprocess"),
+            "{message}"
+        );
     }
 
     #[test]

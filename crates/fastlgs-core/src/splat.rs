@@ -16,11 +16,18 @@ pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
     if data.is_empty() || !data.len().is_multiple_of(ROW) {
         let length = data.len();
-        return Err(Error::format(path, format!("its length of {length} bytes is not a multiple of {ROW} bytes per Gaussian; copy it again")));
+        return Err(Error::format(
+            path,
+            format!(
+                "its length of {length} bytes is not a multiple of {ROW} bytes per Gaussian; copy it again"
+            ),
+        ));
     }
     let mut scene = Gaussians::default();
     for row in data.as_chunks::<ROW>().0 {
-        let float = |k: usize| f32::from_le_bytes([row[4 * k], row[4 * k + 1], row[4 * k + 2], row[4 * k + 3]]);
+        let float = |k: usize| {
+            f32::from_le_bytes([row[4 * k], row[4 * k + 1], row[4 * k + 2], row[4 * k + 3]])
+        };
         let byte = |k: usize| f32::from(row[k]) / 255.0;
         scene.push_sphere(Vec3::new(float(0), float(1), float(2)), 1.0, 0.5, [0.5; 3]);
         let last = scene.len() - 1;
@@ -44,12 +51,21 @@ mod tests {
         let path = dir.path().join("a.splat");
         let floats = [1.0f32, -2.0, 3.0, 0.1, 0.2, 0.4];
         let bytes = [255u8, 0, 128, 204, 255, 128, 128, 128];
-        let row: Vec<u8> = floats.iter().flat_map(|v| v.to_le_bytes()).chain(bytes).collect();
+        let row: Vec<u8> = floats
+            .iter()
+            .flat_map(|v| v.to_le_bytes())
+            .chain(bytes)
+            .collect();
         std::fs::write(&path, [row.as_slice(), &row].concat()).unwrap();
         let scene = read(&path).unwrap();
-        assert_eq!((scene.len(), scene.means[1]), (2, Vec3::new(1.0, -2.0, 3.0)));
+        assert_eq!(
+            (scene.len(), scene.means[1]),
+            (2, Vec3::new(1.0, -2.0, 3.0))
+        );
         assert!((scene.log_scales[0].map(f32::exp) - Vec3::new(0.1, 0.2, 0.4)).length() < 1e-6);
-        assert!((sigmoid(scene.opacity_logits[0]) - 0.8).abs() < 1e-6 && scene.rotation(0).w > 0.9999);
+        assert!(
+            (sigmoid(scene.opacity_logits[0]) - 0.8).abs() < 1e-6 && scene.rotation(0).w > 0.9999
+        );
         assert!((scene.sh_dc[0].x * SH_C0 + 0.5 - 1.0).abs() < 1e-6);
         std::fs::write(&path, &row[..20]).unwrap();
         assert!(read(&path).unwrap_err().to_string().contains("a.splat"));

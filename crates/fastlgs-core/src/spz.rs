@@ -45,7 +45,11 @@ fn sh_byte(value: f32, coefficient: usize) -> u8 {
 /// # Errors
 /// [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
-    let extent = scene.means.iter().map(|m| m.abs().max_element()).fold(1e-6f32, f32::max);
+    let extent = scene
+        .means
+        .iter()
+        .map(|m| m.abs().max_element())
+        .fold(1e-6f32, f32::max);
     // Uses as many fractional bits as the largest coordinate allows.
     let fraction = (POSITION_RANGE / extent).log2().floor().clamp(0.0, 23.0) as u8;
     let unit = f32::from(fraction).exp2();
@@ -60,13 +64,34 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
             data.extend(&((value * unit).round() as i32).to_le_bytes()[..3]);
         }
     }
-    data.extend(scene.opacity_logits.iter().map(|o| byte(sigmoid(*o) * 255.0)));
-    data.extend(scene.sh_dc.iter().flat_map(|c| c.to_array()).map(|c| byte(c * COLOR_SCALE * 255.0 + 127.5)));
-    data.extend(scene.log_scales.iter().flat_map(|s| s.to_array()).map(|s| byte((s + 10.0) * 16.0)));
+    data.extend(
+        scene
+            .opacity_logits
+            .iter()
+            .map(|o| byte(sigmoid(*o) * 255.0)),
+    );
+    data.extend(
+        scene
+            .sh_dc
+            .iter()
+            .flat_map(|c| c.to_array())
+            .map(|c| byte(c * COLOR_SCALE * 255.0 + 127.5)),
+    );
+    data.extend(
+        scene
+            .log_scales
+            .iter()
+            .flat_map(|s| s.to_array())
+            .map(|s| byte((s + 10.0) * 16.0)),
+    );
     for i in 0..scene.len() {
         let q = scene.rotation(i);
         let sign = if q.w < 0.0 { -1.0 } else { 1.0 };
-        data.extend((Vec3::new(q.x, q.y, q.z) * flip * sign).to_array().map(|v| byte(v * 127.5 + 127.5)));
+        data.extend(
+            (Vec3::new(q.x, q.y, q.z) * flip * sign)
+                .to_array()
+                .map(|v| byte(v * 127.5 + 127.5)),
+        );
     }
     for i in 0..scene.len() {
         for (k, v) in scene.rest(i).iter().enumerate() {
@@ -85,7 +110,7 @@ struct Packed {
     version: u32,
     count: usize,
     sh_degree: u32,
-    fraction: u8,
+    fractional_bits: u8,
     /// Positions, opacities, colours, log-scales, rotations, SH coefficients.
     streams: [Vec<u8>; 6],
 }
@@ -99,25 +124,39 @@ const ENTRY: usize = 16;
 /// Returns the length of each attribute in bytes.
 fn lengths(version: u32, n: usize, sh_degree: u32) -> [usize; 6] {
     let rotation = if version == 2 { 3 } else { 4 };
-    [9 * n, n, 3 * n, 3 * n, rotation * n, 3 * rest_len(sh_degree) * n]
+    [
+        9 * n,
+        n,
+        3 * n,
+        3 * n,
+        rotation * n,
+        3 * rest_len(sh_degree) * n,
+    ]
 }
 
 /// Checks the header that all versions begin with. Returns version, count, SH degree and fractional
 /// bits.
 fn checked_header(path: &Path, data: &[u8]) -> Result<(u32, usize, u32, u8)> {
     let bad = |reason: String| Err(Error::format(path, reason));
-    let word = |at: usize| data.get(at..at + 4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+    let word = |at: usize| {
+        data.get(at..at + 4)
+            .map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+    };
     if word(0) != Some(MAGIC) || data.len() < HEADER {
         return bad("not an SPZ file".into());
     }
     let (version, count) = (word(4).unwrap_or(0), word(8).unwrap_or(0));
     if !VERSIONS.contains(&version) {
         let (first, last) = (VERSIONS.start(), VERSIONS.end());
-        return bad(format!("SPZ version {version} is not supported; export it as version {first} to {last}"));
+        return bad(format!(
+            "SPZ version {version} is not supported; export it as version {first} to {last}"
+        ));
     }
     let sh_degree = u32::from(data[12]);
     if sh_degree > MAX_SH_DEGREE {
-        return bad(format!("SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less"));
+        return bad(format!(
+            "SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less"
+        ));
     }
     Ok((version, count as usize, sh_degree, data[13]))
 }
@@ -126,19 +165,30 @@ fn checked_header(path: &Path, data: &[u8]) -> Result<(u32, usize, u32, u8)> {
 fn unpack_gzip(path: &Path, packed: &[u8]) -> Result<Packed> {
     let bad = |reason: String| Error::format(path, reason);
     let mut data = Vec::new();
-    GzDecoder::new(packed).read_to_end(&mut data).map_err(|e| bad(format!("not a complete SPZ file ({e}); copy it again")))?;
+    GzDecoder::new(packed)
+        .read_to_end(&mut data)
+        .map_err(|e| bad(format!("not a complete SPZ file ({e}); copy it again")))?;
     let (version, count, sh_degree, fraction) = checked_header(path, &data)?;
     let lengths = lengths(version, count, sh_degree);
     let expected = HEADER + lengths.iter().sum::<usize>();
     if data.len() < expected {
-        return Err(bad(format!("truncated: {count} Gaussians need {expected} bytes, but it has {}; copy it again", data.len())));
+        return Err(bad(format!(
+            "truncated: {count} Gaussians need {expected} bytes, but it has {}; copy it again",
+            data.len()
+        )));
     }
     let mut at = HEADER;
     let streams = lengths.map(|length| {
         at += length;
         data[at - length..at].to_vec()
     });
-    Ok(Packed { version, count, sh_degree, fraction, streams })
+    Ok(Packed {
+        version,
+        count,
+        sh_degree,
+        fractional_bits: fraction,
+        streams,
+    })
 }
 
 /// Decompresses version 4: a plain header, a table, and a Zstandard stream for each attribute.
@@ -149,30 +199,56 @@ fn unpack_zstd(path: &Path, data: &[u8]) -> Result<Packed> {
     let cut_off = || bad("truncated: its table or a stream ends early; copy it again".to_owned());
     let number = |at: usize, bytes: usize| -> Result<usize> {
         let raw = data.get(at..at.saturating_add(bytes)).ok_or_else(cut_off)?;
-        let value = raw.iter().rev().fold(0u64, |value, byte| value << 8 | u64::from(*byte));
+        let value = raw
+            .iter()
+            .rev()
+            .fold(0u64, |value, byte| value << 8 | u64::from(*byte));
         usize::try_from(value).map_err(|_| cut_off())
     };
     let (used, table) = (usize::from(data[15]), number(16, 4)?);
-    if used != lengths.iter().filter(|length| **length > 0).count() && count > 0 || table < HEADER_4 {
-        return Err(bad(format!("its table of {used} streams does not match SH degree {sh_degree}; export it again")));
+    if used != lengths.iter().filter(|length| **length > 0).count() && count > 0 || table < HEADER_4
+    {
+        return Err(bad(format!(
+            "its table of {used} streams does not match SH degree {sh_degree}; export it again"
+        )));
     }
     let mut streams: [Vec<u8>; 6] = Default::default();
     let mut at = table + used * ENTRY;
     for (k, (stream, length)) in streams.iter_mut().zip(lengths).take(used).enumerate() {
-        let (packed, unpacked) = (number(table + k * ENTRY, 8)?, number(table + k * ENTRY + 8, 8)?);
+        let (packed, unpacked) = (
+            number(table + k * ENTRY, 8)?,
+            number(table + k * ENTRY + 8, 8)?,
+        );
         if unpacked != length {
-            return Err(bad(format!("stream {k} has {unpacked} bytes, but {count} Gaussians need {length}; export it again")));
+            return Err(bad(format!(
+                "stream {k} has {unpacked} bytes, but {count} Gaussians need {length}; export it again"
+            )));
         }
-        let from = data.get(at..at.saturating_add(packed)).ok_or_else(cut_off)?;
-        let decoder = ruzstd::decoding::StreamingDecoder::new(from).map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
+        let from = data
+            .get(at..at.saturating_add(packed))
+            .ok_or_else(cut_off)?;
+        let decoder = ruzstd::decoding::StreamingDecoder::new(from)
+            .map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
         // Decompresses at most one byte more than announced.
-        decoder.take(length as u64 + 1).read_to_end(stream).map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
+        decoder
+            .take(length as u64 + 1)
+            .read_to_end(stream)
+            .map_err(|e| bad(format!("stream {k} is damaged ({e}); copy it again")))?;
         if stream.len() != length {
-            return Err(bad(format!("stream {k} is damaged: it has {} bytes, not {length}; copy it again", stream.len())));
+            return Err(bad(format!(
+                "stream {k} is damaged: it has {} bytes, not {length}; copy it again",
+                stream.len()
+            )));
         }
         at += packed;
     }
-    Ok(Packed { version, count, sh_degree, fraction, streams })
+    Ok(Packed {
+        version,
+        count,
+        sh_degree,
+        fractional_bits: fraction,
+        streams,
+    })
 }
 
 /// Decodes a quaternion of versions 3 and 4 to (w, x, y, z). The top two bits are the index of the
@@ -198,32 +274,59 @@ fn smallest_three(b: &[u8]) -> [f32; 4] {
 /// [`Error::Format`] for other content, truncated files and other versions.
 pub fn read(path: &Path) -> Result<Gaussians> {
     let data = fs::read(path)?;
-    let packed = if data.starts_with(&MAGIC.to_le_bytes()) { unpack_zstd(path, &data)? } else { unpack_gzip(path, &data)? };
+    let packed = if data.starts_with(&MAGIC.to_le_bytes()) {
+        unpack_zstd(path, &data)?
+    } else {
+        unpack_gzip(path, &data)?
+    };
     let (n, sh_degree) = (packed.count, packed.sh_degree);
-    let [positions, opacities, colors, scales, turns, rest] = &packed.streams;
+    let [positions, opacities, colors, scales, rotation_bytes, rest] = &packed.streams;
     let width = rest_len(sh_degree);
-    let unit = f32::from(packed.fraction).exp2();
+    let unit = f32::from(packed.fractional_bits).exp2();
     let flip = Vec3::new(1.0, -1.0, -1.0);
     let fixed = |b: &[u8]| (i32::from_le_bytes([0, b[0], b[1], b[2]]) >> 8) as f32 / unit;
-    let vec3 = |b: &[u8], f: fn(f32) -> f32| Vec3::new(f(b[0].into()), f(b[1].into()), f(b[2].into()));
+    let vec3 =
+        |b: &[u8], f: fn(f32) -> f32| Vec3::new(f(b[0].into()), f(b[1].into()), f(b[2].into()));
     let rotations = if packed.version == 2 {
         let first_three = |b: &[u8]| {
             let v = vec3(b, |v| v / 127.5 - 1.0);
             [(1.0 - v.length_squared()).max(0.0).sqrt(), v.x, v.y, v.z]
         };
-        turns.chunks_exact(3).map(first_three).collect::<Vec<_>>()
+        rotation_bytes
+            .chunks_exact(3)
+            .map(first_three)
+            .collect::<Vec<_>>()
     } else {
-        turns.chunks_exact(4).map(smallest_three).collect()
+        rotation_bytes.chunks_exact(4).map(smallest_three).collect()
     };
     Ok(Gaussians {
-        means: positions.chunks_exact(9).map(|b| Vec3::new(fixed(b), fixed(&b[3..]), fixed(&b[6..])) * flip).collect(),
-        log_scales: scales.chunks_exact(3).map(|b| vec3(b, |v| v / 16.0 - 10.0)).collect(),
-        rotations: rotations.into_iter().map(|[w, x, y, z]| [w, x, -y, -z]).collect(),
+        means: positions
+            .chunks_exact(9)
+            .map(|b| Vec3::new(fixed(b), fixed(&b[3..]), fixed(&b[6..])) * flip)
+            .collect(),
+        log_scales: scales
+            .chunks_exact(3)
+            .map(|b| vec3(b, |v| v / 16.0 - 10.0))
+            .collect(),
+        rotations: rotations
+            .into_iter()
+            .map(|[w, x, y, z]| [w, x, -y, -z])
+            .collect(),
         // Opacities of exactly 0 and 1 have no finite logit.
-        opacity_logits: opacities.iter().map(|b| logit((f32::from(*b) / 255.0).clamp(0.001, 0.999))).collect(),
-        sh_dc: colors.chunks_exact(3).map(|b| vec3(b, |v| (v - 127.5) / (COLOR_SCALE * 255.0))).collect(),
+        opacity_logits: opacities
+            .iter()
+            .map(|b| logit((f32::from(*b) / 255.0).clamp(0.001, 0.999)))
+            .collect(),
+        sh_dc: colors
+            .chunks_exact(3)
+            .map(|b| vec3(b, |v| (v - 127.5) / (COLOR_SCALE * 255.0)))
+            .collect(),
         sh_degree,
-        sh_rest: rest.chunks_exact(3).enumerate().map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % width]).collect(),
+        sh_rest: rest
+            .chunks_exact(3)
+            .enumerate()
+            .map(|(k, b)| vec3(b, |v| (v - 128.0) / 128.0) * SH_SIGNS[k % width])
+            .collect(),
         features: vec![Vec3::ZERO; n],
         object_ids: vec![0; n],
     })
@@ -236,13 +339,23 @@ mod tests {
 
     fn sample() -> Gaussians {
         let mut rng = Rng::new(1, "spz");
-        let mut g = Gaussians { sh_degree: 3, ..Gaussians::default() };
+        let mut g = Gaussians {
+            sh_degree: 3,
+            ..Gaussians::default()
+        };
         for i in 0..50 {
             let mean = 3.0 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
-            g.push_sphere(mean, rng.range(0.001, 0.5), rng.range(0.1, 0.9), [rng.uniform(), rng.uniform(), rng.uniform()]);
+            g.push_sphere(
+                mean,
+                rng.range(0.001, 0.5),
+                rng.range(0.1, 0.9),
+                [rng.uniform(), rng.uniform(), rng.uniform()],
+            );
             g.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
         }
-        g.sh_rest.iter_mut().for_each(|v| *v = 0.3 * Vec3::new(rng.uniform(), rng.uniform(), rng.uniform()));
+        g.sh_rest
+            .iter_mut()
+            .for_each(|v| *v = 0.3 * Vec3::new(rng.uniform(), rng.uniform(), rng.uniform()));
         g
     }
 
@@ -256,8 +369,16 @@ mod tests {
         assert_eq!((after.len(), after.sh_degree), (n, 3));
         for i in 0..n {
             assert!((after.means[i] - before.means[i]).length() < 1e-5);
-            assert!((after.log_scales[i] - before.log_scales[i]).abs().max_element() <= 0.04);
-            assert!((sigmoid(after.opacity_logits[i]) - sigmoid(before.opacity_logits[i])).abs() < 0.003);
+            assert!(
+                (after.log_scales[i] - before.log_scales[i])
+                    .abs()
+                    .max_element()
+                    <= 0.04
+            );
+            assert!(
+                (sigmoid(after.opacity_logits[i]) - sigmoid(before.opacity_logits[i])).abs()
+                    < 0.003
+            );
             assert!((after.sh_dc[i] - before.sh_dc[i]).abs().max_element() < 0.02);
             assert!(after.rotation(i).dot(before.rotation(i)).abs() > 0.99);
             for (a, b) in after.rest(i).iter().zip(before.rest(i)) {
@@ -268,7 +389,10 @@ mod tests {
         let again = dir.path().join("again.spz");
         write(&again, &after).unwrap();
         let again = read(&again).unwrap();
-        assert_eq!((again.means, again.sh_rest, again.sh_dc), (after.means, after.sh_rest, after.sh_dc));
+        assert_eq!(
+            (again.means, again.sh_rest, again.sh_dc),
+            (after.means, after.sh_rest, after.sh_dc)
+        );
     }
 
     #[test]
@@ -293,7 +417,8 @@ mod tests {
         raw.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
         raw.extend([0x00, 0x10, 0x00, 0x00, 0xf0, 0xff, 0x00, 0x08, 0x00]); // 1, -1, 0.5 in 12 fractional bits
         raw.extend([128, 255, 128, 0, 160, 144, 128, 255, 128, 128]);
-        let mut encoder = GzEncoder::new(std::fs::File::create(&path).unwrap(), Compression::fast());
+        let mut encoder =
+            GzEncoder::new(std::fs::File::create(&path).unwrap(), Compression::fast());
         encoder.write_all(&raw).unwrap();
         encoder.finish().unwrap();
         let g = read(&path).unwrap();

@@ -36,9 +36,19 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     assert_eq!(mapped.object_of, [1, 2, 2, 1, 1, 2]);
 
     // The object table, which answers queries: a code and all embeddings for each object.
-    let grid = Grid::build(&masks, &mapped.object_of, codes::lattice(usize::from(mapped.count), 0));
+    let grid = Grid::build(
+        &masks,
+        &mapped.object_of,
+        codes::lattice(usize::from(mapped.count), 0),
+    );
     for object in &grid.objects {
-        println!("object {}: code {:.2}, {} embeddings from {} photos", object.id, object.code, object.embeddings.len(), object.views);
+        println!(
+            "object {}: code {:.2}, {} embeddings from {} photos",
+            object.id,
+            object.code,
+            object.embeddings.len(),
+            object.views
+        );
     }
     Ok(())
 }

@@ -12,7 +12,7 @@ pub struct Calibration {
     /// largest cosine.
     pub anything: f32,
     /// Distribution of the best margin for absent names.
-    pub absent: Law,
+    pub absent: MarginDistribution,
     /// Whether the constants were measured with this encoder. Otherwise they follow from published
     /// statistics of encoders of its kind.
     pub measured: bool,
@@ -24,7 +24,7 @@ pub struct Calibration {
 /// increase would equal the scale. Objects of a scene overlap, and names contribute most of the
 /// scale, so `growth` is measured separately.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Law {
+pub struct MarginDistribution {
     /// Mode for one object.
     pub mode: f32,
     /// Scale.
@@ -39,7 +39,7 @@ pub struct Best {
     /// Largest margin of all objects, in units of cosine.
     pub margin: f32,
     /// Mean of the largest margins of the two halves of the objects.
-    pub of_halves: f32,
+    pub halves_margin: f32,
     /// Number of objects compared.
     pub objects: usize,
 }
@@ -49,7 +49,7 @@ pub struct Best {
 pub struct Samples {
     /// For each present name: the cosine of its own object minus the mean of the other objects, and
     /// the variance of the others.
-    pub told: Vec<[f32; 2]>,
+    pub excesses: Vec<[f32; 2]>,
     /// Best margins of scenes for absent names.
     pub absent: Vec<Best>,
 }
@@ -60,23 +60,26 @@ impl Samples {
     ///
     /// Ignores the name if there are fewer than two other objects. Only the spread around each
     /// name's own mean counts, because the means of names differ.
-    pub fn tell(&mut self, own: f32, others: &[f32]) {
+    pub fn add_name(&mut self, own: f32, others: &[f32]) {
         if others.len() > 1 {
             let (mean, variance) = moments(others);
-            self.told.push([own - mean, variance]);
+            self.excesses.push([own - mean, variance]);
         }
     }
 
     /// Returns the mean distance between an object's cosine with its own name and the mean of the
     /// other objects, in standard deviations of the latter.
     pub fn separation(&self) -> f32 {
-        let [excess, variance] = [0, 1].map(|k| self.told.iter().map(|told| told[k]).sum::<f32>() / self.told.len().max(1) as f32);
+        let [excess, variance] = [0, 1].map(|k| {
+            self.excesses.iter().map(|told| told[k]).sum::<f32>()
+                / self.excesses.len().max(1) as f32
+        });
         excess / variance.sqrt()
     }
 
     /// Appends the samples of another scene.
     pub fn extend(&mut self, other: &Self) {
-        self.told.extend(&other.told);
+        self.excesses.extend(&other.excesses);
         self.absent.extend(&other.absent);
     }
 }
@@ -85,7 +88,10 @@ impl Samples {
 fn moments(values: &[f32]) -> (f32, f32) {
     let n = values.len().max(1) as f32;
     let mean = values.iter().sum::<f32>() / n;
-    (mean, values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n)
+    (
+        mean,
+        values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / n,
+    )
 }
 
 /// Fits a Gumbel distribution to the upper half of `values`; returns mode and scale.
@@ -96,21 +102,35 @@ fn gumbel(values: &[f32]) -> [f32; 2] {
     let mut sorted = values.to_vec();
     sorted.sort_by(f32::total_cmp);
     let share = |k: usize| (k as f32 + 0.5) / sorted.len() as f32;
-    let upper: Vec<(f32, f32)> = (sorted.len() / 2..sorted.len()).map(|k| (-(-share(k).ln()).ln(), sorted[k])).collect();
+    let upper: Vec<(f32, f32)> = (sorted.len() / 2..sorted.len())
+        .map(|k| (-(-share(k).ln()).ln(), sorted[k]))
+        .collect();
     let n = upper.len() as f32;
-    let (x, y) = upper.iter().fold((0.0, 0.0), |(x, y), p| (x + p.0 / n, y + p.1 / n));
+    let (x, y) = upper
+        .iter()
+        .fold((0.0, 0.0), |(x, y), p| (x + p.0 / n, y + p.1 / n));
     let covariance: f32 = upper.iter().map(|p| (p.0 - x) * (p.1 - y)).sum();
     let scale = covariance / upper.iter().map(|p| (p.0 - x).powi(2)).sum::<f32>();
     [y - scale * x, scale]
 }
 
-impl Law {
+impl MarginDistribution {
     /// Fits the distribution to the best margins of scenes. Returns `None` if they do not vary.
     fn of(best: &[Best], temperature: f32) -> Option<Self> {
-        let doubled: f32 = best.iter().map(|b| b.margin - b.of_halves).sum::<f32>() / best.len().max(1) as f32;
+        let doubled: f32 =
+            best.iter().map(|b| b.margin - b.halves_margin).sum::<f32>() / best.len().max(1) as f32;
         let growth = temperature * doubled / std::f32::consts::LN_2;
-        let [mode, scale] = gumbel(&best.iter().map(|b| temperature * b.margin - growth * (b.objects as f32).ln()).collect::<Vec<_>>());
-        (scale > 0.0).then_some(Self { mode, scale, growth })
+        let [mode, scale] = gumbel(
+            &best
+                .iter()
+                .map(|b| temperature * b.margin - growth * (b.objects as f32).ln())
+                .collect::<Vec<_>>(),
+        );
+        (scale > 0.0).then_some(Self {
+            mode,
+            scale,
+            growth,
+        })
     }
 
     /// Returns the share of absent names whose best margin among `objects` objects is smaller than
@@ -127,8 +147,16 @@ impl Calibration {
     /// Measured by `bench names` on three photographed scenes with 40 absent names, with and
     /// without a colour. A sentence encoder has no useful embeddings of canonical phrases, so a
     /// fixed cosine replaces them.
-    pub const OFFLINE: Self =
-        Self { temperature: 20.8, anything: 0.6, absent: Law { mode: -4.65, scale: 0.89, growth: 0.43 }, measured: true };
+    pub const OFFLINE: Self = Self {
+        temperature: 20.8,
+        anything: 0.6,
+        absent: MarginDistribution {
+            mode: -4.65,
+            scale: 0.89,
+            growth: 0.43,
+        },
+        measured: true,
+    };
 
     /// Example queries with the offline encoder, measured on every seventh object of the same
     /// scenes.
@@ -136,20 +164,44 @@ impl Calibration {
     /// The inner product of two embeddings is the cosine of their classes plus twice the cosine of
     /// their appearances, so identical pictures reach 3. `absent` was measured in the other scenes
     /// with all embeddings of an object, as taught names store them.
-    pub const OFFLINE_PICTURES: Self =
-        Self { temperature: 5.0, anything: 1.8, absent: Law { mode: -4.5, scale: 0.72, growth: 0.48 }, measured: true };
+    pub const OFFLINE_PICTURES: Self = Self {
+        temperature: 5.0,
+        anything: 1.8,
+        absent: MarginDistribution {
+            mode: -4.5,
+            scale: 0.72,
+            growth: 0.48,
+        },
+        measured: true,
+    };
 
     /// Example queries with a CLIP that was not measured. Copies the statistics of text embeddings
     /// of the offline encoder between pictures.
-    pub const CLIP_PICTURES: Self =
-        Self { temperature: 26.0, anything: 0.6, absent: Law { mode: 4.66, scale: 0.76, growth: 0.38 }, measured: false };
+    pub const CLIP_PICTURES: Self = Self {
+        temperature: 26.0,
+        anything: 0.6,
+        absent: MarginDistribution {
+            mode: 4.66,
+            scale: 0.76,
+            growth: 0.38,
+        },
+        measured: false,
+    };
 
     /// Text queries with CLIP, from published statistics of cosines.
     ///
     /// They are 0.28 +- 0.02 for the right object, 0.20 +- 0.02 for others and 0.21 +- 0.015 for
     /// canonical phrases. Assumes independent objects with three views each.
-    pub const CLIP: Self =
-        Self { temperature: 200.0, anything: -1.0, absent: Law { mode: 2.3, scale: 1.34, growth: 1.34 }, measured: false };
+    pub const CLIP: Self = Self {
+        temperature: 200.0,
+        anything: -1.0,
+        absent: MarginDistribution {
+            mode: 2.3,
+            scale: 1.34,
+            growth: 1.34,
+        },
+        measured: false,
+    };
 
     /// Computes a calibration from samples.
     ///
@@ -158,12 +210,21 @@ impl Calibration {
     /// The best margins for absent names follow a Gumbel distribution.
     /// Returns `None` with fewer than two samples of a kind, or if names do not separate objects.
     pub fn measured(samples: &Samples, anything: f32) -> Option<Self> {
-        let [excess, variance] = [0, 1].map(|k| samples.told.iter().map(|told| told[k]).sum::<f32>());
+        let [excess, variance] =
+            [0, 1].map(|k| samples.excesses.iter().map(|told| told[k]).sum::<f32>());
         let temperature = excess / variance;
-        if samples.told.len().min(samples.absent.len()) < 2 || !temperature.is_finite() || temperature <= 0.0 {
+        if samples.excesses.len().min(samples.absent.len()) < 2
+            || !temperature.is_finite()
+            || temperature <= 0.0
+        {
             return None;
         }
-        Some(Self { temperature, anything, absent: Law::of(&samples.absent, temperature)?, measured: true })
+        Some(Self {
+            temperature,
+            anything,
+            absent: MarginDistribution::of(&samples.absent, temperature)?,
+            measured: true,
+        })
     }
 
     /// Returns the share of absent names whose best margin among `objects` objects is smaller than
@@ -181,7 +242,9 @@ mod tests {
     /// Cosines of `objects` objects with CLIP's statistics. The first one is the right object if
     /// `present`.
     fn scene(rng: &mut Rng, objects: usize, present: bool) -> Vec<f32> {
-        (0..objects).map(|k| if present && k == 0 { 0.28 } else { 0.20 } + 0.02 * rng.normal()).collect()
+        (0..objects)
+            .map(|k| if present && k == 0 { 0.28 } else { 0.20 } + 0.02 * rng.normal())
+            .collect()
     }
 
     fn best(cosines: &[f32]) -> f32 {
@@ -199,37 +262,66 @@ mod tests {
         let (mut samples, mut blind) = (Samples::default(), Samples::default());
         for _ in 0..60 {
             let cosines = scene(rng, few, true);
-            samples.tell(cosines[0], &cosines[1..]);
-            blind.tell(0.1, &cosines[1..]);
+            samples.add_name(cosines[0], &cosines[1..]);
+            blind.add_name(0.1, &cosines[1..]);
         }
         for _ in 0..1280 {
             let cosines = scene(rng, few, false);
             let (one, other) = cosines.split_at(few / 2);
             let of_halves = 0.5 * (best(one) + best(other)) - anything;
-            samples.absent.push(Best { margin: best(&cosines) - anything, of_halves, objects: few });
+            samples.absent.push(Best {
+                margin: best(&cosines) - anything,
+                halves_margin: of_halves,
+                objects: few,
+            });
         }
-        let calibration = Calibration::measured(&samples, anything).expect("the samples are separable");
-        assert!((calibration.temperature / 200.0 - 1.0).abs() < 0.15, "{calibration:?}");
+        let calibration =
+            Calibration::measured(&samples, anything).expect("the samples are separable");
+        assert!(
+            (calibration.temperature / 200.0 - 1.0).abs() < 0.15,
+            "{calibration:?}"
+        );
         for (objects, fewest) in [(few, 1.0 / 1.5), (many, 0.1)] {
             for share in [0.05, 0.1, 0.2] {
-                let alarms =
-                    (0..4000).filter(|_| calibration.confidence(best(&scene(rng, objects, false)) - anything, objects) >= 1.0 - share);
+                let alarms = (0..4000).filter(|_| {
+                    calibration.confidence(best(&scene(rng, objects, false)) - anything, objects)
+                        >= 1.0 - share
+                });
                 let factor = alarms.count() as f32 / 4000.0 / share;
-                assert!((fewest..1.5).contains(&factor), "accepted rate {share} with {objects} objects: {factor} times as many false alarms");
+                assert!(
+                    (fewest..1.5).contains(&factor),
+                    "accepted rate {share} with {objects} objects: {factor} times as many false alarms"
+                );
             }
         }
-        assert_eq!(Calibration::measured(&Samples { absent: samples.absent, ..blind }, anything), None);
+        assert_eq!(
+            Calibration::measured(
+                &Samples {
+                    absent: samples.absent,
+                    ..blind
+                },
+                anything
+            ),
+            None
+        );
     }
 
     #[test]
     fn clips_law_is_that_of_its_published_statistics() {
         let rng = &mut Rng::new(9, "law");
         for objects in [50usize, 200, 800] {
-            let margin = |rng: &mut Rng| 0.20 + 0.02 * rng.normal() - (0.21 + 0.015 / 3f32.sqrt() * rng.normal());
-            let mut bests: Vec<f32> = (0..2000).map(|_| (0..objects).map(|_| margin(rng)).fold(f32::MIN, f32::max)).collect();
+            let margin = |rng: &mut Rng| {
+                0.20 + 0.02 * rng.normal() - (0.21 + 0.015 / 3f32.sqrt() * rng.normal())
+            };
+            let mut bests: Vec<f32> = (0..2000)
+                .map(|_| (0..objects).map(|_| margin(rng)).fold(f32::MIN, f32::max))
+                .collect();
             bests.sort_by(f32::total_cmp);
             let at = Calibration::CLIP.confidence(bests[1860], objects);
-            assert!((0.90..0.96).contains(&at), "confidence at the 93rd percentile with {objects} objects: {at}");
+            assert!(
+                (0.90..0.96).contains(&at),
+                "confidence at the 93rd percentile with {objects} objects: {at}"
+            );
         }
     }
 }

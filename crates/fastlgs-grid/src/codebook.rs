@@ -22,9 +22,15 @@ impl Codebook {
         // About one code for each cell.
         let side = (grid.objects.len() as f32).cbrt().ceil().max(1.0) as i32;
         let mut codes: Vec<(u16, Vec3)> = grid.objects.iter().map(|o| (o.id, o.code)).collect();
-        codes.sort_by_key(|(id, code)| (place(cell(*code, side), side), *id));
-        let begin = |k: i32| codes.partition_point(|c| place(cell(c.1, side), side) < k as usize) as u32;
-        Self { side, first: (0..=side.pow(3)).map(begin).collect(), codes }
+        codes.sort_by_key(|(id, code)| (cell_index(cell(*code, side), side), *id));
+        let begin = |k: i32| {
+            codes.partition_point(|c| cell_index(cell(c.1, side), side) < k as usize) as u32
+        };
+        Self {
+            side,
+            first: (0..=side.pow(3)).map(begin).collect(),
+            codes,
+        }
     }
 
     /// Returns the object whose code is nearest to `feature`, and the paper's distance Dis_gf
@@ -34,13 +40,18 @@ impl Codebook {
     /// masks towards the origin.
     pub fn owner(&self, feature: Vec3) -> (u16, f32) {
         let nothing = (0, distance(feature, Vec3::ZERO));
-        self.nearest(feature, |_| true).filter(|found| found.1 < nothing.1).unwrap_or(nothing)
+        self.nearest(feature, |_| true)
+            .filter(|found| found.1 < nothing.1)
+            .unwrap_or(nothing)
     }
 
     /// Returns the smallest distance between two codes on the 0..255 scale; [`SCALE`] if there is
     /// only one code.
     pub fn spacing(&self) -> f32 {
-        let other = |&(id, code): &(u16, Vec3)| self.nearest(code, |other| other != id).map_or(SCALE, |found| found.1);
+        let other = |&(id, code): &(u16, Vec3)| {
+            self.nearest(code, |other| other != id)
+                .map_or(SCALE, |found| found.1)
+        };
         self.codes.iter().map(other).fold(SCALE, f32::min)
     }
 
@@ -55,10 +66,13 @@ impl Codebook {
                 break;
             }
             for cell in self.ring(middle, ring) {
-                let place = place(cell, self.side);
-                for &(id, code) in &self.codes[self.first[place] as usize..self.first[place + 1] as usize] {
+                let place = cell_index(cell, self.side);
+                for &(id, code) in
+                    &self.codes[self.first[place] as usize..self.first[place + 1] as usize]
+                {
                     let found = (id, distance(feature, code));
-                    let nearer = best.is_none_or(|best| found.1 < best.1 || found.1 == best.1 && id < best.0);
+                    let nearer = best
+                        .is_none_or(|best| found.1 < best.1 || found.1 == best.1 && id < best.0);
                     if counts(id) && nearer {
                         best = Some(found);
                     }
@@ -77,7 +91,10 @@ impl Codebook {
                 let inner = (z - middle.z).abs() < ring && (y - middle.y).abs() < ring;
                 // In the inner rows, only the two ends lie on the ring.
                 let step = if inner { (2 * ring).max(1) as usize } else { 1 };
-                (middle.x - ring..=middle.x + ring).step_by(step).filter(move |x| (0..=last).contains(x)).map(move |x| IVec3::new(x, y, z))
+                (middle.x - ring..=middle.x + ring)
+                    .step_by(step)
+                    .filter(move |x| (0..=last).contains(x))
+                    .map(move |x| IVec3::new(x, y, z))
             })
         })
     }
@@ -85,10 +102,13 @@ impl Codebook {
 
 /// Returns the cell of a feature, clamped to the cube.
 fn cell(feature: Vec3, side: i32) -> IVec3 {
-    (feature * side as f32).floor().as_ivec3().clamp(IVec3::ZERO, IVec3::splat(side - 1))
+    (feature * side as f32)
+        .floor()
+        .as_ivec3()
+        .clamp(IVec3::ZERO, IVec3::splat(side - 1))
 }
 
-fn place(cell: IVec3, side: i32) -> usize {
+fn cell_index(cell: IVec3, side: i32) -> usize {
     ((cell.z * side + cell.y) * side + cell.x) as usize
 }
 
@@ -109,7 +129,10 @@ mod tests {
             areas: Vec::new(),
             views: 1,
         };
-        Grid { objects: codes.iter().enumerate().map(object).collect(), ..Grid::default() }
+        Grid {
+            objects: codes.iter().enumerate().map(object).collect(),
+            ..Grid::default()
+        }
     }
 
     #[test]
@@ -121,8 +144,14 @@ mod tests {
             for _ in 0..300 {
                 let feature = Vec3::from_array(std::array::from_fn(|_| rng.range(-0.3, 1.3)));
                 let nothing = (0, distance(feature, Vec3::ZERO));
-                let all = grid.objects.iter().map(|o| (o.id, distance(feature, o.code)));
-                let nearest = std::iter::once(nothing).chain(all).min_by(|a, b| a.1.total_cmp(&b.1)).expect("nothing, at least");
+                let all = grid
+                    .objects
+                    .iter()
+                    .map(|o| (o.id, distance(feature, o.code)));
+                let nearest = std::iter::once(nothing)
+                    .chain(all)
+                    .min_by(|a, b| a.1.total_cmp(&b.1))
+                    .expect("nothing, at least");
                 assert_eq!(book.owner(feature).1, nearest.1, "{count} codes, {feature}");
             }
         }
@@ -132,7 +161,10 @@ mod tests {
     fn the_spacing_is_that_of_the_codes_that_are_left() {
         let codes = lattice(27, 1);
         assert!((Codebook::of(&grid(&codes)).spacing() - SCALE / 3.0).abs() < 1e-3);
-        assert!((Codebook::of(&grid(&codes[..2])).spacing() - distance(codes[0], codes[1])).abs() < 1e-3);
+        assert!(
+            (Codebook::of(&grid(&codes[..2])).spacing() - distance(codes[0], codes[1])).abs()
+                < 1e-3
+        );
         assert_eq!(Codebook::of(&grid(&codes[..1])).spacing(), SCALE);
     }
 }

@@ -12,7 +12,9 @@ pub const SCALE: f32 = 255.0;
 /// Returns the number of cells along each axis of the smallest cubic lattice with at least `count`
 /// cells.
 fn side(count: usize) -> i32 {
-    (1i32..).find(|s| s.pow(DIMENSION) as usize >= count).unwrap_or(1)
+    (1i32..)
+        .find(|s| s.pow(DIMENSION) as usize >= count)
+        .unwrap_or(1)
 }
 
 /// Returns codes in (0, 1)^3 for the objects 1..=count: cell centres of the smallest cubic lattice
@@ -22,9 +24,15 @@ fn side(count: usize) -> i32 {
 /// do not get neighbouring codes.
 pub fn lattice(count: usize, seed: u64) -> Vec<Vec3> {
     let side = side(count);
-    let mut cells: Vec<IVec3> = (0..side.pow(DIMENSION)).map(|k| IVec3::new(k % side, k / side % side, k / side / side)).collect();
+    let mut cells: Vec<IVec3> = (0..side.pow(DIMENSION))
+        .map(|k| IVec3::new(k % side, k / side % side, k / side / side))
+        .collect();
     Rng::new(seed, "codes").shuffle(&mut cells);
-    cells.iter().take(count).map(|c| (c.as_vec3() + 0.5) / side as f32).collect()
+    cells
+        .iter()
+        .take(count)
+        .map(|c| (c.as_vec3() + 0.5) / side as f32)
+        .collect()
 }
 
 /// Returns the paper's Dis_gf: the Euclidean distance on the 0..255 scale.

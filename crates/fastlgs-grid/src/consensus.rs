@@ -34,7 +34,9 @@ pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
     // Tracks come first, then single masks in scattered order, so that a batch rarely contains the
     // same object twice.
     let mut seeds: Vec<Vec<MaskId>> = sightings.tracks();
-    let mut single: Vec<MaskId> = (0..sightings.pixels.len() as MaskId).filter(|m| sightings.pixels[*m as usize] >= MIN_PIXELS).collect();
+    let mut single: Vec<MaskId> = (0..sightings.pixels.len() as MaskId)
+        .filter(|m| sightings.pixels[*m as usize] >= MIN_PIXELS)
+        .collect();
     single.sort_by_key(|mask| (mask.wrapping_mul(0x9e37_79b1), *mask));
     seeds.extend(single.into_iter().map(|mask| vec![mask]));
     let mut explained = vec![false; sightings.pixels.len()];
@@ -43,30 +45,51 @@ pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
     while seeds.peek().is_some() {
         let fresh = |seed: &Vec<MaskId>| seed.iter().any(|mask| !explained[*mask as usize]);
         let batch: Vec<Vec<MaskId>> = seeds.by_ref().filter(fresh).take(BATCH).collect();
-        let rest = |scratch: &mut Scratch, seed: &Vec<MaskId>| at_rest(sightings, seed, min_views, scratch);
-        let new: Vec<Option<Proposal>> = batch.par_iter().with_min_len(BATCH / 16).map_init(|| sightings.scratch(), rest).collect();
+        let rest =
+            |scratch: &mut Scratch, seed: &Vec<MaskId>| refine(sightings, seed, min_views, scratch);
+        let new: Vec<Option<Proposal>> = batch
+            .par_iter()
+            .with_min_len(BATCH / 16)
+            .map_init(|| sightings.scratch(), rest)
+            .collect();
         for proposal in new.into_iter().flatten() {
-            proposal.masks.iter().for_each(|fit| explained[fit.mask as usize] = true);
+            proposal
+                .masks
+                .iter()
+                .for_each(|fit| explained[fit.mask as usize] = true);
             found.push(proposal);
         }
     }
-    found.sort_by(|a, b| a.masks.iter().map(|fit| fit.mask).cmp(b.masks.iter().map(|fit| fit.mask)));
+    found.sort_by(|a, b| {
+        a.masks
+            .iter()
+            .map(|fit| fit.mask)
+            .cmp(b.masks.iter().map(|fit| fit.mask))
+    });
     found.dedup_by(|a, b| a.masks == b.masks);
     found
 }
 
 /// Refines the Gaussians of the seed masks until their masks do not change, in at most [`ROUNDS`]
 /// rounds. Returns `None` if fewer than `min_views` views show the set.
-fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &mut Scratch) -> Option<Proposal> {
-    let mut asked = seed.to_vec();
+fn refine(
+    sightings: &Sightings,
+    seed: &[MaskId],
+    min_views: usize,
+    scratch: &mut Scratch,
+) -> Option<Proposal> {
+    let mut masks_in = seed.to_vec();
     let mut found = None;
     for _ in 0..ROUNDS {
-        let set = sightings.held_by(asked.iter().copied(), scratch);
-        let masks = sightings.showing(&set, scratch);
-        let rests = masks.iter().map(|fit| fit.mask).eq(asked.iter().copied());
-        asked = masks.iter().map(|fit| fit.mask).collect();
+        let set = sightings.gaussians_in(masks_in.iter().copied(), scratch);
+        let masks = sightings.matching_masks(&set, scratch);
+        let rests = masks
+            .iter()
+            .map(|fit| fit.mask)
+            .eq(masks_in.iter().copied());
+        masks_in = masks.iter().map(|fit| fit.mask).collect();
         found = (masks.len() >= min_views).then_some(Proposal { set, masks });
-        if rests || asked.is_empty() {
+        if rests || masks_in.is_empty() {
             break;
         }
     }
@@ -77,7 +100,7 @@ fn at_rest(sightings: &Sightings, seed: &[MaskId], min_views: usize, scratch: &m
 mod tests {
     use super::*;
     use crate::sightings::Sighting;
-    use fastlgs_core::mask_list::{Mask, RunLengths, Table};
+    use fastlgs_core::mask_list::{AtomTable, Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 
     /// A mask: first Gaussian, end (exclusive), and track number.
@@ -87,17 +110,29 @@ mod tests {
     /// the views where `shows(view, gaussian)`.
     fn proposed(views: &[&[Range]], shows: impl Fn(usize, u32) -> bool) -> Vec<Vec<u32>> {
         let atoms = |masks: &&[Range]| {
-            let runs = |from, to| RunLengths::of(12, 1, |x, _| (from..to).contains(&x));
-            let mask = |&(from, to, track): &Range| Mask { track, ..Mask::new(Level::Whole, runs(from, to)) };
-            MaskList { masks: masks.iter().map(mask).collect(), ..MaskList::new(12, 1) }.atoms()
+            let runs = |from, to| RunLengths::from_fn(12, 1, |x, _| (from..to).contains(&x));
+            let mask = |&(from, to, track): &Range| Mask {
+                track,
+                ..Mask::new(Level::Whole, runs(from, to))
+            };
+            MaskList {
+                masks: masks.iter().map(mask).collect(),
+                ..MaskList::new(12, 1)
+            }
+            .atoms()
         };
         let atoms: Vec<_> = views.iter().map(atoms).collect();
-        let tables: Vec<Table> = atoms.iter().map(|a| a.table.clone()).collect();
+        let tables: Vec<AtomTable> = atoms.iter().map(|a| a.table.clone()).collect();
         let seen = atoms.iter().enumerate().map(|(view, a)| {
             let shown = (0..12).filter(|g| shows(view, *g));
-            shown.map(|g| Sighting::new(g, a.map.at(g, 0), 50.0)).collect()
+            shown
+                .map(|g| Sighting::new(g, a.map.at(g, 0), 50.0))
+                .collect()
         });
-        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(12, seen.collect(), &tables), 3).into_iter().map(|p| p.set).collect();
+        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(12, seen.collect(), &tables), 3)
+            .into_iter()
+            .map(|p| p.set)
+            .collect();
         sets.sort();
         sets
     }
@@ -107,19 +142,33 @@ mod tests {
         // A handle (2 Gaussians) on a cup (6) on a saucer (10). One view merges all of them,
         // another splits the cup.
         let good: &[_] = &[(0, 10, None), (0, 6, None), (0, 2, None)];
-        let (glued, cut): (&[_], &[_]) = (&[(0, 10, None)], &[(0, 10, None), (0, 3, None), (3, 6, None)]);
+        let (glued, cut): (&[_], &[_]) = (
+            &[(0, 10, None)],
+            &[(0, 10, None), (0, 3, None), (3, 6, None)],
+        );
         let wanted = [0..2, 0..6, 0..10].map(|range| range.collect::<Vec<u32>>());
         let found = proposed(&[good, good, good, glued, cut], |_, _| true);
-        assert_eq!(found, proposed(&[cut, glued, good, good, good], |_, _| true), "the result does not depend on the order of the views");
+        assert_eq!(
+            found,
+            proposed(&[cut, glued, good, good, good], |_, _| true),
+            "the result does not depend on the order of the views"
+        );
         assert!(wanted.iter().all(|set| found.contains(set)), "{found:?}");
-        assert_eq!(proposed(&[good, good, glued, glued, glued], |_, _| true), [wanted[2].clone()], "two views of the cup are fewer than min_views");
+        assert_eq!(
+            proposed(&[good, good, glued, glued, glued], |_, _| true),
+            [wanted[2].clone()],
+            "two views of the cup are fewer than min_views"
+        );
     }
     #[test]
     fn masks_that_hold_most_of_each_other_show_one_thing() {
         // Each view draws a bowl of six Gaussians at another position. The outer masks have an IoU
         // of 2/10, the middle one 4/8 with each of them.
         let drawn: [&[_]; 3] = [&[(1, 7, None)], &[(3, 9, None)], &[(5, 11, None)]];
-        assert_eq!(proposed(&drawn, |_, _| true), [(3..9).collect::<Vec<u32>>()]);
+        assert_eq!(
+            proposed(&drawn, |_, _| true),
+            [(3..9).collect::<Vec<u32>>()]
+        );
         // Masks that share only half of each other do not match.
         let drawn: [&[_]; 3] = [&[(0, 6, None)], &[(3, 9, None)], &[(6, 12, None)]];
         assert!(proposed(&drawn, |_, _| true).is_empty());
@@ -128,7 +177,12 @@ mod tests {
     fn a_tracker_joins_what_no_photo_shows_together() {
         // Each of three views shows a different third of one object.
         let thirds = |track| [0, 1, 2].map(|view| [(4 * view, 4 * view + 4, track)]);
-        let found = |track| proposed(&thirds(track).each_ref().map(|masks| masks.as_slice()), |view, g| g as usize / 4 == view);
+        let found = |track| {
+            proposed(
+                &thirds(track).each_ref().map(|masks| masks.as_slice()),
+                |view, g| g as usize / 4 == view,
+            )
+        };
         assert_eq!(found(Some(7)), [(0..12).collect::<Vec<u32>>()]);
         assert!(found(None).is_empty());
     }

@@ -16,40 +16,56 @@ use rayon::prelude::*;
 /// A pixel is confident if its feature lies within `tau_ac` of a code or of the origin (no object).
 /// `tau_ac` is on the 0..255 scale and defaults to a quarter of the smallest distance between
 /// codes. All other pixels take the nearest code among their decided neighbours, ring by ring.
-pub fn decide(grid: &Grid, width: u32, height: u32, values: &[f32], tau_ac: Option<f32>) -> LabelMap {
+pub fn decide(
+    grid: &Grid,
+    width: u32,
+    height: u32,
+    values: &[f32],
+    tau_ac: Option<f32>,
+) -> LabelMap {
     let pixels = (width * height) as usize;
     let feature = |p: usize| Vec3::new(values[p], values[pixels + p], values[2 * pixels + p]);
     let codebook = Codebook::of(grid);
     let tau_ac = tau_ac.unwrap_or_else(|| codebook.spacing() / 4.0);
-    let sure = |p: usize| {
+    let confident = |p: usize| {
         let (owner, distance) = codebook.owner(feature(p));
         (distance < tau_ac).then_some(owner)
     };
-    let mut labels: Vec<Option<u16>> = (0..pixels).into_par_iter().map(sure).collect();
-    let mut open: Vec<usize> = (0..pixels).filter(|p| labels[*p].is_none()).collect();
-    while !open.is_empty() {
+    let mut labels: Vec<Option<u16>> = (0..pixels).into_par_iter().map(confident).collect();
+    let mut undecided: Vec<usize> = (0..pixels).filter(|p| labels[*p].is_none()).collect();
+    while !undecided.is_empty() {
         let beside = |p: usize| {
             let feature = feature(p);
             let decided = neighbours(p, width as usize, pixels).filter_map(|q| labels[q]);
             let distance = |label: u16| codes::distance(feature, grid.code_of(label));
-            decided.min_by(|a, b| distance(*a).total_cmp(&distance(*b)).then(a.cmp(b))).map(|label| (p, label))
+            decided
+                .min_by(|a, b| distance(*a).total_cmp(&distance(*b)).then(a.cmp(b)))
+                .map(|label| (p, label))
         };
-        let found: Vec<(usize, u16)> = open.par_iter().filter_map(|p| beside(*p)).collect();
+        let found: Vec<(usize, u16)> = undecided.par_iter().filter_map(|p| beside(*p)).collect();
         if found.is_empty() {
             // No pixel is confident.
             break;
         }
-        found.into_iter().for_each(|(p, label)| labels[p] = Some(label));
-        open.retain(|p| labels[*p].is_none());
+        found
+            .into_iter()
+            .for_each(|(p, label)| labels[p] = Some(label));
+        undecided.retain(|p| labels[*p].is_none());
     }
-    LabelMap { width, height, labels: labels.into_iter().map(Option::unwrap_or_default).collect() }
+    LabelMap {
+        width,
+        height,
+        labels: labels.into_iter().map(Option::unwrap_or_default).collect(),
+    }
 }
 
 /// Iterates over the neighbours of a pixel, at most eight.
 fn neighbours(p: usize, width: usize, pixels: usize) -> impl Iterator<Item = usize> {
     let (x, y, rows) = (p % width, p / width, pixels / width);
     let columns = x.saturating_sub(1)..(x + 2).min(width);
-    (y.saturating_sub(1)..(y + 2).min(rows)).flat_map(move |y| columns.clone().map(move |x| y * width + x)).filter(move |q| *q != p)
+    (y.saturating_sub(1)..(y + 2).min(rows))
+        .flat_map(move |y| columns.clone().map(move |x| y * width + x))
+        .filter(move |q| *q != p)
 }
 
 #[cfg(test)]
@@ -66,9 +82,20 @@ mod tests {
     fn blends_belong_to_what_lies_beside_them() {
         // The codes are 0.25, 0.5 and 0.75. A blend of objects 1 and 3 passes the code of object 2,
         // which is absent here.
-        assert_eq!(row(&[0.25, 0.26, 0.35, 0.48, 0.6, 0.75], Some(5.0)), [1, 1, 1, 1, 3, 3]);
-        assert_eq!(row(&[0.5, 0.5, 0.5], Some(5.0)), [2, 2, 2], "object 2 is found where its code is confident");
-        assert_eq!(row(&[0.0, 0.1, 0.2, 0.25], Some(5.0)), [0, 0, 1, 1], "id 0 spreads to its neighbours, too");
+        assert_eq!(
+            row(&[0.25, 0.26, 0.35, 0.48, 0.6, 0.75], Some(5.0)),
+            [1, 1, 1, 1, 3, 3]
+        );
+        assert_eq!(
+            row(&[0.5, 0.5, 0.5], Some(5.0)),
+            [2, 2, 2],
+            "object 2 is found where its code is confident"
+        );
+        assert_eq!(
+            row(&[0.0, 0.1, 0.2, 0.25], Some(5.0)),
+            [0, 0, 1, 1],
+            "id 0 spreads to its neighbours, too"
+        );
         assert_eq!(row(&[0.4, 0.4], Some(1.0)), [0, 0], "no pixel is confident");
     }
 

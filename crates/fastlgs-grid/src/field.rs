@@ -2,17 +2,31 @@
 
 use crate::decision::decide;
 use crate::grid::Grid;
-use crate::overlaps::standing_for;
+use crate::overlaps::representative_id;
 use crate::query::Hit;
-use fastlgs_core::shares::{KEPT, unpack};
+use fastlgs_core::shares::{IDS_PER_PIXEL, unpack};
 use fastlgs_core::{LabelMap, Shares};
 
 /// Returns for each pixel the id that represents its objects. `lists`: the objects of each id,
 /// smallest first.
 pub fn ids(shares: &Shares, lists: &[Vec<u16>]) -> LabelMap {
-    let found = |pixel: &[u32; KEPT]| pixel.map(unpack).into_iter().filter(|s| s.1 > 0).map(|(id, weight)| (id, weight as f32));
-    let labels = shares.held(lists).zip(&shares.pixels).map(|(objects, pixel)| standing_for(&objects, found(pixel), lists)).collect();
-    LabelMap { width: shares.width, height: shares.height, labels }
+    let found = |pixel: &[u32; IDS_PER_PIXEL]| {
+        pixel
+            .map(unpack)
+            .into_iter()
+            .filter(|s| s.1 > 0)
+            .map(|(id, weight)| (id, weight as f32))
+    };
+    let labels = shares
+        .majority_sets(lists)
+        .zip(&shares.pixels)
+        .map(|(objects, pixel)| representative_id(&objects, found(pixel), lists))
+        .collect();
+    LabelMap {
+        width: shares.width,
+        height: shares.height,
+        labels,
+    }
 }
 
 /// The rendered object data of a view.
@@ -34,14 +48,24 @@ pub enum Field {
 }
 
 impl Field {
-    /// Calls `tell` for each pixel, row by row, with the objects that have most of its weight,
+    /// Calls `visit` for each pixel, row by row, with the objects that have most of its weight,
     /// smallest first.
-    pub fn each(&self, grid: &Grid, mut tell: impl FnMut(&[u16])) {
+    pub fn for_each_pixel(&self, grid: &Grid, mut visit: impl FnMut(&[u16])) {
         let lists = grid.lists();
         match self {
-            Self::Shares(shares) => shares.held(&lists).for_each(|objects| tell(&objects)),
-            Self::Features { width, height, values, tau_ac } => {
-                decide(grid, *width, *height, values, *tau_ac).labels.iter().for_each(|id| tell(&lists[usize::from(*id)]));
+            Self::Shares(shares) => shares
+                .majority_sets(&lists)
+                .for_each(|objects| visit(&objects)),
+            Self::Features {
+                width,
+                height,
+                values,
+                tau_ac,
+            } => {
+                decide(grid, *width, *height, values, *tau_ac)
+                    .labels
+                    .iter()
+                    .for_each(|id| visit(&lists[usize::from(*id)]));
             }
         }
     }
@@ -50,10 +74,14 @@ impl Field {
     /// first.
     pub fn at(&self, grid: &Grid, pixels: &[(u32, u32)]) -> Vec<Vec<u16>> {
         let width = self.size().0;
-        let mut asked: Vec<(u32, usize)> = pixels.iter().enumerate().map(|(k, (x, y))| (y * width + x, k)).collect();
+        let mut asked: Vec<(u32, usize)> = pixels
+            .iter()
+            .enumerate()
+            .map(|(k, (x, y))| (y * width + x, k))
+            .collect();
         asked.sort_unstable_by(|a, b| b.cmp(a));
         let (mut place, mut found) = (0, vec![Vec::new(); pixels.len()]);
-        self.each(grid, |objects| {
+        self.for_each_pixel(grid, |objects| {
             while let Some((_, k)) = asked.pop_if(|(wanted, _)| *wanted == place) {
                 found[k] = objects.to_vec();
             }
@@ -66,7 +94,12 @@ impl Field {
     pub fn ids(&self, grid: &Grid) -> LabelMap {
         match self {
             Self::Shares(shares) => ids(shares, &grid.lists()),
-            Self::Features { width, height, values, tau_ac } => decide(grid, *width, *height, values, *tau_ac),
+            Self::Features {
+                width,
+                height,
+                values,
+                tau_ac,
+            } => decide(grid, *width, *height, values, *tau_ac),
         }
     }
 
@@ -74,8 +107,14 @@ impl Field {
     pub fn owners(&self, grid: &Grid) -> LabelMap {
         let (width, height) = self.size();
         let mut labels = Vec::with_capacity((width * height) as usize);
-        self.each(grid, |objects| labels.push(objects.first().copied().unwrap_or(0)));
-        LabelMap { width, height, labels }
+        self.for_each_pixel(grid, |objects| {
+            labels.push(objects.first().copied().unwrap_or(0))
+        });
+        LabelMap {
+            width,
+            height,
+            labels,
+        }
     }
 
     /// Returns width and height in pixels.
@@ -92,7 +131,12 @@ impl Field {
         let members = grid.members(&ids);
         match self {
             Self::Shares(shares) => shares.mask(&members),
-            Self::Features { .. } => self.owners(grid).labels.iter().map(|id| members[usize::from(*id)]).collect(),
+            Self::Features { .. } => self
+                .owners(grid)
+                .labels
+                .iter()
+                .map(|id| members[usize::from(*id)])
+                .collect(),
         }
     }
 
@@ -101,7 +145,14 @@ impl Field {
         let mut own = vec![0.0f32; grid.objects.len() + 1];
         ranked.iter().for_each(|h| own[usize::from(h.id)] = h.score);
         let mut relevancy = Vec::new();
-        self.each(grid, |objects| relevancy.push(objects.iter().map(|id| own[usize::from(*id)]).fold(0.0, f32::max)));
+        self.for_each_pixel(grid, |objects| {
+            relevancy.push(
+                objects
+                    .iter()
+                    .map(|id| own[usize::from(*id)])
+                    .fold(0.0, f32::max),
+            )
+        });
         relevancy
     }
 }
@@ -114,11 +165,26 @@ mod tests {
 
     #[test]
     fn an_object_is_shown_by_its_parts_as_well() {
-        let pixels = vec![[pack(1, 0.4), pack(2, 0.2), pack(3, 0.4), 0], [pack(2, 0.9), 0, 0, 0], [pack(3, 1.0), 0, 0, 0]];
-        let field = Field::Shares(Shares { width: 3, height: 1, pixels });
+        let pixels = vec![
+            [pack(1, 0.4), pack(2, 0.2), pack(3, 0.4), 0],
+            [pack(2, 0.9), 0, 0, 0],
+            [pack(3, 1.0), 0, 0, 0],
+        ];
+        let field = Field::Shares(Shares {
+            width: 3,
+            height: 1,
+            pixels,
+        });
         let mask = |id| field.mask(&grid(), &[Hit { id, score: 1.0 }]);
-        assert_eq!((mask(1), mask(2)), (vec![true, true, false], vec![false, true, false]));
-        let ranked = [Hit { id: 1, score: 0.8 }, Hit { id: 2, score: 0.5 }, Hit { id: 3, score: 0.1 }];
+        assert_eq!(
+            (mask(1), mask(2)),
+            (vec![true, true, false], vec![false, true, false])
+        );
+        let ranked = [
+            Hit { id: 1, score: 0.8 },
+            Hit { id: 2, score: 0.5 },
+            Hit { id: 3, score: 0.1 },
+        ];
         assert_eq!(field.relevancy(&grid(), &ranked), [0.8, 0.8, 0.1]);
     }
 }

@@ -36,7 +36,12 @@ pub struct PaperConfig {
 
 impl Default for PaperConfig {
     fn default() -> Self {
-        Self { tau: 4, theta: 0.95, alpha: 0.3, key_points: true }
+        Self {
+            tau: 4,
+            theta: 0.95,
+            alpha: 0.3,
+            key_points: true,
+        }
     }
 }
 
@@ -51,7 +56,13 @@ impl Mask {
     /// swaps the two names; this follows its formulas.
     fn look(&self, alpha: f32) -> Vec<f32> {
         let color = self.histogram.iter().map(|share| (alpha * share).sqrt());
-        color.chain(self.embedding.iter().map(|value| (1.0 - alpha).sqrt() * value)).collect()
+        color
+            .chain(
+                self.embedding
+                    .iter()
+                    .map(|value| (1.0 - alpha).sqrt() * value),
+            )
+            .collect()
     }
 }
 
@@ -69,10 +80,15 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
         let mut sums = [0.0f32; LANES];
         for (a, b) in a.iter().zip(b) {
             for k in 0..LANES {
-                sums[k] = if FMA { a[k].mul_add(b[k], sums[k]) } else { sums[k] + a[k] * b[k] };
+                sums[k] = if FMA {
+                    a[k].mul_add(b[k], sums[k])
+                } else {
+                    sums[k] + a[k] * b[k]
+                };
             }
         }
-        *out = sums.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum::<f32>();
+        *out =
+            sums.iter().sum::<f32>() + a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum::<f32>();
     }
 }
 
@@ -81,7 +97,7 @@ fn products_body<const FMA: bool>(with: &[f32], others: &[Vec<f32>], out: &mut [
 ///
 /// Objects whose similarities to a mask differ by at most 1 minus this are treated as equally
 /// similar.
-const ALIKE: f32 = 0.98;
+const SAME_SIMILARITY: f32 = 0.98;
 
 /// Result of Algorithm 1.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -111,18 +127,32 @@ pub struct Mapped {
 /// # Errors
 /// There are more than 65,535 objects; ids have 16 bits.
 pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> Result<Mapped> {
-    let mut mapped = Mapped { object_of: Vec::with_capacity(masks.len()), ..Mapped::default() };
+    let mut mapped = Mapped {
+        object_of: Vec::with_capacity(masks.len()),
+        ..Mapped::default()
+    };
     let mut representatives: Vec<usize> = Vec::new();
-    let looks: Vec<Vec<f32>> = masks.par_iter().map(|mask| mask.look(config.alpha)).collect();
+    let looks: Vec<Vec<f32>> = masks
+        .par_iter()
+        .map(|mask| mask.look(config.alpha))
+        .collect();
     for photo in masks.chunk_by(|a, b| a.view == b.view) {
         let first = mapped.object_of.len();
-        let by_key_points: Vec<Option<u16>> =
-            (first..first + photo.len()).map(|j| most_corresponding(j, first, pairs, &mapped, config)).collect();
+        let by_key_points: Vec<Option<u16>> = (first..first + photo.len())
+            .map(|j| most_corresponding(j, first, pairs, &mapped, config))
+            .collect();
         mapped.comparisons += photo.len() * representatives.len();
-        let alike = similarities(&looks, first..first + photo.len(), &representatives, &mapped);
+        let similarity_to = similarities(
+            &looks,
+            first..first + photo.len(),
+            &representatives,
+            &mapped,
+        );
         let mut object_of = by_key_points;
-        let key_points = |mask: usize, object: u16| shared_with(first + mask, object, first, pairs, &mapped, config);
-        for (mask, object) in most_alike_first(&alike, config.theta, key_points) {
+        let key_points = |mask: usize, object: u16| {
+            shared_with(first + mask, object, first, pairs, &mapped, config)
+        };
+        for (mask, object) in most_alike_first(&similarity_to, config.theta, key_points) {
             if object_of[mask].is_none() && !object_of.contains(&Some(object)) {
                 object_of[mask] = Some(object);
             }
@@ -137,7 +167,10 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
             };
             // A representative of the same object that is similar enough makes this mask
             // superfluous.
-            if alike[k].get(&object).is_none_or(|sim| *sim < ALIKE) {
+            if similarity_to[k]
+                .get(&object)
+                .is_none_or(|sim| *sim < SAME_SIMILARITY)
+            {
                 representatives.push(first + k);
             }
             mapped.object_of.push(object);
@@ -148,20 +181,43 @@ pub fn paper(masks: &[Mask], pairs: &Correspondences, config: &PaperConfig) -> R
 
 /// Returns the object of the mask before `first` that shares most key points with mask `j`; `None`
 /// below tau.
-fn most_corresponding(j: usize, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> Option<u16> {
-    let most = pairs.range((j, 0)..(j, first)).map(|(&(_, k), &n)| (n, std::cmp::Reverse(k))).max()?;
+fn most_corresponding(
+    j: usize,
+    first: usize,
+    pairs: &Correspondences,
+    mapped: &Mapped,
+    config: &PaperConfig,
+) -> Option<u16> {
+    let most = pairs
+        .range((j, 0)..(j, first))
+        .map(|(&(_, k), &n)| (n, std::cmp::Reverse(k)))
+        .max()?;
     Some(mapped.object_of[most.1.0]).filter(|_| config.key_points && most.0 >= config.tau)
 }
 
 /// Counts the key points that mask `j` shares with an object's masks before mask `first`.
-fn shared_with(j: usize, object: u16, first: usize, pairs: &Correspondences, mapped: &Mapped, config: &PaperConfig) -> u32 {
-    let of_object = pairs.range((j, 0)..(j, first)).filter(|((_, k), _)| config.key_points && mapped.object_of[*k] == object);
+fn shared_with(
+    j: usize,
+    object: u16,
+    first: usize,
+    pairs: &Correspondences,
+    mapped: &Mapped,
+    config: &PaperConfig,
+) -> u32 {
+    let of_object = pairs
+        .range((j, 0)..(j, first))
+        .filter(|((_, k), _)| config.key_points && mapped.object_of[*k] == object);
     of_object.map(|(_, n)| n).sum()
 }
 
 /// Returns for each mask of a photo its similarity to each object: the largest one to a
 /// representative.
-fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usize], mapped: &Mapped) -> Vec<BTreeMap<u16, f32>> {
+fn similarities(
+    looks: &[Vec<f32>],
+    photo: Range<usize>,
+    representatives: &[usize],
+    mapped: &Mapped,
+) -> Vec<BTreeMap<u16, f32>> {
     // Loop order for the cache: the vectors of the photo stay in it while each representative
     // passes once.
     let with = |k: &usize| {
@@ -185,17 +241,32 @@ fn similarities(looks: &[Vec<f32>], photo: Range<usize>, representatives: &[usiz
 ///
 /// Sorts by shared key points, then by similarity. Key points count only if the object is about as
 /// similar as the mask's most similar one.
-fn most_alike_first(alike: &[BTreeMap<u16, f32>], theta: f32, key_points: impl Fn(usize, u16) -> u32) -> Vec<(usize, u16)> {
+fn most_alike_first(
+    alike: &[BTreeMap<u16, f32>],
+    theta: f32,
+    key_points: impl Fn(usize, u16) -> u32,
+) -> Vec<(usize, u16)> {
     let mut pairs: Vec<(u32, f32, usize, u16)> = Vec::new();
     for (mask, objects) in alike.iter().enumerate() {
         let most = objects.values().copied().fold(f32::MIN, f32::max);
         for (&object, &sim) in objects.iter().filter(|(_, sim)| **sim >= theta) {
-            let shared = if most - sim <= 1.0 - ALIKE { key_points(mask, object) } else { 0 };
+            let shared = if most - sim <= 1.0 - SAME_SIMILARITY {
+                key_points(mask, object)
+            } else {
+                0
+            };
             pairs.push((shared, sim, mask, object));
         }
     }
-    pairs.sort_by(|a, b| b.0.cmp(&a.0).then(b.1.total_cmp(&a.1)).then((a.2, a.3).cmp(&(b.2, b.3))));
-    pairs.into_iter().map(|(_, _, mask, object)| (mask, object)).collect()
+    pairs.sort_by(|a, b| {
+        b.0.cmp(&a.0)
+            .then(b.1.total_cmp(&a.1))
+            .then((a.2, a.3).cmp(&(b.2, b.3)))
+    });
+    pairs
+        .into_iter()
+        .map(|(_, _, mask, object)| (mask, object))
+        .collect()
 }
 
 #[cfg(test)]
@@ -203,7 +274,13 @@ mod tests {
     use super::*;
 
     fn mask(view: usize, label: u16, embedding: [f32; 2], histogram: [f32; 2]) -> Mask {
-        Mask { view, label, area: 0.1, embedding: embedding.to_vec(), histogram: histogram.to_vec() }
+        Mask {
+            view,
+            label,
+            area: 0.1,
+            embedding: embedding.to_vec(),
+            histogram: histogram.to_vec(),
+        }
     }
 
     /// View 0 shows a cup and a book. View 1 shows the cup (by key points), a similar book, and a
@@ -222,8 +299,24 @@ mod tests {
         let map = |config: PaperConfig| paper(&masks, &pairs, &config).unwrap();
         let found = map(PaperConfig::default());
         assert_eq!((found.object_of, found.count), (vec![1, 2, 1, 2, 3, 4], 4));
-        assert_eq!(map(PaperConfig { tau: 3, ..PaperConfig::default() }).object_of[5], 1, "tau is an option");
-        assert_eq!(map(PaperConfig { key_points: false, ..PaperConfig::default() }).object_of, [1, 2, 3, 2, 4, 5], "key points are an option");
+        assert_eq!(
+            map(PaperConfig {
+                tau: 3,
+                ..PaperConfig::default()
+            })
+            .object_of[5],
+            1,
+            "tau is an option"
+        );
+        assert_eq!(
+            map(PaperConfig {
+                key_points: false,
+                ..PaperConfig::default()
+            })
+            .object_of,
+            [1, 2, 3, 2, 4, 5],
+            "key points are an option"
+        );
         let mut similarity = [0.0];
         products(&masks[1].look(0.3), &[masks[3].look(0.3)], &mut similarity);
         assert!((similarity[0] - (0.7 + 0.3 * (0.225f32.sqrt() + 0.275f32.sqrt()))).abs() < 1e-6);
@@ -241,18 +334,44 @@ mod tests {
             mask(1, 2, [1.0, 0.0], [1.0, 0.0]),
         ];
         let pairs = Correspondences::from([((3, 1), 1), ((3, 2), 3)]);
-        let map = |key_points| paper(&masks, &pairs, &PaperConfig { key_points, ..PaperConfig::default() }).unwrap().object_of;
-        assert_eq!([map(false), map(true)], [vec![1, 2, 3, 1, 2], vec![1, 2, 3, 2, 1]]);
+        let map = |key_points| {
+            paper(
+                &masks,
+                &pairs,
+                &PaperConfig {
+                    key_points,
+                    ..PaperConfig::default()
+                },
+            )
+            .unwrap()
+            .object_of
+        };
+        assert_eq!(
+            [map(false), map(true)],
+            [vec![1, 2, 3, 1, 2], vec![1, 2, 3, 2, 1]]
+        );
     }
 
     /// Generates `views` photos of 40 objects. Each photo shows ten; their embeddings vary between
     /// photos.
     fn walk(views: usize) -> Vec<Mask> {
         let mut rng = fastlgs_core::rng::Rng::new(2, "walk");
-        let looks: Vec<Vec<f32>> = (0..40).map(|_| unit((0..16).map(|_| rng.normal()).collect())).collect();
-        let mut wavering = |look: &[f32]| unit(look.iter().map(|v| v + 0.03 * rng.normal()).collect());
-        let mask = |view: usize, label: usize, embedding| Mask { view, label: label as u16, area: 0.1, embedding, histogram: vec![1.0] };
-        (0..views).flat_map(|v| (0..10).map(move |k| (v, (v + k) % 40))).map(|(v, thing)| mask(v, thing, wavering(&looks[thing]))).collect()
+        let looks: Vec<Vec<f32>> = (0..40)
+            .map(|_| unit((0..16).map(|_| rng.normal()).collect()))
+            .collect();
+        let mut wavering =
+            |look: &[f32]| unit(look.iter().map(|v| v + 0.03 * rng.normal()).collect());
+        let mask = |view: usize, label: usize, embedding| Mask {
+            view,
+            label: label as u16,
+            area: 0.1,
+            embedding,
+            histogram: vec![1.0],
+        };
+        (0..views)
+            .flat_map(|v| (0..10).map(move |k| (v, (v + k) % 40)))
+            .map(|(v, thing)| mask(v, thing, wavering(&looks[thing])))
+            .collect()
     }
 
     fn unit(mut v: Vec<f32>) -> Vec<f32> {
@@ -265,26 +384,52 @@ mod tests {
     fn work_grows_with_the_photos_and_not_with_their_square() {
         let [few, many] = [250, 1000].map(|views| {
             let masks = walk(views);
-            let mapped = paper(&masks, &Correspondences::new(), &PaperConfig { theta: 0.9, ..PaperConfig::default() }).unwrap();
+            let mapped = paper(
+                &masks,
+                &Correspondences::new(),
+                &PaperConfig {
+                    theta: 0.9,
+                    ..PaperConfig::default()
+                },
+            )
+            .unwrap();
             assert_eq!(mapped.count, 40, "each generated object is found once");
-            assert!(
-                masks.iter().zip(&mapped.object_of).all(|(m, o)| masks
+            assert!(masks.iter().zip(&mapped.object_of).all(|(m, o)| {
+                masks
                     .iter()
                     .zip(&mapped.object_of)
                     .find(|(n, _)| n.label == m.label)
-                    .is_some_and(|f| f.1 == o))
-            );
+                    .is_some_and(|f| f.1 == o)
+            }));
             mapped.comparisons as f64
         });
         let exponent = (many / few).ln() / 4f64.ln();
-        println!("comparisons grow with the {exponent:.2}th power of the number of photos, up to 1,000");
+        println!(
+            "comparisons grow with the {exponent:.2}th power of the number of photos, up to 1,000"
+        );
         assert!(exponent < 1.3, "{exponent}");
     }
 
     #[test]
     fn ids_have_sixteen_bits() {
-        let masks: Vec<Mask> = (0..=u16::MAX).map(|label| mask(0, label, [1.0, 0.0], [1.0, 0.0])).collect();
-        assert_eq!(paper(&masks[1..], &Correspondences::new(), &PaperConfig::default()).unwrap().count, u16::MAX);
-        assert!(paper(&masks, &Correspondences::new(), &PaperConfig::default()).unwrap_err().to_string().contains("65,535"));
+        let masks: Vec<Mask> = (0..=u16::MAX)
+            .map(|label| mask(0, label, [1.0, 0.0], [1.0, 0.0]))
+            .collect();
+        assert_eq!(
+            paper(
+                &masks[1..],
+                &Correspondences::new(),
+                &PaperConfig::default()
+            )
+            .unwrap()
+            .count,
+            u16::MAX
+        );
+        assert!(
+            paper(&masks, &Correspondences::new(), &PaperConfig::default())
+                .unwrap_err()
+                .to_string()
+                .contains("65,535")
+        );
     }
 }

@@ -21,7 +21,11 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { min_views: 3, min_support: 0.5, same: 0.7 }
+        Self {
+            min_views: 3,
+            min_support: 0.5,
+            same: 0.7,
+        }
     }
 }
 
@@ -54,11 +58,15 @@ impl Chosen {
     pub fn layers(&self) -> Vec<BTreeSet<u16>> {
         let mut beside: Vec<BTreeSet<u16>> = vec![BTreeSet::new(); self.parents.len() + 1];
         for list in self.lists() {
-            list.iter().for_each(|id| beside[usize::from(*id)].extend(&list));
+            list.iter()
+                .for_each(|id| beside[usize::from(*id)].extend(&list));
         }
         let mut layers: Vec<BTreeSet<u16>> = Vec::new();
         for id in 1..=self.parents.len() as u16 {
-            let place = layers.iter().position(|layer| layer.is_disjoint(&beside[usize::from(id)])).unwrap_or(layers.len());
+            let place = layers
+                .iter()
+                .position(|layer| layer.is_disjoint(&beside[usize::from(id)]))
+                .unwrap_or(layers.len());
             layers.resize(layers.len().max(place + 1), BTreeSet::new());
             layers[place].insert(id);
         }
@@ -73,27 +81,45 @@ impl Chosen {
 /// whose set contains it.
 ///
 /// `pixels`: mean number of pixels of a view.
-pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>, pixels: usize, config: &Config) -> Chosen {
+pub fn choose(
+    sightings: &Sightings,
+    sets: Vec<Proposal>,
+    support: Vec<Support>,
+    pixels: usize,
+    config: &Config,
+) -> Chosen {
     let mut chosen = Chosen::default();
     let mut left: Vec<(Proposal, Support)> = Vec::new();
     for (set, s) in sets.into_iter().zip(support) {
-        match [s.areas.len() < config.min_views, s.iou < config.min_support].iter().position(|bad| *bad) {
+        match [s.areas.len() < config.min_views, s.iou < config.min_support]
+            .iter()
+            .position(|bad| *bad)
+        {
             Some(reason) => chosen.dropped[reason] += 1,
             None => left.push((set, s)),
         }
     }
     left.sort_by(|(a, of_a), (b, of_b)| {
-        of_b.iou.total_cmp(&of_a.iou).then_with(|| a.masks.iter().map(|f| f.mask).cmp(b.masks.iter().map(|f| f.mask)))
+        of_b.iou.total_cmp(&of_a.iou).then_with(|| {
+            a.masks
+                .iter()
+                .map(|f| f.mask)
+                .cmp(b.masks.iter().map(|f| f.mask))
+        })
     });
 
-    let weights: Vec<f32> = (0..sightings.gaussians() as u32).map(|g| sightings.weight(g)).collect();
+    let weights: Vec<f32> = (0..sightings.gaussians() as u32)
+        .map(|g| sightings.weight(g))
+        .collect();
     let weight = |set: &[u32]| -> f32 { set.iter().map(|g| weights[*g as usize]).sum() };
-    let mut kept = Holders::new(weights.len());
+    let mut kept = SetsByGaussian::new(weights.len());
     let mut objects: Vec<(f32, Proposal, Support)> = Vec::new();
     for (set, support) in left {
         let size = weight(&set.set);
-        let alike =
-            kept.common(&set.set, &weights).into_iter().any(|(other, common)| common > config.same * (size + objects[other].0 - common));
+        let alike = kept
+            .common(&set.set, &weights)
+            .into_iter()
+            .any(|(other, common)| common > config.same * (size + objects[other].0 - common));
         if alike || objects.len() == usize::from(u16::MAX) - 1 {
             chosen.dropped[2] += 1;
             continue;
@@ -103,35 +129,54 @@ pub fn choose(sightings: &Sightings, sets: Vec<Proposal>, support: Vec<Support>,
     }
     objects.sort_by(|a, b| b.0.total_cmp(&a.0));
 
-    let mut holders = Holders::new(weights.len());
+    let mut holders = SetsByGaussian::new(weights.len());
     for (place, (size, set, _)) in objects.iter().enumerate() {
-        let around =
-            holders.common(&set.set, &weights).into_iter().filter(|(_, common)| *common > PART * size).map(|(other, _)| other as u16 + 1);
+        let around = holders
+            .common(&set.set, &weights)
+            .into_iter()
+            .filter(|(_, common)| *common > PART * size)
+            .map(|(other, _)| other as u16 + 1);
         chosen.parents.push(around.max().unwrap_or(0));
         holders.add(place, &set.set);
     }
-    let list = |objects: Vec<u32>| objects.into_iter().rev().map(|place| place as u16 + 1).collect();
+    let list = |objects: Vec<u32>| {
+        objects
+            .into_iter()
+            .rev()
+            .map(|place| place as u16 + 1)
+            .collect()
+    };
     let lists: Vec<Vec<u16>> = holders.of.into_iter().map(list).collect();
-    (chosen.overlaps, chosen.ids) = Overlaps::of(&lists, &chosen.parents, &weights, overlaps::LISTED);
-    let shown: Vec<f32> = weights.iter().map(|weight| weight / pixels as f32).collect();
-    chosen.shown = chosen.overlaps.sums(chosen.parents.len(), &chosen.ids, &shown);
+    (chosen.overlaps, chosen.ids) =
+        Overlaps::of(&lists, &chosen.parents, &weights, overlaps::LISTED);
+    let shown: Vec<f32> = weights
+        .iter()
+        .map(|weight| weight / pixels as f32)
+        .collect();
+    chosen.shown = chosen
+        .overlaps
+        .sums(chosen.parents.len(), &chosen.ids, &shown);
     chosen.support = objects.into_iter().map(|o| o.2).collect();
     chosen
 }
 
 /// For each Gaussian, the sets that contain it, in order of insertion.
-struct Holders {
+struct SetsByGaussian {
     of: Vec<Vec<u32>>,
     sums: Vec<f32>,
 }
 
-impl Holders {
+impl SetsByGaussian {
     fn new(gaussians: usize) -> Self {
-        Self { of: vec![Vec::new(); gaussians], sums: Vec::new() }
+        Self {
+            of: vec![Vec::new(); gaussians],
+            sums: Vec::new(),
+        }
     }
 
     fn add(&mut self, place: usize, set: &[u32]) {
-        set.iter().for_each(|g| self.of[*g as usize].push(place as u32));
+        set.iter()
+            .for_each(|g| self.of[*g as usize].push(place as u32));
         self.sums.resize(place + 1, 0.0);
     }
 
@@ -149,7 +194,9 @@ impl Holders {
         }
         met.sort_unstable();
         met.dedup();
-        met.into_iter().map(|other| (other, std::mem::take(&mut self.sums[other]))).collect()
+        met.into_iter()
+            .map(|other| (other, std::mem::take(&mut self.sums[other])))
+            .collect()
     }
 }
 
@@ -163,29 +210,88 @@ mod tests {
     fn chosen(sets: &[(std::ops::Range<u32>, f32)], config: &Config) -> Chosen {
         let seen = (0..20).map(|g| Sighting::new(g, 0, 400.0)).collect();
         let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
-        let proposals = sets.iter().map(|(set, _)| Proposal { set: set.clone().collect(), masks: Vec::new() }).collect();
-        let support =
-            |(set, iou): &(std::ops::Range<u32>, f32)| Support { iou: *iou, areas: (0..4).map(|v| (100 * set.len() as u32, v)).collect() };
-        choose(&Sightings::new(20, vec![seen], &[table]), proposals, sets.iter().map(support).collect(), 10_000, config)
+        let proposals = sets
+            .iter()
+            .map(|(set, _)| Proposal {
+                set: set.clone().collect(),
+                masks: Vec::new(),
+            })
+            .collect();
+        let support = |(set, iou): &(std::ops::Range<u32>, f32)| Support {
+            iou: *iou,
+            areas: (0..4).map(|v| (100 * set.len() as u32, v)).collect(),
+        };
+        choose(
+            &Sightings::new(20, vec![seen], &[table]),
+            proposals,
+            sets.iter().map(support).collect(),
+            10_000,
+            config,
+        )
     }
 
     #[test]
     fn supported_sets_are_objects_by_falling_size_and_may_overlap() {
         // A part that extends beyond its object, an object, an unsupported part, and a neighbour
         // that overlaps the object.
-        let found = chosen(&[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)], &Config::default());
-        assert_eq!((found.parents.as_slice(), found.dropped), (&[0, 0, 1][..], [0, 1, 0]));
+        let found = chosen(
+            &[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)],
+            &Config::default(),
+        );
+        assert_eq!(
+            (found.parents.as_slice(), found.dropped),
+            (&[0, 0, 1][..], [0, 1, 0])
+        );
         let lists = found.lists();
-        let of: Vec<&[u16]> = found.ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
-        let all: [(&[u16], usize); 7] = [(&[], 1), (&[3], 1), (&[3, 1], 3), (&[1], 5), (&[2, 1], 2), (&[2], 4), (&[], 4)];
-        assert_eq!(of, all.iter().flat_map(|(list, count)| vec![*list; *count]).collect::<Vec<_>>());
-        assert_eq!(found.layers(), [BTreeSet::from([1]), BTreeSet::from([2, 3])]);
-        assert_eq!(chosen(&[(0..5, 0.9)], &Config { min_views: 5, ..Config::default() }).dropped, [1, 0, 0]);
+        let of: Vec<&[u16]> = found
+            .ids
+            .iter()
+            .map(|id| lists[usize::from(*id)].as_slice())
+            .collect();
+        let all: [(&[u16], usize); 7] = [
+            (&[], 1),
+            (&[3], 1),
+            (&[3, 1], 3),
+            (&[1], 5),
+            (&[2, 1], 2),
+            (&[2], 4),
+            (&[], 4),
+        ];
+        assert_eq!(
+            of,
+            all.iter()
+                .flat_map(|(list, count)| vec![*list; *count])
+                .collect::<Vec<_>>()
+        );
+        assert_eq!(
+            found.layers(),
+            [BTreeSet::from([1]), BTreeSet::from([2, 3])]
+        );
+        assert_eq!(
+            chosen(
+                &[(0..5, 0.9)],
+                &Config {
+                    min_views: 5,
+                    ..Config::default()
+                }
+            )
+            .dropped,
+            [1, 0, 0]
+        );
     }
 
     #[test]
     fn of_two_that_are_nearly_the_same_the_better_one_stays() {
-        let found = chosen(&[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)], &Config::default());
-        assert_eq!((found.support.iter().map(|s| s.iou).collect::<Vec<_>>(), found.dropped), (vec![0.9, 0.6], [0, 0, 1]));
+        let found = chosen(
+            &[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)],
+            &Config::default(),
+        );
+        assert_eq!(
+            (
+                found.support.iter().map(|s| s.iou).collect::<Vec<_>>(),
+                found.dropped
+            ),
+            (vec![0.9, 0.6], [0, 0, 1])
+        );
     }
 }

@@ -20,14 +20,25 @@ impl Overlaps {
     /// `lists` are in descending order of id, with `weights`; `parents` holds the parent of each
     /// object. The heaviest lists are kept, up to `share` of the total weight and 16-bit ids. Each
     /// other list gets the id of the list with the largest IoU to it.
-    pub fn of(lists: &[Vec<u16>], parents: &[u16], weights: &[f32], share: f32) -> (Self, Vec<u16>) {
+    pub fn of(
+        lists: &[Vec<u16>],
+        parents: &[u16],
+        weights: &[f32],
+        share: f32,
+    ) -> (Self, Vec<u16>) {
         let mut found: BTreeMap<&[u16], f32> = BTreeMap::new();
-        lists.iter().zip(weights).filter(|(list, _)| !list.is_empty()).for_each(|(list, weight)| *found.entry(list).or_default() += weight);
+        lists
+            .iter()
+            .zip(weights)
+            .filter(|(list, _)| !list.is_empty())
+            .for_each(|(list, weight)| *found.entry(list).or_default() += weight);
         let mut order: Vec<(&[u16], f32)> = found.into_iter().collect();
         order.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(b.0)));
         let all: f32 = order.iter().map(|o| o.1).sum();
 
-        let chains: Vec<Vec<u16>> = (1..=parents.len() as u16).map(|id| nested(id, parents)).collect();
+        let chains: Vec<Vec<u16>> = (1..=parents.len() as u16)
+            .map(|id| with_ancestors(id, parents))
+            .collect();
         let mut number: BTreeMap<&[u16], u16> = chains.iter().map(Vec::as_slice).zip(1..).collect();
         let (mut kept, mut sum) = (Vec::new(), 0.0);
         for (list, weight) in &order {
@@ -41,7 +52,8 @@ impl Overlaps {
 
         let mut holders: Vec<Vec<(&[u16], u16)>> = vec![Vec::new(); parents.len() + 1];
         for (list, number) in &number {
-            list.iter().for_each(|id| holders[usize::from(*id)].push((list, *number)));
+            list.iter()
+                .for_each(|id| holders[usize::from(*id)].push((list, *number)));
         }
         // The candidates are the lists that contain its smallest object.
         let nearest = |list: &[u16]| {
@@ -49,12 +61,26 @@ impl Overlaps {
                 let common = list.iter().filter(|id| other.contains(id)).count();
                 common as f32 / (list.len() + other.len() - common) as f32
             };
-            let others = holders[usize::from(list[0])].iter().map(|(other, number)| (alike(other), *number));
-            others.max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1))).map_or(0, |other| other.1)
+            let others = holders[usize::from(list[0])]
+                .iter()
+                .map(|(other, number)| (alike(other), *number));
+            others
+                .max_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)))
+                .map_or(0, |other| other.1)
         };
-        let of_list: BTreeMap<&[u16], u16> =
-            order.iter().map(|(list, _)| (*list, number.get(list).copied().unwrap_or_else(|| nearest(list)))).collect();
-        let ids = lists.iter().map(|list| of_list.get(list.as_slice()).copied().unwrap_or(0)).collect();
+        let of_list: BTreeMap<&[u16], u16> = order
+            .iter()
+            .map(|(list, _)| {
+                (
+                    *list,
+                    number.get(list).copied().unwrap_or_else(|| nearest(list)),
+                )
+            })
+            .collect();
+        let ids = lists
+            .iter()
+            .map(|list| of_list.get(list.as_slice()).copied().unwrap_or(0))
+            .collect();
         (Self(kept), ids)
     }
 
@@ -62,13 +88,15 @@ impl Overlaps {
     /// of objects.
     pub fn sums(&self, objects: usize, ids: &[u16], values: &[f32]) -> Vec<f32> {
         let mut sums = vec![0.0; 1 + objects + self.0.len()];
-        ids.iter().zip(values).for_each(|(id, value)| sums[usize::from(*id)] += value);
+        ids.iter()
+            .zip(values)
+            .for_each(|(id, value)| sums[usize::from(*id)] += value);
         sums
     }
 
     /// Returns for each id, 0 included, the objects that it stands for, smallest first.
     pub fn lists(&self, parents: &[u16]) -> Vec<Vec<u16>> {
-        let objects = (0..=parents.len() as u16).map(|id| nested(id, parents));
+        let objects = (0..=parents.len() as u16).map(|id| with_ancestors(id, parents));
         objects.chain(self.0.iter().cloned()).collect()
     }
 }
@@ -77,16 +105,27 @@ impl Overlaps {
 ///
 /// `found`: the ids there with their weights. Prefers the heaviest id of exactly these objects,
 /// then the heaviest one whose smallest object is the same. Otherwise returns the smallest object.
-pub fn standing_for(objects: &[u16], found: impl Iterator<Item = (u16, f32)>, lists: &[Vec<u16>]) -> u16 {
-    let Some(smallest) = objects.first() else { return 0 };
+pub fn representative_id(
+    objects: &[u16],
+    found: impl Iterator<Item = (u16, f32)>,
+    lists: &[Vec<u16>],
+) -> u16 {
+    let Some(smallest) = objects.first() else {
+        return 0;
+    };
     let list = |id: u16| lists.get(usize::from(id)).map_or(&[][..], Vec::as_slice);
-    let fitting = found.filter(|(id, _)| list(*id).first() == Some(smallest)).map(|(id, weight)| (list(id) == objects, weight, id));
-    fitting.max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(b.2.cmp(&a.2))).map_or(*smallest, |best| best.2)
+    let fitting = found
+        .filter(|(id, _)| list(*id).first() == Some(smallest))
+        .map(|(id, weight)| (list(id) == objects, weight, id));
+    fitting
+        .max_by(|a, b| a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(b.2.cmp(&a.2)))
+        .map_or(*smallest, |best| best.2)
 }
 
 /// Returns an object and its ancestors, smallest first; nothing for id 0.
-fn nested(id: u16, parents: &[u16]) -> Vec<u16> {
-    let up = |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|above| (1..*id).contains(above));
+fn with_ancestors(id: u16, parents: &[u16]) -> Vec<u16> {
+    let up =
+        |id: &u16| Some(parents[usize::from(*id) - 1]).filter(|above| (1..*id).contains(above));
     std::iter::successors(Some(id).filter(|id| *id > 0), up).collect()
 }
 
@@ -98,11 +137,30 @@ mod tests {
     fn lists_are_numbered_and_found_again() {
         // Objects 2 and 3 lie in 1. Some Gaussians of 3 lie in 2 as well; some of 2 lie outside 1.
         let parents = [0, 1, 1];
-        let lists = vec![vec![], vec![1], vec![2, 1], vec![3, 2, 1], vec![2], vec![3, 1], vec![2]];
+        let lists = vec![
+            vec![],
+            vec![1],
+            vec![2, 1],
+            vec![3, 2, 1],
+            vec![2],
+            vec![3, 1],
+            vec![2],
+        ];
         let (overlaps, ids) = Overlaps::of(&lists, &parents, &[1.0; 7], 1.0);
-        assert_eq!((ids.as_slice(), &overlaps), (&[0, 1, 2, 5, 4, 3, 4][..], &Overlaps(vec![vec![2], vec![3, 2, 1]])));
+        assert_eq!(
+            (ids.as_slice(), &overlaps),
+            (
+                &[0, 1, 2, 5, 4, 3, 4][..],
+                &Overlaps(vec![vec![2], vec![3, 2, 1]])
+            )
+        );
         let all = overlaps.lists(&parents);
-        assert_eq!(ids.iter().map(|id| all[usize::from(*id)].clone()).collect::<Vec<_>>(), lists);
+        assert_eq!(
+            ids.iter()
+                .map(|id| all[usize::from(*id)].clone())
+                .collect::<Vec<_>>(),
+            lists
+        );
     }
 
     #[test]
@@ -116,10 +174,22 @@ mod tests {
     #[test]
     fn a_place_keeps_a_number_for_its_own_objects() {
         let lists = [vec![], vec![1], vec![2, 1], vec![3, 2], vec![3, 1]];
-        let number = |objects: &[u16], found: &[(u16, f32)]| standing_for(objects, found.iter().copied(), &lists);
-        assert_eq!(number(&[2, 1], &[(3, 9.0), (2, 1.0)]), 2, "id 3 stands for objects 3 and 2");
+        let number = |objects: &[u16], found: &[(u16, f32)]| {
+            representative_id(objects, found.iter().copied(), &lists)
+        };
+        assert_eq!(
+            number(&[2, 1], &[(3, 9.0), (2, 1.0)]),
+            2,
+            "id 3 stands for objects 3 and 2"
+        );
         assert_eq!(number(&[3, 1], &[(3, 9.0), (4, 1.0)]), 4);
         assert_eq!(number(&[3, 2, 1], &[(3, 2.0), (4, 1.0)]), 3);
-        assert_eq!((number(&[1], &[(3, 2.0), (2, 1.0)]), number(&[], &[(3, 2.0)])), (1, 0));
+        assert_eq!(
+            (
+                number(&[1], &[(3, 2.0), (2, 1.0)]),
+                number(&[], &[(3, 2.0)])
+            ),
+            (1, 0)
+        );
     }
 }

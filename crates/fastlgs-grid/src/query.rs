@@ -17,7 +17,10 @@ pub struct QueryConfig {
 
 impl Default for QueryConfig {
     fn default() -> Self {
-        Self { false_alarms: 0.07, top_k: 8 }
+        Self {
+            false_alarms: 0.07,
+            top_k: 8,
+        }
     }
 }
 
@@ -71,14 +74,26 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
     let (shares, equal) = (grid.shares(), 1.0 / grid.objects.len().max(1) as f32);
     let seen = grid.objects.iter().filter(|object| is_seen(object)).count();
     let of_object = |(object, share): (&Object, f32)| {
-        let Some(cosine) = mean_cosine(object, query).filter(|_| !is_refuted(object, query)) else {
-            return Evidence { rank: f32::NEG_INFINITY, likeness: f32::NEG_INFINITY, score: 0.0, error: 0.0 };
+        let Some(cosine) = mean_cosine(object, query).filter(|_| !is_negative(object, query))
+        else {
+            return Evidence {
+                rank: f32::NEG_INFINITY,
+                likeness: f32::NEG_INFINITY,
+                score: 0.0,
+                error: 0.0,
+            };
         };
-        if query.shown && object.embeddings.iter().all(|e| query.meant.contains(e)) {
-            return Evidence { rank: f32::INFINITY, likeness: f32::INFINITY, score: 1.0, error: 0.0 };
+        if query.from_example && object.embeddings.iter().all(|e| query.positive.contains(e)) {
+            return Evidence {
+                rank: f32::INFINITY,
+                likeness: f32::INFINITY,
+                score: 1.0,
+                error: 0.0,
+            };
         }
         let likeness = calibration.temperature * cosine;
-        let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2)) / object.embeddings.len() as f32;
+        let variance = mean_over_views(object, |e| (query.cosine(e) - cosine).powi(2))
+            / object.embeddings.len() as f32;
         let anything = mean_over_views(object, |e| query.canonical(e));
         Evidence {
             rank: likeness + share.min(1.0 - share).max(equal).ln(),
@@ -92,18 +107,38 @@ pub fn evidence(grid: &Grid, query: &TextQuery) -> Vec<Evidence> {
 
 /// Returns the largest margin of the objects; `None` if fewer than two objects have one.
 pub fn best(grid: &Grid, query: &TextQuery) -> Option<Best> {
-    let margins: Vec<f32> = grid.objects.iter().filter_map(|object| margin(object, query)).collect();
+    let margins: Vec<f32> = grid
+        .objects
+        .iter()
+        .filter_map(|object| margin(object, query))
+        .collect();
     // Alternate objects form the halves, because neighbouring ids have similar sizes.
-    let half = |first: usize| margins.iter().skip(first).step_by(2).copied().max_by(f32::total_cmp);
+    let half = |first: usize| {
+        margins
+            .iter()
+            .skip(first)
+            .step_by(2)
+            .copied()
+            .max_by(f32::total_cmp)
+    };
     let (even, odd) = (half(0)?, half(1)?);
-    Some(Best { margin: even.max(odd), of_halves: 0.5 * (even + odd), objects: margins.len() })
+    Some(Best {
+        margin: even.max(odd),
+        halves_margin: 0.5 * (even + odd),
+        objects: margins.len(),
+    })
 }
 
 /// Returns the mean of `of` over an object's embeddings, weighted by mask area; 0 without
 /// embeddings.
 fn mean_over_views(object: &Object, of: impl Fn(&[f32]) -> f32) -> f32 {
     let total: f32 = object.areas.iter().sum();
-    object.embeddings.iter().zip(&object.areas).map(|(e, area)| area / total.max(f32::MIN_POSITIVE) * of(e)).sum()
+    object
+        .embeddings
+        .iter()
+        .zip(&object.areas)
+        .map(|(e, area)| area / total.max(f32::MIN_POSITIVE) * of(e))
+        .sum()
 }
 
 /// Returns whether an object has embeddings.
@@ -118,7 +153,7 @@ pub fn mean_cosine(object: &Object, query: &TextQuery) -> Option<f32> {
 }
 
 /// Returns whether an object is at least as near to a negative as to the query.
-fn is_refuted(object: &Object, query: &TextQuery) -> bool {
+fn is_negative(object: &Object, query: &TextQuery) -> bool {
     mean_over_views(object, |e| query.negative(e)) >= mean_over_views(object, |e| query.cosine(e))
 }
 
@@ -127,13 +162,27 @@ fn is_refuted(object: &Object, query: &TextQuery) -> bool {
 ///
 /// Returns `None` without embeddings, or if the object is at least as near to a negative.
 pub fn margin(object: &Object, query: &TextQuery) -> Option<f32> {
-    (is_seen(object) && !is_refuted(object, query)).then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
+    (is_seen(object) && !is_negative(object, query))
+        .then(|| mean_over_views(object, |e| query.cosine(e) - query.canonical(e)))
 }
 
 /// Returns all objects, sorted by rank in descending order.
 pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
-    let hit = |(object, Evidence { rank, score, .. }): (&Object, Evidence)| (rank, Hit { id: object.id, score });
-    let mut hits: Vec<(f32, Hit)> = grid.objects.iter().zip(evidence(grid, query)).map(hit).collect();
+    let hit = |(object, Evidence { rank, score, .. }): (&Object, Evidence)| {
+        (
+            rank,
+            Hit {
+                id: object.id,
+                score,
+            },
+        )
+    };
+    let mut hits: Vec<(f32, Hit)> = grid
+        .objects
+        .iter()
+        .zip(evidence(grid, query))
+        .map(hit)
+        .collect();
     hits.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
     hits.into_iter().map(|h| h.1).collect()
 }
@@ -143,7 +192,7 @@ pub fn rank(grid: &Grid, query: &TextQuery) -> Vec<Hit> {
 pub const SUPPORT_SHARE: f32 = 0.98;
 
 /// Assumed share of clicks that miss the target.
-const BESIDE: f32 = 0.1;
+const MISCLICK_RATE: f32 = 0.1;
 
 /// Returns the objects at some pixels, smallest first, and the target. `pixels`: for each click,
 /// the objects that have most of that pixel.
@@ -155,18 +204,29 @@ const BESIDE: f32 = 0.1;
 /// miss costs a factor of 10.
 ///
 /// The target is the largest object whose odds are at least [`SUPPORT_SHARE`] of the best ones.
-pub fn pointed(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
+pub fn select_at_pixels(grid: &Grid, pixels: &[Vec<u16>]) -> (Vec<u16>, Option<u16>) {
     let shares = grid.shares();
-    let there: BTreeSet<u16> = pixels.iter().flatten().copied().collect();
+    let candidates: BTreeSet<u16> = pixels.iter().flatten().copied().collect();
     let odds = |id: u16| {
-        let (object, share) = (&grid.objects[usize::from(id) - 1], shares[usize::from(id) - 1].max(1e-6));
+        let (object, share) = (
+            &grid.objects[usize::from(id) - 1],
+            shares[usize::from(id) - 1].max(1e-6),
+        );
         let on = pixels.iter().filter(|at| at.contains(&id)).count();
         // In logarithms, because the odds of many clicks overflow.
-        (object.support * (1.0 - share)).ln() + (1.0 - on as f32) * share.ln() + (pixels.len() - on) as f32 * BESIDE.ln()
+        (object.support * (1.0 - share)).ln()
+            + (1.0 - on as f32) * share.ln()
+            + (pixels.len() - on) as f32 * MISCLICK_RATE.ln()
     };
-    let best = there.iter().map(|id| odds(*id)).fold(f32::NEG_INFINITY, f32::max);
-    let meant = there.iter().find(|id| odds(**id) >= SUPPORT_SHARE.ln() + best).copied();
-    (there.into_iter().rev().collect(), meant)
+    let best = candidates
+        .iter()
+        .map(|id| odds(*id))
+        .fold(f32::NEG_INFINITY, f32::max);
+    let meant = candidates
+        .iter()
+        .find(|id| odds(**id) >= SUPPORT_SHARE.ln() + best)
+        .copied();
+    (candidates.into_iter().rev().collect(), meant)
 }
 
 /// Returns the highest score of the objects, which decides whether the query is answered; 0 without
@@ -188,7 +248,9 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
     let of = |hit: &Hit| evidence[usize::from(hit.id) - 1];
     let found = |hit: &&Hit| of(hit).rank > f32::NEG_INFINITY && hit.score >= config.min_score();
     let mut found = ranked.iter().filter(found);
-    let Some(best) = found.next() else { return Vec::new() };
+    let Some(best) = found.next() else {
+        return Vec::new();
+    };
     let first = of(best);
     let mut chosen = vec![*best];
     let mut taken = grid.related(best.id);
@@ -200,7 +262,10 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
         let alike = own.likeness >= first.likeness - own.error.hypot(first.error);
         if alike && !taken[usize::from(hit.id) - 1] {
             chosen.push(*hit);
-            taken.iter_mut().zip(grid.related(hit.id)).for_each(|(taken, related)| *taken |= related);
+            taken
+                .iter_mut()
+                .zip(grid.related(hit.id))
+                .for_each(|(taken, related)| *taken |= related);
         }
     }
     chosen
@@ -208,23 +273,45 @@ pub fn select(grid: &Grid, ranked: &[Hit], query: &TextQuery, config: &QueryConf
 
 /// Returns the part of the `targets` that answers the query, among all objects in them; `None` if
 /// no part is found.
-pub fn part(grid: &Grid, targets: &[Hit], query: &TextQuery, config: &QueryConfig) -> Option<Found> {
+pub fn part(
+    grid: &Grid,
+    targets: &[Hit],
+    query: &TextQuery,
+    config: &QueryConfig,
+) -> Option<Found> {
     let whole: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let inside = grid.parts(&whole);
-    let below: Vec<Hit> = rank(grid, query).into_iter().filter(|h| inside[usize::from(h.id) - 1] && !whole.contains(&h.id)).collect();
+    let below: Vec<Hit> = rank(grid, query)
+        .into_iter()
+        .filter(|h| inside[usize::from(h.id) - 1] && !whole.contains(&h.id))
+        .collect();
     let parts = select(grid, &below, query, config);
-    (!parts.is_empty()).then_some(Found { ranked: below, targets: parts })
+    (!parts.is_empty()).then_some(Found {
+        ranked: below,
+        targets: parts,
+    })
 }
 
 impl Found {
     /// Returns scores for a heat map that agrees with the mask. Targets get the highest score;
     /// others at most the lowest score of a target.
     pub fn heat(&self) -> Vec<Hit> {
-        let least = self.targets.iter().map(|hit| hit.score).fold(f32::INFINITY, f32::min);
+        let least = self
+            .targets
+            .iter()
+            .map(|hit| hit.score)
+            .fold(f32::INFINITY, f32::min);
         let best = best_score(&self.ranked);
         let shown = |hit: &Hit| {
             let is_target = self.targets.iter().any(|target| target.id == hit.id);
-            Hit { score: if is_target { best } else { hit.score.min(least) }, ..*hit }
+            Hit {
+                score: if is_target {
+                    best
+                } else {
+                    hit.score.min(least)
+                },
+                ..*hit
+            }
         };
         self.ranked.iter().map(shown).collect()
     }
@@ -257,7 +344,14 @@ pub(crate) mod tests {
             areas: vec![0.1],
             views: 1,
         };
-        Grid { objects: vec![object(1, 0, [1.0, 0.0]), object(2, 1, [0.8, 0.6]), object(3, 0, [0.0, 1.0])], ..Grid::default() }
+        Grid {
+            objects: vec![
+                object(1, 0, [1.0, 0.0]),
+                object(2, 1, [0.8, 0.6]),
+                object(3, 0, [0.0, 1.0]),
+            ],
+            ..Grid::default()
+        }
     }
 
     fn ids(hits: &[Hit]) -> Vec<u16> {
@@ -279,8 +373,15 @@ pub(crate) mod tests {
         assert_eq!(find(&grid(), [1.0, 0.0], &config), [1]);
         assert_eq!(find(&grid(), [0.0, 1.0], &config), [3]);
         assert!(find(&grid(), [-1.0, 0.0], &config).is_empty());
-        assert_eq!(find(&grid(), [0.8, 0.6], &config), [2], "the text fits the part better");
-        let lenient = QueryConfig { false_alarms: 1.0, ..config };
+        assert_eq!(
+            find(&grid(), [0.8, 0.6], &config),
+            [2],
+            "the text fits the part better"
+        );
+        let lenient = QueryConfig {
+            false_alarms: 1.0,
+            ..config
+        };
         assert_eq!(find(&grid(), [-1.0, 0.0], &lenient).len(), 1);
     }
 
@@ -288,28 +389,52 @@ pub(crate) mod tests {
     fn the_heat_map_is_hottest_where_the_mask_is() {
         // A small object has the higher score, but a large one is the target.
         let hit = |id, score| Hit { id, score };
-        let found = Found { ranked: vec![hit(1, 0.95), hit(2, 0.99), hit(3, 0.2)], targets: vec![hit(1, 0.95)] };
+        let found = Found {
+            ranked: vec![hit(1, 0.95), hit(2, 0.99), hit(3, 0.2)],
+            targets: vec![hit(1, 0.95)],
+        };
         assert_eq!(found.heat(), [hit(1, 0.99), hit(2, 0.95), hit(3, 0.2)]);
-        let nothing = Found { targets: Vec::new(), ..found };
+        let nothing = Found {
+            targets: Vec::new(),
+            ..found
+        };
         assert_eq!(nothing.heat(), nothing.ranked);
     }
 
     #[test]
     fn of_things_that_are_as_like_the_text_the_larger_is_meant() {
         let mut grid = grid();
-        grid.objects.iter_mut().for_each(|object| object.embeddings = vec![vec![0.999, 0.045]]);
+        grid.objects
+            .iter_mut()
+            .for_each(|object| object.embeddings = vec![vec![0.999, 0.045]]);
         grid.objects.push(known(4, 0, 0.5, vec![[0.0, 1.0]]));
         // Surface of each object without its parts. The last object covers half of the scene.
-        for (places, id) in [([0.1, 0.2, 0.1, 0.15, 0.55], 1), ([0.1, 0.1, 0.05, 0.3, 0.55], 3)] {
-            grid.shown = places.to_vec();
-            assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default())[0], id, "{:?}", grid.shares());
+        for (places, id) in [
+            ([0.1, 0.2, 0.1, 0.15, 0.55], 1),
+            ([0.1, 0.1, 0.05, 0.3, 0.55], 3),
+        ] {
+            grid.id_areas = places.to_vec();
+            assert_eq!(
+                find(&grid, [1.0, 0.0], &QueryConfig::default())[0],
+                id,
+                "{:?}",
+                grid.shares()
+            );
         }
     }
 
     /// An object with given cosines: for each view, with the text and with a canonical phrase.
     fn known(id: u16, parent: u16, area: f32, cosines: Vec<[f32; 2]>) -> Object {
         let (code, areas, views) = (Vec3::ZERO, vec![area; cosines.len()], cosines.len());
-        Object { id, parent, support: 1.0, code, embeddings: cosines.into_iter().map(|c| c.to_vec()).collect(), areas, views }
+        Object {
+            id,
+            parent,
+            support: 1.0,
+            code,
+            embeddings: cosines.into_iter().map(|c| c.to_vec()).collect(),
+            areas,
+            views,
+        }
     }
 
     #[test]
@@ -317,8 +442,13 @@ pub(crate) mod tests {
         let thing = |id, area, cosine: f32| known(id, 0, area, vec![[cosine, 0.0]; 3]);
         let first = |fragment: f32| {
             let others = (3..40).map(|id| thing(id, 0.01, 0.1));
-            let grid =
-                Grid { objects: [thing(1, 0.2, 0.6), thing(2, 0.01, fragment)].into_iter().chain(others).collect(), ..Grid::default() };
+            let grid = Grid {
+                objects: [thing(1, 0.2, 0.6), thing(2, 0.01, fragment)]
+                    .into_iter()
+                    .chain(others)
+                    .collect(),
+                ..Grid::default()
+            };
             rank(&grid, &query([1.0, 0.0]))[0].id
         };
         // A size ratio of 1/13 (limited by the equal share) costs 2.6 in log-odds, about 0.12 in
@@ -332,8 +462,14 @@ pub(crate) mod tests {
         let mut scene = || -> Grid {
             let mut objects: Vec<Object> = Vec::new();
             for id in 1..=200u16 {
-                let parent = if rng.uniform() < 0.2 { 0 } else { (rng.uniform() * f32::from(id - 1)) as u16 };
-                let around = objects.get(usize::from(parent).wrapping_sub(1)).map_or(0.4, |o| o.areas[0]);
+                let parent = if rng.uniform() < 0.2 {
+                    0
+                } else {
+                    (rng.uniform() * f32::from(id - 1)) as u16
+                };
+                let around = objects
+                    .get(usize::from(parent).wrapping_sub(1))
+                    .map_or(0.4, |o| o.areas[0]);
                 // Only the first object matches the text.
                 let right = if id == 1 { 0.08 } else { 0.0 };
                 let own = 0.20 + right + 0.02 * rng.normal();
@@ -342,69 +478,133 @@ pub(crate) mod tests {
             }
             // Exchanges it with a random object.
             let place = 1 + (rng.uniform() * 199.0) as usize;
-            let (first, other) = (objects[0].embeddings.clone(), objects[place].embeddings.clone());
+            let (first, other) = (
+                objects[0].embeddings.clone(),
+                objects[place].embeddings.clone(),
+            );
             (objects[0].embeddings, objects[place].embeddings) = (other, first);
             objects[place].support = 0.5;
-            Grid { objects, ..Grid::default() }
+            Grid {
+                objects,
+                ..Grid::default()
+            }
         };
-        let query = TextQuery { canonical: vec![vec![0.0, 1.0]], ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
+        let query = TextQuery {
+            canonical: vec![vec![0.0, 1.0]],
+            ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP)
+        };
         let (mut ours, mut cosines) = (0, 0);
         const TEXTS: i32 = 4000;
         for _ in 0..TEXTS {
             let grid = scene();
             let own = |o: &&Object| mean_cosine(o, &query).unwrap();
-            let best = grid.objects.iter().max_by(|a, b| own(a).total_cmp(&own(b))).unwrap();
+            let best = grid
+                .objects
+                .iter()
+                .max_by(|a, b| own(a).total_cmp(&own(b)))
+                .unwrap();
             cosines += i32::from(best.support == 0.5);
-            ours += i32::from(grid.objects[usize::from(rank(&grid, &query)[0].id) - 1].support == 0.5);
+            ours +=
+                i32::from(grid.objects[usize::from(rank(&grid, &query)[0].id) - 1].support == 0.5);
         }
         println!("right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}");
-        assert!(ours + TEXTS / 50 >= cosines, "right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}");
+        assert!(
+            ours + TEXTS / 50 >= cosines,
+            "right object first: {cosines} by cosine, {ours} by rank, of {TEXTS}"
+        );
     }
 
     #[test]
     fn a_click_means_a_thing_and_not_all_there_is() {
         // Object 1 is the whole scene, with full support; 2 is an object in it; 3 is a part of 2
         // with less support.
-        let object = |id: u16, parent: u16, support: f32| Object { support, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
+        let object = |id: u16, parent: u16, support: f32| Object {
+            support,
+            parent,
+            ..known(id, parent, 0.1, vec![[0.5, 0.5]])
+        };
         let objects = vec![object(1, 0, 1.0), object(2, 1, 0.9), object(3, 2, 0.7)];
-        let grid = Grid { objects, shown: vec![0.0, 0.8, 0.15, 0.05], ..Grid::default() };
-        let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels);
+        let grid = Grid {
+            objects,
+            id_areas: vec![0.0, 0.8, 0.15, 0.05],
+            ..Grid::default()
+        };
+        let meant = |pixels: &[Vec<u16>]| select_at_pixels(&grid, pixels);
         assert_eq!(meant(&[vec![3, 2, 1]]), (vec![3, 2, 1], Some(2)));
         assert_eq!(meant(&[vec![1]]).1, Some(1), "it is the only object there");
         assert_eq!(meant(&[vec![]]), (vec![], None));
         // If all clicks hit the part, it is the target, however many they are. Two of five clicks
         // beside it select the object.
-        assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1]]).1, Some(3));
+        assert_eq!(
+            meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1]]).1,
+            Some(3)
+        );
         assert_eq!(meant(&vec![vec![3, 2, 1]; 60]).1, Some(3));
-        assert_eq!(meant(&[vec![3, 2, 1], vec![3, 2, 1], vec![3, 2, 1], vec![2, 1], vec![2, 1]]).1, Some(2));
+        assert_eq!(
+            meant(&[
+                vec![3, 2, 1],
+                vec![3, 2, 1],
+                vec![3, 2, 1],
+                vec![2, 1],
+                vec![2, 1]
+            ])
+            .1,
+            Some(2)
+        );
     }
 
     #[test]
     fn clicks_on_two_parts_mean_what_holds_both_and_one_may_go_beside() {
-        let object = |id: u16, parent: u16| Object { support: 0.8, parent, ..known(id, parent, 0.1, vec![[0.5, 0.5]]) };
+        let object = |id: u16, parent: u16| Object {
+            support: 0.8,
+            parent,
+            ..known(id, parent, 0.1, vec![[0.5, 0.5]])
+        };
         // Objects 2 and 3 are parts of 1, which covers 0.4 of the scene; 4 is the rest.
         let objects = vec![object(1, 0), object(2, 1), object(3, 1), object(4, 0)];
-        let grid = Grid { objects, shown: vec![0.0, 0.1, 0.2, 0.1, 0.6], ..Grid::default() };
-        let meant = |pixels: &[Vec<u16>]| pointed(&grid, pixels).1;
+        let grid = Grid {
+            objects,
+            id_areas: vec![0.0, 0.1, 0.2, 0.1, 0.6],
+            ..Grid::default()
+        };
+        let meant = |pixels: &[Vec<u16>]| select_at_pixels(&grid, pixels).1;
         assert_eq!(meant(&[vec![2, 1], vec![3, 1]]), Some(1));
-        assert_eq!(meant(&[vec![2, 1], vec![2, 1], vec![2, 1], vec![2, 1], vec![]]), Some(2));
+        assert_eq!(
+            meant(&[vec![2, 1], vec![2, 1], vec![2, 1], vec![2, 1], vec![]]),
+            Some(2)
+        );
         // One click on the other part is outweighed by four, but not by two.
-        assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![3, 1], vec![3, 1], vec![2, 1]]), Some(3));
+        assert_eq!(
+            meant(&[vec![3, 1], vec![3, 1], vec![3, 1], vec![3, 1], vec![2, 1]]),
+            Some(3)
+        );
         assert_eq!(meant(&[vec![3, 1], vec![3, 1], vec![2, 1]]), Some(1));
     }
 
     #[test]
     fn nothing_is_meant_where_all_is_ruled_out() {
-        let config = QueryConfig { false_alarms: 1.0, ..QueryConfig::default() };
+        let config = QueryConfig {
+            false_alarms: 1.0,
+            ..QueryConfig::default()
+        };
         let mut query = query([0.6, 0.8]);
-        query.negatives.extend([vec![1.0, 0.0], vec![0.0, 1.0], vec![0.8, 0.6]]);
+        query
+            .negatives
+            .extend([vec![1.0, 0.0], vec![0.0, 1.0], vec![0.8, 0.6]]);
         assert!(select(&grid(), &rank(&grid(), &query), &query, &config).is_empty());
     }
 
     #[test]
     fn what_is_nearer_to_a_negative_is_not_meant() {
         let mut query = query([0.95, 0.31]);
-        let find = |query: &TextQuery| ids(&select(&grid(), &rank(&grid(), query), query, &QueryConfig::default()))[0];
+        let find = |query: &TextQuery| {
+            ids(&select(
+                &grid(),
+                &rank(&grid(), query),
+                query,
+                &QueryConfig::default(),
+            ))[0]
+        };
         assert!(evidence(&grid(), &query).iter().all(|e| e.rank.is_finite()));
         query.negatives.push(vec![1.0, 0.0]);
         assert_eq!(find(&query), 2, "object 1 is nearer to the negative");
@@ -413,14 +613,45 @@ pub(crate) mod tests {
     #[test]
     fn one_view_that_fools_the_encoder_counts_little() {
         let seen = |recognised: usize| {
-            let view = |k: usize| if k < recognised { vec![1.0, 0.0] } else { vec![0.0, 1.0] };
-            let object = Object { embeddings: (0..5).map(view).collect(), areas: vec![0.1; 5], ..grid().objects[0].clone() };
-            rank(&Grid { objects: vec![object], ..Grid::default() }, &query([1.0, 0.0]))[0].score
+            let view = |k: usize| {
+                if k < recognised {
+                    vec![1.0, 0.0]
+                } else {
+                    vec![0.0, 1.0]
+                }
+            };
+            let object = Object {
+                embeddings: (0..5).map(view).collect(),
+                areas: vec![0.1; 5],
+                ..grid().objects[0].clone()
+            };
+            rank(
+                &Grid {
+                    objects: vec![object],
+                    ..Grid::default()
+                },
+                &query([1.0, 0.0]),
+            )[0]
+            .score
         };
         assert!(seen(1) < 0.05, "{}", seen(1));
         assert!(seen(4) > 0.9, "recognised in most views: {}", seen(4));
-        let unseen = Object { embeddings: Vec::new(), areas: Vec::new(), ..grid().objects[0].clone() };
-        assert_eq!(rank(&Grid { objects: vec![unseen], ..Grid::default() }, &query([1.0, 0.0]))[0].score, 0.0);
+        let unseen = Object {
+            embeddings: Vec::new(),
+            areas: Vec::new(),
+            ..grid().objects[0].clone()
+        };
+        assert_eq!(
+            rank(
+                &Grid {
+                    objects: vec![unseen],
+                    ..Grid::default()
+                },
+                &query([1.0, 0.0])
+            )[0]
+            .score,
+            0.0
+        );
     }
 
     #[test]
@@ -428,17 +659,30 @@ pub(crate) mod tests {
         let mut grid = grid();
         // A larger object with nearly the same embedding.
         (grid.objects[2].embeddings, grid.objects[2].areas) = (vec![vec![0.81, 0.586]], vec![0.9]);
-        let shown = TextQuery::of_examples(grid.objects[1].embeddings.clone(), Calibration::OFFLINE_PICTURES);
+        let shown = TextQuery::of_examples(
+            grid.objects[1].embeddings.clone(),
+            Calibration::OFFLINE_PICTURES,
+        );
         let ranked = rank(&grid, &shown);
         assert_eq!((ranked[0].id, ranked[0].score), (2, 1.0));
-        assert_eq!(ids(&select(&grid, &ranked, &shown, &QueryConfig::default())), [2]);
+        assert_eq!(
+            ids(&select(&grid, &ranked, &shown, &QueryConfig::default())),
+            [2]
+        );
     }
 
     #[test]
     fn parts_are_looked_for_inside_their_object() {
         let targets = [Hit { id: 1, score: 0.9 }];
-        let ask = |text| part(&grid(), &targets, &query(text), &QueryConfig::default()).map(|found| ids(&found.targets));
-        assert_eq!(ask([0.3, 0.954]), Some(vec![2]), "object 3 has a higher cosine but lies elsewhere");
+        let ask = |text| {
+            part(&grid(), &targets, &query(text), &QueryConfig::default())
+                .map(|found| ids(&found.targets))
+        };
+        assert_eq!(
+            ask([0.3, 0.954]),
+            Some(vec![2]),
+            "object 3 has a higher cosine but lies elsewhere"
+        );
         assert_eq!(ask([0.0, -1.0]), None, "no such part");
     }
 
@@ -447,12 +691,32 @@ pub(crate) mod tests {
         let mut grid = grid();
         // Two similar objects, whose difference is within the variation between views.
         let alike = |k: usize| -> Vec<Vec<f32>> {
-            [0.98f32, 0.999].map(|c| vec![c, (1.0 - c * c).sqrt()]).into_iter().cycle().skip(k).take(2).collect()
+            [0.98f32, 0.999]
+                .map(|c| vec![c, (1.0 - c * c).sqrt()])
+                .into_iter()
+                .cycle()
+                .skip(k)
+                .take(2)
+                .collect()
         };
-        (grid.objects[1].parent, grid.objects[1].embeddings, grid.objects[1].areas) = (0, alike(0), vec![0.11, 0.1]);
+        (
+            grid.objects[1].parent,
+            grid.objects[1].embeddings,
+            grid.objects[1].areas,
+        ) = (0, alike(0), vec![0.11, 0.1]);
         (grid.objects[2].embeddings, grid.objects[2].areas) = (alike(1), vec![0.1, 0.1]);
         grid.objects[0].embeddings = vec![vec![0.0, 1.0]];
         assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig::default()), [2, 3]);
-        assert_eq!(find(&grid, [1.0, 0.0], &QueryConfig { top_k: 1, ..QueryConfig::default() }), [2]);
+        assert_eq!(
+            find(
+                &grid,
+                [1.0, 0.0],
+                &QueryConfig {
+                    top_k: 1,
+                    ..QueryConfig::default()
+                }
+            ),
+            [2]
+        );
     }
 }

@@ -12,16 +12,16 @@ const TEMPERATURE: f32 = 10.0;
 #[derive(Clone, Debug)]
 pub struct TextQuery {
     /// Positive embeddings: one of a text, or those of examples, of which the nearest counts.
-    pub meant: Vec<Vec<f32>>,
+    pub positive: Vec<Vec<f32>>,
     /// Whether the positive embeddings are from examples instead of a text.
-    pub shown: bool,
+    pub from_example: bool,
     /// Embeddings of [`CANONICAL`]; may be empty.
     pub canonical: Vec<Vec<f32>>,
     /// Negative embeddings. An object is excluded if it is at least as near to one of them as to
     /// the query.
     pub negatives: Vec<Vec<f32>>,
     /// Smallest canonical cosine.
-    pub anything: f32,
+    pub min_canonical: f32,
     /// Calibration of the encoder for this kind of query.
     pub calibration: Calibration,
 }
@@ -40,12 +40,22 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 impl TextQuery {
     /// Returns a text query without canonical and negative embeddings.
     pub fn new(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
-        Self { meant, shown: false, canonical: Vec::new(), negatives: Vec::new(), anything: calibration.anything, calibration }
+        Self {
+            positive: meant,
+            from_example: false,
+            canonical: Vec::new(),
+            negatives: Vec::new(),
+            min_canonical: calibration.anything,
+            calibration,
+        }
     }
 
     /// Returns a query from examples, without canonical and negative embeddings.
     pub fn of_examples(meant: Vec<Vec<f32>>, calibration: Calibration) -> Self {
-        Self { shown: true, ..Self::new(meant, calibration) }
+        Self {
+            from_example: true,
+            ..Self::new(meant, calibration)
+        }
     }
 
     /// Returns the relevancy S = min_i exp(t phi.q) / (exp(t phi.c_i) + exp(t phi.q)), 0 to 1. At
@@ -54,20 +64,29 @@ impl TextQuery {
         1.0 / (1.0 + (TEMPERATURE * (self.canonical(embedding) - self.cosine(embedding))).exp())
     }
 
-    /// Returns the largest cosine of an embedding with a canonical phrase, at least `anything`.
+    /// Returns the largest cosine of an embedding with a canonical phrase, at least `min_canonical`.
     pub fn canonical(&self, embedding: &[f32]) -> f32 {
-        self.canonical.iter().map(|c| dot(embedding, c)).fold(self.anything, f32::max)
+        self.canonical
+            .iter()
+            .map(|c| dot(embedding, c))
+            .fold(self.min_canonical, f32::max)
     }
 
     /// Returns the largest cosine of an embedding with a negative; -1 if there is none.
     pub fn negative(&self, embedding: &[f32]) -> f32 {
-        self.negatives.iter().map(|n| dot(embedding, n)).fold(-1.0, f32::max)
+        self.negatives
+            .iter()
+            .map(|n| dot(embedding, n))
+            .fold(-1.0, f32::max)
     }
 
     /// Returns the largest inner product of an embedding with a positive one. It is a cosine for
     /// texts. Between examples, offline embeddings add a weighted cosine of appearance.
     pub fn cosine(&self, embedding: &[f32]) -> f32 {
-        self.meant.iter().map(|meant| dot(embedding, meant)).fold(-1.0, f32::max)
+        self.positive
+            .iter()
+            .map(|meant| dot(embedding, meant))
+            .fold(-1.0, f32::max)
     }
 }
 
@@ -78,12 +97,22 @@ mod tests {
     #[test]
     fn the_strongest_canonical_phrase_counts() {
         let canonical = vec![vec![0.0, 1.0], vec![0.6, 0.8]];
-        let query = TextQuery { canonical, ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
+        let query = TextQuery {
+            canonical,
+            ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP)
+        };
         assert!((query.relevancy(&[1.0, 0.0]) - 1.0 / (1.0 + (-4.0f32).exp())).abs() < 1e-6);
-        let plain = TextQuery { anything: 0.4, ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP) };
+        let plain = TextQuery {
+            min_canonical: 0.4,
+            ..TextQuery::new(vec![vec![1.0, 0.0]], Calibration::CLIP)
+        };
         assert_eq!(plain.relevancy(&[0.4, 0.0]), 0.5);
         let several = TextQuery::new(vec![vec![1.0, 0.0], vec![0.0, 1.0]], Calibration::CLIP);
-        assert_eq!((several.cosine(&[0.6, 0.8]), several.cosine(&[0.8, 0.6])), (0.8, 0.8), "the nearest example counts");
+        assert_eq!(
+            (several.cosine(&[0.6, 0.8]), several.cosine(&[0.8, 0.6])),
+            (0.8, 0.8),
+            "the nearest example counts"
+        );
         assert!((query.relevancy(&[0.8, 0.6]) - 1.0 / (1.0 + (1.6f32).exp())).abs() < 1e-5);
     }
 }

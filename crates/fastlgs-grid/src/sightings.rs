@@ -1,7 +1,7 @@
 //! Observations: blending weights of Gaussians in the atoms of each view's masks, indexed by
 //! Gaussian and by mask.
 
-use fastlgs_core::mask_list::Table;
+use fastlgs_core::mask_list::AtomTable;
 use rayon::prelude::*;
 
 /// Sum of blending weights in pixels, as the upper half of a 32-bit float (error below 0.4 %). A
@@ -30,7 +30,11 @@ pub struct Sighting {
 impl Sighting {
     /// `weight`: sum of blending weights in pixels.
     pub fn new(gaussian: u32, atom: u16, weight: f32) -> Self {
-        Self { gaussian, atom, weight: Weight::new(weight) }
+        Self {
+            gaussian,
+            atom,
+            weight: Weight::new(weight),
+        }
     }
 }
 
@@ -46,7 +50,7 @@ struct Vote {
 pub type MaskId = u32;
 
 /// Masks of a view with their atoms, and the Gaussians on each atom.
-struct Held {
+struct ViewMasks {
     /// Index of the view's first mask.
     first: MaskId,
     /// Atoms of each mask.
@@ -59,21 +63,35 @@ struct Held {
     begin: Vec<usize>,
 }
 
-impl Held {
-    fn new(mut seen: Vec<Sighting>, table: &Table, first: MaskId) -> Self {
+impl ViewMasks {
+    fn new(mut seen: Vec<Sighting>, table: &AtomTable, first: MaskId) -> Self {
         seen.sort_by_key(|s| (s.atom, s.gaussian));
         let mut atoms = vec![Vec::new(); table.areas.len()];
         for atom in 0..table.count() {
-            table.masks(atom as u16).iter().for_each(|m| atoms[usize::from(*m)].push(atom as u16));
+            table
+                .masks(atom as u16)
+                .iter()
+                .for_each(|m| atoms[usize::from(*m)].push(atom as u16));
         }
-        let begin = (0..=table.count()).map(|atom| seen.partition_point(|s| usize::from(s.atom) < atom)).collect();
-        Self { first, atoms, gaussians: seen.iter().map(|s| s.gaussian).collect(), weights: seen.iter().map(|s| s.weight).collect(), begin }
+        let begin = (0..=table.count())
+            .map(|atom| seen.partition_point(|s| usize::from(s.atom) < atom))
+            .collect();
+        Self {
+            first,
+            atoms,
+            gaussians: seen.iter().map(|s| s.gaussian).collect(),
+            weights: seen.iter().map(|s| s.weight).collect(),
+            begin,
+        }
     }
 
     /// Iterates over the Gaussians on an atom, with their weights in pixels.
     fn of(&self, atom: u16) -> impl Iterator<Item = (u32, f32)> {
         let own = self.begin[usize::from(atom)]..self.begin[usize::from(atom) + 1];
-        self.gaussians[own.clone()].iter().copied().zip(self.weights[own].iter().map(|w| w.pixels()))
+        self.gaussians[own.clone()]
+            .iter()
+            .copied()
+            .zip(self.weights[own].iter().map(|w| w.pixels()))
     }
 }
 
@@ -83,8 +101,8 @@ pub struct Sightings<'a> {
     votes: Vec<Vote>,
     /// For each Gaussian: index of its first vote, with a final end index.
     begin: Vec<usize>,
-    tables: &'a [Table],
-    held: Vec<Held>,
+    tables: &'a [AtomTable],
+    view_masks: Vec<ViewMasks>,
     /// For each view: index of its first atom among the atoms of all views, with a final end index.
     first_atom: Vec<u32>,
     /// For each mask of all views: total weight of Gaussians in it, in pixels.
@@ -102,7 +120,7 @@ pub struct Fit {
 
 /// Visibility of a set of Gaussians in a view, with the best mask.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Shown {
+pub struct ViewFit {
     /// The view.
     pub view: u32,
     /// Total weight of the set in the view, in pixels.
@@ -126,41 +144,83 @@ pub const MIN_PIXELS: f32 = 30.0;
 impl<'a> Sightings<'a> {
     /// Indexes the observations of each view. `gaussians`: number of Gaussians; `tables`: mask
     /// tables of all views.
-    pub fn new(gaussians: usize, views: Vec<Vec<Sighting>>, tables: &'a [Table]) -> Self {
+    pub fn new(gaussians: usize, views: Vec<Vec<Sighting>>, tables: &'a [AtomTable]) -> Self {
         let mut begin = vec![0usize; gaussians + 1];
-        views.iter().flatten().for_each(|seen| begin[seen.gaussian as usize + 1] += 1);
+        views
+            .iter()
+            .flatten()
+            .for_each(|seen| begin[seen.gaussian as usize + 1] += 1);
         (0..gaussians).for_each(|g| begin[g + 1] += begin[g]);
         let mut next = begin.clone();
-        let mut votes = vec![Vote { view: 0, atom: 0, weight: Weight(0) }; begin[gaussians]];
+        let mut votes = vec![
+            Vote {
+                view: 0,
+                atom: 0,
+                weight: Weight(0)
+            };
+            begin[gaussians]
+        ];
         for (view, seen) in views.iter().enumerate() {
-            for Sighting { gaussian, atom, weight } in seen {
+            for Sighting {
+                gaussian,
+                atom,
+                weight,
+            } in seen
+            {
                 let place = &mut next[*gaussian as usize];
-                votes[*place] = Vote { view: view as u16, atom: *atom, weight: *weight };
+                votes[*place] = Vote {
+                    view: view as u16,
+                    atom: *atom,
+                    weight: *weight,
+                };
                 *place += 1;
             }
         }
         drop(next);
         let mut first = 0;
-        let mut place = |table: &Table| {
+        let mut place = |table: &AtomTable| {
             first += table.areas.len() as MaskId;
             first - table.areas.len() as MaskId
         };
         let firsts: Vec<MaskId> = tables.iter().map(&mut place).collect();
-        let of_view = |((seen, table), first)| Held::new(seen, table, first);
-        let held: Vec<Held> = views.into_par_iter().zip(tables).zip(firsts).map(of_view).collect();
-        let pixels = |view: &Held| -> Vec<f32> {
-            let of_atom: Vec<f32> = (0..view.begin.len() as u32 - 1).map(|a| view.of(a as u16).map(|seen| seen.1).sum()).collect();
-            view.atoms.iter().map(|atoms| atoms.iter().map(|a| of_atom[usize::from(*a)]).sum()).collect()
+        let of_view = |((seen, table), first)| ViewMasks::new(seen, table, first);
+        let held: Vec<ViewMasks> = views
+            .into_par_iter()
+            .zip(tables)
+            .zip(firsts)
+            .map(of_view)
+            .collect();
+        let pixels = |view: &ViewMasks| -> Vec<f32> {
+            let of_atom: Vec<f32> = (0..view.begin.len() as u32 - 1)
+                .map(|a| view.of(a as u16).map(|seen| seen.1).sum())
+                .collect();
+            view.atoms
+                .iter()
+                .map(|atoms| atoms.iter().map(|a| of_atom[usize::from(*a)]).sum())
+                .collect()
         };
         let pixels = held.par_iter().map(pixels).collect::<Vec<_>>().concat();
-        let first_atom = (0..=tables.len()).map(|v| tables[..v].iter().map(|t| t.count() as u32).sum()).collect();
-        Self { votes, begin, tables, held, first_atom, pixels }
+        let first_atom = (0..=tables.len())
+            .map(|v| tables[..v].iter().map(|t| t.count() as u32).sum())
+            .collect();
+        Self {
+            votes,
+            begin,
+            tables,
+            view_masks: held,
+            first_atom,
+            pixels,
+        }
     }
 
-    /// Allocates accumulators for [`Self::held_by`] and [`Self::showing`].
+    /// Allocates accumulators for [`Self::gaussians_in`] and [`Self::matching_masks`].
     pub fn scratch(&self) -> Scratch {
         let atoms = self.first_atom.last().map_or(0, |count| *count as usize);
-        Scratch { gaussians: vec![0.0; self.gaussians()], atoms: vec![0.0; atoms], masks: vec![0.0; self.pixels.len()] }
+        Scratch {
+            gaussians: vec![0.0; self.gaussians()],
+            atoms: vec![0.0; atoms],
+            masks: vec![0.0; self.pixels.len()],
+        }
     }
 
     /// Returns the number of Gaussians.
@@ -189,18 +249,26 @@ impl<'a> Sightings<'a> {
 
     /// Returns the weight of a Gaussian in all views, in pixels.
     pub fn weight(&self, gaussian: u32) -> f32 {
-        self.votes_of(gaussian).iter().map(|v| v.weight.pixels()).sum()
+        self.votes_of(gaussian)
+            .iter()
+            .map(|v| v.weight.pixels())
+            .sum()
     }
 
     fn view_of(&self, mask: MaskId) -> usize {
-        self.held.partition_point(|view| view.first <= mask) - 1
+        self.view_masks.partition_point(|view| view.first <= mask) - 1
     }
 
     /// Returns the masks of each track, if a tracker provided them.
     pub fn tracks(&self) -> Vec<Vec<MaskId>> {
         let mut tracks = std::collections::BTreeMap::<u32, Vec<MaskId>>::new();
-        for (table, held) in self.tables.iter().zip(&self.held) {
-            for (track, mask) in table.tracks.iter().zip(held.first..).filter_map(|(track, mask)| Some(((*track)?, mask))) {
+        for (table, held) in self.tables.iter().zip(&self.view_masks) {
+            for (track, mask) in table
+                .tracks
+                .iter()
+                .zip(held.first..)
+                .filter_map(|(track, mask)| Some(((*track)?, mask)))
+            {
                 tracks.entry(track).or_default().push(mask);
             }
         }
@@ -209,20 +277,32 @@ impl<'a> Sightings<'a> {
 
     /// Returns the Gaussians with more than half of their weight in `masks`, in ascending order.
     /// Counts only the views of these masks; expects at most one mask for each view.
-    pub fn held_by(&self, masks: impl Iterator<Item = MaskId>, scratch: &mut Scratch) -> Vec<u32> {
+    pub fn gaussians_in(
+        &self,
+        masks: impl Iterator<Item = MaskId>,
+        scratch: &mut Scratch,
+    ) -> Vec<u32> {
         let (mut met, mut asked) = (Vec::new(), vec![false; self.tables.len()]);
         for mask in masks {
             let view = self.view_of(mask);
             asked[view] = true;
-            let held = &self.held[view];
-            for (g, pixels) in held.atoms[(mask - held.first) as usize].iter().flat_map(|atom| held.of(*atom)) {
+            let held = &self.view_masks[view];
+            for (g, pixels) in held.atoms[(mask - held.first) as usize]
+                .iter()
+                .flat_map(|atom| held.of(*atom))
+            {
                 add(&mut scratch.gaussians, g, pixels, &mut met);
             }
         }
-        let mut met = listed(met);
+        let mut met = sorted_unique(met);
         met.retain(|g| {
             let inside = std::mem::take(&mut scratch.gaussians[*g as usize]);
-            let shown: f32 = self.votes_of(*g).iter().filter(|v| asked[usize::from(v.view)]).map(|v| v.weight.pixels()).sum();
+            let shown: f32 = self
+                .votes_of(*g)
+                .iter()
+                .filter(|v| asked[usize::from(v.view)])
+                .map(|v| v.weight.pixels())
+                .sum();
             2.0 * inside > shown
         });
         met
@@ -230,28 +310,37 @@ impl<'a> Sightings<'a> {
 
     /// Returns the best mask of each view, where mask and set each contain more than half of the
     /// other.
-    pub fn showing(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
-        self.shown(set, scratch).into_iter().filter(|shown| shown.mutual).filter_map(|shown| shown.best).collect()
+    pub fn matching_masks(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Fit> {
+        self.view_fits(set, scratch)
+            .into_iter()
+            .filter(|shown| shown.mutual)
+            .filter_map(|shown| shown.best)
+            .collect()
     }
 
     /// Returns all views in which the set has at least [`MIN_PIXELS`], in ascending order.
-    pub fn shown(&self, set: &[u32], scratch: &mut Scratch) -> Vec<Shown> {
+    pub fn view_fits(&self, set: &[u32], scratch: &mut Scratch) -> Vec<ViewFit> {
         let mut atoms = Vec::new();
         for vote in set.iter().flat_map(|g| self.votes_of(*g)) {
             let atom = self.first_atom[usize::from(vote.view)] + u32::from(vote.atom);
             add(&mut scratch.atoms, atom, vote.weight.pixels(), &mut atoms);
         }
         let (mut met, mut shown) = (Vec::new(), vec![0.0f32; self.tables.len()]);
-        for atom in listed(atoms) {
+        for atom in sorted_unique(atoms) {
             let weight = std::mem::take(&mut scratch.atoms[atom as usize]);
             let view = self.first_atom.partition_point(|first| *first <= atom) - 1;
             shown[view] += weight;
             for mask in self.tables[view].masks((atom - self.first_atom[view]) as u16) {
-                add(&mut scratch.masks, self.held[view].first + MaskId::from(*mask), weight, &mut met);
+                add(
+                    &mut scratch.masks,
+                    self.view_masks[view].first + MaskId::from(*mask),
+                    weight,
+                    &mut met,
+                );
             }
         }
         let mut best: Vec<(Option<Fit>, bool)> = vec![(None, false); self.tables.len()];
-        for mask in listed(met) {
+        for mask in sorted_unique(met) {
             let common = std::mem::take(&mut scratch.masks[mask as usize]);
             let view = self.view_of(mask);
             let (own, whole) = (shown[view], self.pixels[mask as usize]);
@@ -260,7 +349,15 @@ impl<'a> Sightings<'a> {
                 best[view] = (Some(Fit { mask, iou }), 2.0 * common > own.max(whole));
             }
         }
-        let views = (0..).zip(shown).zip(best).map(|((view, pixels), (best, mutual))| Shown { view, pixels, best, mutual });
+        let views = (0..)
+            .zip(shown)
+            .zip(best)
+            .map(|((view, pixels), (best, mutual))| ViewFit {
+                view,
+                pixels,
+                best,
+                mutual,
+            });
         views.filter(|shown| shown.pixels >= MIN_PIXELS).collect()
     }
 }
@@ -275,7 +372,7 @@ fn add(sums: &mut [f32], of: u32, weight: f32, met: &mut Vec<u32>) {
 }
 
 /// Sorts and removes duplicates, which occur if a sum stays 0.
-fn listed(mut met: Vec<u32>) -> Vec<u32> {
+fn sorted_unique(mut met: Vec<u32>) -> Vec<u32> {
     met.sort_unstable();
     met.dedup();
     met
@@ -290,7 +387,10 @@ mod tests {
     #[test]
     fn weights_keep_three_digits() {
         for weight in [0.02, 1.0, 3.3, 700.0, 1e6] {
-            assert!((Weight::new(weight).pixels() / weight - 1.0).abs() < 0.005, "{weight}");
+            assert!(
+                (Weight::new(weight).pixels() / weight - 1.0).abs() < 0.005,
+                "{weight}"
+            );
         }
     }
 
@@ -299,28 +399,74 @@ mod tests {
         // Ten Gaussians in a row, 40 pixels each in both views. View 0 has masks of 0..4 and 0..2,
         // view 1 of 0..5.
         let atoms = |ends: &[u32], track: Option<u32>| {
-            let mask = |end: &u32| Mask { track, ..Mask::new(Level::Whole, RunLengths::of(10, 1, |x, _| x < *end)) };
-            MaskList { masks: ends.iter().map(mask).collect(), ..MaskList::new(10, 1) }.atoms()
+            let mask = |end: &u32| Mask {
+                track,
+                ..Mask::new(Level::Whole, RunLengths::from_fn(10, 1, |x, _| x < *end))
+            };
+            MaskList {
+                masks: ends.iter().map(mask).collect(),
+                ..MaskList::new(10, 1)
+            }
+            .atoms()
         };
         let atoms = [atoms(&[4, 2], None), atoms(&[5], Some(7))];
         let tables = atoms.each_ref().map(|a| a.table.clone());
-        let seen = atoms.iter().map(|a| (0..10).map(|g| Sighting::new(g, a.map.at(g, 0), 40.0)).collect()).collect();
+        let seen = atoms
+            .iter()
+            .map(|a| {
+                (0..10)
+                    .map(|g| Sighting::new(g, a.map.at(g, 0), 40.0))
+                    .collect()
+            })
+            .collect();
         let sightings = Sightings::new(10, seen, &tables);
         assert_eq!(
-            (sightings.pixels.as_slice(), sightings.weight(3), sightings.tracks()),
+            (
+                sightings.pixels.as_slice(),
+                sightings.weight(3),
+                sightings.tracks()
+            ),
             (&[160.0, 80.0, 200.0][..], 80.0, vec![vec![2]])
         );
         let mut scratch = sightings.scratch();
-        assert_eq!(sightings.held_by([1].into_iter(), &mut scratch), [0, 1]);
-        assert_eq!(sightings.held_by([0, 2].into_iter(), &mut scratch), [0, 1, 2, 3], "exactly half of Gaussian 4 lies in the masks, not more");
-        assert_eq!(sightings.showing(&[0, 1, 2, 3], &mut scratch), [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]);
+        assert_eq!(
+            sightings.gaussians_in([1].into_iter(), &mut scratch),
+            [0, 1]
+        );
+        assert_eq!(
+            sightings.gaussians_in([0, 2].into_iter(), &mut scratch),
+            [0, 1, 2, 3],
+            "exactly half of Gaussian 4 lies in the masks, not more"
+        );
+        assert_eq!(
+            sightings.matching_masks(&[0, 1, 2, 3], &mut scratch),
+            [Fit { mask: 0, iou: 1.0 }, Fit { mask: 2, iou: 0.8 }]
+        );
         // The set contains half of mask 0..4, which is not enough. Mask 0..5 and the set share
         // three of five Gaussians each.
-        assert_eq!(sightings.showing(&[2, 3, 4, 5, 6], &mut scratch), [Fit { mask: 2, iou: 3.0 / 7.0 }]);
+        assert_eq!(
+            sightings.matching_masks(&[2, 3, 4, 5, 6], &mut scratch),
+            [Fit {
+                mask: 2,
+                iou: 3.0 / 7.0
+            }]
+        );
         // Masks 0..4 and 0..5 contain the whole set, but the set contains less than half of them.
-        assert_eq!(sightings.showing(&[2], &mut scratch), []);
-        assert_eq!(sightings.shown(&[2], &mut scratch).iter().map(|shown| shown.best.is_some()).collect::<Vec<_>>(), [true, true]);
-        assert_eq!(sightings.showing(&[8], &mut scratch), []);
-        assert!([scratch.gaussians, scratch.atoms, scratch.masks].concat().iter().all(|sum| *sum == 0.0));
+        assert_eq!(sightings.matching_masks(&[2], &mut scratch), []);
+        assert_eq!(
+            sightings
+                .view_fits(&[2], &mut scratch)
+                .iter()
+                .map(|shown| shown.best.is_some())
+                .collect::<Vec<_>>(),
+            [true, true]
+        );
+        assert_eq!(sightings.matching_masks(&[8], &mut scratch), []);
+        assert!(
+            [scratch.gaussians, scratch.atoms, scratch.masks]
+                .concat()
+                .iter()
+                .all(|sum| *sum == 0.0)
+        );
     }
 }

@@ -17,13 +17,25 @@ pub struct Support {
 /// Computes the support of each set.
 pub fn support(sightings: &Sightings, sets: &[Proposal]) -> Vec<Support> {
     let of = |scratch: &mut _, set: &Proposal| {
-        let shown = sightings.shown(&set.set, scratch);
-        let (pixels, common) = shown
-            .iter()
-            .fold((0.0, 0.0), |(pixels, common), s| (pixels + s.pixels, common + s.pixels * s.best.map_or(0.0, |best| best.iou)));
-        Support { iou: common / pixels.max(1.0), areas: shown.iter().map(|s| (s.pixels.round() as u32, s.view)).collect() }
+        let shown = sightings.view_fits(&set.set, scratch);
+        let (pixels, common) = shown.iter().fold((0.0, 0.0), |(pixels, common), s| {
+            (
+                pixels + s.pixels,
+                common + s.pixels * s.best.map_or(0.0, |best| best.iou),
+            )
+        });
+        Support {
+            iou: common / pixels.max(1.0),
+            areas: shown
+                .iter()
+                .map(|s| (s.pixels.round() as u32, s.view))
+                .collect(),
+        }
     };
-    sets.par_iter().with_min_len(16).map_init(|| sightings.scratch(), of).collect()
+    sets.par_iter()
+        .with_min_len(16)
+        .map_init(|| sightings.scratch(), of)
+        .collect()
 }
 
 #[cfg(test)]
@@ -36,14 +48,28 @@ mod tests {
     #[test]
     fn sets_are_compared_with_whole_masks() {
         // Five Gaussians of 100 pixels; masks of the first two and of the first four.
-        let mask = |end: u32| Mask::new(Level::Whole, RunLengths::of(5, 1, |x, _| x < end));
-        let atoms = MaskList { masks: vec![mask(2), mask(4)], ..MaskList::new(5, 1) }.atoms();
-        let seen = |_| (0..5).map(|g| Sighting::new(g, atoms.map.at(g, 0), 100.0)).collect();
+        let mask = |end: u32| Mask::new(Level::Whole, RunLengths::from_fn(5, 1, |x, _| x < end));
+        let atoms = MaskList {
+            masks: vec![mask(2), mask(4)],
+            ..MaskList::new(5, 1)
+        }
+        .atoms();
+        let seen = |_| {
+            (0..5)
+                .map(|g| Sighting::new(g, atoms.map.at(g, 0), 100.0))
+                .collect()
+        };
         let tables = [(); 3].map(|()| atoms.table.clone());
         let sightings = Sightings::new(5, [(); 3].map(seen).to_vec(), &tables);
-        let sets = [0..2, 1..2, 0..4, 4..5, 0..5].map(|set| Proposal { set: set.collect(), masks: Vec::new() });
+        let sets = [0..2, 1..2, 0..4, 4..5, 0..5].map(|set| Proposal {
+            set: set.collect(),
+            masks: Vec::new(),
+        });
         let found = support(&sightings, &sets);
-        assert_eq!(found.iter().map(|s| s.iou).collect::<Vec<_>>(), [1.0, 0.5, 1.0, 0.0, 0.8]);
+        assert_eq!(
+            found.iter().map(|s| s.iou).collect::<Vec<_>>(),
+            [1.0, 0.5, 1.0, 0.0, 0.8]
+        );
         assert_eq!(found[2].areas, [(400, 0), (400, 1), (400, 2)]);
     }
 }

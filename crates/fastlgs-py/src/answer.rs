@@ -1,36 +1,36 @@
-//! Answers.
+//! The Python class `Answer`.
 
 use crate::options::to_python;
 use fastlgs::session::answer::Report;
 use numpy::PyArray2;
 use pyo3::prelude::*;
 
-/// What a question was answered with, in one view.
+/// The answer to a query in one view. It is true if something was found.
 #[pyclass(frozen, module = "fastlgs")]
 pub struct Answer {
-    /// What is told of it.
+    /// Report of the answer.
     pub report: Report,
-    /// Pixels of the answer, `(height, width)`.
+    /// Mask of the answer, `(height, width)`.
     pub mask: Py<PyArray2<bool>>,
-    /// How much each pixel is like what was asked for, `(height, width)`.
+    /// Confidence of the object at each pixel, 0 to 1, `(height, width)`.
     pub relevancy: Py<PyArray2<f32>>,
 }
 
 #[pymethods]
 impl Answer {
-    /// What was asked.
+    /// The text, the name of the picture, or the pixels of the query.
     #[getter]
     fn text(&self) -> &str {
         &self.report.text
     }
 
-    /// Whether anything in the scene matches.
+    /// Whether any object matches.
     #[getter]
     fn found(&self) -> bool {
         self.report.found
     }
 
-    /// The share of absent names whose best score is lower.
+    /// Score of the best object, 0 to 1: share of absent names whose best score is lower.
     #[getter]
     fn confidence(&self) -> f32 {
         self.report.score
@@ -42,31 +42,31 @@ impl Answer {
         &self.report.view
     }
 
-    /// The view that shows the answer best, where this one hardly does.
+    /// Name of the view that shows most of the answer, if this view hardly shows it; else None.
     #[getter]
     fn seen_best(&self) -> Option<&str> {
         self.report.seen_best.as_deref()
     }
 
-    /// Pixels of the answer: bool, (height, width).
+    /// Mask of the answer: bool, (height, width).
     #[getter]
     fn mask(&self, py: Python<'_>) -> Py<PyArray2<bool>> {
         self.mask.clone_ref(py)
     }
 
-    /// Confidence of the object that each pixel shows: float32, (height, width), 0 to 1.
+    /// Confidence of the object at each pixel: float32, (height, width), 0 to 1.
     #[getter]
     fn relevancy(&self, py: Python<'_>) -> Py<PyArray2<f32>> {
         self.relevancy.clone_ref(py)
     }
 
-    /// The objects of the answer: id, parent, support, score, bbox2d, bbox3d, pixels, gaussians.
+    /// Objects of the answer: id, parent, support, score, bbox2d, bbox3d, pixels, gaussians.
     #[getter]
     fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         to_python(py, &self.report.objects)
     }
 
-    /// The same as `query --json` prints.
+    /// The report of the answer, as `fastlgs query --json` prints it.
     #[getter]
     fn report<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         to_python(py, &self.report)
@@ -77,7 +77,14 @@ impl Answer {
     }
 
     fn __repr__(&self) -> String {
-        let Report { text, found, score, pixels, view, .. } = &self.report;
+        let Report {
+            text,
+            found,
+            score,
+            pixels,
+            view,
+            ..
+        } = &self.report;
         let found = if *found { "found" } else { "not found" };
         format!("Answer('{text}': {found}, confidence {score:.2}, {pixels} pixels in {view})")
     }

@@ -1,4 +1,4 @@
-//! Cameras.
+//! The Python class `Camera`.
 
 use crate::Error;
 use fastlgs_core::WorldFrame;
@@ -11,14 +11,14 @@ use pyo3::prelude::*;
 #[pyclass(frozen, module = "fastlgs")]
 #[derive(Clone)]
 pub struct Camera {
-    /// Its pose is that of `pose`, rounded.
+    /// The camera; its pose is `pose` in single precision.
     camera: fastlgs_core::Camera,
-    /// World to camera, in the coordinates of the world.
+    /// World-to-camera matrix, in world coordinates.
     pose: DMat4,
 }
 
 impl Camera {
-    /// A camera of a scene.
+    /// Converts a camera of a scene to world coordinates.
     pub fn of(camera: fastlgs_core::Camera, frame: &WorldFrame) -> Self {
         let pose = match frame.is_identity() {
             true => camera.world_to_camera.as_dmat4(),
@@ -27,26 +27,44 @@ impl Camera {
         Self { camera, pose }
     }
 
-    /// The camera in the coordinates of a scene.
+    /// Converts the camera to the coordinates of a scene.
     pub fn within(&self, frame: &WorldFrame) -> fastlgs_core::Camera {
-        fastlgs_core::Camera { world_to_camera: frame.local_pose(&Pose::WorldToCamera(self.pose)), ..self.camera.clone() }
+        fastlgs_core::Camera {
+            world_to_camera: frame.local_pose(&Pose::WorldToCamera(self.pose)),
+            ..self.camera.clone()
+        }
     }
 }
 
-/// A matrix of at least three rows of four, as Python has it: by rows, of any kind of numbers.
+/// Reads a pose from a NumPy array or nested lists of numbers, (3, 4) or (4, 4).
+///
+/// # Errors
+/// Another shape, values that are not finite, or a singular matrix.
 fn matrix(values: &Bound<'_, PyAny>) -> PyResult<DMat4> {
     let numpy = values.py().import("numpy")?;
-    let array = numpy.call_method1("asarray", (values, "float64")).map_err(|_| Error::new_err("a pose is a matrix of numbers"))?;
-    let array: PyReadonlyArray2<'_, f64> = array.extract().map_err(|_| Error::new_err("a pose is a matrix of 3x4 or 4x4 numbers"))?;
+    let array = numpy
+        .call_method1("asarray", (values, "float64"))
+        .map_err(|_| Error::new_err("a pose must be a matrix of numbers"))?;
+    let array: PyReadonlyArray2<'_, f64> = array
+        .extract()
+        .map_err(|_| Error::new_err("a pose must be a matrix of 3x4 or 4x4 numbers"))?;
     let view = array.as_array();
     let (rows, columns) = view.dim();
     if columns != 4 || !(3..=4).contains(&rows) {
-        return Err(Error::new_err(format!("a pose is a matrix of 3x4 or 4x4 numbers, not of {rows}x{columns}")));
+        return Err(Error::new_err(format!(
+            "a pose must be a matrix of 3x4 or 4x4 numbers, not {rows}x{columns}"
+        )));
     }
-    let row = |r: usize| DVec4::from_array(std::array::from_fn(|c| if r < rows { view[(r, c)] } else { DVec4::W[c] }));
+    let row = |r: usize| {
+        DVec4::from_array(std::array::from_fn(|c| {
+            if r < rows { view[(r, c)] } else { DVec4::W[c] }
+        }))
+    };
     let matrix = DMat4::from_cols(row(0), row(1), row(2), row(3)).transpose();
     if !matrix.is_finite() || matrix.determinant().abs() < 1e-6 {
-        return Err(Error::new_err("the pose has values that are no numbers, or does not turn space into space"));
+        return Err(Error::new_err(
+            "the pose has values that are not finite, or is singular",
+        ));
     }
     Ok(matrix)
 }
@@ -65,20 +83,39 @@ impl Camera {
         cy: Option<f32>,
         name: &str,
     ) -> PyResult<Self> {
-        let fits =
-            (1..=16384).contains(&width) && (1..=16384).contains(&height) && fx > 0.0 && fy > 0.0 && fx.is_finite() && fy.is_finite();
+        let fits = (1..=16384).contains(&width)
+            && (1..=16384).contains(&height)
+            && fx > 0.0
+            && fy > 0.0
+            && fx.is_finite()
+            && fy.is_finite();
         if !fits {
-            return Err(Error::new_err(format!("no camera has {width}x{height} pixels and focal lengths of {fx} and {fy}")));
+            return Err(Error::new_err(format!(
+                "a camera cannot have {width}x{height} pixels and focal lengths {fx} and {fy}; sides must be 1 to 16384 pixels, focal lengths positive"
+            )));
         }
-        let (cx, cy) = (cx.unwrap_or(width as f32 / 2.0), cy.unwrap_or(height as f32 / 2.0));
+        let (cx, cy) = (
+            cx.unwrap_or(width as f32 / 2.0),
+            cy.unwrap_or(height as f32 / 2.0),
+        );
         let name = name.to_owned();
         let pose = matrix(world_to_camera)?;
-        let camera = fastlgs_core::Camera { name, width, height, fx, fy, cx, cy, world_to_camera: pose.as_mat4() };
+        let camera = fastlgs_core::Camera {
+            name,
+            width,
+            height,
+            fx,
+            fy,
+            cx,
+            cy,
+            world_to_camera: pose.as_mat4(),
+        };
         camera.check().map_err(Error::new_err)?;
         Ok(Self { camera, pose })
     }
 
-    /// From a pose as nerfstudio and OpenGL have it: camera to world, x right, y up, looking along -z.
+    /// Creates a camera from a pose of nerfstudio or OpenGL: camera to world, x right, y up,
+    /// looking along -z.
     #[staticmethod]
     #[pyo3(signature = (camera_to_world, fx, fy, width, height, cx = None, cy = None, name = "camera"))]
     fn from_nerfstudio(
@@ -92,11 +129,14 @@ impl Camera {
         name: &str,
     ) -> PyResult<Self> {
         let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
-        let rows = by_rows(camera_to_world.py(), (matrix(camera_to_world)? * flip).inverse())?;
+        let rows = by_rows(
+            camera_to_world.py(),
+            (matrix(camera_to_world)? * flip).inverse(),
+        )?;
         Self::new(width, height, fx, fy, &rows, cx, cy, name)
     }
 
-    /// The view's name: that of its photo.
+    /// Name of the view, which is that of its photo.
     #[getter]
     fn name(&self) -> &str {
         &self.camera.name
@@ -111,30 +151,45 @@ impl Camera {
     /// Focal lengths and principal point in pixels: fx, fy, cx, cy.
     #[getter]
     fn intrinsics(&self) -> (f32, f32, f32, f32) {
-        (self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy)
+        (
+            self.camera.fx,
+            self.camera.fy,
+            self.camera.cx,
+            self.camera.cy,
+        )
     }
 
-    /// World to camera, (4, 4).
+    /// World-to-camera matrix, (4, 4).
     #[getter]
     fn world_to_camera<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         by_rows(py, self.pose)
     }
 
-    /// The same view at another size; the field of view is kept along each axis.
+    /// Returns the same view at another size. The field of view stays the same along each axis.
     fn resized(&self, width: u32, height: u32) -> PyResult<Self> {
         if !(1..=16384).contains(&width) || !(1..=16384).contains(&height) {
-            return Err(Error::new_err(format!("no camera has {width}x{height} pixels")));
+            return Err(Error::new_err(format!(
+                "a camera cannot have {width}x{height} pixels; sides must be 1 to 16384 pixels"
+            )));
         }
-        Ok(Self { camera: self.camera.resized(width, height), pose: self.pose })
+        Ok(Self {
+            camera: self.camera.resized(width, height),
+            pose: self.pose,
+        })
     }
 
     fn __repr__(&self) -> String {
-        format!("Camera('{}', {}x{})", self.camera.name, self.camera.width, self.camera.height)
+        format!(
+            "Camera('{}', {}x{})",
+            self.camera.name, self.camera.width, self.camera.height
+        )
     }
 }
 
-/// A matrix as Python has it.
+/// Converts a matrix to a NumPy array, (4, 4).
 fn by_rows<'py>(py: Python<'py>, matrix: DMat4) -> PyResult<Bound<'py, PyAny>> {
     let rows = matrix.transpose().to_cols_array().to_vec();
-    Ok(numpy::PyArray1::from_vec(py, rows).reshape([4, 4])?.into_any())
+    Ok(numpy::PyArray1::from_vec(py, rows)
+        .reshape([4, 4])?
+        .into_any())
 }

@@ -1,5 +1,7 @@
-//! `fastlgs._fastlgs`: the pipeline as a Python module. `python/fastlgs/__init__.pyi` says what there is; names, units and conventions are those of the
-//! libraries beneath.
+//! `fastlgs._fastlgs`: the pipeline as a Python module.
+//!
+//! `python/fastlgs/__init__.pyi` documents the interface. Names, units and conventions are those of
+//! the Rust libraries.
 
 mod answer;
 mod camera;
@@ -14,14 +16,20 @@ use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-create_exception!(fastlgs, Error, PyException, "What went wrong, in one sentence that names the file and the mend.");
+create_exception!(
+    fastlgs,
+    Error,
+    PyException,
+    "An error of the pipeline: one sentence that names the file and the solution."
+);
 
-/// An error of the pipeline as Python's.
+/// Converts an error of the pipeline to a Python exception.
 fn raised(error: impl Into<fastlgs::Error>) -> PyErr {
     Error::new_err(fastlgs::one_sentence(&error.into()))
 }
 
-/// From photos to a scene that answers; what was made before from the same photos with the same options is kept.
+/// Makes a queryable scene from photos. Keeps an existing scene if photos and options have not
+/// changed.
 #[pyfunction]
 #[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, effort = None, **options))]
 #[expect(clippy::too_many_arguments, reason = "they are keywords")]
@@ -35,15 +43,27 @@ fn make<'py>(
     effort: Option<&str>,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::preprocess::Config { photos, output, ..Default::default() };
+    let known = fastlgs::preprocess::Config {
+        photos,
+        output,
+        ..Default::default()
+    };
     let usual = fastlgs::make::Config::default();
-    let effort = effort.map(|effort| options::value_of("effort", effort)).transpose()?.unwrap_or(usual.effort);
-    let config = fastlgs::make::Config { preprocess: options::with(&known, options)?, effort };
-    let made = stage::run(py, progress, device, seed, move |run| fastlgs::make(&config, run))?;
+    let effort = effort
+        .map(|effort| options::value_of("effort", effort))
+        .transpose()?
+        .unwrap_or(usual.effort);
+    let config = fastlgs::make::Config {
+        preprocess: options::with(&known, options)?,
+        effort,
+    };
+    let made = stage::run(py, progress, device, seed, move |run| {
+        fastlgs::make(&config, run)
+    })?;
     options::to_python(py, &made)
 }
 
-/// Photos to masks, key points, poses and points, in the scene folder `output`.
+/// Computes masks, key points, poses and points from photos, in the scene folder `output`.
 #[pyfunction]
 #[pyo3(signature = (photos, output, *, progress = None, device = "auto", seed = 0, **options))]
 fn preprocess<'py>(
@@ -55,11 +75,23 @@ fn preprocess<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::preprocess::Config { photos, output, ..Default::default() };
-    stage::with_options(py, &known, options, progress, device, seed, fastlgs::preprocess)
+    let known = fastlgs::preprocess::Config {
+        photos,
+        output,
+        ..Default::default()
+    };
+    stage::with_options(
+        py,
+        &known,
+        options,
+        progress,
+        device,
+        seed,
+        fastlgs::preprocess,
+    )
 }
 
-/// Gaussians with colour and objects for the scene folder `scene`.
+/// Trains Gaussians and finds objects in the scene folder `scene`.
 #[pyfunction]
 #[pyo3(signature = (scene, *, progress = None, device = "auto", seed = 0, **options))]
 fn train<'py>(
@@ -70,11 +102,14 @@ fn train<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::train::Config { scene, ..Default::default() };
+    let known = fastlgs::train::Config {
+        scene,
+        ..Default::default()
+    };
     stage::with_options(py, &known, options, progress, device, seed, fastlgs::train)
 }
 
-/// A generated scene with exact poses, depths and masks, in the folder `output`.
+/// Generates photos with exact poses, depths and masks in the folder `output`.
 #[pyfunction]
 #[pyo3(signature = (kind, output, *, progress = None, device = "auto", seed = 0, **options))]
 fn synth<'py>(
@@ -86,7 +121,11 @@ fn synth<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::synth::Config { kind, output, ..Default::default() };
+    let known = fastlgs::synth::Config {
+        kind,
+        output,
+        ..Default::default()
+    };
     stage::with_options(py, &known, options, progress, device, seed, fastlgs::synth)
 }
 

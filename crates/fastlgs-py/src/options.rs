@@ -1,4 +1,5 @@
-//! Keyword arguments to configurations, and reports to dictionaries: by way of JSON, which both have.
+//! Conversion of keyword arguments to configurations, and of reports to dictionaries, by way of
+//! JSON.
 
 use crate::Error;
 use pyo3::prelude::*;
@@ -11,57 +12,82 @@ fn refused(error: impl std::fmt::Display) -> PyErr {
     Error::new_err(error.to_string())
 }
 
-/// An option that JSON does not know as one that it does: numbers and arrays of NumPy, and paths.
+/// Converts an option that is not JSON: NumPy numbers and arrays, and paths.
 fn plain<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
     if value.hasattr("tolist")? {
         return value.call_method0("tolist");
     }
     let path = value.py().import("os")?.call_method1("fspath", (value,));
-    path.map_err(|_| Error::new_err(format!("'{value}' is no number, text, path or list")))
+    path.map_err(|_| Error::new_err(format!("'{value}' is not a number, text, path or list")))
 }
 
-/// A configuration with some of its values replaced.
+/// Returns a configuration with the given options replaced.
 ///
 /// # Errors
-/// An option that it does not have, or a value that does not fit.
-pub fn with<T: Serialize + DeserializeOwned>(known: &T, options: Option<&Bound<'_, PyDict>>) -> PyResult<T> {
+/// An unknown option, or a value of the wrong type.
+pub fn with<T: Serialize + DeserializeOwned>(
+    known: &T,
+    options: Option<&Bound<'_, PyDict>>,
+) -> PyResult<T> {
     let mut all = serde_json::to_value(known).map_err(refused)?;
-    let Some(options) = options else { return serde_json::from_value(all).map_err(refused) };
+    let Some(options) = options else {
+        return serde_json::from_value(all).map_err(refused);
+    };
     let py = options.py();
-    let default = PyCFunction::new_closure(py, None, None, |arguments, _| plain(&arguments.get_item(0)?).map(Bound::unbind))?;
+    let default = PyCFunction::new_closure(py, None, None, |arguments, _| {
+        plain(&arguments.get_item(0)?).map(Bound::unbind)
+    })?;
     let how = [("default", default)].into_py_dict(py)?;
-    let dumped = py.import("json")?.call_method("dumps", (options,), Some(&how));
-    let plain = dumped.map_err(|error| Error::new_err(format!("an option does not fit: {error}")))?;
-    let given: serde_json::Map<String, Value> = serde_json::from_str(&plain.extract::<String>()?).map_err(refused)?;
+    let dumped = py
+        .import("json")?
+        .call_method("dumps", (options,), Some(&how));
+    let plain =
+        dumped.map_err(|error| Error::new_err(format!("an option is not valid: {error}")))?;
+    let given: serde_json::Map<String, Value> =
+        serde_json::from_str(&plain.extract::<String>()?).map_err(refused)?;
     for (name, value) in given {
-        // Its name in earlier versions.
-        let name = if name == "init_ply" { "init".to_owned() } else { name };
+        // `init_ply` is an alias of `init`.
+        let name = if name == "init_ply" {
+            "init".to_owned()
+        } else {
+            name
+        };
         let Some(place) = all.get_mut(&name) else {
-            let names: Vec<&str> = all.as_object().into_iter().flat_map(|all| all.keys().map(String::as_str)).collect();
-            return Err(Error::new_err(format!("there is no option '{name}'; there are {}", names.join(", "))));
+            let names: Vec<&str> = all
+                .as_object()
+                .into_iter()
+                .flat_map(|all| all.keys().map(String::as_str))
+                .collect();
+            return Err(Error::new_err(format!(
+                "unknown option '{name}'; the options are {}",
+                names.join(", ")
+            )));
         };
         let before = place.clone();
         *place = value;
-        // One by one, so that the message names the one that does not fit.
+        // Checked one by one, so that the message names the invalid option.
         if let Err(error) = serde_json::from_value::<T>(all.clone()) {
-            return Err(Error::new_err(format!("the option '{name}' does not fit: {error}; by default it is {before}")));
+            return Err(Error::new_err(format!(
+                "the option '{name}' is not valid: {error}; its default is {before}"
+            )));
         }
     }
     serde_json::from_value(all).map_err(refused)
 }
 
-/// A value by its name, such as `quick`.
+/// Returns a value of an option by its name, such as `quick`.
 ///
 /// # Errors
-/// A name that there is not.
+/// An unknown name.
 pub fn value_of<T: DeserializeOwned>(option: &str, name: &str) -> PyResult<T> {
-    serde_json::from_value(Value::from(name)).map_err(|error| Error::new_err(format!("the option '{option}' does not fit: {error}")))
+    serde_json::from_value(Value::from(name))
+        .map_err(|error| Error::new_err(format!("the option '{option}' is not valid: {error}")))
 }
 
-/// A report as dictionaries, lists and numbers.
+/// Converts a report to dictionaries, lists and numbers.
 ///
 /// # Errors
-/// None that a report gives cause for.
+/// None for the reports of this crate.
 pub fn to_python<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
     let text = serde_json::to_string(value).map_err(refused)?;
     py.import("json")?.call_method1("loads", (text,))

@@ -1,4 +1,4 @@
-//! Scenes.
+//! The Python class `Scene`.
 
 use crate::answer::Answer;
 use crate::camera::Camera;
@@ -25,7 +25,7 @@ use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-/// One pixel, or several of one thing.
+/// One pixel, or several pixels of one object.
 #[derive(FromPyObject)]
 enum Pointed {
     One([u32; 2]),
@@ -42,7 +42,7 @@ impl Pointed {
     }
 }
 
-/// A trained scene on a device.
+/// A trained scene folder, opened on a device.
 #[pyclass(frozen, module = "fastlgs")]
 pub struct Scene {
     opened: Mutex<Opened>,
@@ -51,11 +51,11 @@ pub struct Scene {
 struct Opened {
     session: Session,
     grid: Grid,
-    /// The view that was asked last, rendered.
+    /// Camera and field of the view that was rendered last.
     shown: Option<(fastlgs_core::Camera, Field)>,
 }
 
-/// Which view is meant.
+/// The view of a query or picture.
 #[derive(Clone)]
 enum Which {
     First,
@@ -64,21 +64,33 @@ enum Which {
 }
 
 impl Which {
-    /// A view's name or a `Camera`; the first view where nothing is said.
+    /// Reads the name of a view or a `Camera`; `None` means the first view.
     fn of(view: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
-        let Some(view) = view else { return Ok(Self::First) };
+        let Some(view) = view else {
+            return Ok(Self::First);
+        };
         if let Ok(camera) = view.cast::<Camera>() {
             return Ok(Self::Given(Box::new(camera.get().clone())));
         }
-        view.extract().map(Self::Named).map_err(|_| Error::new_err("a view is the name of a photo, or a Camera"))
+        view.extract()
+            .map(Self::Named)
+            .map_err(|_| Error::new_err("view must be the name of a photo, or a Camera"))
     }
 }
 
 impl Scene {
-    /// Works on the scene while Python is free. Python must not be held while waiting for the scene: who has the scene may wait for Python.
-    fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut Opened) -> fastlgs::Result<T> + Send) -> PyResult<T> {
+    /// Runs `work` on the scene with the GIL released.
+    ///
+    /// The GIL must not be held while waiting for the scene: the thread that holds the scene may
+    /// wait for the GIL.
+    fn with<T: Send>(
+        &self,
+        py: Python<'_>,
+        work: impl FnOnce(&mut Opened) -> fastlgs::Result<T> + Send,
+    ) -> PyResult<T> {
         fork::check()?;
-        py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner))).map_err(raised)
+        py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner)))
+            .map_err(raised)
     }
 }
 
@@ -95,7 +107,7 @@ impl Opened {
         })
     }
 
-    /// What a view tells about objects; rendered unless it is the one that was asked last. Returns the milliseconds that took.
+    /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
     fn look(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<f64> {
         let started = Instant::now();
         if self.shown.as_ref().is_none_or(|(shown, _)| shown != camera) {
@@ -105,17 +117,30 @@ impl Opened {
     }
 }
 
-/// Values of rows as an array of that many columns.
-fn table<'py, T: numpy::Element>(py: Python<'py>, values: Vec<T>, shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
-    Ok(PyArray1::from_vec(py, values).reshape(shape.to_vec())?.into_any())
+/// Converts values in row-major order to a NumPy array of this shape.
+fn table<'py, T: numpy::Element>(
+    py: Python<'py>,
+    values: Vec<T>,
+    shape: &[usize],
+) -> PyResult<Bound<'py, PyAny>> {
+    Ok(PyArray1::from_vec(py, values)
+        .reshape(shape.to_vec())?
+        .into_any())
 }
 
 #[pymethods]
 impl Scene {
-    /// Opens a trained scene folder. Texts are embedded by `embed_text`, where it is given: a list of str to float32 (texts, numbers).
+    /// Opens a trained scene folder. `embed_text` replaces the text encoder: a function from a list
+    /// of str to float32 (texts, numbers).
     #[new]
     #[pyo3(signature = (path, *, device = "auto", clip_text = None, embed_text = None))]
-    fn new(py: Python<'_>, path: PathBuf, device: &str, clip_text: Option<PathBuf>, embed_text: Option<Py<PyAny>>) -> PyResult<Self> {
+    fn new(
+        py: Python<'_>,
+        path: PathBuf,
+        device: &str,
+        clip_text: Option<PathBuf>,
+        embed_text: Option<Py<PyAny>>,
+    ) -> PyResult<Self> {
         fork::check()?;
         let open = || -> fastlgs::Result<Opened> {
             let mut session = Session::open(&path, device)?;
@@ -124,18 +149,24 @@ impl Scene {
                 session.use_text_encoder(Box::new(Texts(embed)))?;
             }
             let grid = session.grid()?;
-            Ok(Opened { session, grid, shown: None })
+            Ok(Opened {
+                session,
+                grid,
+                shown: None,
+            })
         };
-        Ok(Self { opened: Mutex::new(py.detach(open).map_err(raised)?) })
+        Ok(Self {
+            opened: Mutex::new(py.detach(open).map_err(raised)?),
+        })
     }
 
-    /// The folder.
+    /// The scene folder.
     #[getter]
     fn path(&self, py: Python<'_>) -> PyResult<PathBuf> {
         self.with(py, |opened| Ok(opened.session.folder.root.clone()))
     }
 
-    /// The device's name.
+    /// Name of the device.
     #[getter]
     fn device(&self, py: Python<'_>) -> PyResult<String> {
         self.with(py, |opened| Ok(opened.session.engine.name()))
@@ -144,22 +175,44 @@ impl Scene {
     /// Names of all views, sorted.
     #[getter]
     fn views(&self, py: Python<'_>) -> PyResult<Vec<String>> {
-        self.with(py, |opened| Ok(opened.session.cameras.iter().map(|c| c.name.clone()).collect()))
+        self.with(py, |opened| {
+            Ok(opened
+                .session
+                .cameras
+                .iter()
+                .map(|c| c.name.clone())
+                .collect())
+        })
     }
 
-    /// Names of the views that were kept out of training.
+    /// Names of the held-out views.
     #[getter]
     fn held_out(&self, py: Python<'_>) -> PyResult<Vec<String>> {
-        self.with(py, |Opened { session, .. }| Ok(session.manifest.held_out(&session.cameras).into_iter().map(|c| c.name).collect()))
+        self.with(py, |Opened { session, .. }| {
+            Ok(session
+                .manifest
+                .held_out(&session.cameras)
+                .into_iter()
+                .map(|c| c.name)
+                .collect())
+        })
     }
 
-    /// The camera of a view.
+    /// Returns the camera of a view.
     fn camera(&self, py: Python<'_>, view: &Bound<'_, PyAny>) -> PyResult<Camera> {
         let which = Which::of(Some(view))?;
-        self.with(py, |opened| Ok(Camera::of(opened.camera(&which)?, &opened.session.manifest.frame)))
+        self.with(py, |opened| {
+            Ok(Camera::of(
+                opened.camera(&which)?,
+                &opened.session.manifest.frame,
+            ))
+        })
     }
 
-    /// Asks for a text, for what a pixel of the view shows (or several of one thing, as a list), or for what a picture (uint8, (height, width, 3)) shows.
+    /// Finds objects by a text, by pixels of the view, or by a picture.
+    ///
+    /// `point` is one pixel (x, y), or a list of pixels of one object. `image` is uint8 (height,
+    /// width, 3).
     #[pyo3(signature = (text = None, *, view = None, point = None, image = None, negatives = Vec::new(), false_alarms = None, top_k = None))]
     fn query(
         &self,
@@ -176,20 +229,41 @@ impl Scene {
             (Some(text), None, None) => Ask::Text(text),
             (None, Some(point), None) => Ask::Point(point.pixels()?),
             (None, None, Some(image)) => Ask::Image("image".to_owned(), picture(&image)?),
-            _ => return Err(Error::new_err("ask in one way: a text, a point or an image")),
+            _ => {
+                return Err(Error::new_err(
+                    "query in one way: give a text, a point or an image",
+                ));
+            }
         };
         let usual = QueryConfig::default();
-        let config = QueryConfig { false_alarms: false_alarms.unwrap_or(usual.false_alarms), top_k: top_k.unwrap_or(usual.top_k) };
+        let config = QueryConfig {
+            false_alarms: false_alarms.unwrap_or(usual.false_alarms),
+            top_k: top_k.unwrap_or(usual.top_k),
+        };
         if !(0.0..=1.0).contains(&config.false_alarms) || config.top_k == 0 {
-            return Err(Error::new_err("false_alarms is a share from 0 to 1, and top_k is 1 at least"));
+            return Err(Error::new_err(
+                "false_alarms must be a number from 0 to 1, and top_k at least 1",
+            ));
         }
         let which = Which::of(view)?;
         let (camera, report, mask, relevancy) = self.with(py, |opened| {
             let camera = opened.camera(&which)?;
             let render_ms = opened.look(&camera)?;
-            let Opened { session, grid, shown } = opened;
-            let Some((_, field)) = shown else { unreachable!("rendered above") };
-            let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates: CANDIDATES };
+            let Opened {
+                session,
+                grid,
+                shown,
+            } = opened;
+            let Some((_, field)) = shown else {
+                unreachable!("rendered above")
+            };
+            let question = Question {
+                ask: &ask,
+                negatives: &negatives,
+                config,
+                dilate: None,
+                candidates: CANDIDATES,
+            };
             let (answer, mut report) = question.put(session, grid, field, &camera, render_ms)?;
             let relevancy = field.relevancy(grid, &answer.found.heat());
             let mask = answer.mask;
@@ -198,50 +272,86 @@ impl Scene {
         })?;
         let shape = [camera.height as usize, camera.width as usize];
         let mask = PyArray1::from_vec(py, mask).reshape(shape)?.unbind();
-        let relevancy: Py<PyArray2<f32>> = PyArray1::from_vec(py, relevancy).reshape(shape)?.unbind();
-        Ok(Answer { report, mask, relevancy })
+        let relevancy: Py<PyArray2<f32>> =
+            PyArray1::from_vec(py, relevancy).reshape(shape)?.unbind();
+        Ok(Answer {
+            report,
+            mask,
+            relevancy,
+        })
     }
 
-    /// All objects and parts: id, parent (0 for none), support, views, area (largest share of a photo), code.
+    /// All objects and parts: id, parent (0 for none), support, views, area (largest share of a
+    /// photo), code.
     #[getter]
     fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let area = |areas: &[f32]| areas.iter().fold(0.0f32, |most, area| most.max(*area));
         let told = |o: &Object| json!({ "id": o.id, "parent": o.parent, "support": o.support, "views": o.views, "area": area(&o.areas), "code": o.code.to_array() });
-        to_python(py, &self.with(py, |opened| Ok(opened.grid.objects.iter().map(told).collect::<Vec<_>>()))?)
+        to_python(
+            py,
+            &self.with(py, |opened| {
+                Ok(opened.grid.objects.iter().map(told).collect::<Vec<_>>())
+            })?,
+        )
     }
 
-    /// Embeddings of an object's views, (views, numbers).
+    /// Returns the embeddings of an object's masks, (masks, numbers).
     fn embeddings<'py>(&self, py: Python<'py>, id: u16) -> PyResult<Bound<'py, PyAny>> {
         let embeddings = self.with(py, |opened| {
             let known = opened.grid.objects.len();
-            let object = usize::from(id).checked_sub(1).and_then(|k| opened.grid.objects.get(k));
-            let unknown = || fastlgs::Error::Invalid(format!("there is no object {id}; there are {known}"));
+            let object = usize::from(id)
+                .checked_sub(1)
+                .and_then(|k| opened.grid.objects.get(k));
+            let unknown = || {
+                fastlgs::Error::Invalid(format!(
+                    "there is no object {id}; the scene has {known} objects"
+                ))
+            };
             Ok(object.ok_or_else(unknown)?.embeddings.clone())
         })?;
         let columns = embeddings.first().map_or(0, Vec::len);
         table(py, embeddings.concat(), &[embeddings.len(), columns])
     }
 
-    /// A picture: `color` uint8 (h, w, 3), `depth` float32 (h, w) in units of the scene, `feature` float32 (h, w, 3), `objects` uint16 (h, w).
+    /// Renders a view: `color` uint8 (h, w, 3), `depth` float32 (h, w) in world units, `feature`
+    /// float32 (h, w, 3), or `objects` uint16 (h, w).
     #[pyo3(signature = (view = None, what = "color"))]
-    fn render<'py>(&self, py: Python<'py>, view: Option<&Bound<'py, PyAny>>, what: &str) -> PyResult<Bound<'py, PyAny>> {
+    fn render<'py>(
+        &self,
+        py: Python<'py>,
+        view: Option<&Bound<'py, PyAny>>,
+        what: &str,
+    ) -> PyResult<Bound<'py, PyAny>> {
         let which = Which::of(view)?;
         let size = |camera: &fastlgs_core::Camera| [camera.height as usize, camera.width as usize];
         let planes = |color: bool| {
             self.with(py, |opened| {
                 let camera = opened.camera(&which)?;
                 let session = &mut opened.session;
-                let frame = if color { session.render(&camera) } else { session.render_feature(&camera) }?;
+                let frame = if color {
+                    session.render(&camera)
+                } else {
+                    session.render_feature(&camera)
+                }?;
                 let pixels = size(&camera).iter().product::<usize>();
-                let planes = if color { frame.channels(0, 3) } else { frame.channels(3, 6) };
-                let values: Vec<f32> = (0..pixels).flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]]).collect();
+                let planes = if color {
+                    frame.channels(0, 3)
+                } else {
+                    frame.channels(3, 6)
+                };
+                let values: Vec<f32> = (0..pixels)
+                    .flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]])
+                    .collect();
                 Ok((size(&camera), values))
             })
         };
         match what {
             "color" => {
                 let ([h, w], values) = planes(true)?;
-                let bytes: Vec<u8> = values.into_iter().map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8).collect();
+                let bytes: Vec<u8> = values
+                    .into_iter()
+                    .map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8)
+                    .collect();
                 table(py, bytes, &[h, w, 3])
             }
             "feature" => {
@@ -252,7 +362,15 @@ impl Scene {
                 let (size, values) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
                     let unit = opened.session.manifest.frame.scale as f32;
-                    Ok((size(&camera), opened.session.render_depth(&camera)?.into_iter().map(|depth| unit * depth).collect()))
+                    Ok((
+                        size(&camera),
+                        opened
+                            .session
+                            .render_depth(&camera)?
+                            .into_iter()
+                            .map(|depth| unit * depth)
+                            .collect(),
+                    ))
                 })?;
                 table(py, values, &size)
             }
@@ -260,90 +378,179 @@ impl Scene {
                 let (size, owners) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
                     opened.look(&camera)?;
-                    let owners = opened.shown.as_ref().map(|(_, field)| field.owners(&opened.grid).labels);
+                    let owners = opened
+                        .shown
+                        .as_ref()
+                        .map(|(_, field)| field.owners(&opened.grid).labels);
                     Ok((size(&camera), owners.unwrap_or_default()))
                 })?;
                 table(py, owners, &size)
             }
-            other => Err(Error::new_err(format!("'{other}' is none of color, depth, feature and objects"))),
+            other => Err(Error::new_err(format!(
+                "what: '{other}' is unknown; use color, depth, feature or objects"
+            ))),
         }
     }
 
-    /// For each of the Gaussians' object_ids, 0 included, the objects that it stands for, from small to large.
+    /// Objects of each value of the Gaussians' object_ids, 0 included, from small to large.
     #[getter]
     fn object_lists(&self, py: Python<'_>) -> PyResult<Vec<Vec<u16>>> {
         self.with(py, |opened| Ok(opened.grid.lists()))
     }
 
-    /// All Gaussians as arrays: means and scales (n, 3) in units of the scene, rotations (n, 4) as (w, x, y, z), opacities (n), sh (n, k, 3),
-    /// features (n, 3) and object_ids (n), places in object_lists.
+    /// All Gaussians as arrays: means and scales (n, 3), rotations (n, 4), opacities (n), sh (n, k,
+    /// 3), features (n, 3) and object_ids (n).
+    ///
+    /// Means and scales are in world units, rotations are (w, x, y, z), and object_ids are indices
+    /// into object_lists.
     #[getter]
     fn gaussians<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let (mut scene, frame) = self.with(py, |opened| Ok((opened.session.gaussians.clone(), opened.session.manifest.frame)))?;
+        let (mut scene, frame) = self.with(py, |opened| {
+            Ok((
+                opened.session.gaussians.clone(),
+                opened.session.manifest.frame,
+            ))
+        })?;
         let n = scene.len();
         if frame.scale != 1.0 {
-            scene.log_scales.iter_mut().for_each(|s| *s += frame.scale.ln() as f32);
+            scene
+                .log_scales
+                .iter_mut()
+                .for_each(|s| *s += frame.scale.ln() as f32);
         }
-        let rows = |values: &[Vec3]| -> Vec<f32> { values.iter().flat_map(|v| v.to_array()).collect() };
-        let scales: Vec<f32> = scene.log_scales.iter().flat_map(|s| s.exp().to_array()).collect();
+        let rows =
+            |values: &[Vec3]| -> Vec<f32> { values.iter().flat_map(|v| v.to_array()).collect() };
+        let scales: Vec<f32> = scene
+            .log_scales
+            .iter()
+            .flat_map(|s| s.exp().to_array())
+            .collect();
         let unit = |q: &[f32; 4]| {
             let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
             q.map(|v| v / length)
         };
         let rest = rest_len(scene.sh_degree);
-        let sh = (0..n).flat_map(|i| std::iter::once(scene.sh_dc[i]).chain(scene.sh_rest[i * rest..(i + 1) * rest].iter().copied()));
-        let opacities: Vec<f32> = scene.opacity_logits.iter().map(|o| 1.0 / (1.0 + (-o).exp())).collect();
+        let sh = (0..n).flat_map(|i| {
+            std::iter::once(scene.sh_dc[i])
+                .chain(scene.sh_rest[i * rest..(i + 1) * rest].iter().copied())
+        });
+        let opacities: Vec<f32> = scene
+            .opacity_logits
+            .iter()
+            .map(|o| 1.0 / (1.0 + (-o).exp()))
+            .collect();
         let arrays = PyDict::new(py);
-        // Floats would lose digits far from the origin.
+        // Double precision: single precision would lose digits far from the origin.
         let means = match frame.is_identity() {
             true => table(py, rows(&scene.means), &[n, 3])?,
-            false => table(py, scene.means.iter().flat_map(|mean| frame.to_world(*mean).to_array()).collect(), &[n, 3])?,
+            false => table(
+                py,
+                scene
+                    .means
+                    .iter()
+                    .flat_map(|mean| frame.to_world(*mean).to_array())
+                    .collect(),
+                &[n, 3],
+            )?,
         };
         arrays.set_item("means", means)?;
         arrays.set_item("scales", table(py, scales, &[n, 3])?)?;
-        arrays.set_item("rotations", table(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?)?;
+        arrays.set_item(
+            "rotations",
+            table(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?,
+        )?;
         arrays.set_item("opacities", table(py, opacities, &[n])?)?;
-        arrays.set_item("sh", table(py, sh.flat_map(|c| c.to_array()).collect(), &[n, 1 + rest, 3])?)?;
+        arrays.set_item(
+            "sh",
+            table(
+                py,
+                sh.flat_map(|c| c.to_array()).collect(),
+                &[n, 1 + rest, 3],
+            )?,
+        )?;
         arrays.set_item("features", table(py, rows(&scene.features), &[n, 3])?)?;
         arrays.set_item("object_ids", table(py, scene.object_ids, &[n])?)?;
         Ok(arrays)
     }
 
-    /// Places of the Gaussians of some objects and their parts: uint32, rising.
+    /// Returns the indices of the Gaussians of objects and their parts: uint32, ascending.
     fn select<'py>(&self, py: Python<'py>, ids: Vec<u16>) -> PyResult<Bound<'py, PyArray1<u32>>> {
-        let places = self.with(py, |opened| Ok(selection::gaussians(&opened.session.gaussians, &opened.grid, &ids)))?;
-        Ok(PyArray1::from_vec(py, places.into_iter().map(|place| place as u32).collect()))
+        let places = self.with(py, |opened| {
+            Ok(selection::gaussians(
+                &opened.session.gaussians,
+                &opened.grid,
+                &ids,
+            ))
+        })?;
+        Ok(PyArray1::from_vec(
+            py,
+            places.into_iter().map(|place| place as u32).collect(),
+        ))
     }
 
-    /// Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz, .sog or .glb; all of them without `ids`.
+    /// Writes the Gaussians of objects, or with `rest` all others, as .ply, .spz, .sog or .glb.
+    /// Without `ids`, writes all Gaussians.
     #[pyo3(signature = (path, ids = None, *, rest = false))]
-    fn export(&self, py: Python<'_>, path: PathBuf, ids: Option<Vec<u16>>, rest: bool) -> PyResult<()> {
+    fn export(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        ids: Option<Vec<u16>>,
+        rest: bool,
+    ) -> PyResult<()> {
         if rest && ids.is_none() {
-            return Err(Error::new_err("rest leaves out some objects: give their ids"));
+            return Err(Error::new_err("rest needs ids: the objects to leave out"));
         }
-        self.with(py, |Opened { session: Session { gaussians, cameras, manifest, .. }, grid, .. }| {
-            let world = selection::World::of(manifest, cameras);
-            match &ids {
-                None => selection::write(&path, gaussians, &world),
-                Some(ids) => selection::export(&path, gaussians, &world, &selection::gaussians(gaussians, grid, ids), !rest),
-            }
-        })
+        self.with(
+            py,
+            |Opened {
+                 session:
+                     Session {
+                         gaussians,
+                         cameras,
+                         manifest,
+                         ..
+                     },
+                 grid,
+                 ..
+             }| {
+                let world = selection::World::of(manifest, cameras);
+                match &ids {
+                    None => selection::write(&path, gaussians, &world),
+                    Some(ids) => selection::export(
+                        &path,
+                        gaussians,
+                        &world,
+                        &selection::gaussians(gaussians, grid, ids),
+                        !rest,
+                    ),
+                }
+            },
+        )
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
         self.with(py, |Opened { session, grid, .. }| {
             let root = session.folder.root.display();
-            Ok(format!("Scene('{root}', {} Gaussians, {} objects)", session.gaussians.len(), grid.objects.len()))
+            Ok(format!(
+                "Scene('{root}', {} Gaussians, {} objects)",
+                session.gaussians.len(),
+                grid.objects.len()
+            ))
         })
     }
 }
 
-/// A picture of Python's.
+/// Converts a NumPy array, uint8 (height, width, 3), to a picture.
 fn picture(image: &PyReadonlyArray3<'_, u8>) -> PyResult<RgbImage> {
     let view = image.as_array();
     let (height, width, channels) = view.dim();
     if channels != 3 || width == 0 || height == 0 {
-        return Err(Error::new_err(format!("a picture is uint8 of (height, width, 3), not of ({height}, {width}, {channels})")));
+        return Err(Error::new_err(format!(
+            "a picture must be uint8 of shape (height, width, 3), not ({height}, {width}, {channels})"
+        )));
     }
-    Ok(RgbImage::from_fn(width as u32, height as u32, |x, y| image::Rgb(std::array::from_fn(|k| view[(y as usize, x as usize, k)]))))
+    Ok(RgbImage::from_fn(width as u32, height as u32, |x, y| {
+        image::Rgb(std::array::from_fn(|k| view[(y as usize, x as usize, k)]))
+    }))
 }

@@ -1,4 +1,4 @@
-//! Runs a stage on a thread of its own, while Python's main thread hears of its progress and of Ctrl-C.
+//! Runs a stage on its own thread, while Python's main thread receives progress and Ctrl-C.
 
 use crate::{fork, options, raised};
 use fastlgs::Run;
@@ -11,13 +11,21 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
-/// How long Ctrl-C may wait to be noticed.
+/// Longest time until Ctrl-C is noticed.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// What a stage told, as far as Python hears of it.
+/// A progress message that is passed to Python.
 enum Event {
-    Stage { stage: &'static str, done: u64, total: u64, note: String },
-    Trained { step: fastlgs::progress::TrainStep, total: u32 },
+    Stage {
+        stage: &'static str,
+        done: u64,
+        total: u64,
+        note: String,
+    },
+    Trained {
+        step: fastlgs::progress::TrainStep,
+        total: u32,
+    },
     Warning(String),
 }
 
@@ -25,7 +33,12 @@ impl Event {
     fn to_python<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let event = PyDict::new(py);
         match self {
-            Self::Stage { stage, done, total, note } => {
+            Self::Stage {
+                stage,
+                done,
+                total,
+                note,
+            } => {
                 event.set_item("stage", stage)?;
                 event.set_item("done", done)?;
                 event.set_item("total", total)?;
@@ -45,7 +58,7 @@ impl Event {
     }
 }
 
-/// Passes on what it hears, and ends the stage where that is asked for.
+/// Progress sink that sends events to the main thread, and cancels the stage on request.
 struct Listener<'a> {
     events: std::sync::Mutex<Sender<Event>>,
     cancelled: &'a AtomicBool,
@@ -54,14 +67,33 @@ struct Listener<'a> {
 impl Sink for Listener<'_> {
     fn tell(&self, message: Message<'_>) {
         let event = match message {
-            Message::Started { stage, total } => Event::Stage { stage, done: 0, total, note: String::new() },
-            Message::Advanced { stage, done, total, note } => Event::Stage { stage, done, total, note: note.to_owned() },
+            Message::Started { stage, total } => Event::Stage {
+                stage,
+                done: 0,
+                total,
+                note: String::new(),
+            },
+            Message::Advanced {
+                stage,
+                done,
+                total,
+                note,
+            } => Event::Stage {
+                stage,
+                done,
+                total,
+                note: note.to_owned(),
+            },
             Message::Trained { step, total, .. } => Event::Trained { step, total },
             Message::Warning(text) => Event::Warning(text.to_owned()),
             _ => return,
         };
-        // Nobody may be listening any more.
-        let _ = self.events.lock().unwrap_or_else(std::sync::PoisonError::into_inner).send(event);
+        // The receiver may be closed.
+        let _ = self
+            .events
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
+            .send(event);
     }
 
     fn cancelled(&self) -> bool {
@@ -69,15 +101,16 @@ impl Sink for Listener<'_> {
     }
 }
 
-/// The next thing that is told. A receiver may be waited on from one place at a time, which `&mut` says.
+/// Waits for the next event. A receiver is not `Sync`; `&mut` makes the borrow `Send`.
 fn wait(heard: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
     heard.recv_timeout(PATIENCE)
 }
 
-/// Runs `work`, with Python free to do something else; `progress` is called with a dictionary for each thing that is told.
+/// Runs `work` with the GIL released. `progress` is called with a dictionary for each event.
 ///
 /// # Errors
-/// Those of the stage; what `progress` raises, and `KeyboardInterrupt`, both of which end the stage first.
+/// Errors of the stage, exceptions of `progress`, and `KeyboardInterrupt`. The last two cancel the
+/// stage first.
 pub fn run<T: Send>(
     py: Python<'_>,
     progress: Option<Py<PyAny>>,
@@ -91,18 +124,27 @@ pub fn run<T: Send>(
         let (events, mut heard) = channel();
         let cancelled = &cancelled;
         let thread = scope.spawn(move || {
-            let listener = Listener { events: std::sync::Mutex::new(events), cancelled };
-            work(&Run { device, seed, progress: &listener })
+            let listener = Listener {
+                events: std::sync::Mutex::new(events),
+                cancelled,
+            };
+            work(&Run {
+                device,
+                seed,
+                progress: &listener,
+            })
         });
         let mut interruption = None;
         loop {
             let event = py.detach(|| wait(&mut heard));
             let told = match &event {
-                Ok(event) => progress.as_ref().map_or(Ok(()), |f| f.call1(py, (event.to_python(py)?,)).map(drop)),
+                Ok(event) => progress
+                    .as_ref()
+                    .map_or(Ok(()), |f| f.call1(py, (event.to_python(py)?,)).map(drop)),
                 Err(RecvTimeoutError::Timeout) => Ok(()),
                 Err(RecvTimeoutError::Disconnected) => break,
             };
-            // The first interruption ends the stage; what comes after it is the stage ending.
+            // The first interruption cancels the stage. Later ones are ignored until it has ended.
             if let (Err(error), None) = (told.and_then(|()| py.check_signals()), &interruption) {
                 interruption = Some(error);
                 cancelled.store(true, Ordering::Relaxed);
@@ -117,10 +159,10 @@ pub fn run<T: Send>(
     })
 }
 
-/// Runs a stage with some values of its configuration replaced; its report as Python's.
+/// Runs a stage with some options replaced. Returns its report as Python objects.
 ///
 /// # Errors
-/// Options that do not fit, and those of [`run`].
+/// Invalid options, and errors of [`run`].
 pub fn with_options<'py, C: Serialize + DeserializeOwned + Send, R: Serialize + Send>(
     py: Python<'py>,
     known: &C,
@@ -131,5 +173,8 @@ pub fn with_options<'py, C: Serialize + DeserializeOwned + Send, R: Serialize + 
     stage: fn(&C, &Run) -> fastlgs::Result<R>,
 ) -> PyResult<Bound<'py, PyAny>> {
     let config = options::with(known, options)?;
-    options::to_python(py, &run(py, progress, device, seed, move |run| stage(&config, run))?)
+    options::to_python(
+        py,
+        &run(py, progress, device, seed, move |run| stage(&config, run))?,
+    )
 }

@@ -15,7 +15,9 @@ use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut args = std::env::args().skip(1);
-    let (Some(scene), Some(output)) = (args.next(), args.next()) else { return Err("usage: lift_labels SCENE labelled.ply".into()) };
+    let (Some(scene), Some(output)) = (args.next(), args.next()) else {
+        return Err("usage: lift_labels SCENE labelled.ply".into());
+    };
     let folder = SceneFolder::open(Path::new(&scene))?;
     let mut gaussians = folder.gaussians()?;
     let cameras = folder.manifest()?.training(&folder.cameras()?);
@@ -23,15 +25,29 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![BTreeMap::new(); gaussians.len()];
     for camera in &cameras {
         // The weight that each Gaussian contributes to each label of the view.
-        for vote in lift::votes(&gaussians, &View::new(camera, gaussians.len(), 0), &folder.objects(&camera.name)?) {
-            *weights[vote.gaussian as usize].entry(vote.label).or_default() += vote.weight;
+        for vote in lift::votes(
+            &gaussians,
+            &View::new(camera, gaussians.len(), 0),
+            &folder.objects(&camera.name)?,
+        ) {
+            *weights[vote.gaussian as usize]
+                .entry(vote.label)
+                .or_default() += vote.weight;
         }
     }
-    let heaviest = |w: &BTreeMap<u16, f32>| w.iter().max_by(|a, b| a.1.total_cmp(b.1)).map_or(0, |(label, _)| *label);
+    let heaviest = |w: &BTreeMap<u16, f32>| {
+        w.iter()
+            .max_by(|a, b| a.1.total_cmp(b.1))
+            .map_or(0, |(label, _)| *label)
+    };
     gaussians.object_ids = weights.iter().map(heaviest).collect();
 
     let labelled = gaussians.object_ids.iter().filter(|id| **id > 0).count();
     ply::write(Path::new(&output), &gaussians)?;
-    println!("{labelled} of {} Gaussians have a label, from {} views: {output}", gaussians.len(), cameras.len());
+    println!(
+        "{labelled} of {} Gaussians have a label, from {} views: {output}",
+        gaussians.len(),
+        cameras.len()
+    );
     Ok(())
 }

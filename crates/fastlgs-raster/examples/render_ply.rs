@@ -28,8 +28,19 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let mut engine = open_engine(&args.next().unwrap_or_else(|| "auto".into()))?;
     engine.set_state(&State::of(&gaussians))?;
-    let frame = engine.render(View::new(&camera, gaussians.len(), gaussians.sh_degree), Channels::Color)?;
-    image_io::save_png(Path::new(&picture), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
-    println!("{} Gaussians and {} (tile, Gaussian) pairs, rendered on {}: {picture}", gaussians.len(), frame.pairs, engine.name());
+    let frame = engine.render(
+        View::new(&camera, gaussians.len(), gaussians.sh_degree),
+        Channels::Color,
+    )?;
+    image_io::save_png(
+        Path::new(&picture),
+        image_io::from_planar(frame.channels(0, 3), frame.width, frame.height),
+    )?;
+    println!(
+        "{} Gaussians and {} (tile, Gaussian) pairs, rendered on {}: {picture}",
+        gaussians.len(),
+        frame.pairs,
+        engine.name()
+    );
     Ok(())
 }

@@ -14,14 +14,14 @@ use glam::{Mat4, Quat, Vec3};
 use nalgebra::{SMatrix, SVector};
 
 /// Image motion between the renders of a finite difference, in pixels.
-const NUDGE: f32 = 0.25;
+const DIFFERENCE_PX: f32 = 0.25;
 /// Scale of the robust loss, as a residual of a colour channel (0 to 1). Moved objects and
 /// highlights exceed it and lose weight.
-const SOFT: f32 = 0.1;
+const RESIDUAL_SCALE: f32 = 0.1;
 /// Steps at a quarter, half and full resolution.
 pub const STEPS: [usize; 3] = [4, 2, 2];
 /// Levels whose shorter side has fewer pixels are skipped.
-const SMALL: u32 = 24;
+const MIN_SIDE: u32 = 24;
 
 /// Rotation vector and translation in camera space: q becomes exp(rotation) q + translation.
 type Motion = [f32; 6];
@@ -29,7 +29,10 @@ type Motion = [f32; 6];
 fn moved(camera: &Camera, motion: &Motion) -> Camera {
     let turn = Quat::from_scaled_axis(Vec3::new(motion[0], motion[1], motion[2]));
     let motion = Mat4::from_rotation_translation(turn, Vec3::new(motion[3], motion[4], motion[5]));
-    Camera { world_to_camera: motion * camera.world_to_camera, ..camera.clone() }
+    Camera {
+        world_to_camera: motion * camera.world_to_camera,
+        ..camera.clone()
+    }
 }
 
 /// Returns `target`'s camera at the nearby pose from which the engine's scene looks most like the
@@ -49,15 +52,20 @@ pub fn align(
 ) -> Result<Camera> {
     let half = target.halved();
     let quarter = half.halved();
-    let Some(depth) = median_depth(engine, frame(&target.camera))? else { return Ok(target.camera.clone()) };
+    let Some(depth) = median_depth(engine, frame(&target.camera))? else {
+        return Ok(target.camera.clone());
+    };
     let mut pose = target.camera.world_to_camera;
     for (level, steps) in [&quarter, &half, target].into_iter().zip(steps) {
-        if level.camera.width.min(level.camera.height) < SMALL {
+        if level.camera.width.min(level.camera.height) < MIN_SIDE {
             continue;
         }
-        let mut camera = Camera { world_to_camera: pose, ..level.camera.clone() };
+        let mut camera = Camera {
+            world_to_camera: pose,
+            ..level.camera.clone()
+        };
         let mut damping = 1e-3;
-        let mut render = |camera: &Camera| compared(engine, frame(camera), level, exposure);
+        let mut render = |camera: &Camera| residuals_of(engine, frame(camera), level, exposure);
         let mut now = render(&camera)?;
         // The pose from the coarser level may fit this level worse than the given pose.
         let given = render(&level.camera)?;
@@ -65,15 +73,23 @@ pub fn align(
             (camera, now) = (level.camera.clone(), given);
         }
         for _ in 0..steps {
-            let pixel = NUDGE / camera.fx;
-            let sizes = [pixel, pixel, pixel, pixel * depth, pixel * depth, pixel * depth];
+            let pixel = DIFFERENCE_PX / camera.fx;
+            let sizes = [
+                pixel,
+                pixel,
+                pixel,
+                pixel * depth,
+                pixel * depth,
+                pixel * depth,
+            ];
             let mut slopes = Vec::with_capacity(6);
             for (k, size) in sizes.into_iter().enumerate() {
                 let mut motion = Motion::default();
                 motion[k] = size;
                 slopes.push(render(&moved(&camera, &motion))?);
             }
-            let (mut normal, mut right) = (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
+            let (mut normal, mut right) =
+                (SMatrix::<f64, 6, 6>::zeros(), SVector::<f64, 6>::zeros());
             for (p, r) in now.iter().enumerate() {
                 let row = SVector::<f32, 6>::from_fn(|k, _| slopes[k][p] - r);
                 let weight = weight(*r);
@@ -81,7 +97,9 @@ pub fn align(
                 right -= (row * (weight * r)).cast::<f64>();
             }
             (0..6).for_each(|k| normal[(k, k)] = normal[(k, k)] * (1.0 + damping) + 1e-12);
-            let Some(step) = normal.cholesky().map(|factors| factors.solve(&right)) else { break };
+            let Some(step) = normal.cholesky().map(|factors| factors.solve(&right)) else {
+                break;
+            };
             let next = moved(&camera, &std::array::from_fn(|k| step[k] as f32 * sizes[k]));
             let then = render(&next)?;
             if cost(&then) < cost(&now) {
@@ -92,7 +110,10 @@ pub fn align(
         }
         pose = camera.world_to_camera;
     }
-    Ok(Camera { world_to_camera: pose, ..target.camera.clone() })
+    Ok(Camera {
+        world_to_camera: pose,
+        ..target.camera.clone()
+    })
 }
 
 /// Moves all cameras by one rigid motion that restores their mean pose. Photos do not determine
@@ -101,41 +122,83 @@ pub(crate) fn keep_mean(before: &[Camera], after: &mut [Camera]) {
     let n = before.len().max(1) as f32;
     let middle = before.iter().map(Camera::centre).sum::<Vec3>() / n;
     // Rigid motion M of the world for each camera, with after * M = before.
-    let motion = |(before, after): (&Camera, &Camera)| after.world_to_camera.inverse() * before.world_to_camera;
+    let motion = |(before, after): (&Camera, &Camera)| {
+        after.world_to_camera.inverse() * before.world_to_camera
+    };
     let (mut turn, mut shift) = (Vec3::ZERO, Vec3::ZERO);
     for motion in before.iter().zip(after.iter()).map(motion) {
         turn += Quat::from_mat4(&motion).to_scaled_axis() / n;
         shift += (motion.transform_point3(middle) - middle) / n;
     }
-    let back = Mat4::from_translation(middle + shift) * Mat4::from_quat(Quat::from_scaled_axis(turn)) * Mat4::from_translation(-middle);
-    after.iter_mut().for_each(|camera| camera.world_to_camera *= back);
+    let back = Mat4::from_translation(middle + shift)
+        * Mat4::from_quat(Quat::from_scaled_axis(turn))
+        * Mat4::from_translation(-middle);
+    after
+        .iter_mut()
+        .for_each(|camera| camera.world_to_camera *= back);
 }
 
 fn weight(residual: f32) -> f32 {
-    1.0 / (1.0 + (residual / SOFT).powi(2))
+    1.0 / (1.0 + (residual / RESIDUAL_SCALE).powi(2))
 }
 
 fn cost(residuals: &[f32]) -> f64 {
-    residuals.iter().map(|r| f64::from((r / SOFT).powi(2)).ln_1p()).sum()
+    residuals
+        .iter()
+        .map(|r| f64::from((r / RESIDUAL_SCALE).powi(2)).ln_1p())
+        .sum()
 }
 
 /// Returns rendered minus photographed colour, `[channel][pixel]`; 0 at pixels that do not count.
-fn compared(engine: &mut dyn Engine, view: View, target: &Target, exposure: &Exposure) -> Result<Vec<f32>> {
+fn residuals_of(
+    engine: &mut dyn Engine,
+    view: View,
+    target: &Target,
+    exposure: &Exposure,
+) -> Result<Vec<f32>> {
     let frame = engine.render(view, Channels::Color)?;
     let difference = |(c, value, packed): (usize, &f32, &u32)| {
         let bytes = packed.to_le_bytes();
         let shown = exposure.gain[c] * value + exposure.offset[c];
-        if bytes[3] == 255 { shown - f32::from(bytes[c]) / 255.0 } else { 0.0 }
+        if bytes[3] == 255 {
+            shown - f32::from(bytes[c]) / 255.0
+        } else {
+            0.0
+        }
     };
-    let of_channel = |c: usize| frame.channels(c, c + 1).iter().zip(&target.image.color).map(move |(v, p)| (c, v, p)).collect::<Vec<_>>();
-    Ok((0..3).flat_map(|c| of_channel(c).into_iter().map(difference).collect::<Vec<_>>()).collect())
+    let of_channel = |c: usize| {
+        frame
+            .channels(c, c + 1)
+            .iter()
+            .zip(&target.image.color)
+            .map(move |(v, p)| (c, v, p))
+            .collect::<Vec<_>>()
+    };
+    Ok((0..3)
+        .flat_map(|c| {
+            of_channel(c)
+                .into_iter()
+                .map(difference)
+                .collect::<Vec<_>>()
+        })
+        .collect())
 }
 
 /// Returns the median depth of the pixels whose transmittance is below 0.5; `None` if there are
 /// none.
 fn median_depth(engine: &mut dyn Engine, view: View) -> Result<Option<f32>> {
-    let frame = engine.render(View { depth_as_feature: 1, ..view }, Channels::Feature)?;
-    let solid = frame.channels(3, 4).iter().zip(frame.channels(6, 7)).filter(|(_, t)| **t < 0.5);
+    let frame = engine.render(
+        View {
+            depth_as_feature: 1,
+            ..view
+        },
+        Channels::Feature,
+    )?;
+    let solid = frame
+        .channels(3, 4)
+        .iter()
+        .zip(frame.channels(6, 7))
+        .filter(|(_, t)| **t < 0.5);
     let mut depths: Vec<f32> = solid.map(|(z, t)| z / (1.0 - t)).collect();
     depths.sort_by(f32::total_cmp);
     Ok(depths.get(depths.len() / 2).copied())

@@ -3,8 +3,8 @@
 //! The scene first grows up to the limit. Then each Gaussian is scored by how much the training
 //! views would change without it alone, as in Optimal Brain Damage (LeCun et al. 1990); see
 //! `change.rs`. Gaussians are removed in ascending order of their scores, while the sum stays below
-//! `AFFORDABLE` times the squared error of the views. Fewer are removed if the removal costs more
-//! than `AT_ONCE` dB.
+//! `MAX_REMOVED_SHARE` times the squared error of the views. Fewer are removed if the removal costs more
+//! than `MAX_REMOVAL_COST` dB.
 //!
 //! The limit is a share of the error. So an accurate scene keeps faint Gaussians, and an inaccurate
 //! one loses those that could only fit noise. Together, the removed Gaussians cost more than the
@@ -15,10 +15,10 @@ use serde::{Deserialize, Serialize};
 
 /// Largest sum of the scores removed at once, as a share of the squared error of the training
 /// views.
-const AFFORDABLE: f64 = 0.05;
+const MAX_REMOVED_SHARE: f64 = 0.05;
 /// Largest loss of PSNR right after a removal, in dB: twice the squared error. Where a scene fits
 /// its photos badly, nearly all Gaussians are affordable one by one, but not together.
-const AT_ONCE: f64 = 3.01;
+const MAX_REMOVAL_COST: f64 = 3.01;
 /// Number of times that the share is halved before nothing is removed.
 const HALVINGS: usize = 9;
 /// Largest loss of PSNR on the validation views when the SH degree is lowered, in dB.
@@ -27,11 +27,11 @@ pub const DEGREE_LOSS: f64 = 0.02;
 pub(crate) const WATCHED: usize = 10;
 /// With fewer views left to train on, there are no validation views: of 28 views, holding out three
 /// cost 1.7 dB.
-const FEW: usize = 40;
+const MIN_TRAINED_VIEWS: usize = 40;
 
 /// Returns whether training view `index` of `count` is a validation view while the scene grows.
 pub(crate) fn is_watched(index: usize, count: usize) -> bool {
-    count >= FEW + count / WATCHED && index % WATCHED == WATCHED / 2
+    count >= MIN_TRAINED_VIEWS + count / WATCHED && index % WATCHED == WATCHED / 2
 }
 
 /// A removal of Gaussians and its cost, for reports.
@@ -51,22 +51,27 @@ pub struct Removal {
 }
 
 impl Removal {
-    /// Returns whether it costs at most `AT_ONCE` dB, or the cost is unknown.
-    pub(crate) fn is_bearable(&self) -> bool {
-        self.psnr_before.zip(self.psnr_after).is_none_or(|(before, after)| before - after <= AT_ONCE)
+    /// Returns whether it costs at most `MAX_REMOVAL_COST` dB, or the cost is unknown.
+    pub(crate) fn is_acceptable(&self) -> bool {
+        self.psnr_before
+            .zip(self.psnr_after)
+            .is_none_or(|(before, after)| before - after <= MAX_REMOVAL_COST)
     }
 }
 
 /// Returns candidate sets of Gaussians to keep, by index, in ascending size; the last one is all.
 /// `changes` are the scores.
 pub(crate) fn candidates(changes: &[f32], squared_error: f64) -> impl Iterator<Item = Vec<usize>> {
-    let shares = std::iter::successors(Some(AFFORDABLE), |share| Some(0.5 * share)).take(1 + HALVINGS);
-    shares.map(move |share| needed(changes, share * squared_error)).chain(std::iter::once_with(|| (0..changes.len()).collect()))
+    let shares = std::iter::successors(Some(MAX_REMOVED_SHARE), |share| Some(0.5 * share))
+        .take(1 + HALVINGS);
+    shares
+        .map(move |share| remaining(changes, share * squared_error))
+        .chain(std::iter::once_with(|| (0..changes.len()).collect()))
 }
 
 /// Returns the indices that remain when the smallest changes are removed, up to the sum
 /// `affordable`. Returns all indices if none would remain.
-fn needed(changes: &[f32], affordable: f64) -> Vec<usize> {
+fn remaining(changes: &[f32], affordable: f64) -> Vec<usize> {
     let mut places: Vec<usize> = (0..changes.len()).collect();
     places.sort_by(|&a, &b| changes[a].total_cmp(&changes[b]).then(a.cmp(&b)));
     let mut sum = 0.0;
@@ -90,8 +95,24 @@ mod tests {
 
     #[test]
     fn what_no_photo_shows_goes_and_what_makes_a_difference_stays() {
-        let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
-        let other = Camera::look_at("b", Vec3::new(0.0, 0.0, 4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let camera = Camera::look_at(
+            "a",
+            Vec3::new(0.0, 0.0, -4.0),
+            Vec3::ZERO,
+            Vec3::Y,
+            64,
+            48,
+            0.8,
+        );
+        let other = Camera::look_at(
+            "b",
+            Vec3::new(0.0, 0.0, 4.0),
+            Vec3::ZERO,
+            Vec3::Y,
+            64,
+            48,
+            0.8,
+        );
         let mut scene = Gaussians::default();
         for depth in [0.0, 0.1, 0.2] {
             scene.push_sphere(Vec3::Z * depth, 0.2, 0.99, [0.5; 3]);
@@ -100,35 +121,58 @@ mod tests {
         scene.push_sphere(Vec3::new(0.5, 0.5, 0.0), 0.05, 0.01, [0.5; 3]);
         let [camera, other] = [camera, other].map(|c| View::new(&c, scene.len(), 0));
         let mut changes = Changes::of(&scene);
-        changes.see(&camera, None);
-        let one = changes.each.clone();
-        changes.see(&other, None);
-        let both = changes.each;
+        changes.add_view(&camera, None);
+        let one = changes.scores.clone();
+        changes.add_view(&other, None);
+        let both = changes.scores;
         // The first view does not see the small Gaussian. Both views see the faint one, but hardly.
-        assert!(one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3], "{one:?} {both:?}");
+        assert!(
+            one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3],
+            "{one:?} {both:?}"
+        );
         let error = f64::from(both[4]);
-        assert_eq!(needed(&one, 2.0 * error), [0, 1, 2]);
-        assert_eq!(needed(&both, 2.0 * error), [0, 1, 2, 3]);
-        assert_eq!(needed(&both, 0.5 * error), [0, 1, 2, 3, 4]);
+        assert_eq!(remaining(&one, 2.0 * error), [0, 1, 2]);
+        assert_eq!(remaining(&both, 2.0 * error), [0, 1, 2, 3]);
+        assert_eq!(remaining(&both, 0.5 * error), [0, 1, 2, 3, 4]);
     }
 
     #[test]
     fn less_and_less_goes_until_a_removal_is_bearable() {
         let changes: Vec<f32> = (0..100).map(|i| 0.01 * i as f32).collect();
-        let stay: Vec<usize> = candidates(&changes, 100.0).map(|places| places.len()).collect();
+        let stay: Vec<usize> = candidates(&changes, 100.0)
+            .map(|places| places.len())
+            .collect();
         assert_eq!(stay.len(), 2 + HALVINGS);
         assert!(stay.is_sorted() && stay[0] < stay[1], "{stay:?}");
         assert_eq!(stay[1 + HALVINGS], 100, "the last candidate keeps all");
-        let removal = |psnr_after| Removal { iteration: 1, before: 2, after: 1, psnr_before: Some(20.0), psnr_after };
-        let bearable = [Some(17.5), Some(16.5), None].map(|after| removal(after).is_bearable());
+        let removal = |psnr_after| Removal {
+            iteration: 1,
+            before: 2,
+            after: 1,
+            psnr_before: Some(20.0),
+            psnr_after,
+        };
+        let bearable = [Some(17.5), Some(16.5), None].map(|after| removal(after).is_acceptable());
         assert_eq!(bearable, [true, false, true]);
     }
 
     #[test]
     fn what_goes_adds_up_to_what_is_affordable() {
-        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 1.0), [0, 4]);
-        assert_eq!(needed(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0), [0, 2, 3, 4], "a Gaussian without effect is always removed");
-        assert_eq!(needed(&[0.3; 5], 1.0), [3, 4], "of equal changes, the first are removed");
-        assert_eq!(needed(&[0.3; 3], 1.0), [0, 1, 2], "if all could be removed, all are kept");
+        assert_eq!(remaining(&[0.5, 0.0, 0.4, 0.3, 9.0], 1.0), [0, 4]);
+        assert_eq!(
+            remaining(&[0.5, 0.0, 0.4, 0.3, 9.0], 0.0),
+            [0, 2, 3, 4],
+            "a Gaussian without effect is always removed"
+        );
+        assert_eq!(
+            remaining(&[0.3; 5], 1.0),
+            [3, 4],
+            "of equal changes, the first are removed"
+        );
+        assert_eq!(
+            remaining(&[0.3; 3], 1.0),
+            [0, 1, 2],
+            "if all could be removed, all are kept"
+        );
     }
 }

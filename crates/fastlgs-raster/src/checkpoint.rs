@@ -59,18 +59,30 @@ pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -
     let keep = tensors_path(path, course.iteration);
     save_tensors(&keep, &tensors)?;
     fs::write_json(&path.with_extension("json"), course)?;
-    tensors_of(path).filter(|old| *old != keep).for_each(|old| drop(std::fs::remove_file(old)));
+    tensors_of(path)
+        .filter(|old| *old != keep)
+        .for_each(|old| drop(std::fs::remove_file(old)));
     Ok(())
 }
 
 /// Returns the tensor files of a checkpoint: `NAME.ITERATION.safetensors` beside `path`.
 fn tensors_of(path: &Path) -> impl Iterator<Item = PathBuf> {
-    let entries = std::fs::read_dir(path.parent().unwrap_or(Path::new("."))).into_iter().flatten().flatten();
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let entries = std::fs::read_dir(path.parent().unwrap_or(Path::new(".")))
+        .into_iter()
+        .flatten()
+        .flatten();
+    let name = path
+        .file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
     entries.map(|entry| entry.path()).filter(move |file| {
         let own = file.file_name().unwrap_or_default().to_string_lossy();
-        let iteration = own.strip_prefix(&name).and_then(|rest| rest.strip_prefix('.')?.strip_suffix(".safetensors"));
-        iteration.is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit()))
+        let iteration = own
+            .strip_prefix(&name)
+            .and_then(|rest| rest.strip_prefix('.')?.strip_suffix(".safetensors"));
+        iteration
+            .is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit()))
     })
 }
 
@@ -90,12 +102,25 @@ pub(crate) fn load(path: &Path) -> Result<Option<(Course, State, Vec<f32>)>> {
     let tensors_path = tensors_path(path, course.iteration);
     let mut tensors = load_tensors(&tensors_path)?;
     let mut take = |name: &str, rows: usize| {
-        let found = tensors.remove(name).filter(|t| t.0 == [rows, course.gaussians]).map(|t| t.1);
-        found.ok_or_else(|| fastlgs_core::Error::format(&tensors_path, format!("tensor '{name}' is missing or has the wrong shape; delete the checkpoint")))
+        let found = tensors
+            .remove(name)
+            .filter(|t| t.0 == [rows, course.gaussians])
+            .map(|t| t.1);
+        found.ok_or_else(|| {
+            fastlgs_core::Error::format(
+                &tensors_path,
+                format!("tensor '{name}' is missing or has the wrong shape; delete the checkpoint"),
+            )
+        })
     };
     let sh_degree = course.config.sh_degree;
     let rows = channels(sh_degree);
-    let state = State { sh_degree, params: take("params", rows)?, moment1: take("moment1", rows)?, moment2: take("moment2", rows)? };
+    let state = State {
+        sh_degree,
+        params: take("params", rows)?,
+        moment1: take("moment1", rows)?,
+        moment2: take("moment2", rows)?,
+    };
     let stats = take("stats", 2)?;
     Ok(Some((course, state, stats)))
 }

@@ -2,7 +2,7 @@
 //! (3DGS, section 5).
 
 use fastlgs_core::Gaussians;
-use fastlgs_core::curve::along_curve;
+use fastlgs_core::curve::morton_order;
 use fastlgs_core::gaussians::{channels, logit, sigmoid};
 use fastlgs_core::rng::Rng;
 use glam::{Quat, Vec3};
@@ -40,7 +40,13 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { gradient: 2e-4, split_scale: 0.01, min_opacity: 0.005, largest: f32::INFINITY, budget: 60_000 }
+        Self {
+            gradient: 2e-4,
+            split_scale: 0.01,
+            min_opacity: 0.005,
+            largest: f32::INFINITY,
+            budget: 60_000,
+        }
     }
 }
 
@@ -60,7 +66,12 @@ impl State {
     pub fn of(scene: &Gaussians) -> Self {
         let params = scene.to_channels();
         let zeros = vec![0.0; params.len()];
-        Self { sh_degree: scene.sh_degree, params, moment1: zeros.clone(), moment2: zeros }
+        Self {
+            sh_degree: scene.sh_degree,
+            params,
+            moment1: zeros.clone(),
+            moment2: zeros,
+        }
     }
 
     /// Returns the number of Gaussians.
@@ -75,7 +86,11 @@ impl State {
 
     fn vec3(&self, channel: usize, i: usize) -> Vec3 {
         let n = self.len();
-        Vec3::new(self.params[channel * n + i], self.params[(channel + 1) * n + i], self.params[(channel + 2) * n + i])
+        Vec3::new(
+            self.params[channel * n + i],
+            self.params[(channel + 1) * n + i],
+            self.params[(channel + 2) * n + i],
+        )
     }
 
     fn opacity(&self, i: usize) -> f32 {
@@ -92,15 +107,27 @@ impl State {
         let n = self.len();
         let pick = |values: &[f32], keep_fresh: bool| {
             let mut picked = vec![0.0; channels(self.sh_degree) * sources.len()];
-            picked.par_chunks_mut(sources.len().max(1)).zip(values.par_chunks(n.max(1))).for_each(|(out, values)| {
-                for (value, &(i, fresh)) in out.iter_mut().zip(sources) {
-                    *value = if fresh && !keep_fresh { 0.0 } else { values[i] };
-                }
-            });
+            picked
+                .par_chunks_mut(sources.len().max(1))
+                .zip(values.par_chunks(n.max(1)))
+                .for_each(|(out, values)| {
+                    for (value, &(i, fresh)) in out.iter_mut().zip(sources) {
+                        *value = if fresh && !keep_fresh { 0.0 } else { values[i] };
+                    }
+                });
             picked
         };
-        let (params, moment1, moment2) = (pick(&self.params, true), pick(&self.moment1, false), pick(&self.moment2, false));
-        Self { sh_degree: self.sh_degree, params, moment1, moment2 }
+        let (params, moment1, moment2) = (
+            pick(&self.params, true),
+            pick(&self.moment1, false),
+            pick(&self.moment2, false),
+        );
+        Self {
+            sh_degree: self.sh_degree,
+            params,
+            moment1,
+            moment2,
+        }
     }
 
     /// Keeps only the Gaussians with the indices `places`, in this order.
@@ -113,13 +140,16 @@ impl State {
     /// images, so a step reads contiguous memory.
     pub(crate) fn sort_along_curve(&mut self) {
         let means: Vec<Vec3> = (0..self.len()).map(|i| self.vec3(0, i)).collect();
-        self.keep(&along_curve(&means));
+        self.keep(&morton_order(&means));
     }
 
     /// Removes Gaussians whose mean lies in free space. Returns how many.
-    pub(crate) fn remove_in(&mut self, free: impl Fn(Vec3) -> bool + Sync) -> usize {
+    pub(crate) fn remove_where(&mut self, free: impl Fn(Vec3) -> bool + Sync) -> usize {
         let n = self.len();
-        let places: Vec<usize> = (0..n).into_par_iter().filter(|&i| !free(self.vec3(0, i))).collect();
+        let places: Vec<usize> = (0..n)
+            .into_par_iter()
+            .filter(|&i| !free(self.vec3(0, i)))
+            .collect();
         if places.len() < n {
             self.keep(&places);
         }
@@ -167,13 +197,25 @@ fn too_coarse(stats: &[f32], threshold: f32, room: usize) -> Vec<usize> {
 
 /// Runs one round: prunes faint, too large and non-finite Gaussians, clones small coarse ones and
 /// splits large coarse ones, within the budget.
-pub fn refine(state: &mut State, stats: &[f32], extent: f32, config: &Config, rng: &mut Rng) -> Counts {
+pub fn refine(
+    state: &mut State,
+    stats: &[f32],
+    extent: f32,
+    config: &Config,
+    rng: &mut Rng,
+) -> Counts {
     let n = state.len();
-    let keeps =
-        |i: usize| state.is_finite(i) && state.opacity(i) >= config.min_opacity && state.largest_scale(i) <= config.largest * extent;
+    let keeps = |i: usize| {
+        state.is_finite(i)
+            && state.opacity(i) >= config.min_opacity
+            && state.largest_scale(i) <= config.largest * extent
+    };
     let keep: Vec<bool> = (0..n).map(keeps).collect();
     let kept = keep.iter().filter(|k| **k).count();
-    let mut counts = Counts { pruned: n - kept, ..Counts::default() };
+    let mut counts = Counts {
+        pruned: n - kept,
+        ..Counts::default()
+    };
     let mut coarse = vec![false; n];
     for i in too_coarse(stats, config.gradient, config.budget.saturating_sub(kept)) {
         coarse[i] = keep[i];
@@ -216,7 +258,11 @@ mod tests {
     fn state(scene: &Gaussians) -> State {
         let state = State::of(scene);
         let ones = vec![1.0; state.params.len()];
-        State { moment1: ones.clone(), moment2: ones, ..state }
+        State {
+            moment1: ones.clone(),
+            moment2: ones,
+            ..state
+        }
     }
 
     #[test]
@@ -229,14 +275,31 @@ mod tests {
         let mut s = state(&scene);
         // Gradient sums, then how often each Gaussian was drawn.
         let stats = [1.0, 1.0, 1.0, 0.0, 10.0, 10.0, 10.0, 10.0];
-        let counts = refine(&mut s, &stats, 1.0, &Config::default(), &mut Rng::new(1, "test"));
-        assert_eq!(counts, Counts { cloned: 1, split: 1, pruned: 1 });
+        let counts = refine(
+            &mut s,
+            &stats,
+            1.0,
+            &Config::default(),
+            &mut Rng::new(1, "test"),
+        );
+        assert_eq!(
+            counts,
+            Counts {
+                cloned: 1,
+                split: 1,
+                pruned: 1
+            }
+        );
         let after = Gaussians::from_channels(&s.params, 0, None);
         assert_eq!(after.len(), 5);
         assert_eq!(after.means[0], after.means[1]);
         assert!((after.log_scales[2].x - (0.5f32 / 1.6).ln()).abs() < 1e-5);
         assert_ne!(after.means[2], after.means[3]);
-        assert_eq!((s.moment1[0], s.moment1[1]), (1.0, 0.0), "a clone starts without momentum");
+        assert_eq!(
+            (s.moment1[0], s.moment1[1]),
+            (1.0, 0.0),
+            "a clone starts without momentum"
+        );
         reset_opacity(&mut s, 0.01);
         assert!((s.opacity(0) - 0.01).abs() < 1e-4);
     }
@@ -246,7 +309,10 @@ mod tests {
         let mut scene = Gaussians::default();
         (0..10).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
         let mut s = state(&scene);
-        let config = Config { budget: 13, ..Config::default() };
+        let config = Config {
+            budget: 13,
+            ..Config::default()
+        };
         refine(&mut s, &[1.0; 20], 1.0, &config, &mut Rng::new(1, "test"));
         assert_eq!(s.len(), 13);
     }
@@ -260,7 +326,17 @@ mod tests {
         let mut s = state(&scene);
         assert_eq!(s.keep_finite(), 2);
         let mut s = state(&scene);
-        assert_eq!(refine(&mut s, &[0.0; 8], 1.0, &Config::default(), &mut Rng::new(1, "test")).pruned, 2);
+        assert_eq!(
+            refine(
+                &mut s,
+                &[0.0; 8],
+                1.0,
+                &Config::default(),
+                &mut Rng::new(1, "test")
+            )
+            .pruned,
+            2
+        );
         assert_eq!(s.len(), 2);
     }
 }

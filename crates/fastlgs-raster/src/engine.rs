@@ -1,7 +1,7 @@
 //! The interface of both engines: GPU and CPU.
 
 use crate::channels::Channels;
-use crate::cpu::RUN;
+use crate::cpu::ROWS_PER_INVOCATION;
 use crate::density::State;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
@@ -35,19 +35,30 @@ pub(crate) fn rendered(channels: Channels, channel: usize) -> bool {
 impl Frame {
     /// Returns a frame of the view's size, filled with 0.
     pub(crate) fn new(view: &View) -> Self {
-        Self { width: view.size[0], height: view.size[1], data: vec![0.0; 8 * view.pixels()], pairs: view.pairs }
+        Self {
+            width: view.size[0],
+            height: view.size[1],
+            data: vec![0.0; 8 * view.pixels()],
+            pairs: view.pairs,
+        }
     }
 
     /// Copies the rendered channels of a view into a frame. `row(channel, y)` returns a row from
     /// the left border on, which may be padded.
-    pub(crate) fn gathered<'a>(view: &View, channels: Channels, row: impl Fn(usize, u32) -> &'a [f32] + Sync) -> Self {
+    pub(crate) fn gathered<'a>(
+        view: &View,
+        channels: Channels,
+        row: impl Fn(usize, u32) -> &'a [f32] + Sync,
+    ) -> Self {
         let (mut frame, w) = (Self::new(view), view.size[0] as usize);
         let planes = frame.data.par_chunks_exact_mut(view.pixels()).enumerate();
-        planes.filter(|(channel, _)| rendered(channels, *channel)).for_each(|(channel, plane)| {
-            for (y, out) in plane.chunks_exact_mut(w).enumerate() {
-                out.copy_from_slice(&row(channel, y as u32)[..w]);
-            }
-        });
+        planes
+            .filter(|(channel, _)| rendered(channels, *channel))
+            .for_each(|(channel, plane)| {
+                for (y, out) in plane.chunks_exact_mut(w).enumerate() {
+                    out.copy_from_slice(&row(channel, y as u32)[..w]);
+                }
+            });
         frame
     }
 
@@ -72,7 +83,12 @@ pub struct TargetImage {
 
 /// Packs a pixel of a target image. The loss ignores pixels that do not count.
 pub fn pack(values: [u8; 3], counts: bool) -> u32 {
-    u32::from_le_bytes([values[0], values[1], values[2], if counts { 255 } else { 0 }])
+    u32::from_le_bytes([
+        values[0],
+        values[1],
+        values[2],
+        if counts { 255 } else { 0 },
+    ])
 }
 
 impl TargetImage {
@@ -103,7 +119,10 @@ pub struct Exposure {
 
 impl Default for Exposure {
     fn default() -> Self {
-        Self { gain: [1.0; 3], offset: [0.0; 3] }
+        Self {
+            gain: [1.0; 3],
+            offset: [0.0; 3],
+        }
     }
 }
 
@@ -180,7 +199,7 @@ pub trait Engine: Send {
     /// When the image does not fit the device.
     fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()>;
     /// Removes the target image of view `id` from the device.
-    fn forget_target(&mut self, id: usize);
+    fn remove_target(&mut self, id: usize);
     /// Renders a frame; `view.gaussians` must equal [`Self::len`].
     ///
     /// # Errors
@@ -218,7 +237,11 @@ pub trait Engine: Send {
 /// Checks that view, engine and `ids` have the same number of Gaussians, and more than 0.
 pub(crate) fn check_ids(view: &View, ids: &[u16], n: usize) -> Result<()> {
     if view.gaussians as usize != n || ids.len() != n || n == 0 {
-        let reason = format!("the view has {} Gaussians, there are {} object ids, and the engine holds {n} Gaussians; all three must be equal", view.gaussians, ids.len());
+        let reason = format!(
+            "the view has {} Gaussians, there are {} object ids, and the engine holds {n} Gaussians; all three must be equal",
+            view.gaussians,
+            ids.len()
+        );
         return Err(Error::Invalid(reason));
     }
     Ok(())
@@ -243,18 +266,36 @@ pub struct Memory {
 /// (3..6).
 pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
     let per_pixel = 1.0 / (3.0 * view.pixels() as f32);
-    let trained = |c: &usize| if *c < 3 { options.channels.color() } else { options.channels.feature() };
+    let trained = |c: &usize| {
+        if *c < 3 {
+            options.channels.color()
+        } else {
+            options.channels.feature()
+        }
+    };
     (0..6usize)
         .filter(trained)
         .map(|channel| Plane {
             size: view.size,
             quads: 2 * view.tiles[0],
-            rows: RUN as u32 * view.tiles[1],
+            rows: ROWS_PER_INVOCATION as u32 * view.tiles[1],
             channel: channel as u32,
-            scale: if channel < 3 { per_pixel } else { options.feature_weight * per_pixel },
+            scale: if channel < 3 {
+                per_pixel
+            } else {
+                options.feature_weight * per_pixel
+            },
             lambda: options.lambda,
-            gain: if channel < 3 { options.exposure.gain[channel] } else { 1.0 },
-            offset: if channel < 3 { options.exposure.offset[channel] } else { 0.0 },
+            gain: if channel < 3 {
+                options.exposure.gain[channel]
+            } else {
+                1.0
+            },
+            offset: if channel < 3 {
+                options.exposure.offset[channel]
+            } else {
+                0.0
+            },
             unused: [0; 3],
         })
         .collect()
@@ -262,15 +303,28 @@ pub(crate) fn planes(view: &View, options: &StepOptions) -> Vec<Plane> {
 
 /// Computes the losses from the sums of `shaders/ssim_columns.wgsl` and
 /// `shaders/loss_gradient.wgsl`.
-pub(crate) fn losses_of(view: &View, channels: Channels, ssim: &[f32], sums: &[f32]) -> Losses {
-    let per_channel = (view.tiles[1] * view.tiles[0] * RUN as u32) as usize;
+pub(crate) fn losses_from_sums(
+    view: &View,
+    channels: Channels,
+    ssim: &[f32],
+    sums: &[f32],
+) -> Losses {
+    let per_channel = (view.tiles[1] * view.tiles[0] * ROWS_PER_INVOCATION as u32) as usize;
     let sum = |sums: &[f32], plane: usize| -> f64 {
         let part = &sums[plane * per_channel..(plane + 1) * per_channel];
         part.iter().map(|v| f64::from(*v)).sum()
     };
-    let mean = |sums: &[f32], from: usize| (from..from + 3).map(|p| sum(sums, p)).sum::<f64>() / (3.0 * view.pixels() as f64);
+    let mean = |sums: &[f32], from: usize| {
+        (from..from + 3).map(|p| sum(sums, p)).sum::<f64>() / (3.0 * view.pixels() as f64)
+    };
     let (color, feature) = (channels.color(), channels.feature());
-    let three = |from: usize| if color { [0, 1, 2].map(|c| sum(sums, from + c)) } else { [0.0; 3] };
+    let three = |from: usize| {
+        if color {
+            [0, 1, 2].map(|c| sum(sums, from + c))
+        } else {
+            [0.0; 3]
+        }
+    };
     let trained = |c: usize| if c < 3 { color } else { feature };
     Losses {
         color_l1: if color { mean(sums, 0) } else { 0.0 },

@@ -22,31 +22,31 @@ use rayon::prelude::*;
 /// shows.
 pub const FEW_VIEWS: usize = 25;
 /// Share of the depth of a point up to which space is free.
-const BEFORE: f32 = 0.85;
+const FREE_SHARE: f32 = 0.85;
 /// Longer side of the depth maps in pixels: the resolution at which photos are compared for points.
-const SIDE: u32 = 240;
+const DEPTH_MAP_SIDE: u32 = 240;
 /// Distance in pixels up to which a point frees the pixels around its own.
-const AROUND: usize = 1;
+const FREE_RADIUS: usize = 1;
 /// Distance in pixels up to which a point limits the free space of the pixels around its own. Thin
 /// objects have few points, and between these only the wall behind has points. With 0, views of
 /// wires lose 1.2 dB; with 8, nothing.
-const BESIDE: usize = 8;
+const LIMIT_RADIUS: usize = 8;
 /// Cameras that must agree on a point. Two are too few: two lines of sight meet wherever both
 /// cameras look.
-const AGREE: usize = 3;
+const MIN_CAMERAS: usize = 3;
 /// Share of the median depth of the first Gaussians up to which space near a camera is free. It is
 /// less if more than one in `OUTLIER` of them would lie in it.
-const NEAR: f32 = 0.2;
+const NEAR_SHARE: f32 = 0.2;
 /// One of this many first Gaussians may be wrong.
 const OUTLIER: usize = 50;
 /// Fewest visible Gaussians that determine near space; also the most Gaussians around a camera that
 /// may be wrong.
-const FEW: usize = 50;
+const MIN_GAUSSIANS: usize = 50;
 
 /// The free space of a camera.
 #[derive(Clone, Debug)]
-struct Free {
-    /// At most [`SIDE`] pixels wide and high.
+struct CameraFreeSpace {
+    /// At most [`DEPTH_MAP_SIDE`] pixels wide and high.
     camera: Camera,
     /// Depth up to which space is free at each pixel, row by row.
     depth: Vec<f32>,
@@ -55,39 +55,71 @@ struct Free {
     radius: f32,
 }
 
-impl Free {
+impl CameraFreeSpace {
     /// Computes the free space of a camera that sees the points `seen`. `means` are the centres of
     /// the first Gaussians.
     fn of(camera: &Camera, means: &[Vec3], seen: &[Vec3]) -> Self {
-        let camera = camera.shrunk_to(SIDE);
-        let depths = sorted(means.iter().filter_map(|mean| camera.see(*mean)).map(|(_, depth)| depth));
+        let camera = camera.shrunk_to(DEPTH_MAP_SIDE);
+        let depths = sorted(
+            means
+                .iter()
+                .filter_map(|mean| camera.pixel_and_depth(*mean))
+                .map(|(_, depth)| depth),
+        );
         let distances = sorted(means.iter().map(|mean| mean.distance(camera.centre())));
         let [mut near, mut radius] = [0.0; 2];
-        if depths.len() >= FEW {
-            let share = NEAR * depths[depths.len() / 2];
+        if depths.len() >= MIN_GAUSSIANS {
+            let share = NEAR_SHARE * depths[depths.len() / 2];
             near = share.min(depths[depths.len() / OUTLIER]);
             // Other cameras may see what this one does not, so only few of these Gaussians can be
             // wrong.
-            radius = share.min(distances[(distances.len() / OUTLIER).min(FEW)]);
+            radius = share.min(distances[(distances.len() / OUTLIER).min(MIN_GAUSSIANS)]);
         }
         let pixels = (camera.width * camera.height) as usize;
         let (mut known, mut nearest) = (vec![false; pixels], vec![f32::INFINITY; pixels]);
-        for (pixel, depth) in seen.iter().filter_map(|point| camera.see(*point)) {
-            around(&camera, pixel, AROUND).for_each(|at| known[at] = true);
-            around(&camera, pixel, BESIDE).for_each(|at| nearest[at] = nearest[at].min(depth));
+        for (pixel, depth) in seen
+            .iter()
+            .filter_map(|point| camera.pixel_and_depth(*point))
+        {
+            neighbourhood(&camera, pixel, FREE_RADIUS).for_each(|at| known[at] = true);
+            neighbourhood(&camera, pixel, LIMIT_RADIUS)
+                .for_each(|at| nearest[at] = nearest[at].min(depth));
         }
-        let depth = known.into_iter().zip(nearest).map(|(known, nearest)| if known { near.max(BEFORE * nearest) } else { near }).collect();
-        Self { centre: camera.centre(), camera, depth, radius }
+        let depth = known
+            .into_iter()
+            .zip(nearest)
+            .map(|(known, nearest)| {
+                if known {
+                    near.max(FREE_SHARE * nearest)
+                } else {
+                    near
+                }
+            })
+            .collect();
+        Self {
+            centre: camera.centre(),
+            camera,
+            depth,
+            radius,
+        }
     }
 
-    fn holds(&self, place: Vec3) -> bool {
-        let before = || self.camera.see(place).is_some_and(|(pixel, depth)| depth < self.depth[pixel]);
+    fn contains(&self, place: Vec3) -> bool {
+        let before = || {
+            self.camera
+                .pixel_and_depth(place)
+                .is_some_and(|(pixel, depth)| depth < self.depth[pixel])
+        };
         self.centre.distance(place) < self.radius || before()
     }
 }
 
 /// Returns the indices of the pixels up to `reach` columns and rows from a pixel, itself included.
-pub(crate) fn around(camera: &Camera, pixel: usize, reach: usize) -> impl Iterator<Item = usize> {
+pub(crate) fn neighbourhood(
+    camera: &Camera,
+    pixel: usize,
+    reach: usize,
+) -> impl Iterator<Item = usize> {
     let [width, height] = [camera.width, camera.height].map(|side| side as usize);
     let beside = |at: usize, side: usize| at.saturating_sub(reach)..(at + reach + 1).min(side);
     let (columns, rows) = (beside(pixel % width, width), beside(pixel / width, height));
@@ -96,7 +128,7 @@ pub(crate) fn around(camera: &Camera, pixel: usize, reach: usize) -> impl Iterat
 
 /// The free space of all cameras.
 #[derive(Clone, Debug, Default)]
-pub struct FreeSpace(Vec<Free>);
+pub struct FreeSpace(Vec<CameraFreeSpace>);
 
 impl FreeSpace {
     /// Computes the free space of `cameras` from the centres of the first Gaussians and from
@@ -107,19 +139,28 @@ impl FreeSpace {
             return Self::default();
         }
         let mut seen = vec![Vec::new(); cameras.len()];
-        for point in points.iter().filter(|point| point.seen_by.len() >= AGREE) {
+        for point in points
+            .iter()
+            .filter(|point| point.seen_by.len() >= MIN_CAMERAS)
+        {
             for view in &point.seen_by {
                 if let Some(seen) = seen.get_mut(*view as usize) {
                     seen.push(point.position);
                 }
             }
         }
-        Self(cameras.par_iter().zip(&seen).map(|(camera, seen)| Free::of(camera, means, seen)).collect())
+        Self(
+            cameras
+                .par_iter()
+                .zip(&seen)
+                .map(|(camera, seen)| CameraFreeSpace::of(camera, means, seen))
+                .collect(),
+        )
     }
 
     /// Returns whether a position lies in free space.
     pub(crate) fn holds(&self, place: Vec3) -> bool {
-        self.0.iter().any(|free| free.holds(place))
+        self.0.iter().any(|free| free.contains(place))
     }
 }
 
@@ -136,68 +177,149 @@ mod tests {
     use glam::Vec2;
 
     fn camera(x: f32) -> Camera {
-        Camera::look_at("a", Vec3::new(x, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8)
+        Camera::look_at(
+            "a",
+            Vec3::new(x, 0.0, -4.0),
+            Vec3::ZERO,
+            Vec3::Y,
+            64,
+            48,
+            0.8,
+        )
     }
 
     fn point(position: Vec3, seen_by: &[u32]) -> SfmPoint {
-        SfmPoint { position, color: [9; 3], seen_by: seen_by.to_vec() }
+        SfmPoint {
+            position,
+            color: [9; 3],
+            seen_by: seen_by.to_vec(),
+        }
     }
 
     #[test]
     fn what_a_camera_sees_a_point_through_is_free() {
         // The second camera stands aside, the third looks away.
-        let away = Camera::look_at("b", Vec3::new(0.0, 0.0, -4.0), Vec3::new(0.0, 0.0, -8.0), Vec3::Y, 64, 48, 0.8);
+        let away = Camera::look_at(
+            "b",
+            Vec3::new(0.0, 0.0, -4.0),
+            Vec3::new(0.0, 0.0, -8.0),
+            Vec3::Y,
+            64,
+            48,
+            0.8,
+        );
         let cameras = [camera(0.0), camera(3.0), away];
-        let free = FreeSpace::of(&cameras, &[], &[point(Vec3::ZERO, &[0, 2, 7]), point(4.0 * Vec3::Z, &[1, 2, 7])]);
-        assert!(free.holds(-Vec3::Z) && free.holds(-3.9 * Vec3::Z), "in front of the nearer point, seen from the first camera");
+        let free = FreeSpace::of(
+            &cameras,
+            &[],
+            &[
+                point(Vec3::ZERO, &[0, 2, 7]),
+                point(4.0 * Vec3::Z, &[1, 2, 7]),
+            ],
+        );
+        assert!(
+            free.holds(-Vec3::Z) && free.holds(-3.9 * Vec3::Z),
+            "in front of the nearer point, seen from the first camera"
+        );
         assert!(!free.holds(-0.5 * Vec3::Z), "too near to the point");
-        assert!(!free.holds(Vec3::Z) && !free.holds(-5.0 * Vec3::Z), "behind the point, and behind the camera");
-        assert!(free.holds(Vec3::new(1.5, 0.0, 0.0)), "in front of the farther point, seen from the second camera");
+        assert!(
+            !free.holds(Vec3::Z) && !free.holds(-5.0 * Vec3::Z),
+            "behind the point, and behind the camera"
+        );
+        assert!(
+            free.holds(Vec3::new(1.5, 0.0, 0.0)),
+            "in front of the farther point, seen from the second camera"
+        );
         for seen_by in [vec![], vec![0, 1]] {
-            assert!(!FreeSpace::of(&cameras, &[], &[point(Vec3::ZERO, &seen_by)]).holds(-Vec3::Z), "too few cameras agree: {seen_by:?}");
+            assert!(
+                !FreeSpace::of(&cameras, &[], &[point(Vec3::ZERO, &seen_by)]).holds(-Vec3::Z),
+                "too few cameras agree: {seen_by:?}"
+            );
         }
         let many: Vec<Camera> = (0..FEW_VIEWS).map(|k| camera(0.01 * k as f32)).collect();
-        assert!(!FreeSpace::of(&many, &[], &[point(Vec3::ZERO, &[0, 1, 2])]).holds(-Vec3::Z), "with many views no space is free");
+        assert!(
+            !FreeSpace::of(&many, &[], &[point(Vec3::ZERO, &[0, 1, 2])]).holds(-Vec3::Z),
+            "with many views no space is free"
+        );
     }
 
     #[test]
     fn a_point_speaks_for_few_pixels_and_limits_more() {
         // Twice as wide as the depth maps.
-        let wide = Camera::look_at("a", -4.0 * Vec3::Z, Vec3::ZERO, Vec3::Y, 2 * SIDE, SIDE, 0.8);
-        let sight = wide.shrunk_to(SIDE);
+        let wide = Camera::look_at(
+            "a",
+            -4.0 * Vec3::Z,
+            Vec3::ZERO,
+            Vec3::Y,
+            2 * DEPTH_MAP_SIDE,
+            DEPTH_MAP_SIDE,
+            0.8,
+        );
+        let sight = wide.shrunk_to(DEPTH_MAP_SIDE);
         let at = |column: f32, depth: f32| {
-            let middle = Vec2::new(column + 0.5, (SIDE / 4) as f32 + 0.5);
-            sight.world_to_camera.inverse().transform_point3(sight.ray(middle) * depth)
+            let middle = Vec2::new(column + 0.5, (DEPTH_MAP_SIDE / 4) as f32 + 0.5);
+            sight
+                .world_to_camera
+                .inverse()
+                .transform_point3(sight.ray(middle) * depth)
         };
         let free = |points: &[(f32, f32)]| {
-            let points: Vec<SfmPoint> = points.iter().map(|(column, depth)| point(at(*column, *depth), &[0, 1, 2])).collect();
+            let points: Vec<SfmPoint> = points
+                .iter()
+                .map(|(column, depth)| point(at(*column, *depth), &[0, 1, 2]))
+                .collect();
             FreeSpace::of(std::slice::from_ref(&wide), &[], &points)
         };
         let one = free(&[(100.0, 4.0)]);
-        let reach = AROUND as f32;
+        let reach = FREE_RADIUS as f32;
         assert!(one.holds(at(100.0 - reach, 3.0)) && one.holds(at(100.0 + reach, 3.0)));
-        assert!(!one.holds(at(99.0 - reach, 3.0)) && !one.holds(at(101.0 + reach, 3.0)), "no point is near these pixels");
+        assert!(
+            !one.holds(at(99.0 - reach, 3.0)) && !one.holds(at(101.0 + reach, 3.0)),
+            "no point is near these pixels"
+        );
         let two = |apart: f32| free(&[(100.0, 4.0), (100.0 + apart, 2.0)]);
-        let (near, far) = (two(BESIDE as f32), two((BESIDE + 1) as f32));
-        assert!(!near.holds(at(100.0, 3.0)) && near.holds(at(100.0, 1.0)), "free only up to the nearer point beside it");
-        assert!(far.holds(at(100.0, 3.0)), "the nearer point is too far beside it");
+        let (near, far) = (two(LIMIT_RADIUS as f32), two((LIMIT_RADIUS + 1) as f32));
+        assert!(
+            !near.holds(at(100.0, 3.0)) && near.holds(at(100.0, 1.0)),
+            "free only up to the nearer point beside it"
+        );
+        assert!(
+            far.holds(at(100.0, 3.0)),
+            "the nearer point is too far beside it"
+        );
     }
 
     #[test]
     fn what_hangs_before_a_camera_is_no_part_of_the_scene() {
-        let row = |count: usize, first: f32, z: f32| (0..count).map(move |k| Vec3::new(0.01 * k as f32 + first, 0.0, z));
+        let row = |count: usize, first: f32, z: f32| {
+            (0..count).map(move |k| Vec3::new(0.01 * k as f32 + first, 0.0, z))
+        };
         let mut means: Vec<Vec3> = row(100, -0.5, 0.0).collect();
         // One Gaussian is wrong.
         means.push(Vec3::new(0.0, 0.0, -3.9));
         let free = FreeSpace::of(&[camera(0.0), camera(0.3)], &means, &[]);
         assert!(free.holds(Vec3::new(0.0, 0.0, -3.3)) && free.holds(Vec3::new(0.3, 0.0, -3.5)));
-        assert!(!free.holds(Vec3::new(0.0, 0.0, -1.0)), "far enough from the cameras");
+        assert!(
+            !free.holds(Vec3::new(0.0, 0.0, -1.0)),
+            "far enough from the cameras"
+        );
         assert!(free.holds(Vec3::new(-0.5, 0.0, -4.2)), "around the cameras");
-        assert!(!free.holds(Vec3::new(2.0, 0.0, -3.5)), "far beside the views of the cameras");
-        let free_before = |means: &[Vec3]| FreeSpace::of(&[camera(0.0), camera(0.3)], means, &[]).holds(Vec3::new(-0.5, 0.0, -4.2));
+        assert!(
+            !free.holds(Vec3::new(2.0, 0.0, -3.5)),
+            "far beside the views of the cameras"
+        );
+        let free_before = |means: &[Vec3]| {
+            FreeSpace::of(&[camera(0.0), camera(0.3)], means, &[]).holds(Vec3::new(-0.5, 0.0, -4.2))
+        };
         let walled: Vec<Vec3> = means.iter().copied().chain(row(500, -2.5, -4.3)).collect();
-        assert!(free_before(&means) && !free_before(&walled), "many Gaussians behind the cameras are a wall");
-        assert!(!FreeSpace::of(&[camera(0.0)], &means[..10], &[]).holds(Vec3::new(0.0, 0.0, -3.0)), "ten Gaussians are too few");
+        assert!(
+            free_before(&means) && !free_before(&walled),
+            "many Gaussians behind the cameras are a wall"
+        );
+        assert!(
+            !FreeSpace::of(&[camera(0.0)], &means[..10], &[]).holds(Vec3::new(0.0, 0.0, -3.0)),
+            "ten Gaussians are too few"
+        );
         let near_point = [point(Vec3::new(0.0, 0.0, -3.9), &[0, 1, 2])];
         assert!(
             FreeSpace::of(&[camera(0.0)], &means, &near_point).holds(Vec3::new(0.0, 0.0, -3.3)),

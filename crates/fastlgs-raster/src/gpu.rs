@@ -60,12 +60,16 @@ impl Gpu {
         let wanted = which.to_lowercase();
         let found = if which == "auto" {
             let hardware = |a: &wgpu::Adapter| a.get_info().device_type != wgpu::DeviceType::Cpu;
-            list.iter().position(hardware).or(if list.is_empty() { None } else { Some(0) })
+            list.iter()
+                .position(hardware)
+                .or(if list.is_empty() { None } else { Some(0) })
         } else {
             match which.parse::<usize>() {
                 // A short number is an index. A long one, such as "4090", is a part of a name.
                 Ok(index) if which.len() < 3 => Some(index).filter(|index| *index < list.len()),
-                _ => names.iter().position(|n| n.to_lowercase().contains(&wanted)),
+                _ => names
+                    .iter()
+                    .position(|n| n.to_lowercase().contains(&wanted)),
             }
         };
         let index = found.ok_or_else(|| {
@@ -97,8 +101,12 @@ impl Gpu {
             },
             ..Default::default()
         };
-        let failed = |reason: String| Error::Device { device: info.name.clone(), reason };
-        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|e| failed(e.to_string()))?;
+        let failed = |reason: String| Error::Device {
+            device: info.name.clone(),
+            reason,
+        };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|e| failed(e.to_string()))?;
         let uniforms = device.create_buffer(&wgpu::BufferDescriptor {
             label: Some("uniforms"),
             size: UNIFORM_SLOTS * UNIFORM_SLOT,
@@ -109,10 +117,14 @@ impl Gpu {
         let slot = failure.clone();
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
             let reason = match e {
-                wgpu::Error::OutOfMemory { .. } => "out of memory; lower the option budget, size or sh_degree".to_owned(),
+                wgpu::Error::OutOfMemory { .. } => {
+                    "out of memory; lower the option budget, size or sh_degree".to_owned()
+                }
                 other => other.to_string(),
             };
-            slot.lock().expect("no panic while holding the lock").get_or_insert(reason);
+            slot.lock()
+                .expect("no panic while holding the lock")
+                .get_or_insert(reason);
         }));
         Ok(Self {
             device,
@@ -146,7 +158,9 @@ impl Gpu {
         Ok(self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(what),
             size,
-            usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC | wgpu::BufferUsages::COPY_DST,
+            usage: wgpu::BufferUsages::STORAGE
+                | wgpu::BufferUsages::COPY_SRC
+                | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         }))
     }
@@ -164,7 +178,8 @@ impl Gpu {
 
     /// Returns a new command encoder.
     pub fn encoder(&self) -> wgpu::CommandEncoder {
-        self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
+        self.device
+            .create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
     /// Submits the recorded commands.
@@ -184,29 +199,52 @@ impl Gpu {
     ///
     /// # Errors
     /// When the device failed since the last call.
-    pub fn read_with<T: bytemuck::Pod, R>(&self, buffer: &wgpu::Buffer, count: usize, take: impl FnOnce(&[T]) -> R) -> Result<R> {
-        let bytes = ((count * size_of::<T>()) as u64).next_multiple_of(8).min(buffer.size());
+    pub fn read_with<T: bytemuck::Pod, R>(
+        &self,
+        buffer: &wgpu::Buffer,
+        count: usize,
+        take: impl FnOnce(&[T]) -> R,
+    ) -> Result<R> {
+        let bytes = ((count * size_of::<T>()) as u64)
+            .next_multiple_of(8)
+            .min(buffer.size());
         // Keep the buffer for the next call: allocation costs more than the copy.
-        let mut kept = self.staging.lock().expect("no panic while holding the lock");
-        let staging = kept.take().filter(|b| b.size() >= bytes).unwrap_or_else(|| {
-            self.device.create_buffer(&wgpu::BufferDescriptor {
-                label: Some("read"),
-                size: bytes.max(8),
-                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
-                mapped_at_creation: false,
-            })
-        });
+        let mut kept = self
+            .staging
+            .lock()
+            .expect("no panic while holding the lock");
+        let staging = kept
+            .take()
+            .filter(|b| b.size() >= bytes)
+            .unwrap_or_else(|| {
+                self.device.create_buffer(&wgpu::BufferDescriptor {
+                    label: Some("read"),
+                    size: bytes.max(8),
+                    usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                    mapped_at_creation: false,
+                })
+            });
         let mut encoder = self.encoder();
         encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
         self.submit(encoder);
         staging.map_async(wgpu::MapMode::Read, .., |_| {});
         let waited = self.device.poll(wgpu::PollType::wait_indefinitely());
-        let failed = |reason: String| Error::Device { device: self.name.clone(), reason };
+        let failed = |reason: String| Error::Device {
+            device: self.name.clone(),
+            reason,
+        };
         waited.map_err(|e| failed(e.to_string()))?;
-        if let Some(reason) = self.failure.lock().expect("no panic while holding the lock").take() {
+        if let Some(reason) = self
+            .failure
+            .lock()
+            .expect("no panic while holding the lock")
+            .take()
+        {
             return Err(failed(reason));
         }
-        let view = staging.get_mapped_range(..bytes).map_err(|e| failed(e.to_string()))?;
+        let view = staging
+            .get_mapped_range(..bytes)
+            .map_err(|e| failed(e.to_string()))?;
         let taken = take(&bytemuck::cast_slice(&view)[..count]);
         drop(view);
         staging.unmap();

@@ -1,7 +1,7 @@
 //! The first Gaussians: from points, from random points as a last resort, and as a backdrop.
 
 use crate::Result;
-use crate::floaters::around;
+use crate::floaters::neighbourhood;
 use crate::target::{Target, Targets};
 use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::rng::Rng;
@@ -14,7 +14,10 @@ use std::collections::BTreeSet;
 /// three nearest neighbours (3DGS). Of points at the same position only the first is used.
 pub fn from_points(points: &[SfmPoint]) -> Gaussians {
     let mut known = BTreeSet::new();
-    let points: Vec<&SfmPoint> = points.iter().filter(|p| known.insert(p.position.to_array().map(f32::to_bits))).collect();
+    let points: Vec<&SfmPoint> = points
+        .iter()
+        .filter(|p| known.insert(p.position.to_array().map(f32::to_bits)))
+        .collect();
     let mut tree: KdTree<f64, 3> = KdTree::new();
     for (i, p) in points.iter().enumerate() {
         tree.add(&p.position.as_dvec3().to_array(), i as u64);
@@ -25,7 +28,12 @@ pub fn from_points(points: &[SfmPoint]) -> Gaussians {
         let others = near.iter().skip(1).map(|n| n.distance);
         let mean_square = others.sum::<f64>() / near.len().saturating_sub(1).max(1) as f64;
         let radius = (mean_square.sqrt() as f32).clamp(1e-6, 1e3);
-        scene.push_sphere(p.position, radius, 0.1, p.color.map(|c| f32::from(c) / 255.0));
+        scene.push_sphere(
+            p.position,
+            radius,
+            0.1,
+            p.color.map(|c| f32::from(c) / 255.0),
+        );
     }
     scene
 }
@@ -63,7 +71,11 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
             let depth = camera.centre().distance(focus).max(1e-3) * rng.range(0.3, 2.0);
             let ray = camera.ray(Vec2::new(pixel[0] as f32 + 0.5, pixel[1] as f32 + 0.5));
             let [r, g, b, _] = image.color[pixel[1] * width + pixel[0]].to_le_bytes();
-            out.push(SfmPoint { position: inverse.transform_point3(ray * depth), color: [r, g, b], seen_by: Vec::new() });
+            out.push(SfmPoint {
+                position: inverse.transform_point3(ray * depth),
+                color: [r, g, b],
+                seen_by: Vec::new(),
+            });
         }
     }
     Ok(out)
@@ -72,13 +84,13 @@ pub fn random_points(views: &Targets, count: usize, rng: &mut Rng) -> Result<Vec
 /// Cells of the backdrop along the longer side of a photo.
 const CELLS: u32 = 30;
 /// Share of the points that may lie outside the backdrop.
-const BEYOND: f32 = 0.02;
+const OUTSIDE_SHARE: f32 = 0.02;
 /// Smallest radius of the backdrop, in multiples of the largest distance between a camera and the
 /// focus. It keeps the backdrop away from cameras that look outwards.
-const ROOM: f32 = 2.0;
+const RADIUS_FACTOR: f32 = 2.0;
 /// Opacity of the backdrop: nearly opaque, so that training adds nothing to explain the same
 /// pixels.
-const SOLID: f32 = 0.9;
+const BACKDROP_OPACITY: f32 = 0.9;
 
 /// Returns a backdrop for few photos: at most `most` nearly opaque Gaussians on a sphere.
 ///
@@ -92,10 +104,20 @@ const SOLID: f32 = 0.9;
 /// When a photo cannot be read.
 pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gaussians> {
     let focus = common_focus(&views.cameras);
-    let mut distances: Vec<f32> = points.iter().map(|point| point.position.distance(focus)).collect();
+    let mut distances: Vec<f32> = points
+        .iter()
+        .map(|point| point.position.distance(focus))
+        .collect();
     distances.sort_by(f32::total_cmp);
-    let room = ROOM * views.cameras.iter().map(|camera| camera.centre().distance(focus)).fold(0.0, f32::max);
-    let radius = distances.get(((1.0 - BEYOND) * distances.len() as f32) as usize).map_or(room, |farthest| farthest.max(room));
+    let room = RADIUS_FACTOR
+        * views
+            .cameras
+            .iter()
+            .map(|camera| camera.centre().distance(focus))
+            .fold(0.0, f32::max);
+    let radius = distances
+        .get(((1.0 - OUTSIDE_SHARE) * distances.len() as f32) as usize)
+        .map_or(room, |farthest| farthest.max(room));
     let mut scene = Gaussians::default();
     for id in 0..views.len() {
         let Target { camera, image, .. } = views.get(id)?;
@@ -103,9 +125,12 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
         let [width, height] = [cells.width, cells.height].map(|side| side as usize);
         let mut known = vec![false; width * height];
         // Include the Gaussians that earlier photos added.
-        let shown = points.iter().map(|point| point.position).chain(scene.means.iter().copied());
-        for (cell, _) in shown.filter_map(|place| cells.see(place)) {
-            around(&cells, cell, 1).for_each(|at| known[at] = true);
+        let shown = points
+            .iter()
+            .map(|point| point.position)
+            .chain(scene.means.iter().copied());
+        for (cell, _) in shown.filter_map(|place| cells.pixel_and_depth(place)) {
+            neighbourhood(&cells, cell, 1).for_each(|at| known[at] = true);
         }
         let turn = Mat3::from_mat4(camera.world_to_camera).transpose();
         let from = camera.centre() - focus;
@@ -114,16 +139,30 @@ pub fn backdrop(views: &Targets, points: &[SfmPoint], most: usize) -> Result<Gau
             let ray = turn * cells.ray(middle).normalize();
             // Distance to the point where the ray leaves the sphere.
             let towards = from.dot(ray);
-            let way = (towards * towards + radius * radius - from.length_squared()).max(0.0).sqrt() - towards;
-            let [x, y] = [middle.x * camera.width as f32 / cells.width as f32, middle.y * camera.height as f32 / cells.height as f32];
-            let [r, g, b, counts] = image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
+            let way = (towards * towards + radius * radius - from.length_squared())
+                .max(0.0)
+                .sqrt()
+                - towards;
+            let [x, y] = [
+                middle.x * camera.width as f32 / cells.width as f32,
+                middle.y * camera.height as f32 / cells.height as f32,
+            ];
+            let [r, g, b, counts] =
+                image.color[y as usize * camera.width as usize + x as usize].to_le_bytes();
             // The radius is 0 if all cameras stand in one place and no points are known.
             if counts == 255 && way > 0.0 {
-                scene.push_sphere(camera.centre() + way * ray, way / cells.fx, SOLID, [r, g, b].map(|c| f32::from(c) / 255.0));
+                scene.push_sphere(
+                    camera.centre() + way * ray,
+                    way / cells.fx,
+                    BACKDROP_OPACITY,
+                    [r, g, b].map(|c| f32::from(c) / 255.0),
+                );
             }
         }
     }
-    let kept: Vec<usize> = (0..scene.len().min(most)).map(|k| k * scene.len() / most.min(scene.len())).collect();
+    let kept: Vec<usize> = (0..scene.len().min(most))
+        .map(|k| k * scene.len() / most.min(scene.len()))
+        .collect();
     Ok(scene.select(&kept))
 }
 
@@ -139,7 +178,11 @@ pub fn common_focus(cameras: &[Camera]) -> Vec3 {
     }
     let mean = cameras.iter().map(Camera::centre).sum::<Vec3>() / cameras.len().max(1) as f32;
     // Parallel axes have no nearest point.
-    if a.determinant().abs() > 1e-4 { a.inverse() * b } else { mean + cameras[0].forward() }
+    if a.determinant().abs() > 1e-4 {
+        a.inverse() * b
+    } else {
+        mean + cameras[0].forward()
+    }
 }
 
 #[cfg(test)]
@@ -149,19 +192,30 @@ mod tests {
 
     #[test]
     fn points_in_one_place_are_one() {
-        let point = |x: f32| SfmPoint { position: Vec3::X * x, color: [9; 3], seen_by: Vec::new() };
+        let point = |x: f32| SfmPoint {
+            position: Vec3::X * x,
+            color: [9; 3],
+            seen_by: Vec::new(),
+        };
         let mut points = vec![point(0.0); 100];
         points.extend([point(1.0), point(2.0)]);
         let scene = from_points(&points);
         assert_eq!(scene.len(), 3);
-        assert!((scene.log_scales[1].x.exp() - 1.0).abs() < 1e-5, "the distance to both neighbours");
+        assert!(
+            (scene.log_scales[1].x.exp() - 1.0).abs() < 1e-5,
+            "the distance to both neighbours"
+        );
         assert_eq!(from_points(&points[..1]).len(), 1);
     }
 
     #[test]
     fn focus_is_where_the_cameras_look() {
         let target = Vec3::new(0.5, -1.0, 2.0);
-        let eyes = [Vec3::new(4.0, 0.0, 0.0), Vec3::new(0.0, 1.0, -5.0), Vec3::new(-3.0, 0.5, 3.0)];
+        let eyes = [
+            Vec3::new(4.0, 0.0, 0.0),
+            Vec3::new(0.0, 1.0, -5.0),
+            Vec3::new(-3.0, 0.5, 3.0),
+        ];
         let cameras = eyes.map(|e| Camera::look_at("c", e, target, Vec3::Y, 64, 48, 0.8));
         assert!((common_focus(&cameras) - target).length() < 1e-3);
     }
@@ -171,10 +225,24 @@ mod tests {
         let eyes = [Vec3::X, Vec3::Z, -Vec3::X, -Vec3::Z].map(|eye| 4.0 * eye);
         let target = |(k, eye): (usize, &Vec3)| {
             let camera = Camera::look_at(&k.to_string(), *eye, Vec3::ZERO, Vec3::Y, 60, 40, 0.8);
-            let color = (0..60 * 40).map(|pixel| crate::pack([50 + k as u8, 100, 200], pixel % 60 < 40)).collect();
-            Target { camera, image: TargetImage { size: [60, 40], color, feature: Vec::new() }, gain: [1.0; 3] }
+            let color = (0..60 * 40)
+                .map(|pixel| crate::pack([50 + k as u8, 100, 200], pixel % 60 < 40))
+                .collect();
+            Target {
+                camera,
+                image: TargetImage {
+                    size: [60, 40],
+                    color,
+                    feature: Vec::new(),
+                },
+                gain: [1.0; 3],
+            }
         };
-        eyes.iter().enumerate().map(target).collect::<Vec<_>>().into()
+        eyes.iter()
+            .enumerate()
+            .map(target)
+            .collect::<Vec<_>>()
+            .into()
     }
 
     #[test]
@@ -185,24 +253,55 @@ mod tests {
             .map(|k| {
                 let (up, around) = (k as f32 / 100.0 - 1.0, 2.4 * k as f32);
                 let across = (1.0 - up * up).max(0.0).sqrt();
-                SfmPoint { position: Vec3::new(across * around.cos(), up, across * around.sin()), color: [0; 3], seen_by: Vec::new() }
+                SfmPoint {
+                    position: Vec3::new(across * around.cos(), up, across * around.sin()),
+                    color: [0; 3],
+                    seen_by: Vec::new(),
+                }
             })
             .collect();
-        points.push(SfmPoint { position: Vec3::splat(900.0), color: [0; 3], seen_by: Vec::new() });
+        points.push(SfmPoint {
+            position: Vec3::splat(900.0),
+            color: [0; 3],
+            seen_by: Vec::new(),
+        });
         let scene = backdrop(&views, &points, usize::MAX).unwrap();
         assert!(scene.len() > 500, "{} Gaussians", scene.len());
         for (mean, color) in scene.means.iter().zip(&scene.sh_dc) {
-            assert!((mean.length() - 8.0).abs() < 1e-3, "on the sphere around cameras and points: {mean}");
-            let shown = [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
-            assert!((50.0..54.0).contains(&shown[0]) && shown[1..] == [100.0, 200.0], "{shown:?}");
+            assert!(
+                (mean.length() - 8.0).abs() < 1e-3,
+                "on the sphere around cameras and points: {mean}"
+            );
+            let shown =
+                [color.x, color.y, color.z].map(|c| (255.0 * (0.5 + 0.282_094_79 * c)).round());
+            assert!(
+                (50.0..54.0).contains(&shown[0]) && shown[1..] == [100.0, 200.0],
+                "{shown:?}"
+            );
         }
         let first = &views.cameras[0].shrunk_to(CELLS);
-        let shown: Vec<usize> = scene.means.iter().filter_map(|mean| first.see(*mean)).map(|(cell, _)| cell).collect();
-        assert!(shown.iter().all(|cell| cell % first.width as usize != 15 || cell / first.width as usize != 10), "no Gaussian covers the ball");
+        let shown: Vec<usize> = scene
+            .means
+            .iter()
+            .filter_map(|mean| first.pixel_and_depth(*mean))
+            .map(|(cell, _)| cell)
+            .collect();
+        assert!(
+            shown
+                .iter()
+                .all(|cell| cell % first.width as usize != 15 || cell / first.width as usize != 10),
+            "no Gaussian covers the ball"
+        );
         let own = 20 * 20 - shown.iter().filter(|cell| *cell % 30 < 20).count();
-        assert!(own < 200, "all other cells that count are covered, except {own}");
+        assert!(
+            own < 200,
+            "all other cells that count are covered, except {own}"
+        );
         assert!(backdrop(&views, &points, 40).unwrap().len() == 40);
-        assert!(backdrop(&views, &[], usize::MAX).unwrap().len() > scene.len(), "no points are needed");
+        assert!(
+            backdrop(&views, &[], usize::MAX).unwrap().len() > scene.len(),
+            "no points are needed"
+        );
         assert_eq!(backdrop(&views, &points, 0).unwrap().len(), 0);
     }
 }

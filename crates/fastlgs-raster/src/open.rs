@@ -18,7 +18,10 @@ pub struct Choice {
 
 impl Choice {
     fn new(device: impl Into<String>, why: impl Into<String>) -> Self {
-        Self { device: device.into(), why: why.into() }
+        Self {
+            device: device.into(),
+            why: why.into(),
+        }
     }
 }
 
@@ -32,7 +35,10 @@ pub fn choice(device: &str) -> Choice {
         return Choice::new("cpu", "there is no Vulkan, Metal or DirectX device");
     }
     match Gpu::open("auto") {
-        Ok(gpu) if gpu.software => Choice::new("cpu", format!("faster than the software adapter '{}'", gpu.name)),
+        Ok(gpu) if gpu.software => Choice::new(
+            "cpu",
+            format!("faster than the software adapter '{}'", gpu.name),
+        ),
         Ok(gpu) => Choice::new(gpu.name, "a hardware adapter"),
         Err(error) => Choice::new("cpu", format!("no graphics device can be opened: {error}")),
     }
@@ -59,8 +65,14 @@ mod tests {
     fn auto_prefers_hardware_and_else_the_cpu() {
         assert_eq!(choice("cpu"), Choice::new("cpu", "requested"));
         assert_eq!(choice("3").device, "3");
-        let Some(gpu) = crate::tests::gpu() else { return };
-        let expected = if gpu.software { "cpu" } else { gpu.name.as_str() };
+        let Some(gpu) = crate::tests::gpu() else {
+            return;
+        };
+        let expected = if gpu.software {
+            "cpu"
+        } else {
+            gpu.name.as_str()
+        };
         assert_eq!(choice("auto").device, expected);
         assert!(open_engine("no such adapter").is_err());
     }

@@ -16,15 +16,18 @@ pub struct Pass {
 }
 
 /// A [`Pass`] with typed uniform and buffers.
-pub struct Typed<K: Kernel> {
+pub struct TypedPass<K: Kernel> {
     pass: Pass,
     kernel: PhantomData<K>,
 }
 
-impl<K: Kernel> Typed<K> {
+impl<K: Kernel> TypedPass<K> {
     /// Compiles the pass as [`Pass::new`] does.
     pub fn new(gpu: &Gpu, channels: Channels, harmonics: bool) -> Self {
-        Self { pass: Pass::new(gpu, K::SHADER, channels, harmonics), kernel: PhantomData }
+        Self {
+            pass: Pass::new(gpu, K::SHADER, channels, harmonics),
+            kernel: PhantomData,
+        }
     }
 }
 
@@ -48,7 +51,7 @@ pub(crate) struct Recorder<'a> {
     encoder: wgpu::CommandEncoder,
     /// The current compute pass. All passes share it, because beginning a compute pass costs more
     /// than recording one of ours.
-    open: Option<wgpu::ComputePass<'static>>,
+    compute_pass: Option<wgpu::ComputePass<'static>>,
     /// Content of [`Gpu::uniforms`], written once when the passes are submitted.
     uniforms: Vec<u8>,
     on_cpu: usize,
@@ -56,13 +59,19 @@ pub(crate) struct Recorder<'a> {
 
 impl<'a> Recorder<'a> {
     pub fn new(gpu: &'a Gpu, on_cpu: usize) -> Self {
-        Self { gpu, encoder: gpu.encoder(), open: None, uniforms: Vec::new(), on_cpu }
+        Self {
+            gpu,
+            encoder: gpu.encoder(),
+            compute_pass: None,
+            uniforms: Vec::new(),
+            on_cpu,
+        }
     }
 
     /// Runs one pass with its uniform and storage buffers.
     pub fn run<K: Kernel>(
         &mut self,
-        pass: &Typed<K>,
+        pass: &TypedPass<K>,
         uniform: &K::Uniform,
         buffers: K::Buffers<'_>,
         groups: impl Into<Groups>,
@@ -78,7 +87,13 @@ impl<'a> Recorder<'a> {
     }
 
     /// Records a pass whose storage buffers are untyped and in the order of their bindings.
-    pub fn record(&mut self, pass: &Pass, uniform: &[u8], storages: &[&wgpu::Buffer], groups: Groups) {
+    pub fn record(
+        &mut self,
+        pass: &Pass,
+        uniform: &[u8],
+        storages: &[&wgpu::Buffer],
+        groups: Groups,
+    ) {
         if groups.flat == 0 {
             return;
         }
@@ -89,15 +104,28 @@ impl<'a> Recorder<'a> {
         self.uniforms.extend_from_slice(uniform);
         self.uniforms.resize(place + UNIFORM_SLOT as usize, 0);
         let size = std::num::NonZeroU64::new(uniform.len() as u64);
-        let uniform = wgpu::BufferBinding { buffer: &self.gpu.uniforms, offset: place as u64, size };
+        let uniform = wgpu::BufferBinding {
+            buffer: &self.gpu.uniforms,
+            offset: place as u64,
+            size,
+        };
         // Timestamps are written at the ends of compute passes, so each pass needs its own.
-        let timestamp_writes = self.gpu.profile.as_ref().and_then(|p| p.next(pass.shader.name));
+        let timestamp_writes = self
+            .gpu
+            .profile
+            .as_ref()
+            .and_then(|p| p.next(pass.shader.name));
         if self.gpu.profile.is_some() {
-            self.open = None;
+            self.compute_pass = None;
         }
         let encoder = &mut self.encoder;
-        let open = self.open.get_or_insert_with(|| {
-            encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(pass.shader.name), timestamp_writes }).forget_lifetime()
+        let open = self.compute_pass.get_or_insert_with(|| {
+            encoder
+                .begin_compute_pass(&wgpu::ComputePassDescriptor {
+                    label: Some(pass.shader.name),
+                    timestamp_writes,
+                })
+                .forget_lifetime()
         });
         pass.record(self.gpu, open, uniform, storages, groups);
     }
@@ -107,9 +135,15 @@ impl<'a> Recorder<'a> {
         let words = |b: &&wgpu::Buffer| self.gpu.read::<u32>(b, (b.size() / 4) as usize);
         let mut contents = storages.iter().map(words).collect::<Result<Vec<_>>>()?;
         cpu::run(pass.shader.name, pass.channels, uniform, &mut contents);
-        for ((buffer, content), kind) in storages.iter().zip(&contents).zip(&pass.shader.bindings[1..]) {
+        for ((buffer, content), kind) in storages
+            .iter()
+            .zip(&contents)
+            .zip(&pass.shader.bindings[1..])
+        {
             if *kind == Binding::ReadWrite {
-                self.gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(content));
+                self.gpu
+                    .queue
+                    .write_buffer(buffer, 0, bytemuck::cast_slice(content));
             }
         }
         Ok(())
@@ -117,22 +151,26 @@ impl<'a> Recorder<'a> {
 
     /// Sets a buffer to zero.
     pub fn clear(&mut self, buffer: &wgpu::Buffer) {
-        self.open = None;
+        self.compute_pass = None;
         self.encoder.clear_buffer(buffer, 0, None);
     }
 
     /// Copies the start of one buffer to another, up to the smaller size.
     pub fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer) {
-        self.open = None;
-        self.encoder.copy_buffer_to_buffer(from, 0, to, 0, to.size().min(from.size()));
+        self.compute_pass = None;
+        self.encoder
+            .copy_buffer_to_buffer(from, 0, to, 0, to.size().min(from.size()));
     }
 
     fn flush(&mut self) {
-        self.open = None;
+        self.compute_pass = None;
         // This write takes effect before the submission below and after all earlier ones.
-        self.gpu.queue.write_buffer(&self.gpu.uniforms, 0, &self.uniforms);
+        self.gpu
+            .queue
+            .write_buffer(&self.gpu.uniforms, 0, &self.uniforms);
         self.uniforms.clear();
-        self.gpu.submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
+        self.gpu
+            .submit(std::mem::replace(&mut self.encoder, self.gpu.encoder()));
     }
 
     /// Submits the recorded passes. Returns how many further passes may run on the CPU.
@@ -149,15 +187,27 @@ impl Pass {
     /// Compiles the permutation for the device's shape and for `channels`, with view-dependent
     /// colour if `harmonics`.
     pub fn new(gpu: &Gpu, shader: &'static Shader, channels: Channels, harmonics: bool) -> Self {
-        let wanted = |flag: &&str| gpu.shape.flag() == Some(*flag) || channels.flags().contains(flag) || (harmonics && *flag == "WITH_SH");
+        let wanted = |flag: &&str| {
+            gpu.shape.flag() == Some(*flag)
+                || channels.flags().contains(flag)
+                || (harmonics && *flag == "WITH_SH")
+        };
         // Of the permutations with only wanted flags, take the one with most flags. It lacks only
         // flags that the pass does not use.
-        let fitting = shader.sources.iter().filter(|(flags, _)| flags.iter().all(&wanted));
-        let source = fitting.max_by_key(|(flags, _)| flags.len()).expect("a permutation for every choice").1;
-        let module = gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some(shader.name),
-            source: wgpu::ShaderSource::Wgsl(source.into()),
-        });
+        let fitting = shader
+            .sources
+            .iter()
+            .filter(|(flags, _)| flags.iter().all(&wanted));
+        let source = fitting
+            .max_by_key(|(flags, _)| flags.len())
+            .expect("a permutation for every choice")
+            .1;
+        let module = gpu
+            .device
+            .create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(shader.name),
+                source: wgpu::ShaderSource::Wgsl(source.into()),
+            });
         let entries: Vec<_> = shader
             .bindings
             .iter()
@@ -177,22 +227,39 @@ impl Pass {
                 count: None,
             })
             .collect();
-        let layout = gpu.device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(shader.name), entries: &entries });
-        let pipeline_layout = gpu.device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            label: Some(shader.name),
-            bind_group_layouts: &[Some(&layout)],
-            immediate_size: 0,
-        });
-        let pipeline = gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some(shader.name),
-            layout: Some(&pipeline_layout),
-            module: &module,
-            entry_point: Some("main"),
-            // Every pass writes its workgroup memory before it reads it.
-            compilation_options: wgpu::PipelineCompilationOptions { zero_initialize_workgroup_memory: false, ..Default::default() },
-            cache: None,
-        });
-        Self { shader, channels, pipeline, layout }
+        let layout = gpu
+            .device
+            .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor {
+                label: Some(shader.name),
+                entries: &entries,
+            });
+        let pipeline_layout = gpu
+            .device
+            .create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+                label: Some(shader.name),
+                bind_group_layouts: &[Some(&layout)],
+                immediate_size: 0,
+            });
+        let pipeline = gpu
+            .device
+            .create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(shader.name),
+                layout: Some(&pipeline_layout),
+                module: &module,
+                entry_point: Some("main"),
+                // Every pass writes its workgroup memory before it reads it.
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
+                cache: None,
+            });
+        Self {
+            shader,
+            channels,
+            pipeline,
+            layout,
+        }
     }
 
     /// Records one dispatch of `groups` workgroups. Above the limit, they are split over y.
@@ -204,8 +271,15 @@ impl Pass {
         storages: &[&wgpu::Buffer],
         groups: Groups,
     ) {
-        let resources = std::iter::once(wgpu::BindingResource::Buffer(uniform)).chain(storages.iter().map(|b| b.as_entire_binding()));
-        let entries: Vec<_> = resources.enumerate().map(|(i, resource)| wgpu::BindGroupEntry { binding: i as u32, resource }).collect();
+        let resources = std::iter::once(wgpu::BindingResource::Buffer(uniform))
+            .chain(storages.iter().map(|b| b.as_entire_binding()));
+        let entries: Vec<_> = resources
+            .enumerate()
+            .map(|(i, resource)| wgpu::BindGroupEntry {
+                binding: i as u32,
+                resource,
+            })
+            .collect();
         let bindings = gpu.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: Some(self.shader.name),
             layout: &self.layout,

@@ -17,7 +17,11 @@ pub(crate) struct Profile {
 impl Profile {
     /// Returns `None` if the device has no timestamps.
     pub fn new(gpu: &Gpu) -> Option<Self> {
-        if !gpu.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+        if !gpu
+            .device
+            .features()
+            .contains(wgpu::Features::TIMESTAMP_QUERY)
+        {
             return None;
         }
         let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -31,7 +35,11 @@ impl Profile {
             usage: wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC,
             mapped_at_creation: false,
         });
-        Some(Self { queries, resolved, names: Mutex::default() })
+        Some(Self {
+            queries,
+            resolved,
+            names: Mutex::default(),
+        })
     }
 
     /// Returns where the next dispatch writes its times; `None` if the set is full.
@@ -51,7 +59,8 @@ impl Profile {
 
     /// Returns the seconds of each pass since the last call.
     pub fn take(&self, gpu: &Gpu) -> Result<BTreeMap<&'static str, f64>> {
-        let names = std::mem::take(&mut *self.names.lock().expect("no panic while holding the lock"));
+        let names =
+            std::mem::take(&mut *self.names.lock().expect("no panic while holding the lock"));
         let mut seconds = BTreeMap::new();
         if names.is_empty() {
             return Ok(seconds);

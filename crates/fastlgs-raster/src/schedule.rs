@@ -16,7 +16,7 @@ pub enum Budget {
 
 impl Budget {
     /// Returns the largest number of Gaussians.
-    pub fn most(self) -> usize {
+    pub fn max_gaussians(self) -> usize {
         match self {
             Self::Auto(n) | Self::Fixed(n) => n,
         }
@@ -117,9 +117,9 @@ const ALIGN_AT: [f32; 4] = [0.3, 0.45, 0.6, 0.75];
 /// what dark photos show. The weight replaces opacity resets, from which runs of a few thousand
 /// steps would not recover. It applies until the first removal, so that Gaussians that no photo
 /// needs fade before.
-const OPACITY_PRICE: f32 = 0.04;
+const MEAN_OPACITY_WEIGHT: f32 = 0.04;
 /// Share of the Gaussians that the last step drops if photos are few (DropGaussian).
-const LEFT_OUT: f32 = 0.2;
+const MAX_DROPOUT: f32 = 0.2;
 
 impl TrainConfig {
     /// Returns the share of the run that is done at a step.
@@ -152,7 +152,9 @@ impl TrainConfig {
     /// Returns the SH degree in use: one more every 1,000 steps as in 3DGS, sooner in short runs.
     pub(crate) fn degree(&self, iteration: u32) -> u32 {
         let every = (self.iterations / 8).clamp(1, 1000);
-        (iteration / every).max(self.first_degree).min(self.sh_degree)
+        (iteration / every)
+            .max(self.first_degree)
+            .min(self.sh_degree)
     }
 
     /// Returns whether a step runs at half the resolution.
@@ -163,18 +165,24 @@ impl TrainConfig {
     /// Returns the share of the Gaussians that a step drops (DropGaussian, Park et al. 2025). With
     /// few photos it rises linearly. Occluded Gaussians then get gradients too, and the scene
     /// overfits less.
-    pub(crate) fn left_out(&self, iteration: u32, views: usize) -> f32 {
-        if views < FEW_VIEWS && self.channels.color() { LEFT_OUT * self.progress(iteration) } else { 0.0 }
+    pub(crate) fn dropout(&self, iteration: u32, views: usize) -> f32 {
+        if views < FEW_VIEWS && self.channels.color() {
+            MAX_DROPOUT * self.progress(iteration)
+        } else {
+            0.0
+        }
     }
 
     /// Returns the seed of a step's random choices.
-    pub(crate) fn draw(&self, iteration: u32) -> u32 {
+    pub(crate) fn step_seed(&self, iteration: u32) -> u32 {
         iteration ^ (self.seed as u32).wrapping_mul(0x9e37_79b9)
     }
 
     /// Returns the number of steps between two rounds of density control.
     fn between_rounds(&self) -> u32 {
-        let growing = self.step_at(self.refine_until).saturating_sub(self.step_at(REFINE_FROM));
+        let growing = self
+            .step_at(self.refine_until)
+            .saturating_sub(self.step_at(REFINE_FROM));
         (growing / ROUNDS).clamp(BETWEEN_ROUNDS[0], BETWEEN_ROUNDS[1])
     }
 
@@ -186,34 +194,48 @@ impl TrainConfig {
     /// Returns whether a round of density control follows when `iteration` steps are done.
     pub(crate) fn refines(&self, iteration: u32) -> bool {
         let (from, until) = (self.step_at(REFINE_FROM), self.step_at(self.refine_until));
-        let due = iteration.checked_sub(from).is_some_and(|since| since.is_multiple_of(self.between_rounds()));
+        let due = iteration
+            .checked_sub(from)
+            .is_some_and(|since| since.is_multiple_of(self.between_rounds()));
         self.channels.color() && due && iteration > 0 && iteration <= until
     }
 
     /// Returns whether opacities are reset when `iteration` steps are done. The last reset leaves
     /// time to recover before growth ends.
     pub(crate) fn resets_opacity(&self, iteration: u32) -> bool {
-        iteration.is_multiple_of(RESET_EVERY) && iteration + RESET_EVERY / 2 <= self.step_at(self.refine_until)
+        iteration.is_multiple_of(RESET_EVERY)
+            && iteration + RESET_EVERY / 2 <= self.step_at(self.refine_until)
     }
 
     /// Returns whether unimportant Gaussians are removed when `iteration` steps are done.
     pub(crate) fn prunes(&self, iteration: u32) -> bool {
         let automatic = matches!(self.budget, Budget::Auto(_)) && self.channels.color();
-        automatic && PRUNE_AFTER.iter().any(|share| iteration == self.step_at(self.refine_until + share).max(1))
+        automatic
+            && PRUNE_AFTER
+                .iter()
+                .any(|share| iteration == self.step_at(self.refine_until + share).max(1))
     }
 
     /// Returns whether the cameras are aligned to the scene when `iteration` steps are done.
     pub(crate) fn aligns(&self, iteration: u32) -> bool {
         let asked = self.alignment != Alignment::Off && self.channels.color();
-        asked && ALIGN_AT.iter().any(|share| iteration == self.step_at(*share).max(1))
+        asked
+            && ALIGN_AT
+                .iter()
+                .any(|share| iteration == self.step_at(*share).max(1))
     }
 
     /// Returns the weight of each Gaussian's opacity in the loss of a step. `contrast` is the
     /// standard deviation of the photos' brightness.
     pub(crate) fn opacity_weight(&self, iteration: u32, gaussians: usize, contrast: f32) -> f32 {
-        let fades = self.channels.color() && iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]);
+        let fades =
+            self.channels.color() && iteration < self.step_at(self.refine_until + PRUNE_AFTER[0]);
         let each = 1.0 / gaussians as f32;
-        if fades { OPACITY_PRICE * contrast * each } else { 0.0 }
+        if fades {
+            MEAN_OPACITY_WEIGHT * contrast * each
+        } else {
+            0.0
+        }
     }
 }
 
@@ -223,30 +245,81 @@ mod tests {
 
     #[test]
     fn the_schedule_of_a_run() {
-        let config = TrainConfig { iterations: 8000, sh_degree: 3, budget: Budget::Auto(1000), ..TrainConfig::default() };
-        assert_eq!([0, 999, 1000, 2500, 7999].map(|i| config.degree(i)), [0, 0, 1, 2, 3]);
+        let config = TrainConfig {
+            iterations: 8000,
+            sh_degree: 3,
+            budget: Budget::Auto(1000),
+            ..TrainConfig::default()
+        };
+        assert_eq!(
+            [0, 999, 1000, 2500, 7999].map(|i| config.degree(i)),
+            [0, 0, 1, 2, 3]
+        );
         assert!(config.coarse(3199) && !config.coarse(3200));
-        assert!(config.refines(400) && !config.refines(300) && config.refines(3200) && !config.refines(3300));
+        assert!(
+            config.refines(400)
+                && !config.refines(300)
+                && config.refines(3200)
+                && !config.refines(3300)
+        );
         let rounds = |iterations: u32| {
-            let config = TrainConfig { iterations, ..config.clone() };
+            let config = TrainConfig {
+                iterations,
+                ..config.clone()
+            };
             (0..=iterations).filter(|i| config.refines(*i)).count()
         };
         assert_eq!([1000, 2000, 7000, 30_000].map(rounds), [15, 17, 25, 106]);
-        let few = |views: usize, iteration: u32| config.left_out(iteration, views);
-        assert_eq!([few(24, 0), few(24, 4000), few(24, 8000), few(25, 8000)], [0.0, 0.1, 0.2, 0.0]);
-        let frozen = TrainConfig { channels: crate::Channels::Feature, ..config.clone() };
-        assert_eq!(frozen.left_out(8000, 24), 0.0, "cached lists contain all Gaussians");
-        assert_ne!(config.draw(5), TrainConfig { seed: 1, ..config.clone() }.draw(5));
+        let few = |views: usize, iteration: u32| config.dropout(iteration, views);
+        assert_eq!(
+            [few(24, 0), few(24, 4000), few(24, 8000), few(25, 8000)],
+            [0.0, 0.1, 0.2, 0.0]
+        );
+        let frozen = TrainConfig {
+            channels: crate::Channels::Feature,
+            ..config.clone()
+        };
+        assert_eq!(
+            frozen.dropout(8000, 24),
+            0.0,
+            "cached lists contain all Gaussians"
+        );
+        assert_ne!(
+            config.step_seed(5),
+            TrainConfig {
+                seed: 1,
+                ..config.clone()
+            }
+            .step_seed(5)
+        );
         assert!(!config.resets_opacity(3000), "too late to recover");
-        let long = TrainConfig { iterations: 30_000, ..config.clone() };
-        assert!(long.resets_opacity(3000) && long.resets_opacity(9000) && !long.resets_opacity(12_000));
+        let long = TrainConfig {
+            iterations: 30_000,
+            ..config.clone()
+        };
+        assert!(
+            long.resets_opacity(3000) && long.resets_opacity(9000) && !long.resets_opacity(12_000)
+        );
         assert!(config.prunes(3600) && config.prunes(5200) && !config.prunes(5201));
         let (first, last) = (config.rates(0, 2.0)[0], config.rates(8000, 2.0)[0]);
         assert!((first - 3.2e-4).abs() < 1e-8 && (last - first / 100.0).abs() < 1e-8);
-        assert_eq!([3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)), [0.5 * OPACITY_PRICE, 0.0]);
-        let continued = TrainConfig { first_degree: 2, ..config.clone() };
-        assert_eq!([0, 1000, 3000].map(|i| continued.degree(i)), [2, 2, 3], "training continues at the degree of the scene");
-        let frozen = TrainConfig { channels: crate::Channels::Feature, ..config };
+        assert_eq!(
+            [3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)),
+            [0.5 * MEAN_OPACITY_WEIGHT, 0.0]
+        );
+        let continued = TrainConfig {
+            first_degree: 2,
+            ..config.clone()
+        };
+        assert_eq!(
+            [0, 1000, 3000].map(|i| continued.degree(i)),
+            [2, 2, 3],
+            "training continues at the degree of the scene"
+        );
+        let frozen = TrainConfig {
+            channels: crate::Channels::Feature,
+            ..config
+        };
         assert!(!frozen.refines(400) && !frozen.prunes(3600));
     }
 }

@@ -21,7 +21,11 @@ pub struct Target {
 impl Target {
     /// Returns the view at half the resolution.
     pub(crate) fn halved(&self) -> Self {
-        Self { camera: self.camera.halved(), image: self.image.halved(), gain: self.gain }
+        Self {
+            camera: self.camera.halved(),
+            image: self.image.halved(),
+            gain: self.gain,
+        }
     }
 }
 
@@ -39,21 +43,38 @@ impl TargetImage {
             let pixels = (0..size[1]).flat_map(|y| (0..size[0]).map(move |x| (2 * x, 2 * y)));
             pixels
                 .map(|(x, y)| {
-                    let block = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)].map(|(x, y)| (x.min(w - 1), y.min(h - 1)));
+                    let block = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)]
+                        .map(|(x, y)| (x.min(w - 1), y.min(h - 1)));
                     let bytes = block.map(|(x, y)| plane[(y * w + x) as usize].to_le_bytes());
-                    let counting: Vec<[u8; 4]> = bytes.into_iter().filter(|b| b[3] == 255).collect();
-                    pack(if counting.is_empty() { [0; 3] } else { of(&counting) }, !counting.is_empty())
+                    let counting: Vec<[u8; 4]> =
+                        bytes.into_iter().filter(|b| b[3] == 255).collect();
+                    pack(
+                        if counting.is_empty() {
+                            [0; 3]
+                        } else {
+                            of(&counting)
+                        },
+                        !counting.is_empty(),
+                    )
                 })
                 .collect()
         };
-        Self { size, color: halve(&self.color, mean), feature: halve(&self.feature, mode) }
+        Self {
+            size,
+            color: halve(&self.color, mean),
+            feature: halve(&self.feature, mode),
+        }
     }
 
     /// Returns the standard deviation of the brightness of the pixels that count (0 to 1), averaged
     /// over the colours.
     fn contrast(&self) -> f64 {
         let deviation = |c: usize| {
-            let counting = self.color.iter().map(|p| p.to_le_bytes()).filter(|p| p[3] == 255);
+            let counting = self
+                .color
+                .iter()
+                .map(|p| p.to_le_bytes())
+                .filter(|p| p[3] == 255);
             let (n, sum, squares) = counting.fold((0u64, 0u64, 0u64), |(n, sum, squares), p| {
                 let value = u64::from(p[c]);
                 (n + 1, sum + value, squares + value * value)
@@ -78,8 +99,16 @@ pub struct Targets {
 
 impl Targets {
     /// Creates views whose images `read` returns. It must return the same image on every call.
-    pub fn new(cameras: Vec<Camera>, gains: Vec<[f32; 3]>, read: impl Fn(usize) -> Result<TargetImage> + Send + Sync + 'static) -> Self {
-        Self { cameras, gains, read: Arc::new(read) }
+    pub fn new(
+        cameras: Vec<Camera>,
+        gains: Vec<[f32; 3]>,
+        read: impl Fn(usize) -> Result<TargetImage> + Send + Sync + 'static,
+    ) -> Self {
+        Self {
+            cameras,
+            gains,
+            read: Arc::new(read),
+        }
     }
 
     /// Returns the number of views.
@@ -94,7 +123,10 @@ impl Targets {
 
     /// Returns the number of pixels of all views.
     pub fn pixels(&self) -> usize {
-        self.cameras.iter().map(|c| (c.width * c.height) as usize).sum()
+        self.cameras
+            .iter()
+            .map(|c| (c.width * c.height) as usize)
+            .sum()
     }
 
     /// Returns the brightness of each photo relative to the mean, by channel, as measured before
@@ -108,7 +140,11 @@ impl Targets {
     /// # Errors
     /// When the image cannot be read.
     pub fn get(&self, id: usize) -> Result<Target> {
-        Ok(Target { camera: self.cameras[id].clone(), image: (self.read)(id)?, gain: self.gains[id] })
+        Ok(Target {
+            camera: self.cameras[id].clone(),
+            image: (self.read)(id)?,
+            gain: self.gains[id],
+        })
     }
 
     /// Reads all images once, to detect errors before training.
@@ -116,12 +152,17 @@ impl Targets {
     /// # Errors
     /// When an image cannot be read.
     pub fn check(&self) -> Result<()> {
-        (0..self.len()).into_par_iter().try_for_each(|id| (self.read)(id).map(drop))
+        (0..self.len())
+            .into_par_iter()
+            .try_for_each(|id| (self.read)(id).map(drop))
     }
 
     /// Returns a subset of the views.
-    pub(crate) fn some(&self, ids: Vec<usize>) -> Self {
-        let (cameras, gains) = ids.iter().map(|&id| (self.cameras[id].clone(), self.gains[id])).unzip();
+    pub(crate) fn subset(&self, ids: Vec<usize>) -> Self {
+        let (cameras, gains) = ids
+            .iter()
+            .map(|&id| (self.cameras[id].clone(), self.gains[id]))
+            .unzip();
         let read = self.read.clone();
         Self::new(cameras, gains, move |k| read(ids[k]))
     }
@@ -131,16 +172,28 @@ impl Targets {
         let (read, gains) = (self.read, self.gains.clone());
         let unclipped = move |id: usize| {
             let mut image = read(id)?;
-            image.color.iter_mut().filter(|pixel| exposure::is_clipped(**pixel, gains[id])).for_each(|pixel| *pixel &= 0x00ff_ffff);
+            image
+                .color
+                .iter_mut()
+                .filter(|pixel| exposure::is_clipped(**pixel, gains[id]))
+                .for_each(|pixel| *pixel &= 0x00ff_ffff);
             Ok(image)
         };
         Self::new(self.cameras, self.gains, unclipped)
     }
 
     /// Returns the views with these feature images.
-    pub(crate) fn with_features(self, features: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) -> Self {
+    pub(crate) fn with_features(
+        self,
+        features: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static,
+    ) -> Self {
         let read = self.read;
-        Self::new(self.cameras, self.gains, move |id| Ok(TargetImage { feature: features(id)?, ..read(id)? }))
+        Self::new(self.cameras, self.gains, move |id| {
+            Ok(TargetImage {
+                feature: features(id)?,
+                ..read(id)?
+            })
+        })
     }
 
     /// Returns the mean contrast of all images and their fingerprint. The contrast is the standard
@@ -148,17 +201,35 @@ impl Targets {
     ///
     /// # Errors
     /// When an image cannot be read, or no pixel counts.
-    pub(crate) fn survey(&self) -> Result<(f32, u64)> {
+    pub(crate) fn contrast_and_fingerprint(&self) -> Result<(f32, u64)> {
         let of_picture = |image: TargetImage| {
-            let counts = image.color.iter().chain(&image.feature).any(|pixel| pixel.to_le_bytes()[3] == 255);
-            (image.contrast(), fingerprint(image.color.iter().chain(&image.feature).copied()), counts)
+            let counts = image
+                .color
+                .iter()
+                .chain(&image.feature)
+                .any(|pixel| pixel.to_le_bytes()[3] == 255);
+            (
+                image.contrast(),
+                fingerprint(image.color.iter().chain(&image.feature).copied()),
+                counts,
+            )
         };
-        let each = (0..self.len()).into_par_iter().map(|id| Ok(of_picture((self.read)(id)?))).collect::<Result<Vec<(f64, u64, bool)>>>()?;
+        let each = (0..self.len())
+            .into_par_iter()
+            .map(|id| Ok(of_picture((self.read)(id)?)))
+            .collect::<Result<Vec<(f64, u64, bool)>>>()?;
         if !each.iter().any(|(.., counts)| *counts) {
             return Err(Error::Invalid("the masks leave nothing to train on: they exclude every pixel of all training photos; check whether they are inverted".to_owned()));
         }
-        let contrast = each.iter().map(|(contrast, ..)| contrast).sum::<f64>() / each.len().max(1) as f64;
-        Ok((contrast as f32, fingerprint(each.iter().flat_map(|(_, print, _)| [*print as u32, (print >> 32) as u32]))))
+        let contrast =
+            each.iter().map(|(contrast, ..)| contrast).sum::<f64>() / each.len().max(1) as f64;
+        Ok((
+            contrast as f32,
+            fingerprint(
+                each.iter()
+                    .flat_map(|(_, print, _)| [*print as u32, (print >> 32) as u32]),
+            ),
+        ))
     }
 }
 
@@ -171,18 +242,27 @@ impl From<Vec<Target>> for Targets {
 
 /// Returns an FNV-1a hash of words (instead of bytes); it depends on their order.
 pub(crate) fn fingerprint(words: impl Iterator<Item = u32>) -> u64 {
-    words.fold(0xcbf2_9ce4_8422_2325, |print, word| (print ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3))
+    words.fold(0xcbf2_9ce4_8422_2325, |print, word| {
+        (print ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3)
+    })
 }
 
 fn mean(pixels: &[[u8; 4]]) -> [u8; 3] {
     let n = pixels.len() as u32;
-    std::array::from_fn(|c| ((pixels.iter().map(|p| u32::from(p[c])).sum::<u32>() + n / 2) / n) as u8)
+    std::array::from_fn(|c| {
+        ((pixels.iter().map(|p| u32::from(p[c])).sum::<u32>() + n / 2) / n) as u8
+    })
 }
 
 /// Returns the most frequent pixel; of several, the first.
 fn mode(pixels: &[[u8; 4]]) -> [u8; 3] {
     let count = |pixel: &[u8; 4]| pixels.iter().filter(|p| *p == pixel).count();
-    let [x, y, z, _] = pixels.iter().rev().copied().max_by_key(count).unwrap_or_default();
+    let [x, y, z, _] = pixels
+        .iter()
+        .rev()
+        .copied()
+        .max_by_key(count)
+        .unwrap_or_default();
     [x, y, z]
 }
 
@@ -192,25 +272,82 @@ mod tests {
 
     #[test]
     fn contrast_is_that_of_the_pixels_that_count() {
-        let camera = Camera::look_at("v", glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::Y, 2, 2, 1.0);
-        let color = vec![pack([0, 50, 255], true), pack([102, 50, 0], true), pack([255; 3], false), pack([51, 50, 0], true)];
-        let target = Target { camera, image: TargetImage { size: [2, 2], color, feature: Vec::new() }, gain: [1.0; 3] };
+        let camera = Camera::look_at(
+            "v",
+            glam::Vec3::NEG_Z,
+            glam::Vec3::ZERO,
+            glam::Vec3::Y,
+            2,
+            2,
+            1.0,
+        );
+        let color = vec![
+            pack([0, 50, 255], true),
+            pack([102, 50, 0], true),
+            pack([255; 3], false),
+            pack([51, 50, 0], true),
+        ];
+        let target = Target {
+            camera,
+            image: TargetImage {
+                size: [2, 2],
+                color,
+                feature: Vec::new(),
+            },
+            gain: [1.0; 3],
+        };
         // Values of red: 0, 0.4, 0.2; of green: constant; of blue: 1, 0, 0.
         let expected = ((0.08f32 / 3.0).sqrt() + (2.0f32 / 9.0).sqrt()) / 3.0;
         let mut other = target.clone();
-        let (contrast, print) = Targets::from(vec![target.clone()]).survey().unwrap();
+        let (contrast, print) = Targets::from(vec![target.clone()])
+            .contrast_and_fingerprint()
+            .unwrap();
         assert!((contrast - expected).abs() < 1e-5);
         other.image.feature = vec![0; 4];
-        assert_ne!(print, Targets::from(vec![other]).survey().unwrap().1);
-        assert_eq!(print, Targets::from(vec![target]).survey().unwrap().1);
+        assert_ne!(
+            print,
+            Targets::from(vec![other])
+                .contrast_and_fingerprint()
+                .unwrap()
+                .1
+        );
+        assert_eq!(
+            print,
+            Targets::from(vec![target])
+                .contrast_and_fingerprint()
+                .unwrap()
+                .1
+        );
     }
 
     #[test]
     fn colours_are_averaged_and_codes_are_not() {
-        let camera = Camera::look_at("v", glam::Vec3::NEG_Z, glam::Vec3::ZERO, glam::Vec3::Y, 4, 2, 1.0);
-        let plane: Vec<u32> = [10, 20, 40, 90, 20, 30, 90, 40].map(|v| pack([v; 3], true)).to_vec();
-        let feature = plane.iter().enumerate().map(|(k, p)| if k == 5 { p & 0x00ff_ffff } else { *p }).collect();
-        let target = Target { camera, image: TargetImage { size: [4, 2], color: plane, feature }, gain: [1.0; 3] };
+        let camera = Camera::look_at(
+            "v",
+            glam::Vec3::NEG_Z,
+            glam::Vec3::ZERO,
+            glam::Vec3::Y,
+            4,
+            2,
+            1.0,
+        );
+        let plane: Vec<u32> = [10, 20, 40, 90, 20, 30, 90, 40]
+            .map(|v| pack([v; 3], true))
+            .to_vec();
+        let feature = plane
+            .iter()
+            .enumerate()
+            .map(|(k, p)| if k == 5 { p & 0x00ff_ffff } else { *p })
+            .collect();
+        let target = Target {
+            camera,
+            image: TargetImage {
+                size: [4, 2],
+                color: plane,
+                feature,
+            },
+            gain: [1.0; 3],
+        };
         let half = target.halved().image;
         assert_eq!(half.size, [2, 1]);
         assert_eq!(half.color, [20, 65].map(|v| pack([v; 3], true)));

@@ -51,15 +51,15 @@ pub struct View {
     /// 1: the first feature channel carries the depth.
     pub depth_as_feature: u32,
     /// Transmittance below which a pixel ignores further Gaussians.
-    pub finished: f32,
+    pub min_transmittance: f32,
     /// A step drops each Gaussian with the probability `dropped` / 2^32.
     pub dropped: u32,
     /// Seed that selects the dropped Gaussians.
     pub draw: u32,
     /// Length of the runs of pairs in which `fold_slots` sums a Gaussian's slots; 1 if it does not
     /// run.
-    pub fold: u32,
-    /// 1: Gaussians of transparent objects ([`fastlgs_core::gaussians::CLEAR`]) are drawn as opaque
+    pub fold_length: u32,
+    /// 1: Gaussians of transparent objects ([`fastlgs_core::gaussians::TRANSPARENT_LOGIT`]) are drawn as opaque
     /// ones, to show which objects are where.
     pub solid: u32,
     /// Padding to 16 bytes.
@@ -88,10 +88,10 @@ impl View {
             sh_degree,
             antialias: 0,
             depth_as_feature: 0,
-            finished: TRANSMITTANCE_MIN,
+            min_transmittance: TRANSMITTANCE_MIN,
             dropped: 0,
             draw: 0,
-            fold: 1,
+            fold_length: 1,
             solid: 0,
             unused: [0; 2],
         }
@@ -99,14 +99,21 @@ impl View {
 
     /// Returns the view for a training step, which ignores the last half of a grey level.
     #[must_use]
-    pub fn trained(self) -> Self {
-        Self { finished: TRANSMITTANCE_TRAINED, ..self }
+    pub fn for_training(self) -> Self {
+        Self {
+            min_transmittance: TRANSMITTANCE_TRAINED,
+            ..self
+        }
     }
 
     /// Returns the view with a share of the Gaussians dropped, at most 0.9; `draw` is the seed.
     #[must_use]
-    pub fn without(self, share: f32, draw: u32) -> Self {
-        Self { dropped: (f64::from(share.clamp(0.0, 0.9)) * 4_294_967_296.0) as u32, draw, ..self }
+    pub fn with_dropout(self, share: f32, draw: u32) -> Self {
+        Self {
+            dropped: (f64::from(share.clamp(0.0, 0.9)) * 4_294_967_296.0) as u32,
+            draw,
+            ..self
+        }
     }
 
     /// Returns the factor on the remaining opacities that compensates for dropped Gaussians, up to
@@ -126,7 +133,7 @@ impl View {
     }
 
     /// Returns the index of a pixel in a padded plane.
-    pub(crate) fn at(&self, x: u32, y: u32) -> usize {
+    pub(crate) fn index_of(&self, x: u32, y: u32) -> usize {
         (y * self.tiles[0] * TILE + x) as usize
     }
 
@@ -134,9 +141,12 @@ impl View {
     pub(crate) fn padded<T: Copy + Default>(&self, planes: &[T]) -> Vec<T> {
         let [w, h] = self.size.map(|s| s as usize);
         let mut out = vec![T::default(); planes.len() / (w * h) * self.padded_pixels()];
-        for (plane, from) in out.chunks_exact_mut(self.padded_pixels()).zip(planes.chunks_exact(w * h)) {
+        for (plane, from) in out
+            .chunks_exact_mut(self.padded_pixels())
+            .zip(planes.chunks_exact(w * h))
+        {
             for (y, row) in from.chunks_exact(w).enumerate() {
-                let at = self.at(0, y as u32);
+                let at = self.index_of(0, y as u32);
                 plane[at..at + w].copy_from_slice(row);
             }
         }
@@ -236,14 +246,17 @@ impl Planes {
     pub(crate) fn new(planes: &[Plane]) -> Self {
         let mut all: Self = Zeroable::zeroed();
         all.each[..planes.len()].copy_from_slice(planes);
-        Self { count: planes.len() as u32, ..all }
+        Self {
+            count: planes.len() as u32,
+            ..all
+        }
     }
 }
 
 /// Uniform of sorting and scanning; `shaders/shared/chunks.wgsl`.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct Job {
+pub struct ChunkJob {
     /// Number of items.
     pub n: u32,
     /// Shift of the radix digit in bits.

@@ -1,4 +1,4 @@
-//! The HTTP interface: what each address does. `web/openapi.json` describes it for programs.
+//! Handlers of the HTTP interface. `web/openapi.json` describes it for programs.
 
 use crate::desk::{Choice, Desk};
 use crate::failure::Failure;
@@ -28,15 +28,15 @@ use std::sync::Arc;
 
 /// Largest picture that is rendered for a request, in pixels.
 const MOST_PIXELS: u32 = 1 << 22;
-/// Longest text.
+/// Longest text of a query or name, in characters.
 const LONGEST_TEXT: usize = 300;
-/// Most texts of one question that its answer must not be nearer to.
+/// Largest number of negative texts of a query.
 const MOST_NEGATIVES: usize = 8;
 
 type Answer<T = Json<Value>> = Result<T, Failure>;
 type App = State<Arc<Shared>>;
 
-/// `GET /api/scene`: everything that the page needs to begin.
+/// `GET /api/scene`: describes the scene, its views and the limits of requests.
 pub async fn scene(State(app): App) -> Answer {
     let mut value = json!({
         "name": app.name,
@@ -58,13 +58,18 @@ pub async fn scene(State(app): App) -> Answer {
     Ok(Json(value))
 }
 
-/// `GET /api/training`: the curves of a run; 404 where there was none.
+/// `GET /api/training`: returns the curves of the training run; 404 without one.
 pub async fn training(State(app): App) -> Answer<Response> {
-    let live = app.live.as_ref().ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, "this scene was not trained here"))?;
+    let live = app.live.as_ref().ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            "this scene was not trained here, so it has no curves",
+        )
+    })?;
     Ok(Json(live.progress()).into_response())
 }
 
-/// `GET /api/splats`: the Gaussians as browsers draw them.
+/// `GET /api/splats`: returns the Gaussians, packed for browsers.
 pub async fn splats(State(app): App) -> Answer<Response> {
     let data = match (app.bell(), &app.live) {
         (Some(bell), _) => bell.ask(|desk| Ok(desk.splats())).await?,
@@ -74,28 +79,36 @@ pub async fn splats(State(app): App) -> Answer<Response> {
     Ok(([(header::CONTENT_TYPE, "application/octet-stream")], data).into_response())
 }
 
-/// `GET /api/objects`: all objects and parts, by id.
+/// `GET /api/objects`: lists all objects and parts in order of their ids.
 pub async fn objects(State(app): App) -> Answer {
     app.ready()?.ask(|desk| Ok(Json(desk.objects()?))).await
 }
 
-/// `GET /api/objects/{id}/thumbnail.png`
+/// `GET /api/objects/{id}/thumbnail.png`: returns a small picture of an object.
 pub async fn thumbnail(State(app): App, id: Result<Path<u16>, PathRejection>) -> Answer<Response> {
     let Path(id) = id?;
-    let made = app.ready()?.ask(move |desk| Ok(desk.thumbnail(id)?)).await?;
-    let data = made.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
+    let made = app
+        .ready()?
+        .ask(move |desk| Ok(desk.thumbnail(id)?))
+        .await?;
+    let data = made
+        .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
-/// `GET /api/objects/{id}/view`: where to look at it from.
+/// `GET /api/objects/{id}/view`: returns the view that shows most of an object.
 pub async fn best_view(State(app): App, id: Result<Path<u16>, PathRejection>) -> Answer {
     let Path(id) = id?;
-    let view = app.ready()?.ask(move |desk| Ok(desk.best_view(id)?)).await?;
-    let view = view.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows an object {id}")))?;
+    let view = app
+        .ready()?
+        .ask(move |desk| Ok(desk.best_view(id)?))
+        .await?;
+    let view = view
+        .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
     Ok(Json(json!({ "view": view })))
 }
 
-/// What an object is called.
+/// Body of `POST /api/names`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Naming {
@@ -103,46 +116,86 @@ pub struct Naming {
     object: u16,
 }
 
-/// `GET /api/names`: names that were taught with the scene's encoder.
+/// `GET /api/names`: lists the names that were taught with the scene's encoder.
 pub async fn names(State(app): App) -> Answer {
-    app.ready()?.ask(|desk| Ok(Json(json!(desk.scene.taught_names()?)))).await
+    app.ready()?
+        .ask(|desk| Ok(Json(json!(desk.scene.taught_names()?))))
+        .await
 }
 
-/// `POST /api/names`: teaches the name of an object; texts know it from now on.
+/// `POST /api/names`: teaches the name of an object. Later text queries find it.
 pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>) -> Answer {
     let Json(naming) = request?;
     let name = checked_text(&naming.name)?.to_owned();
     let work = move |desk: &mut Desk| {
-        let known = usize::from(naming.object).checked_sub(1).is_some_and(|k| k < desk.grid.objects.len());
+        let known = usize::from(naming.object)
+            .checked_sub(1)
+            .is_some_and(|k| k < desk.grid.objects.len());
         if !known {
-            return Err(Failure::new(StatusCode::NOT_FOUND, format!("there is no object {}", naming.object)));
+            return Err(Failure::new(
+                StatusCode::NOT_FOUND,
+                format!("the scene has no object {}", naming.object),
+            ));
         }
         let learned = learn(&desk.scene, &desk.grid, &name, naming.object)?;
         desk.scene.forget_texts();
-        Ok(Json(json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples })))
+        Ok(Json(
+            json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples }),
+        ))
     };
     app.ready()?.ask(work).await
 }
 
-/// `GET /api/photos/{view}`: the photo as it was trained on.
+/// `GET /api/photos/{view}`: returns the prepared photo of a view.
 pub async fn photo(State(app): App, view: Result<Path<String>, PathRejection>) -> Answer<Response> {
     let Path(view) = view?;
-    let known = app.cameras().iter().find(|c| c.name == view).map(|c| app.folder.photo_path(&c.name)).filter(|p| p.is_file());
-    let path = known.ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("the scene has no photo '{view}'")))?;
-    Ok(([(header::CONTENT_TYPE, "image/png")], fastlgs_core::fs::read(&path)?).into_response())
+    let known = app
+        .cameras()
+        .iter()
+        .find(|c| c.name == view)
+        .map(|c| app.folder.photo_path(&c.name))
+        .filter(|p| p.is_file());
+    let path = known.ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            format!("the scene has no photo '{view}'"),
+        )
+    })?;
+    Ok((
+        [(header::CONTENT_TYPE, "image/png")],
+        fastlgs_core::fs::read(&path)?,
+    )
+        .into_response())
 }
 
-/// Where a request looks from.
-fn camera_of(app: &Shared, view: Option<&str>, camera: Option<Camera>, size: Option<&str>) -> Answer<Camera> {
+/// Returns the camera of a request: `camera`, else that of the named view, else that of the first
+/// view.
+///
+/// # Errors
+/// Status 400 for both a view and a camera, an unknown view, an invalid camera or size, or too many
+/// pixels.
+fn camera_of(
+    app: &Shared,
+    view: Option<&str>,
+    camera: Option<Camera>,
+    size: Option<&str>,
+) -> Answer<Camera> {
     let mut camera = match (view, camera) {
         (Some(_), Some(_)) => return Err(Failure::bad("give a view or a camera, not both")),
         (None, Some(camera)) => camera,
         (Some(view), None) => {
             let cameras = app.cameras();
-            let index = app.folder.view_index(&cameras, view).map_err(|e| Failure::bad(e.to_string()))?;
+            let index = app
+                .folder
+                .view_index(&cameras, view)
+                .map_err(|e| Failure::bad(e.to_string()))?;
             cameras[index].clone()
         }
-        (None, None) => app.cameras().first().cloned().ok_or_else(|| Failure::bad("the scene has no views"))?,
+        (None, None) => app
+            .cameras()
+            .first()
+            .cloned()
+            .ok_or_else(|| Failure::bad("the scene has no views"))?,
     };
     if let Some(size) = size {
         let (w, h) = parse_size(size).map_err(Failure::bad)?;
@@ -164,12 +217,14 @@ fn checked_text(text: &str) -> Answer<&str> {
     let text = text.trim();
     match text.chars().count() {
         0 => Err(Failure::bad("the text is empty")),
-        n if n > LONGEST_TEXT => Err(Failure::bad(format!("the text has {n} letters; at most {LONGEST_TEXT}"))),
+        n if n > LONGEST_TEXT => Err(Failure::bad(format!(
+            "the text has {n} characters; at most {LONGEST_TEXT} are allowed"
+        ))),
         _ => Ok(text),
     }
 }
 
-/// A question; one of `text`, `point` and `image`.
+/// Body of `POST /api/query`; exactly one of `text`, `point` and `image` is required.
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 pub struct Asked {
@@ -183,47 +238,75 @@ pub struct Asked {
     size: Option<String>,
     top_k: Option<usize>,
     false_alarms: Option<f32>,
-    /// Objects that are listed with their scores.
+    /// Number of objects to list with their scores.
     candidates: Option<usize>,
-    /// Objects that are not looked at, as in `/api/render`.
+    /// Ids of objects to leave out, as in `/api/render`.
     hidden: Vec<u16>,
-    /// Objects that alone are looked at.
+    /// Ids of the only objects to show; all if empty.
     only: Vec<u16>,
-    /// Whether mask and heat map come with the answer, as data URLs.
+    /// Whether to return the mask and the heat map, as data URLs.
     mask: bool,
     heatmap: bool,
 }
 
-/// `POST /api/query`: the fields of `fastlgs query --json`.
+/// `POST /api/query`: answers a query with the fields of `fastlgs query --json`.
 pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>) -> Answer {
     let Json(asked) = request?;
-    let camera = camera_of(&app, asked.view.as_deref(), asked.camera.clone(), asked.size.as_deref())?;
+    let camera = camera_of(
+        &app,
+        asked.view.as_deref(),
+        asked.camera.clone(),
+        asked.size.as_deref(),
+    )?;
     let ask = match (&asked.text, &asked.point, &asked.image) {
         (Some(text), None, None) => Ask::Text(checked_text(text)?.to_owned()),
         (None, Some(pixels), None) => match pixels.outside(&camera) {
             None => Ask::Point(pixels.clone()),
             Some((x, y)) => {
-                return Err(Failure::bad(format!("the point {x},{y} lies outside the view of {}x{}", camera.width, camera.height)));
+                return Err(Failure::bad(format!(
+                    "the point {x},{y} lies outside the view of {}x{}",
+                    camera.width, camera.height
+                )));
             }
         },
         (None, None, Some(data)) => {
-            let data = base64::engine::general_purpose::STANDARD.decode(data).map_err(|e| Failure::bad(format!("image: {e}")))?;
-            // Beside what answers others.
-            let decoded = tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
+            let data = base64::engine::general_purpose::STANDARD
+                .decode(data)
+                .map_err(|e| Failure::bad(format!("image: {e}")))?;
+            // Decoded on a blocking thread, so that other requests are not delayed.
+            let decoded =
+                tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
             let decoded = decoded.map_err(|e| anyhow::anyhow!("image: {e}"))?;
-            Ask::Image("image".into(), decoded.map_err(|e| Failure::bad(e.to_string()))?)
+            Ask::Image(
+                "image".into(),
+                decoded.map_err(|e| Failure::bad(e.to_string()))?,
+            )
         }
-        _ => return Err(Failure::bad("ask for one of text, point and image")),
+        _ => return Err(Failure::bad("give exactly one of text, point and image")),
     };
-    if asked.false_alarms.is_some_and(|share| !(share > 0.0 && share < 1.0)) {
-        return Err(Failure::bad("false_alarms: a share between 0 and 1, like 0.05"));
+    if asked
+        .false_alarms
+        .is_some_and(|share| !(share > 0.0 && share < 1.0))
+    {
+        return Err(Failure::bad(
+            "false_alarms: give a number between 0 and 1, such as 0.05",
+        ));
     }
     if asked.negative.len() > MOST_NEGATIVES {
-        return Err(Failure::bad(format!("at most {MOST_NEGATIVES} negatives")));
+        return Err(Failure::bad(format!(
+            "negative: at most {MOST_NEGATIVES} texts are allowed"
+        )));
     }
-    let negatives = asked.negative.iter().map(|n| checked_text(n).map(str::to_owned)).collect::<Answer<Vec<_>>>()?;
+    let negatives = asked
+        .negative
+        .iter()
+        .map(|n| checked_text(n).map(str::to_owned))
+        .collect::<Answer<Vec<_>>>()?;
     let (want_mask, want_heat) = (asked.mask, asked.heatmap);
-    let choice = Choice { hidden: asked.hidden, only: asked.only };
+    let choice = Choice {
+        hidden: asked.hidden,
+        only: asked.only,
+    };
     let work = move |desk: &mut Desk| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
@@ -231,10 +314,22 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
             top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
         };
         let candidates = asked.candidates.unwrap_or(CANDIDATES);
-        let Some(render_ms) = desk.look(&camera, &choice)? else { return Err(Failure::bad("nothing would be left to look at")) };
-        let question = Question { ask: &ask, negatives: &negatives, config, dilate: None, candidates };
-        let (answer, mut report) = question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
-        let mask = (want_mask && report.found).then(|| mask_picture(&answer.mask, camera.width, camera.height));
+        let Some(render_ms) = desk.look(&camera, &choice)? else {
+            return Err(Failure::bad(
+                "nothing would be left to query; hide fewer objects",
+            ));
+        };
+        let question = Question {
+            ask: &ask,
+            negatives: &negatives,
+            config,
+            dilate: None,
+            candidates,
+        };
+        let (answer, mut report) =
+            question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
+        let mask = (want_mask && report.found)
+            .then(|| mask_picture(&answer.mask, camera.width, camera.height));
         let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.heat()));
         report.look_elsewhere(&mut desk.scene, &desk.grid)?;
         let mut value = serde_json::to_value(&report).map_err(anyhow::Error::from)?;
@@ -256,7 +351,7 @@ fn data_url(picture: impl Into<DynamicImage>) -> Answer<Value> {
     Ok(json!(format!("data:image/png;base64,{data}")))
 }
 
-/// A picture.
+/// Body of `POST /api/render`.
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
 pub struct Wanted {
@@ -266,36 +361,60 @@ pub struct Wanted {
     /// `color`, `objects`, or `heatmap`, which needs `text`.
     what: Option<String>,
     text: Option<String>,
-    /// Objects that are lit up while the rest is dimmed.
+    /// Ids of objects to highlight; the rest is dimmed.
     selected: Vec<u16>,
-    /// Objects that are left out.
+    /// Ids of objects to leave out.
     hidden: Vec<u16>,
-    /// Objects that are shown alone.
+    /// Ids of the only objects to show; all if empty.
     only: Vec<u16>,
 }
 
-/// `POST /api/render`: a PNG.
-pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection>) -> Answer<Response> {
+/// `POST /api/render`: renders a view as PNG.
+pub async fn render(
+    State(app): App,
+    request: Result<Json<Wanted>, JsonRejection>,
+) -> Answer<Response> {
     let Json(wanted) = request?;
-    let camera = camera_of(&app, wanted.view.as_deref(), wanted.camera.clone(), wanted.size.as_deref())?;
+    let camera = camera_of(
+        &app,
+        wanted.view.as_deref(),
+        wanted.camera.clone(),
+        wanted.size.as_deref(),
+    )?;
     let what = wanted.what.as_deref().unwrap_or("color").to_owned();
-    let text = wanted.text.as_deref().map(checked_text).transpose()?.map(str::to_owned);
+    let text = wanted
+        .text
+        .as_deref()
+        .map(checked_text)
+        .transpose()?
+        .map(str::to_owned);
     if !["color", "objects", "heatmap"].contains(&what.as_str()) {
-        return Err(Failure::bad(format!("what: '{what}' is unknown; there are color, objects and heatmap")));
+        return Err(Failure::bad(format!(
+            "what: '{what}' is unknown; use color, objects or heatmap"
+        )));
     }
     if (what == "heatmap") != text.is_some() {
-        return Err(Failure::bad("a heatmap needs a text, and nothing else does"));
+        return Err(Failure::bad(
+            "text: required for a heatmap, and allowed only there",
+        ));
     }
-    let choice = Choice { hidden: wanted.hidden, only: wanted.only };
+    let choice = Choice {
+        hidden: wanted.hidden,
+        only: wanted.only,
+    };
     let work = move |desk: &mut Desk| {
         if !desk.choose(&choice)? {
-            return Err(Failure::bad("nothing would be left to show"));
+            return Err(Failure::bad(
+                "nothing would be left to show; hide fewer objects",
+            ));
         }
         let frame = desk.scene.render(&camera)?;
         let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
         let picture = if what == "objects" {
             let ids = desk.scene.field(&camera, None)?.owners(&desk.grid);
-            RgbImage::from_fn(ids.width, ids.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))))
+            RgbImage::from_fn(ids.width, ids.height, |x, y| {
+                Rgb(turbo::id_color(ids.at(x, y)))
+            })
         } else if let Some(text) = &text {
             let field = desk.scene.field(&camera, None)?;
             let meaning = Ask::Text(text.clone()).meaning(&desk.scene, &[])?;
@@ -304,8 +423,18 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
         } else if wanted.selected.is_empty() {
             color
         } else {
-            let hits: Vec<query::Hit> = wanted.selected.iter().map(|id| query::Hit { id: *id, score: 1.0 }).collect();
-            overlay(&color, &desk.scene.field(&camera, None)?.mask(&desk.grid, &hits))
+            let hits: Vec<query::Hit> = wanted
+                .selected
+                .iter()
+                .map(|id| query::Hit {
+                    id: *id,
+                    score: 1.0,
+                })
+                .collect();
+            overlay(
+                &color,
+                &desk.scene.field(&camera, None)?.mask(&desk.grid, &hits),
+            )
         };
         Ok(image_io::encode_png(picture)?)
     };
@@ -313,7 +442,7 @@ pub async fn render(State(app): App, request: Result<Json<Wanted>, JsonRejection
     Ok(([(header::CONTENT_TYPE, "image/png")], data).into_response())
 }
 
-/// A selection as a file.
+/// Query string of `GET /api/export`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Export {
@@ -321,10 +450,10 @@ pub struct Export {
     objects: String,
     /// `ply`, `spz`, `sog` or `glb`.
     format: String,
-    /// False: everything but these objects.
+    /// Whether to write these objects, or all others.
     #[serde(default = "yes")]
     keep: bool,
-    /// Checked before.
+    /// Checked by the guard; listed here because unknown fields are rejected.
     #[serde(rename = "token")]
     _token: Option<String>,
 }
@@ -333,23 +462,40 @@ fn yes() -> bool {
     true
 }
 
-/// `GET /api/export`
-pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejection>) -> Answer<Response> {
+/// `GET /api/export`: returns the Gaussians of objects, or all others, as a file.
+pub async fn export(
+    State(app): App,
+    request: Result<Query<Export>, QueryRejection>,
+) -> Answer<Response> {
     let Query(wanted) = request?;
-    let ids: Option<Vec<u16>> = wanted.objects.split(',').map(|id| id.trim().parse().ok()).collect();
+    let ids: Option<Vec<u16>> = wanted
+        .objects
+        .split(',')
+        .map(|id| id.trim().parse().ok())
+        .collect();
     let ids = ids.ok_or_else(|| Failure::bad("objects: give ids like 3,17"))?;
     let ending = wanted.format;
     if !selection::ENDINGS.contains(&ending.as_str()) {
-        return Err(Failure::bad(format!("format: '{ending}' is unknown; there are {}", selection::ENDINGS.join(", "))));
+        return Err(Failure::bad(format!(
+            "format: '{ending}' is unknown; use one of {}",
+            selection::ENDINGS.join(", ")
+        )));
     }
-    let name = format!("{}-{}.{ending}", app.name, if wanted.keep { "selection" } else { "rest" });
+    let name = format!(
+        "{}-{}.{ending}",
+        app.name,
+        if wanted.keep { "selection" } else { "rest" }
+    );
     let work = move |desk: &mut Desk| {
         desk.choose(&Choice::default())?;
         let selected = selection::gaussians(&desk.scene.gaussians, &desk.grid, &ids);
         if selected.is_empty() || (!wanted.keep && selected.len() == desk.scene.gaussians.len()) {
-            return Err(Failure::bad("there is nothing to write: these objects have no Gaussians, or all of them"));
+            return Err(Failure::bad(
+                "there is nothing to write: the selection has no Gaussians",
+            ));
         }
-        let folder = tempfile::tempdir().map_err(|e| anyhow::anyhow!("no temporary folder: {e}"))?;
+        let folder = tempfile::tempdir()
+            .map_err(|e| anyhow::anyhow!("cannot create a temporary folder: {e}"))?;
         let path = folder.path().join("selection").with_extension(&ending);
         let world = World::of(&desk.scene.manifest, &desk.scene.cameras);
         selection::export(&path, &desk.scene.gaussians, &world, &selected, wanted.keep)?;
@@ -357,19 +503,42 @@ pub async fn export(State(app): App, request: Result<Query<Export>, QueryRejecti
     };
     let data: Vec<u8> = app.ready()?.ask(work).await?;
     let mut headers = HeaderMap::new();
-    let safe: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' }).collect();
+    let safe: String = name
+        .chars()
+        .map(|c| {
+            if c.is_ascii_alphanumeric() || "-_.".contains(c) {
+                c
+            } else {
+                '_'
+            }
+        })
+        .collect();
     let disposition = format!("attachment; filename=\"{safe}\"");
-    headers.insert(header::CONTENT_DISPOSITION, disposition.parse().map_err(|e| anyhow::anyhow!("{disposition}: {e}"))?);
-    headers.insert(header::CONTENT_TYPE, header::HeaderValue::from_static("application/octet-stream"));
+    headers.insert(
+        header::CONTENT_DISPOSITION,
+        disposition
+            .parse()
+            .map_err(|e| anyhow::anyhow!("{disposition}: {e}"))?,
+    );
+    headers.insert(
+        header::CONTENT_TYPE,
+        header::HeaderValue::from_static("application/octet-stream"),
+    );
     Ok((headers, Bytes::from(data)).into_response())
 }
 
-/// `GET` of anything else.
+/// Answers requests for unknown addresses with status 404.
 pub async fn unknown() -> Failure {
-    Failure::new(StatusCode::NOT_FOUND, "there is nothing here; /api/openapi.json lists what there is")
+    Failure::new(
+        StatusCode::NOT_FOUND,
+        "unknown address; /api/openapi.json lists all addresses",
+    )
 }
 
-/// A known address asked in the wrong way.
+/// Answers requests with a wrong method with status 405.
 pub async fn wrong_method() -> Failure {
-    Failure::new(StatusCode::METHOD_NOT_ALLOWED, "this address is asked in another way; see /api/openapi.json")
+    Failure::new(
+        StatusCode::METHOD_NOT_ALLOWED,
+        "this address does not support this method; see /api/openapi.json",
+    )
 }

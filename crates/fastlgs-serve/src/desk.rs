@@ -1,4 +1,4 @@
-//! The one thread that holds the opened scene. Requests leave their work on its desk and wait.
+//! The scene worker: a thread that owns the opened scene and runs the work of all requests.
 
 use crate::failure::Failure;
 use crate::splats;
@@ -19,87 +19,105 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 
-/// Pieces of work that may wait; who comes later is told to come back.
+/// Largest number of waiting requests; further ones get status 503.
 const WAITING: usize = 32;
 
-/// The opened scene with what is kept between requests.
+/// The opened scene, and the state that is kept between requests.
 pub struct Desk {
     /// The scene.
     pub scene: Session,
-    /// Its objects.
+    /// Object table of the scene.
     pub grid: Grid,
-    /// Pictures of the objects.
+    /// Cached pictures of objects.
     thumbnails: Thumbnails,
-    /// The view that was last looked at, and what was shown there, with what it tells about objects.
+    /// Camera and visible objects of the last query, and the field rendered for them.
     seen: Option<(Camera, Choice, Field)>,
-    /// Which Gaussians are on the device, and all of them while these are not.
+    /// Visible objects, whose Gaussians are on the device. `all` has all Gaussians while some are
+    /// hidden.
     choice: Choice,
     all: Option<Gaussians>,
-    /// What browsers draw, once one has asked for it.
+    /// Gaussians packed for browsers, after the first request for them.
     splats: Option<Bytes>,
 }
 
-/// Which objects pictures show; each with all that lies in it.
+/// Visible objects; each includes its parts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Choice {
-    /// Objects that are left out.
+    /// Ids of objects to leave out.
     pub hidden: Vec<u16>,
-    /// Objects that are shown alone; all where there are none.
+    /// Ids of the only objects to show; all if empty.
     pub only: Vec<u16>,
 }
 
 type Work = Box<dyn FnOnce(&mut Desk) + Send>;
 
-/// Where work is left.
+/// Handle of the scene worker, to which requests send their work.
 #[derive(Clone)]
 pub struct Bell(mpsc::Sender<Work>);
 
 impl Desk {
-    /// Opens a scene.
+    /// Opens a scene on a device. `clip_text` replaces the CLIP text tower that the scene names.
     pub fn new(root: &Path, device: &str, clip_text: Option<PathBuf>) -> Result<Self> {
         let mut scene = Session::open(root, device)?;
         scene.clip_text = clip_text;
         let grid = scene.grid()?;
-        Ok(Self { scene, grid, thumbnails: Thumbnails::default(), seen: None, choice: Choice::default(), all: None, splats: None })
+        Ok(Self {
+            scene,
+            grid,
+            thumbnails: Thumbnails::default(),
+            seen: None,
+            choice: Choice::default(),
+            all: None,
+            splats: None,
+        })
     }
 
-    /// Opens a scene on a thread of its own; returns once it can be asked.
+    /// Opens a scene on a new thread. Returns when it can answer queries.
     pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<Bell> {
         let (bell, mut work) = mpsc::channel::<Work>(WAITING);
         let (opened, wait) = std::sync::mpsc::channel();
-        std::thread::Builder::new().name("scene".into()).spawn(move || {
-            let open = || -> Result<Self> {
-                let mut desk = Self::new(&root, &device, clip_text)?;
-                desk.scene.warm_up()?;
-                // The first question should not wait for the encoder. Without it the page still shows the scene.
-                if let Err(error) = desk.scene.text_query("warm up") {
-                    tracing::warn!("texts cannot be asked for: {error:#}");
-                }
-                Ok(desk)
-            };
-            match open() {
-                Ok(mut desk) => {
-                    let _ = opened.send(Ok(()));
-                    while let Some(work) = work.blocking_recv() {
-                        work(&mut desk);
+        std::thread::Builder::new()
+            .name("scene".into())
+            .spawn(move || {
+                let open = || -> Result<Self> {
+                    let mut desk = Self::new(&root, &device, clip_text)?;
+                    desk.scene.warm_up()?;
+                    // Loads the text encoder before the first query. Without it, the page still shows
+                    // the scene.
+                    if let Err(error) = desk.scene.text_query("warm up") {
+                        tracing::warn!("text queries are not available: {error:#}");
+                    }
+                    Ok(desk)
+                };
+                match open() {
+                    Ok(mut desk) => {
+                        let _ = opened.send(Ok(()));
+                        while let Some(work) = work.blocking_recv() {
+                            work(&mut desk);
+                        }
+                    }
+                    Err(error) => {
+                        let _ = opened.send(Err(error));
                     }
                 }
-                Err(error) => {
-                    let _ = opened.send(Err(error));
-                }
-            }
-        })?;
-        wait.recv().map_err(|_| anyhow!("the scene's thread ended before it was opened"))??;
+            })?;
+        wait.recv()
+            .map_err(|_| anyhow!("the scene worker stopped before the scene was opened"))??;
         Ok(Bell(bell))
     }
 
-    /// What a view tells about some objects, rendered unless it is the last one; with the milliseconds it took. `None`, and all stays as it
-    /// was, where nothing would be left to look at.
+    /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
+    ///
+    /// Returns `None` and changes nothing if no Gaussian would be visible.
     pub fn look(&mut self, camera: &Camera, choice: &Choice) -> Result<Option<f64>> {
         if !self.choose(choice)? {
             return Ok(None);
         }
-        if self.seen.as_ref().is_some_and(|(seen, shown, _)| (seen, shown) == (camera, choice)) {
+        if self
+            .seen
+            .as_ref()
+            .is_some_and(|(seen, shown, _)| (seen, shown) == (camera, choice))
+        {
             return Ok(Some(0.0));
         }
         let started = Instant::now();
@@ -108,12 +126,20 @@ impl Desk {
         Ok(Some(started.elapsed().as_secs_f64() * 1e3))
     }
 
-    /// What [`Self::look`] last saw.
+    /// Returns the field that [`Self::look`] rendered last.
+    ///
+    /// # Errors
+    /// No view was rendered yet.
     pub fn seen(&self) -> Result<&Field> {
-        self.seen.as_ref().map(|seen| &seen.2).context("no view was looked at")
+        self.seen
+            .as_ref()
+            .map(|seen| &seen.2)
+            .context("no view was rendered")
     }
 
-    /// Shows some objects in the pictures that follow; `false`, and all stays as it was, where nothing would be left to show.
+    /// Sets the visible objects of later renderings.
+    ///
+    /// Returns `false` and changes nothing if no Gaussian would be visible.
     pub fn choose(&mut self, choice: &Choice) -> Result<bool> {
         if self.choice == *choice {
             return Ok(true);
@@ -123,9 +149,15 @@ impl Desk {
             self.scene.show(all.clone())?;
             self.all = None;
         } else {
-            let (hidden, only) = (self.grid.members(&choice.hidden), self.grid.members(&choice.only));
-            let among = |members: &[bool], i: usize| members.get(usize::from(all.object_ids[i])) == Some(&true);
-            let shown = |i: &usize| !among(&hidden, *i) && (choice.only.is_empty() || among(&only, *i));
+            let (hidden, only) = (
+                self.grid.members(&choice.hidden),
+                self.grid.members(&choice.only),
+            );
+            let among = |members: &[bool], i: usize| {
+                members.get(usize::from(all.object_ids[i])) == Some(&true)
+            };
+            let shown =
+                |i: &usize| !among(&hidden, *i) && (choice.only.is_empty() || among(&only, *i));
             let places: Vec<usize> = (0..all.len()).filter(shown).collect();
             if places.is_empty() {
                 return Ok(false);
@@ -136,7 +168,7 @@ impl Desk {
         Ok(true)
     }
 
-    /// What the page needs to know of a scene that can be asked.
+    /// Describes the opened scene for the page.
     pub fn about(&self) -> Value {
         json!({
             "stage": "ready",
@@ -150,15 +182,15 @@ impl Desk {
             "segmenter": self.scene.manifest.segmenter,
             "encoder": self.scene.manifest.encoder,
             "adapter": self.scene.engine.name(),
-            // Cameras, boxes and Gaussians of this interface are in the scene's own coordinates: world = origin + scale x own.
+            // This interface uses scene coordinates: world = origin + scale x scene.
             "frame": self.scene.manifest.frame,
         })
     }
 
-    /// All objects and parts, by id.
+    /// Lists all objects and parts in order of their ids.
     pub fn objects(&mut self) -> Result<Value> {
         self.choose(&Choice::default())?;
-        // One pass: the Gaussians of each object, those of what lies in it included.
+        // One pass over all Gaussians. Those of an object include those of its parts.
         let mut own: Vec<Vec<usize>> = vec![Vec::new(); self.grid.objects.len() + 1];
         for (i, id) in self.scene.gaussians.object_ids.iter().enumerate() {
             for above in self.grid.chain(*id) {
@@ -182,45 +214,60 @@ impl Desk {
         Ok(Value::Array(self.grid.objects.iter().map(row).collect()))
     }
 
-    /// The picture of an object; nothing for one that no view shows.
+    /// Returns the picture of an object, or `None` if no searched view shows it.
     pub fn picture(&mut self, id: u16) -> Result<Option<RgbImage>> {
         self.choose(&Choice::default())?;
         self.thumbnails.picture(&mut self.scene, &self.grid, id)
     }
 
-    /// The PNG of an object; nothing for one that no view shows.
+    /// Returns the picture of an object as PNG, or `None` if no searched view shows it.
     pub fn thumbnail(&mut self, id: u16) -> Result<Option<Vec<u8>>> {
         self.choose(&Choice::default())?;
         self.thumbnails.png(&mut self.scene, &self.grid, id)
     }
 
-    /// The view that shows most of an object; nothing for one that no view shows.
+    /// Returns the name of the view that shows most of an object, or `None` if no searched view
+    /// does.
     pub fn best_view(&mut self, id: u16) -> Result<Option<String>> {
         self.choose(&Choice::default())?;
         self.thumbnails.view(&mut self.scene, &self.grid, id)
     }
 
-    /// How many Gaussians there are, hidden ones included.
+    /// Returns the number of Gaussians, including hidden ones.
     pub fn gaussians(&self) -> usize {
         self.all.as_ref().unwrap_or(&self.scene.gaussians).len()
     }
 
-    /// All Gaussians as browsers draw them.
+    /// Returns all Gaussians, packed for browsers.
     pub fn splats(&mut self) -> Bytes {
         let all = self.all.as_ref().unwrap_or(&self.scene.gaussians);
-        self.splats.get_or_insert_with(|| Bytes::from(splats::pack(all))).clone()
+        self.splats
+            .get_or_insert_with(|| Bytes::from(splats::pack(all)))
+            .clone()
     }
 }
 
 impl Bell {
-    /// Leaves work and waits for what comes of it. Work whose asker has gone is not begun.
-    pub async fn ask<T: Send + 'static>(&self, work: impl FnOnce(&mut Desk) -> Result<T, Failure> + Send + 'static) -> Result<T, Failure> {
+    /// Sends work to the scene worker and waits for its result. Work of a cancelled request is not
+    /// started.
+    ///
+    /// # Errors
+    /// Errors of `work`, status 500 if it panics, and 503 if too many requests are waiting.
+    pub async fn ask<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&mut Desk) -> Result<T, Failure> + Send + 'static,
+    ) -> Result<T, Failure> {
         let (reply, answer) = oneshot::channel();
         let work: Work = Box::new(move |desk| {
             if !reply.is_closed() {
-                // A panic must cost one request, not the server.
+                // A panic fails this request, not the server.
                 let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(desk)));
-                let failed = || Failure::new(StatusCode::INTERNAL_SERVER_ERROR, "this request failed inside; the log says where");
+                let failed = || {
+                    Failure::new(
+                        StatusCode::INTERNAL_SERVER_ERROR,
+                        "internal error; see the log of the server",
+                    )
+                };
                 let _ = reply.send(done.unwrap_or_else(|_| Err(failed())));
             }
         });

@@ -1,4 +1,4 @@
-//! Answers that say why there is none.
+//! Error responses of the HTTP interface.
 
 use axum::Json;
 use axum::extract::rejection::{JsonRejection, PathRejection, QueryRejection};
@@ -6,7 +6,7 @@ use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use serde_json::json;
 
-/// An answer that says why there is none.
+/// An error response: HTTP status and reason.
 #[derive(Debug)]
 pub struct Failure {
     status: StatusCode,
@@ -14,17 +14,23 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A refusal with its reason in one sentence.
+    /// Creates an error response; `reason` is one sentence.
     pub fn new(status: StatusCode, reason: impl Into<String>) -> Self {
-        Self { status, reason: reason.into() }
+        Self {
+            status,
+            reason: reason.into(),
+        }
     }
 
-    /// Too much is waiting.
+    /// Returns status 503: too many requests are waiting or running.
     pub fn busy() -> Self {
-        Self::new(StatusCode::SERVICE_UNAVAILABLE, "the server is busy; ask again in a moment")
+        Self::new(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "the server is busy; try again in a moment",
+        )
     }
 
-    /// The asker's mistake.
+    /// Returns status 400: the request is invalid.
     pub fn bad(reason: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, reason)
     }
@@ -39,7 +45,10 @@ impl IntoResponse for Failure {
 impl From<anyhow::Error> for Failure {
     fn from(error: anyhow::Error) -> Self {
         tracing::error!("{error:#}");
-        Self::new(StatusCode::INTERNAL_SERVER_ERROR, fastlgs::one_sentence(error.as_ref()))
+        Self::new(
+            StatusCode::INTERNAL_SERVER_ERROR,
+            fastlgs::one_sentence(error.as_ref()),
+        )
     }
 }
 

@@ -1,5 +1,7 @@
-//! Who may ask: on the loopback any program of this machine that calls the server by a loopback name; elsewhere who knows the token.
-//! And how much: at most so many requests at a time, of at most so many bytes.
+//! Access control and limits of the HTTP interface.
+//!
+//! On a loopback address, a request must use a loopback host name. On other addresses, requests to
+//! `/api/` need the token. The number of simultaneous requests and their size are limited.
 
 use crate::failure::Failure;
 use axum::body::Body;
@@ -14,78 +16,139 @@ use std::sync::Arc;
 use std::time::Duration;
 use tokio::sync::Semaphore;
 
-/// Requests that are worked on at the same time; more are told to come back.
+/// Largest number of simultaneous requests to `/api/`; further ones get status 503.
 const AT_ONCE: usize = 64;
 /// Largest body of a request, in bytes.
 pub const LARGEST_BODY: usize = 8 << 20;
-/// So much of a body is listened to; who sends more may not hear the answer.
+/// Number of bytes that are read from a body that is too large. A client that sends more may not
+/// receive the response.
 const PATIENCE: usize = 64 << 20;
-/// And so long.
+/// Longest time for reading a body.
 const PATIENT_FOR: Duration = Duration::from_secs(60);
 
-/// What every request is checked against.
+/// Access rules and limits that every request is checked against.
 pub struct Guard {
     loopback: bool,
-    /// Names under which a proxy on this machine passes requests on.
+    /// Host names of proxies on this machine.
     hosts: Vec<String>,
-    /// Hexadecimal digits that requests must know; nothing on the loopback.
+    /// Token that requests must contain: 32 hexadecimal digits. `None` on a loopback address.
     pub token: Option<String>,
     places: Semaphore,
 }
 
 impl Guard {
-    /// The guard of a server at `address`; with a new token unless that is the machine itself.
+    /// Creates the guard of a server at `address`, with a new token unless it is a loopback
+    /// address.
+    ///
+    /// # Errors
+    /// The system provides no random numbers.
     pub fn new(address: SocketAddr, hosts: &[String]) -> anyhow::Result<Self> {
         let loopback = address.ip().is_loopback();
         let mut secret = [0u8; 16];
-        // The one thing that must not follow from --seed.
-        getrandom::fill(&mut secret).map_err(|e| anyhow::anyhow!("the system gives no random numbers for the token: {e}"))?;
+        // The token must be unpredictable, so it does not depend on --seed.
+        getrandom::fill(&mut secret).map_err(|e| {
+            anyhow::anyhow!("the system provides no random numbers for the token: {e}")
+        })?;
         let token = (!loopback).then(|| secret.iter().map(|b| format!("{b:02x}")).collect());
-        Ok(Self { loopback, hosts: hosts.to_vec(), token, places: Semaphore::new(AT_ONCE) })
+        Ok(Self {
+            loopback,
+            hosts: hosts.to_vec(),
+            token,
+            places: Semaphore::new(AT_ONCE),
+        })
     }
 
-    /// Whether a request may pass. A foreign page that had its name resolve to this machine would send that name as host.
+    /// Returns the reason to refuse a request, or `None` if it may pass.
+    ///
+    /// The check of the host name stops DNS rebinding: a foreign page whose name resolves to this
+    /// machine sends that name as host.
     fn refusal(&self, request: &Parts) -> Option<Failure> {
         if self.loopback {
-            let host = request.headers.get(header::HOST).and_then(|h| h.to_str().ok()).unwrap_or_default();
-            let name = host.rsplit_once(':').filter(|(_, port)| port.parse::<u16>().is_ok()).map_or(host, |(name, _)| name);
+            let host = request
+                .headers
+                .get(header::HOST)
+                .and_then(|h| h.to_str().ok())
+                .unwrap_or_default();
+            let name = host
+                .rsplit_once(':')
+                .filter(|(_, port)| port.parse::<u16>().is_ok())
+                .map_or(host, |(name, _)| name);
             let bare = name.trim_start_matches('[').trim_end_matches(']');
-            let known = self.hosts.iter().any(|host| host.eq_ignore_ascii_case(bare));
-            let own = known || bare == "localhost" || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
+            let known = self
+                .hosts
+                .iter()
+                .any(|host| host.eq_ignore_ascii_case(bare));
+            let own = known
+                || bare == "localhost"
+                || bare.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
             if !own {
                 return Some(Failure::new(
                     StatusCode::FORBIDDEN,
                     format!(
-                        "this server is not '{name}'; use its loopback address, or start it with --host-name {bare} behind a proxy of that name"
+                        "this server does not accept the host name '{name}'; use its loopback address, or start it with --host-name {bare} if that is a proxy"
                     ),
                 ));
             }
-            // Browsers say whose page asks. One may lead here, and nothing more.
-            let from = request.headers.get("sec-fetch-site").and_then(|h| h.to_str().ok()).unwrap_or_default();
+            // Browsers report which site sends a request. Other sites may link to the page, but not
+            // use the interface.
+            let from = request
+                .headers
+                .get("sec-fetch-site")
+                .and_then(|h| h.to_str().ok())
+                .unwrap_or_default();
             let foreign = matches!(from, "cross-site" | "same-site") && is_api(request);
-            return foreign.then(|| Failure::new(StatusCode::FORBIDDEN, "pages of other sites may not ask this server"));
+            return foreign.then(|| {
+                Failure::new(
+                    StatusCode::FORBIDDEN,
+                    "pages of other sites may not use this server",
+                )
+            });
         }
         let wanted = self.token.as_deref()?;
-        // The page itself holds no secret; it passes the token on with what it asks for.
+        // The page itself is not secret. Its requests to the interface contain the token.
         if !is_api(request) {
             return None;
         }
-        let by_header = request.headers.get(header::AUTHORIZATION).and_then(|h| h.to_str().ok()).and_then(|h| h.strip_prefix("Bearer "));
-        let by_query = request.uri.query().and_then(|q| q.split('&').find_map(|p| p.strip_prefix("token=")));
-        // Every byte is looked at, so that time tells nothing about the first wrong one.
-        let same = |given: &str| given.len() == wanted.len() && given.bytes().zip(wanted.bytes()).fold(0, |sum, (a, b)| sum | (a ^ b)) == 0;
+        let by_header = request
+            .headers
+            .get(header::AUTHORIZATION)
+            .and_then(|h| h.to_str().ok())
+            .and_then(|h| h.strip_prefix("Bearer "));
+        let by_query = request
+            .uri
+            .query()
+            .and_then(|q| q.split('&').find_map(|p| p.strip_prefix("token=")));
+        // Compares all bytes, so that the time reveals nothing about the token.
+        let same = |given: &str| {
+            given.len() == wanted.len()
+                && given
+                    .bytes()
+                    .zip(wanted.bytes())
+                    .fold(0, |sum, (a, b)| sum | (a ^ b))
+                    == 0
+        };
         let known = by_header.is_some_and(same) || by_query.is_some_and(same);
-        (!known).then(|| Failure::new(StatusCode::UNAUTHORIZED, "the token is missing or wrong; open the address that the server printed"))
+        (!known).then(|| {
+            Failure::new(
+                StatusCode::UNAUTHORIZED,
+                "the token is missing or wrong; open the address that the server printed",
+            )
+        })
     }
 }
 
-/// Whether it asks for more than the page.
+/// Returns whether a request is for the interface, not for a file of the page.
 fn is_api(request: &Parts) -> bool {
     request.uri.path().starts_with("/api/")
 }
 
-/// The bytes of a body, or why it is not taken; what is more than `most` is listened to but not kept. An answer that is sent before
-/// its request has arrived is lost to whoever is still sending.
+/// Reads a body of at most `most` bytes.
+///
+/// A longer body is read but not kept, up to a limit: a client that is still sending would lose an
+/// early response.
+///
+/// # Errors
+/// Status 413 if the body is too large, 408 if it does not arrive completely or in time.
 async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
     let (mut kept, mut arrived) = (Vec::new(), 0);
     let listen = async {
@@ -102,21 +165,42 @@ async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
     };
     match tokio::time::timeout(PATIENT_FOR, listen).await {
         Ok(Some(())) if arrived <= most => Ok(kept),
-        Ok(Some(())) => Err(Failure::new(StatusCode::PAYLOAD_TOO_LARGE, format!("too large: at most {} MiB", LARGEST_BODY >> 20))),
-        Ok(None) | Err(_) => Err(Failure::new(StatusCode::REQUEST_TIMEOUT, "the request did not arrive whole")),
+        Ok(Some(())) => Err(Failure::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            format!(
+                "the request is too large: at most {} MiB are allowed",
+                LARGEST_BODY >> 20
+            ),
+        )),
+        Ok(None) | Err(_) => Err(Failure::new(
+            StatusCode::REQUEST_TIMEOUT,
+            "the request did not arrive completely",
+        )),
     }
 }
 
-/// Checks a request, counts it, and adds what browsers need to know to every answer.
+/// Checks a request, limits simultaneous requests, and adds security headers to every response.
 pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let (parts, body) = request.into_parts();
-    // Who is refused takes no place, and the page, which everybody may have, needs none.
+    // Refused requests and files of the page do not count towards the limit.
     let place = match guard.refusal(&parts) {
         Some(refusal) => Err(refusal),
         None if !is_api(&parts) => Ok(None),
-        None => guard.places.try_acquire().map(Some).map_err(|_| Failure::busy()),
+        None => guard
+            .places
+            .try_acquire()
+            .map(Some)
+            .map_err(|_| Failure::busy()),
     };
-    let body = receive(body, if matches!(place, Ok(Some(_))) { LARGEST_BODY } else { 0 }).await;
+    let body = receive(
+        body,
+        if matches!(place, Ok(Some(_))) {
+            LARGEST_BODY
+        } else {
+            0
+        },
+    )
+    .await;
     let mut response = match (place, body) {
         (Err(refusal), _) | (Ok(_), Err(refusal)) => refusal.into_response(),
         (Ok(_place), Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
@@ -127,9 +211,14 @@ pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
         (header::REFERRER_POLICY, "no-referrer"),
         (header::CACHE_CONTROL, "no-store"),
-        (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
+        (
+            HeaderName::from_static("cross-origin-resource-policy"),
+            "same-origin",
+        ),
     ] {
-        response.headers_mut().insert(name, HeaderValue::from_static(value));
+        response
+            .headers_mut()
+            .insert(name, HeaderValue::from_static(value));
     }
     response
 }

@@ -1,4 +1,5 @@
-//! The viewer: a page in the browser and an HTTP interface to one scene, opened or still in training.
+//! The viewer: a page in the browser and an HTTP interface to one scene, which is opened or in
+//! training.
 
 mod api;
 mod desk;
@@ -32,25 +33,47 @@ use tokio::runtime::Runtime;
 pub struct Server {
     runtime: Runtime,
     shared: Arc<Shared>,
-    /// Where the page is.
+    /// Address of the page, with the token if there is one.
     pub url: String,
 }
 
 impl Server {
-    /// Binds and answers from now on; on the loopback also under the names `hosts` of a proxy. With `live` the scene is still in training; without it, [`Self::open_scene`] must follow.
-    pub fn start(folder: &SceneFolder, bind: SocketAddr, live: Option<Arc<Live>>, hosts: &[String]) -> Result<Self> {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    /// Starts a server at the address `bind`.
+    ///
+    /// With `live`, the scene is still in training; without it, [`Self::open_scene`] must follow.
+    /// `hosts` are further host names that a server on a loopback address accepts.
+    ///
+    /// # Errors
+    /// The address cannot be used, or the cameras cannot be read.
+    pub fn start(
+        folder: &SceneFolder,
+        bind: SocketAddr,
+        live: Option<Arc<Live>>,
+        hosts: &[String],
+    ) -> Result<Self> {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()?;
         let listener = runtime.block_on(TcpListener::bind(bind));
-        let listener = listener.with_context(|| format!("{bind} cannot be listened on; name another address with --bind"))?;
+        let listener = listener
+            .with_context(|| format!("cannot listen on {bind}; choose another address or port"))?;
         let address = listener.local_addr()?;
         let guard = Arc::new(Guard::new(address, hosts)?);
         let url = match &guard.token {
             Some(token) => format!("http://{address}/?token={token}"),
             None => format!("http://{address}/"),
         };
-        let root = folder.root.canonicalize().unwrap_or_else(|_| folder.root.clone());
+        let root = folder
+            .root
+            .canonicalize()
+            .unwrap_or_else(|_| folder.root.clone());
         let shared = Arc::new(Shared {
-            name: root.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            name: root
+                .file_name()
+                .unwrap_or_default()
+                .to_string_lossy()
+                .into_owned(),
             cameras: RwLock::new(Arc::new(folder.cameras()?)),
             folder: folder.clone(),
             live,
@@ -63,29 +86,52 @@ impl Server {
                 tracing::error!("the server stopped: {error}");
             }
         });
-        Ok(Self { runtime, shared, url })
+        Ok(Self {
+            runtime,
+            shared,
+            url,
+        })
     }
 
-    /// Tells the page how far the cameras' subjects are.
+    /// Sets the distance from each camera to its subject, for the page. `means` are those of the
+    /// Gaussians.
     pub fn set_focus(&self, means: &[Vec3]) {
-        let _ = self.shared.focus.set(self.shared.cameras().iter().map(|c| focus(means, c)).collect());
+        let _ = self.shared.focus.set(
+            self.shared
+                .cameras()
+                .iter()
+                .map(|c| focus(means, c))
+                .collect(),
+        );
     }
 
-    /// Opens the trained scene for questions.
+    /// Opens the trained scene for queries.
+    ///
+    /// # Errors
+    /// The scene cannot be read, or the device fails.
     pub fn open_scene(&self, device: &str, clip_text: Option<PathBuf>) -> Result<()> {
-        // Training may have moved them.
-        *self.shared.cameras.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(self.shared.folder.cameras()?);
-        let bell = Desk::open(self.shared.folder.root.clone(), device.to_owned(), clip_text)?;
+        // Training may have moved the cameras.
+        *self
+            .shared
+            .cameras
+            .write()
+            .unwrap_or_else(PoisonError::into_inner) = Arc::new(self.shared.folder.cameras()?);
+        let bell = Desk::open(
+            self.shared.folder.root.clone(),
+            device.to_owned(),
+            clip_text,
+        )?;
         let _ = self.shared.bell.set(bell);
         Ok(())
     }
 
-    /// Answers until the process is told to stop (Ctrl-C or SIGTERM).
+    /// Serves until Ctrl-C or SIGTERM.
     pub fn wait(self) -> Result<()> {
         self.runtime.block_on(async {
             #[cfg(unix)]
             {
-                let mut terminate = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?;
+                let mut terminate =
+                    tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?;
                 tokio::select! {
                     pressed = tokio::signal::ctrl_c() => pressed,
                     _ = terminate.recv() => Ok(()),
@@ -99,10 +145,12 @@ impl Server {
     }
 }
 
-/// A server that watches a training shows it.
+/// Shows a running training on the page.
 impl Sink for Server {
     fn tell(&self, message: Message<'_>) {
-        let Some(live) = &self.shared.live else { return };
+        let Some(live) = &self.shared.live else {
+            return;
+        };
         match message {
             Message::TrainingBegins(first) => {
                 self.set_focus(&first.means);
@@ -110,7 +158,7 @@ impl Sink for Server {
             }
             Message::Trained { step, total, scene } if live.report(step, total) => match scene() {
                 Ok(scene) => live.picture(&scene),
-                Err(error) => tracing::warn!("the growing scene cannot be shown: {error}"),
+                Err(error) => tracing::warn!("cannot show the scene during training: {error}"),
             },
             Message::TrainingEnds(scene) => live.finish(scene),
             _ => {}
@@ -133,13 +181,14 @@ fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
         .route("/api/export", get(api::export))
         .fallback(api::unknown)
         .method_not_allowed_fallback(api::wrong_method)
-        // The guard has limited bodies already.
+        // The guard limits bodies.
         .layer(DefaultBodyLimit::disable())
         .layer(middleware::from_fn_with_state(guard, guard::check))
         .with_state(shared)
 }
 
-/// Distance from each camera to what it looks at: the median depth of what lies in the middle of its picture.
+/// Returns the distance from a camera to its subject: the median depth of the Gaussians in the
+/// central 40 % of the image along each axis. Returns 1 if there are none.
 fn focus(means: &[Vec3], camera: &Camera) -> f32 {
     const SAMPLES: usize = 4_000;
     let middle = |m: &Vec3| {
@@ -148,7 +197,11 @@ fn focus(means: &[Vec3], camera: &Camera) -> f32 {
         let near = |v: f32, size: u32| (v / size as f32 - 0.5).abs() < 0.2;
         (p.z > 0.0 && near(pixel.x, camera.width) && near(pixel.y, camera.height)).then_some(p.z)
     };
-    let mut depths: Vec<f32> = means.iter().step_by(means.len().div_ceil(SAMPLES).max(1)).filter_map(middle).collect();
+    let mut depths: Vec<f32> = means
+        .iter()
+        .step_by(means.len().div_ceil(SAMPLES).max(1))
+        .filter_map(middle)
+        .collect();
     depths.sort_by(f32::total_cmp);
     depths.get(depths.len() / 2).copied().unwrap_or(1.0)
 }

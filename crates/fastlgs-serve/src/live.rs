@@ -1,4 +1,4 @@
-//! A training run that is watched: what the page shows while the scene grows.
+//! State of a running training, for the page.
 
 use crate::splats;
 use axum::body::Bytes;
@@ -8,31 +8,31 @@ use serde::Serialize;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// Pictures of the growing scene are not made more often than this.
+/// Shortest time between two snapshots of the Gaussians.
 const PICTURE_EVERY: Duration = Duration::from_secs(2);
-/// Nor at all when no page has asked for so long.
+/// No snapshots are taken if no page has polled for this time.
 const WATCHED: Duration = Duration::from_secs(10);
-/// Points of the curves; older ones are thinned out when there are more.
+/// Largest number of points of the curves. Above it, every second point is dropped.
 const POINTS: usize = 600;
 
-/// What a page is told about a run.
+/// Progress of a training run, for the page.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Progress {
-    /// Steps that the run will have.
+    /// Total number of iterations.
     pub iterations: u32,
-    /// Number of the picture that `/api/splats` gives now.
+    /// Number of the snapshot that `/api/splats` returns.
     pub revision: u32,
-    /// Whether the run is over.
+    /// Whether all iterations are done.
     pub finished: bool,
     /// The curves, oldest first.
     pub curve: Vec<TrainStep>,
 }
 
-/// A run and who watches it.
+/// State of a training run that pages can watch.
 pub struct Live {
     /// Whether the 2-D Mip filter is on.
     pub antialias: bool,
-    /// Colour behind everything.
+    /// Background colour, each channel 0 to 1.
     pub background: [f32; 3],
     state: Mutex<Watched>,
 }
@@ -46,18 +46,32 @@ struct Watched {
 }
 
 impl Live {
-    /// A run that is about to begin, as far as is known of `iterations` steps.
+    /// Creates the state of a run before its start. `iterations` is the expected total.
     pub fn new(iterations: u32, antialias: bool, background: [f32; 3]) -> Self {
-        let progress = Progress { iterations, ..Progress::default() };
-        let first = Watched { progress, splats: Bytes::from(splats::pack(&Gaussians::default())), ..Watched::default() };
-        Self { antialias, background, state: Mutex::new(first) }
+        let progress = Progress {
+            iterations,
+            ..Progress::default()
+        };
+        let first = Watched {
+            progress,
+            splats: Bytes::from(splats::pack(&Gaussians::default())),
+            ..Watched::default()
+        };
+        Self {
+            antialias,
+            background,
+            state: Mutex::new(first),
+        }
     }
 
     fn state(&self) -> std::sync::MutexGuard<'_, Watched> {
-        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+        self.state
+            .lock()
+            .unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// Adds to the curves of a run of `total` steps; true when a new picture of the scene is wanted.
+    /// Adds a point to the curves of a run with `total` iterations. Returns whether a new snapshot
+    /// is needed.
     pub fn report(&self, point: TrainStep, total: u32) -> bool {
         let mut state = self.state();
         state.progress.iterations = total;
@@ -65,7 +79,7 @@ impl Live {
         curve.push(point);
         if curve.len() > POINTS {
             let mut number = 0;
-            // Measured held-out values are few and stay.
+            // Points with a held-out PSNR are few and are kept.
             curve.retain(|p| {
                 number += 1;
                 number % 2 == 0 || p.psnr_held_out.is_some()
@@ -75,7 +89,7 @@ impl Live {
         watched && state.pictured.is_none_or(|t| t.elapsed() >= PICTURE_EVERY)
     }
 
-    /// The scene as it is now.
+    /// Stores a snapshot of the Gaussians.
     pub fn picture(&self, scene: &Gaussians) {
         let splats = Bytes::from(splats::pack(scene));
         let mut state = self.state();
@@ -84,20 +98,20 @@ impl Live {
         state.pictured = Some(Instant::now());
     }
 
-    /// Steps are over; objects are being made.
+    /// Stores the final Gaussians. All iterations are done, and objects follow.
     pub fn finish(&self, scene: &Gaussians) {
         self.picture(scene);
         self.state().progress.finished = true;
     }
 
-    /// What the page asks for.
+    /// Returns the progress, and notes that a page is watching.
     pub fn progress(&self) -> Progress {
         let mut state = self.state();
         state.asked = Some(Instant::now());
         state.progress.clone()
     }
 
-    /// The last picture.
+    /// Returns the last snapshot, packed for browsers.
     pub fn splats(&self) -> Bytes {
         self.state().splats.clone()
     }
@@ -110,7 +124,14 @@ mod tests {
     #[test]
     fn pictures_are_made_for_those_who_watch_and_curves_stay_short() {
         let live = Live::new(100_000, false, [0.0; 3]);
-        let point = |iteration: u32| TrainStep { iteration, seconds: 0.0, loss: 0.1, psnr: 20.0, psnr_held_out: None, gaussians: 1 };
+        let point = |iteration: u32| TrainStep {
+            iteration,
+            seconds: 0.0,
+            loss: 0.1,
+            psnr: 20.0,
+            psnr_held_out: None,
+            gaussians: 1,
+        };
         live.picture(&Gaussians::default());
         live.state().pictured = None;
         assert!(!live.report(point(20), 30_000), "no one watches");
@@ -119,11 +140,23 @@ mod tests {
         live.picture(&Gaussians::default());
         assert!(!live.report(point(60), 30_000), "the last picture is fresh");
         for k in 4..5_000 {
-            live.report(TrainStep { psnr_held_out: (k == 1_000).then_some(25.0), ..point(20 * k) }, 30_000);
+            live.report(
+                TrainStep {
+                    psnr_held_out: (k == 1_000).then_some(25.0),
+                    ..point(20 * k)
+                },
+                30_000,
+            );
         }
         let progress = live.progress();
         assert_eq!(progress.revision, 2);
-        assert!(progress.curve.len() <= POINTS && progress.curve.windows(2).all(|w| w[0].iteration < w[1].iteration));
+        assert!(
+            progress.curve.len() <= POINTS
+                && progress
+                    .curve
+                    .windows(2)
+                    .all(|w| w[0].iteration < w[1].iteration)
+        );
         assert!(progress.curve.iter().any(|p| p.psnr_held_out.is_some()));
     }
 }

@@ -1,4 +1,4 @@
-//! The files of the page; all of them are in the binary.
+//! The files of the page, which are embedded in the binary.
 
 use crate::shared::Shared;
 use axum::Router;
@@ -6,10 +6,14 @@ use axum::http::header;
 use axum::routing::get;
 use std::sync::Arc;
 
-/// Address, kind, and content.
+/// Address, content type, and content of each file.
 const FILES: [(&str, &str, &str); 24] = [
     ("/", HTML, include_str!("../web/index.html")),
-    ("/style.css", "text/css; charset=utf-8", include_str!("../web/style.css")),
+    (
+        "/style.css",
+        "text/css; charset=utf-8",
+        include_str!("../web/style.css"),
+    ),
     ("/app.js", SCRIPT, include_str!("../web/app.js")),
     ("/stage.js", SCRIPT, include_str!("../web/stage.js")),
     ("/objects.js", SCRIPT, include_str!("../web/objects.js")),
@@ -27,30 +31,55 @@ const FILES: [(&str, &str, &str); 24] = [
     ("/webgl2.js", SCRIPT, include_str!("../web/webgl2.js")),
     ("/pictures.js", SCRIPT, include_str!("../web/pictures.js")),
     ("/sorter.js", SCRIPT, include_str!("../web/sorter.js")),
-    ("/splat.wgsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/splat.wgsl"))),
+    (
+        "/splat.wgsl",
+        TEXT,
+        include_str!(concat!(env!("OUT_DIR"), "/splat.wgsl")),
+    ),
     ("/present.wgsl", TEXT, include_str!("../web/present.wgsl")),
-    ("/corner.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/corner.glsl"))),
-    ("/pixel.glsl", TEXT, include_str!(concat!(env!("OUT_DIR"), "/pixel.glsl"))),
-    ("/api/openapi.json", "application/json", include_str!("../web/openapi.json")),
+    (
+        "/corner.glsl",
+        TEXT,
+        include_str!(concat!(env!("OUT_DIR"), "/corner.glsl")),
+    ),
+    (
+        "/pixel.glsl",
+        TEXT,
+        include_str!(concat!(env!("OUT_DIR"), "/pixel.glsl")),
+    ),
+    (
+        "/api/openapi.json",
+        "application/json",
+        include_str!("../web/openapi.json"),
+    ),
 ];
 
 const HTML: &str = "text/html; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const TEXT: &str = "text/plain; charset=utf-8";
 
-/// The page as files, by name: for a folder that no program stands behind.
+/// Returns names and contents of the files of a static folder. In it, `files.js` takes the place of
+/// `server.js`.
 pub fn files() -> impl Iterator<Item = (&'static str, &'static str)> {
     let of = |(address, _, content): (&'static str, &str, &'static str)| match address {
         "/" => Some(("index.html", content)),
         "/server.js" => Some(("server.js", include_str!("../web/files.js"))),
-        _ => address.strip_prefix('/').filter(|name| !name.contains('/')).map(|name| (name, content)),
+        _ => address
+            .strip_prefix('/')
+            .filter(|name| !name.contains('/'))
+            .map(|name| (name, content)),
     };
     FILES.into_iter().filter_map(of)
 }
 
-/// One route a file.
+/// Returns a router with one route per file.
 pub fn routes() -> Router<Arc<Shared>> {
-    FILES.into_iter().fold(Router::new(), |router, (address, kind, content)| {
-        router.route(address, get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }))
-    })
+    FILES
+        .into_iter()
+        .fold(Router::new(), |router, (address, kind, content)| {
+            router.route(
+                address,
+                get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }),
+            )
+        })
 }

@@ -1,4 +1,5 @@
-//! A scene as a folder of files that any web server can give out: the page, what it shows, and what common words mean in it.
+//! Exports a scene as a static folder for any web server: the page, the Gaussians, and answers for
+//! common words.
 
 use crate::desk::Desk;
 use crate::shared::views;
@@ -20,82 +21,107 @@ use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Component, Path, PathBuf};
 
-/// Common words that are answered, unless another number is asked for.
+/// Default number of common words.
 pub const WORDS: usize = 20_000;
-/// Words that are embedded at once.
+/// Number of words that are embedded together.
 const BATCH: usize = 256;
-/// Objects that are told for each word; `web/files.js` has the same number.
+/// Number of objects that are stored for each word. `web/files.js` must have the same number.
 const CANDIDATES: usize = 8;
-/// Of the pictures of objects.
+/// JPEG quality of the pictures of objects, 1 to 100.
 const JPEG_QUALITY: u8 = 80;
 
-/// What is shared, and where.
+/// Options of [`share`].
 #[derive(Clone, Debug)]
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// Folder to write.
+    /// Output folder.
     pub output: PathBuf,
-    /// Drop colour's SH coefficients above this degree.
+    /// Largest SH degree to keep; all if `None`.
     pub sh_degree: Option<u32>,
-    /// Common words that are answered.
+    /// Number of common words to answer.
     pub words: usize,
-    /// CLIP's text tower, instead of the one that the scene remembers.
+    /// CLIP text tower, instead of the one that the scene names.
     pub clip_text: Option<PathBuf>,
 }
 
-/// What was written.
+/// Report of [`share`].
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// The scene.
+    /// Scene folder.
     pub scene: PathBuf,
-    /// The folder.
+    /// Output folder.
     pub output: PathBuf,
-    /// Its bytes.
+    /// Size of the files in bytes.
     pub bytes: u64,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
-    /// Words that are answered.
+    /// Number of words that are answered, including taught names.
     pub words: usize,
-    /// Those of them that name something in the scene.
+    /// Number of words that name an object of the scene.
     pub found: usize,
 }
 
-/// Writes the folder. What an earlier one had is replaced when the new one is whole; other files in it stay.
+/// Writes the folder. Files of an earlier export are replaced when the new ones are complete; other
+/// files are kept.
 ///
 /// # Errors
-/// A scene that cannot be asked, a folder that holds something else, and a place that cannot be written.
+/// The scene cannot be queried, the folder holds something else, or a file cannot be written.
 pub fn share(config: &Config, run: &Run) -> Result<Report> {
     let root = &config.output;
     let listed = listed(root);
     let ours = !listed.is_empty();
-    if root.exists() && !ours && root.read_dir().map_or(true, |mut entries| entries.next().is_some()) {
-        bail!("{}: something else is there; name a new folder", root.display());
+    if root.exists()
+        && !ours
+        && root
+            .read_dir()
+            .map_or(true, |mut entries| entries.next().is_some())
+    {
+        bail!(
+            "{}: exists and is not an export with --html; choose another folder",
+            root.display()
+        );
     }
     let mut desk = Desk::new(&config.scene, run.device, config.clip_text.clone())?;
     if let Some(degree) = config.sh_degree {
-        let lower = desk.scene.gaussians.clone().with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
+        let lower = desk
+            .scene
+            .gaussians
+            .clone()
+            .with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
         desk.scene.show(lower)?;
     }
-    let parent = std::path::absolute(root)?.parent().map(Path::to_owned).context("the folder has no parent")?;
+    let parent = std::path::absolute(root)?
+        .parent()
+        .map(Path::to_owned)
+        .context("the output folder has no parent folder")?;
     std::fs::create_dir_all(&parent).with_context(|| parent.display().to_string())?;
-    // Beside the folder, so that it can be renamed into place.
-    let partial = tempfile::Builder::new().prefix(".share-").tempdir_in(&parent).with_context(|| parent.display().to_string())?;
+    // In the same folder, so that it can be renamed to its final name.
+    let partial = tempfile::Builder::new()
+        .prefix(".share-")
+        .tempdir_in(&parent)
+        .with_context(|| parent.display().to_string())?;
     let (words, found) = fill(partial.path(), &mut desk, config, run)?;
     let size = bytes(partial.path());
     if ours {
-        // Only what is ours: the folder may be somebody's repository.
+        // Replaces only files of an earlier export: the folder may be a repository.
         let made = files_below(partial.path(), Path::new(""))?;
-        if let Some(foreign) =
-            made.iter().map(|file| root.join(file)).find(|path| path.exists() && !listed.iter().any(|own| root.join(own) == *path))
+        if let Some(foreign) = made
+            .iter()
+            .map(|file| root.join(file))
+            .find(|path| path.exists() && !listed.iter().any(|own| root.join(own) == *path))
         {
-            bail!("{}: this file is not of FastLGS and is in the way; move it, or name a new folder", foreign.display());
+            bail!(
+                "{}: this file was not written by FastLGS and would be overwritten; move it, or choose another folder",
+                foreign.display()
+            );
         }
         for file in &made {
             let place = root.join(file);
             let parent = place.parent().unwrap_or(root);
             std::fs::create_dir_all(parent).with_context(|| parent.display().to_string())?;
-            std::fs::rename(partial.path().join(file), &place).with_context(|| place.display().to_string())?;
+            std::fs::rename(partial.path().join(file), &place)
+                .with_context(|| place.display().to_string())?;
         }
         for old in listed.difference(&made) {
             let _ = std::fs::remove_file(root.join(old));
@@ -105,23 +131,38 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
         readable(&partial)?;
         std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
     }
-    Ok(Report { scene: config.scene.clone(), output: root.clone(), bytes: size, gaussians: desk.gaussians(), words, found })
+    Ok(Report {
+        scene: config.scene.clone(),
+        output: root.clone(),
+        bytes: size,
+        gaussians: desk.gaussians(),
+        words,
+        found,
+    })
 }
 
-/// First line of the list of files.
+/// First line of `files.txt`. It identifies a folder as an export.
 const SHARED: &str = "A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.";
 
-/// The files that an earlier call wrote; none where the folder is not ours.
+/// Returns the files of an earlier export, or nothing if the folder is not an export.
 fn listed(root: &Path) -> BTreeSet<PathBuf> {
     let text = std::fs::read_to_string(root.join("files.txt")).unwrap_or_default();
-    let is_below = |file: &PathBuf| file.components().all(|part| matches!(part, Component::Normal(_)));
+    let is_below = |file: &PathBuf| {
+        file.components()
+            .all(|part| matches!(part, Component::Normal(_)))
+    };
     match text.strip_prefix(SHARED) {
-        Some(list) => list.lines().filter(|line| !line.is_empty()).map(PathBuf::from).filter(is_below).collect(),
+        Some(list) => list
+            .lines()
+            .filter(|line| !line.is_empty())
+            .map(PathBuf::from)
+            .filter(is_below)
+            .collect(),
         None => BTreeSet::new(),
     }
 }
 
-/// Paths of all files below a folder, relative to it.
+/// Returns the paths of all files below `folder`, relative to `root`.
 fn files_below(root: &Path, folder: &Path) -> Result<BTreeSet<PathBuf>> {
     let mut found = BTreeSet::new();
     for entry in std::fs::read_dir(root.join(folder))? {
@@ -136,7 +177,7 @@ fn files_below(root: &Path, folder: &Path) -> Result<BTreeSet<PathBuf>> {
     Ok(found)
 }
 
-/// Temporary folders are their owner's alone; this one is for a web server.
+/// Makes a folder readable for the web server. Temporary folders are private to their owner.
 fn readable(folder: &Path) -> Result<()> {
     #[cfg(unix)]
     {
@@ -147,7 +188,7 @@ fn readable(folder: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Writes everything; returns how many words are answered, and how many of them name something.
+/// Writes all files. Returns the number of words, and the number of those that name an object.
 fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usize, usize)> {
     let data = root.join("data");
     let (words, rows, found) = words(desk, config.words, run)?;
@@ -155,11 +196,19 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     write_json(&data.join("names.json"), &desk.scene.taught_names()?)?;
     write(&data.join("words.bin"), &rows)?;
     let cameras = &desk.scene.cameras;
-    let focus: Vec<f32> = cameras.iter().map(|camera| focus(&desk.scene.gaussians.means, camera)).collect();
+    let focus: Vec<f32> = cameras
+        .iter()
+        .map(|camera| focus(&desk.scene.gaussians.means, camera))
+        .collect();
     let mut views = views(&desk.scene.folder, cameras, &focus)?;
-    // Photos stay at home.
-    views.iter_mut().for_each(|view| view["photo"] = json!(false));
-    let scene = config.scene.canonicalize().unwrap_or_else(|_| config.scene.clone());
+    // Photos are not exported.
+    views
+        .iter_mut()
+        .for_each(|view| view["photo"] = json!(false));
+    let scene = config
+        .scene
+        .canonicalize()
+        .unwrap_or_else(|_| config.scene.clone());
     let mut about = desk.about();
     about["name"] = json!(scene.file_name().unwrap_or_default().to_string_lossy());
     about["up"] = json!(mean_up(cameras).to_array());
@@ -167,7 +216,10 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     about["trained_here"] = json!(false);
     about["shared"] = json!({ "words": words.len() });
     write_json(&data.join("scene.json"), &about)?;
-    write(&data.join("splats.bin"), &splats::pack(&desk.scene.gaussians))?;
+    write(
+        &data.join("splats.bin"),
+        &splats::pack(&desk.scene.gaussians),
+    )?;
     write_json(&data.join("objects.json"), &desk.objects()?)?;
     for id in 1..=desk.grid.objects.len() as u16 {
         if let Some(picture) = desk.picture(id)? {
@@ -175,38 +227,65 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
             picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
             write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
         }
-        write_json(&data.join(format!("objects/{id}/view.json")), &json!({ "view": desk.best_view(id)? }))?;
+        write_json(
+            &data.join(format!("objects/{id}/view.json")),
+            &json!({ "view": desk.best_view(id)? }),
+        )?;
     }
     for (name, content) in page::files() {
         write(&root.join(name), content.as_bytes())?;
     }
     let list = root.join("files.txt");
     write(&list, b"")?;
-    let files: String = files_below(root, Path::new(""))?.iter().map(|file| format!("{}\n", file.display())).collect();
+    let files: String = files_below(root, Path::new(""))?
+        .iter()
+        .map(|file| format!("{}\n", file.display()))
+        .collect();
     write(&list, format!("{SHARED}\n{files}").as_bytes())?;
     Ok((words.len(), found))
 }
 
-/// Bytes of all files in a folder.
+/// Returns the size of all files below a folder, in bytes.
 fn bytes(folder: &Path) -> u64 {
-    let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
-    entries.map(|path| if path.is_dir() { bytes(&path) } else { path.metadata().map_or(0, |m| m.len()) }).sum()
+    let entries = folder
+        .read_dir()
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path());
+    entries
+        .map(|path| {
+            if path.is_dir() {
+                bytes(&path)
+            } else {
+                path.metadata().map_or(0, |m| m.len())
+            }
+        })
+        .sum()
 }
 
 fn write(path: &Path, content: &[u8]) -> Result<()> {
     Ok(write_atomic(path, |file| file.write_all(content))?)
 }
 
-/// The words, a row of the table for each, and how many of them name something.
+/// Returns the words, one [`Row`] for each, and the number of words that name an object.
 fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
-    let taught = desk.scene.taught_names()?.into_iter().map(|name| name.to_lowercase());
-    // Some words differ only by a hyphen.
+    let taught = desk
+        .scene
+        .taught_names()?
+        .into_iter()
+        .map(|name| name.to_lowercase());
+    // Removes duplicates: some words differ only by a hyphen.
     let mut seen = BTreeSet::new();
-    let known = names::common(usize::MAX)?.into_iter().map(|word| normalised(&word));
-    let known = known.filter(|word| !word.is_empty() && seen.insert(word.clone())).take(common);
+    let known = names::common_words(usize::MAX)?
+        .into_iter()
+        .map(|word| normalised(&word));
+    let known = known
+        .filter(|word| !word.is_empty() && seen.insert(word.clone()))
+        .take(common);
     let words: BTreeSet<String> = known.chain(taught).collect();
     let mut words: Vec<String> = words.into_iter().collect();
-    // Texts of like length waste no padding.
+    // Texts of similar length need less padding in a batch.
     words.sort_by_key(|word| (word.split_whitespace().count(), word.len()));
     let work = run.work("words", words.len().div_ceil(BATCH) as u64);
     let (grid, config) = (&desk.grid, QueryConfig::default());
@@ -220,7 +299,11 @@ fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>,
     Ok((words, rows.into_flattened(), found))
 }
 
-/// What is kept of a word's answer: the best score, how many objects are meant, and then objects with their scores, those first.
+/// Answer to a word: best score, number of targets, then [`CANDIDATES`] objects with scores,
+/// targets first.
+///
+/// A score is one byte, 0 to 255 for 0 to 1. An object is a little-endian id of two bytes, 0 for
+/// none, and its score.
 type Row = [u8; 2 + 3 * CANDIDATES];
 
 fn row(grid: &Grid, query: &TextQuery, config: &QueryConfig) -> Row {
@@ -230,7 +313,9 @@ fn row(grid: &Grid, query: &TextQuery, config: &QueryConfig) -> Row {
     let mut row = [0; 2 + 3 * CANDIDATES];
     row[0] = byte(query::best_score(&ranked));
     row[1] = meant.len().min(CANDIDATES) as u8;
-    let others = ranked.iter().filter(|hit| !meant.iter().any(|m| m.id == hit.id));
+    let others = ranked
+        .iter()
+        .filter(|hit| !meant.iter().any(|m| m.id == hit.id));
     for (place, Hit { id, score }) in row[2..].chunks_exact_mut(3).zip(meant.iter().chain(others)) {
         place[..2].copy_from_slice(&id.to_le_bytes());
         place[2] = byte(*score);

@@ -1,4 +1,4 @@
-//! What all requests share.
+//! State that all requests share.
 
 use crate::desk::Bell;
 use crate::failure::Failure;
@@ -9,11 +9,11 @@ use fastlgs_core::{Camera, SceneFolder};
 use serde_json::{Value, json};
 use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
-/// What all requests share.
+/// State that all requests share.
 pub struct Shared {
     pub name: String,
     pub folder: SceneFolder,
-    /// As training left them so far.
+    /// Current cameras; training may move them.
     pub cameras: RwLock<Arc<Vec<Camera>>>,
     pub live: Option<Arc<Live>>,
     pub bell: OnceLock<Bell>,
@@ -21,28 +21,44 @@ pub struct Shared {
 }
 
 impl Shared {
-    /// The opened scene, once there is one.
+    /// Returns the handle of the scene worker, or `None` during training.
     pub fn bell(&self) -> Option<Bell> {
         self.bell.get().cloned()
     }
 
-    /// The opened scene, or why there is none yet.
+    /// Returns the handle of the scene worker.
+    ///
+    /// # Errors
+    /// Status 409 during training.
     pub fn ready(&self) -> Result<Bell, Failure> {
-        self.bell().ok_or_else(|| Failure::new(StatusCode::CONFLICT, "the scene is still in training; ask again when it has objects"))
+        self.bell().ok_or_else(|| {
+            Failure::new(
+                StatusCode::CONFLICT,
+                "the scene is still in training; try again when its objects are found",
+            )
+        })
     }
 
-    /// The cameras that the scene has now.
+    /// Returns the current cameras.
     pub fn cameras(&self) -> Arc<Vec<Camera>> {
-        self.cameras.read().unwrap_or_else(PoisonError::into_inner).clone()
+        self.cameras
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
     }
 
-    /// All views as the page wants them.
+    /// Describes all views for the page.
     pub fn views(&self) -> Result<Vec<Value>> {
-        views(&self.folder, &self.cameras(), self.focus.get().map_or(&[], Vec::as_slice))
+        views(
+            &self.folder,
+            &self.cameras(),
+            self.focus.get().map_or(&[], Vec::as_slice),
+        )
     }
 }
 
-/// All views as the page wants them. `focus` is how far what each looks at is, where that is known.
+/// Describes views for the page. `focus` has the distance from each camera to its subject; 1 if
+/// missing.
 pub fn views(folder: &SceneFolder, cameras: &[Camera], focus: &[f32]) -> Result<Vec<Value>> {
     let manifest = folder.manifest()?;
     let view = |(k, camera): (usize, &Camera)| {

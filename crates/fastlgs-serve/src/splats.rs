@@ -1,29 +1,45 @@
-//! Gaussians as browsers draw them: the texels of `web/splat.wgsl`, after a header of 32 bytes.
+//! Packs Gaussians for browsers: a header of 32 bytes, then the texels that `web/splat.wgsl` reads.
 
 use fastlgs_core::Gaussians;
 use fastlgs_core::gaussians::{rest_len, sigmoid};
 use glam::Vec3;
 
-/// Format of the bytes; `web/renderer.js` checks it.
+/// Version of the format; `web/frame.js` checks it.
 const VERSION: u32 = 1;
 const MAGIC: u32 = u32::from_le_bytes(*b"FLGS");
-/// Log-scales as 16 bits between -20 and 10.
+/// Log-scales are stored in 16 bits, from -20 to 10.
 const LOG_SCALE_LOW: f32 = -20.0;
 const LOG_SCALE_RANGE: f32 = 30.0;
 
-/// 16-byte texels of a Gaussian.
+/// Returns the number of 16-byte texels of a Gaussian.
 fn texels(sh_degree: u32) -> usize {
     2 + rest_len(sh_degree).div_ceil(4)
 }
 
-/// All Gaussians, little-endian: magic, version, their number, SH degree, texels of each; largest coefficient of colour and of SH
-/// (floats); one unused word; then the texels. 32 bytes a Gaussian and 16 more for each four SH coefficients.
+/// Packs all Gaussians, little-endian.
+///
+/// The header has eight 32-bit words: magic, version, number of Gaussians, SH degree, texels per
+/// Gaussian, largest coefficient of degree 0 (float), largest coefficient of higher degrees
+/// (float), 0. A Gaussian has 32 bytes, and 16 more for every four SH coefficients.
 pub fn pack(scene: &Gaussians) -> Vec<u8> {
-    let largest = |values: &[Vec3]| values.iter().fold(1e-6f32, |most, v| most.max(v.abs().max_element()));
+    let largest = |values: &[Vec3]| {
+        values
+            .iter()
+            .fold(1e-6f32, |most, v| most.max(v.abs().max_element()))
+    };
     let (color_range, sh_range) = (largest(&scene.sh_dc), largest(&scene.sh_rest));
     let texels = texels(scene.sh_degree);
     let mut words: Vec<u32> = Vec::with_capacity(8 + 4 * texels * scene.len());
-    words.extend([MAGIC, VERSION, scene.len() as u32, scene.sh_degree, texels as u32, color_range.to_bits(), sh_range.to_bits(), 0]);
+    words.extend([
+        MAGIC,
+        VERSION,
+        scene.len() as u32,
+        scene.sh_degree,
+        texels as u32,
+        color_range.to_bits(),
+        sh_range.to_bits(),
+        0,
+    ]);
     for i in 0..scene.len() {
         let scale = (scene.log_scales[i] - LOG_SCALE_LOW) / LOG_SCALE_RANGE;
         let (low, high) = pack_rotation(scene.rotations[i]);
@@ -39,7 +55,7 @@ pub fn pack(scene: &Gaussians) -> Vec<u8> {
     words.iter().flat_map(|w| w.to_le_bytes()).collect()
 }
 
-/// A value of 0 to 1 in `bits` bits.
+/// Quantises a value from 0 to 1 to `bits` bits.
 fn fixed(value: f32, bits: u32) -> u32 {
     let most = ((1u32 << bits) - 1) as f32;
     (value.clamp(0.0, 1.0) * most).round() as u32
@@ -49,18 +65,23 @@ fn two(low: f32, high: f32) -> u32 {
     fixed(low, 16) | fixed(high, 16) << 16
 }
 
-/// Three values of -1 to 1 in ten bits each.
+/// Packs three values from -1 to 1 with ten bits each.
 fn ten_bits(v: Vec3) -> u32 {
     let v = v * 0.5 + 0.5;
     fixed(v.x, 10) | fixed(v.y, 10) << 10 | fixed(v.z, 10) << 20
 }
 
-/// The three smallest components of a quaternion (w, x, y, z) in 16, 16 and 14 bits, and which one is the largest in two.
+/// Packs a quaternion (w, x, y, z) into 48 bits: its three smallest components in 16, 16 and 14
+/// bits, and the index of the largest in two bits.
 fn pack_rotation(q: [f32; 4]) -> (u32, u32) {
     let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
-    let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).expect("four components");
+    let largest = (0..4)
+        .max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs()))
+        .expect("four components");
     let sign = if q[largest] < 0.0 { -length } else { length };
-    let mut rest = (0..4).filter(|k| *k != largest).map(|k| q[k] / sign * std::f32::consts::FRAC_1_SQRT_2 + 0.5);
+    let mut rest = (0..4)
+        .filter(|k| *k != largest)
+        .map(|k| q[k] / sign * std::f32::consts::FRAC_1_SQRT_2 + 0.5);
     let mut next = || rest.next().expect("three of four are left");
     let (a, b, c) = (next(), next(), next());
     (two(a, b), fixed(c, 14) | (largest as u32) << 14)
@@ -70,10 +91,16 @@ fn pack_rotation(q: [f32; 4]) -> (u32, u32) {
 mod tests {
     use super::*;
 
-    /// As `unpack_rotation` of the shader.
+    /// Same as `unpack_rotation` of `web/splat.wgsl`.
     fn unpack_rotation(low: u32, high: u32) -> [f32; 4] {
-        let part = |bits: u32, most: f32| ((bits as f32 / most) * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2;
-        let v = [part(low & 0xffff, 65535.0), part(low >> 16, 65535.0), part(high & 0x3fff, 16383.0)];
+        let part = |bits: u32, most: f32| {
+            ((bits as f32 / most) * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2
+        };
+        let v = [
+            part(low & 0xffff, 65535.0),
+            part(low >> 16, 65535.0),
+            part(high & 0x3fff, 16383.0),
+        ];
         let largest = (1.0 - v.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
         let mut out = v.to_vec();
         out.insert(((high >> 14) & 3) as usize, largest);
@@ -82,11 +109,21 @@ mod tests {
 
     #[test]
     fn rotations_lose_little() {
-        for q in [[1.0, 0.0, 0.0, 0.0], [-0.1, 0.9, -0.3, 0.2], [0.5, -0.5, 0.5, -0.5], [0.0, 0.0, 0.01, -3.0]] {
+        for q in [
+            [1.0, 0.0, 0.0, 0.0],
+            [-0.1, 0.9, -0.3, 0.2],
+            [0.5, -0.5, 0.5, -0.5],
+            [0.0, 0.0, 0.01, -3.0],
+        ] {
             let (low, high) = pack_rotation(q);
             let back = unpack_rotation(low, high);
             let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
-            let same = q.iter().zip(back).map(|(a, b)| a / length * b).sum::<f32>().abs();
+            let same = q
+                .iter()
+                .zip(back)
+                .map(|(a, b)| a / length * b)
+                .sum::<f32>()
+                .abs();
             assert!(same > 0.999_999, "{q:?} {back:?}");
             assert_eq!(high >> 16, 0, "the object id needs these bits");
         }
@@ -101,7 +138,10 @@ mod tests {
         for (degree, texels) in [(0, 2), (1, 3), (2, 4), (3, 6)] {
             let data = pack(&scene.clone().with_sh_degree(degree));
             let word = |k: usize| u32::from_le_bytes(data[4 * k..4 * k + 4].try_into().unwrap());
-            assert_eq!((word(0), word(2), word(3), word(4) as usize), (MAGIC, 2, degree, texels));
+            assert_eq!(
+                (word(0), word(2), word(3), word(4) as usize),
+                (MAGIC, 2, degree, texels)
+            );
             assert_eq!(data.len(), 32 + 2 * 16 * texels);
             assert_eq!(word(8 + 4 * texels + 7) >> 16, 517);
             assert_eq!(f32::from_bits(word(8)), 1.0);

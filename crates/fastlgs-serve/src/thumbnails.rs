@@ -1,4 +1,4 @@
-//! Small pictures of objects: each as the training view that shows most of it does.
+//! Small pictures of objects. Each is cut from the searched view that shows most of the object.
 
 use anyhow::Result;
 use fastlgs::Session;
@@ -8,16 +8,16 @@ use image::RgbImage;
 use image::imageops::{FilterType, crop_imm, resize};
 use std::collections::BTreeMap;
 
-/// Views that are searched, spread over all.
+/// Largest number of views that are searched, evenly spread.
 const VIEWS: usize = 16;
-/// Longer side of these views.
+/// Longer side of these views, in pixels.
 const VIEW_SIDE: u32 = 400;
-/// Longer side of a thumbnail.
+/// Longer side of a thumbnail, in pixels.
 const SIDE: u32 = 96;
-/// Share of its box that is shown around an object.
+/// Margin around the box of an object, relative to the longer side of the box.
 const MARGIN: f32 = 0.15;
 
-/// Pictures that were made, and where to make more from.
+/// Cached thumbnails, and the rendered views from which more are cut.
 #[derive(Default)]
 pub struct Thumbnails {
     views: Vec<RgbImage>,
@@ -25,7 +25,8 @@ pub struct Thumbnails {
     made: BTreeMap<u16, Vec<u8>>,
 }
 
-/// Where an object is largest: view, pixels, and box (left, top, right, bottom; the last two excluded).
+/// The searched view in which an object has most pixels: index, number of pixels, and box (left,
+/// top, right, bottom; right and bottom are exclusive).
 #[derive(Clone, Copy)]
 struct Best {
     view: usize,
@@ -33,35 +34,57 @@ struct Best {
     bounds: [u32; 4],
 }
 
-/// Of so many views one is searched.
+/// Returns the step between searched views.
 fn step(scene: &Session) -> usize {
     scene.cameras.len().div_ceil(VIEWS).max(1)
 }
 
 impl Thumbnails {
-    /// The PNG of an object; nothing for one that no view shows.
+    /// Returns the thumbnail of an object as PNG, or `None` if no searched view shows it.
     pub fn png(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
         if !self.made.contains_key(&id) {
-            let Some(picture) = self.picture(scene, grid, id)? else { return Ok(None) };
+            let Some(picture) = self.picture(scene, grid, id)? else {
+                return Ok(None);
+            };
             self.made.insert(id, image_io::encode_png(picture)?);
         }
         Ok(self.made.get(&id).cloned())
     }
 
-    /// The picture of an object; nothing for one that no view shows.
-    pub fn picture(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<RgbImage>> {
-        let Some(Best { view, bounds: [left, top, right, bottom], .. }) = self.best(scene, grid, id)? else { return Ok(None) };
+    /// Returns the thumbnail of an object, or `None` if no searched view shows it.
+    pub fn picture(
+        &mut self,
+        scene: &mut Session,
+        grid: &Grid,
+        id: u16,
+    ) -> Result<Option<RgbImage>> {
+        let Some(Best {
+            view,
+            bounds: [left, top, right, bottom],
+            ..
+        }) = self.best(scene, grid, id)?
+        else {
+            return Ok(None);
+        };
         let picture = &self.views[view];
         let margin = (MARGIN * (right - left).max(bottom - top) as f32).ceil() as u32 + 2;
         let (left, top) = (left.saturating_sub(margin), top.saturating_sub(margin));
-        let (right, bottom) = ((right + margin).min(picture.width()), (bottom + margin).min(picture.height()));
+        let (right, bottom) = (
+            (right + margin).min(picture.width()),
+            (bottom + margin).min(picture.height()),
+        );
         let (w, h) = (right - left, bottom - top);
         let scale = SIDE as f32 / w.max(h) as f32;
         let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
-        Ok(Some(resize(&*crop_imm(picture, left, top, w, h), size(w), size(h), FilterType::Triangle)))
+        Ok(Some(resize(
+            &*crop_imm(picture, left, top, w, h),
+            size(w),
+            size(h),
+            FilterType::Triangle,
+        )))
     }
 
-    /// The view, of those that are searched, that shows most of an object; nothing for one that none shows.
+    /// Returns the name of the searched view that shows most of an object, or `None` if none does.
     pub fn view(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<String>> {
         let best = self.best(scene, grid, id)?;
         Ok(best.map(|best| scene.cameras[best.view * step(scene)].name.clone()))
@@ -74,18 +97,28 @@ impl Thumbnails {
         Ok(self.best.get(usize::from(id)).copied().flatten())
     }
 
-    /// Looks through some views for the place where each object is largest.
+    /// Renders the searched views, and finds for each object the one with most of its pixels.
     fn search(&mut self, scene: &mut Session, grid: &Grid) -> Result<()> {
-        let cameras: Vec<Camera> = scene.cameras.iter().step_by(step(scene)).map(|c| c.shrunk_to(VIEW_SIDE)).collect();
+        let cameras: Vec<Camera> = scene
+            .cameras
+            .iter()
+            .step_by(step(scene))
+            .map(|c| c.shrunk_to(VIEW_SIDE))
+            .collect();
         let mut best: Vec<Option<Best>> = vec![None; grid.objects.len() + 1];
         let mut views = Vec::new();
         for (view, camera) in cameras.iter().enumerate() {
             let mut here: BTreeMap<u16, Best> = BTreeMap::new();
-            let mut pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
-            scene.field(camera, None)?.each(grid, |objects| {
+            let mut pixels =
+                (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
+            scene.field(camera, None)?.for_each_pixel(grid, |objects| {
                 let (x, y) = pixels.next().unwrap_or_default();
                 for id in objects {
-                    let own = here.entry(*id).or_insert(Best { view, pixels: 0, bounds: [x, y, x, y] });
+                    let own = here.entry(*id).or_insert(Best {
+                        view,
+                        pixels: 0,
+                        bounds: [x, y, x, y],
+                    });
                     let b = own.bounds;
                     own.pixels += 1;
                     own.bounds = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
@@ -98,7 +131,11 @@ impl Thumbnails {
                 }
             }
             let frame = scene.render(camera)?;
-            views.push(image_io::from_planar(frame.channels(0, 3), frame.width, frame.height));
+            views.push(image_io::from_planar(
+                frame.channels(0, 3),
+                frame.width,
+                frame.height,
+            ));
         }
         self.views = views;
         self.best = best;

@@ -1,4 +1,4 @@
-// The page: what is asked, selected, hidden and shown, and the controls for it.
+// The page: the state of queries, selection and visibility, and the controls for it.
 
 import { follow as followLink, linkOf } from "./link.js";
 import { Objects } from "./objects.js";
@@ -10,8 +10,8 @@ import { save } from "./save.js";
 import { getBlob, getJson, postJson } from "./server.js";
 
 const $ = (id) => document.getElementById(id);
-const LISTED = 24; // objects before "more"
-const ASKED_SIDE = 640; // pixels of the view that a question is put to
+const LISTED = 24; // objects listed before "more"
+const ASKED_SIDE = 640; // longer side of the view that is queried, in pixels
 
 let scene, stage, objects, recent;
 const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, wish: null, listed: LISTED };
@@ -23,7 +23,7 @@ function failed(error) {
   failed.timer = setTimeout(() => { $("problem").hidden = true; }, 8000);
 }
 
-// Runs what a control does; what goes wrong is shown, not thrown.
+// Wraps an event handler: errors are shown on the page, not thrown.
 const guarded = (work) => async (...args) => {
   try {
     await work(...args);
@@ -37,7 +37,7 @@ function say(text, absent = false) {
   $("answer").classList.toggle("absent", absent);
 }
 
-// Shows the state: in the picture, in the lists, and on the buttons.
+// Updates the picture, the lists and the buttons from the state.
 function update() {
   const { selected, hidden, only, scores, text } = state;
   stage.setObjects({ selected, hidden, only, scores, text, list: objects.colored, members: objects.chain });
@@ -62,7 +62,7 @@ function update() {
   const own = [...selected].map((id) => objects.byId.get(id));
   const sum = own.reduce((n, o) => n + o.gaussians, 0).toLocaleString("en");
   $("facts").textContent = own.length === 1
-    ? `${sum} Gaussians, seen in ${own[0].views} photos, support by masks ${own[0].support.toFixed(2)}`
+    ? `${sum} Gaussians, visible in ${own[0].views} photos, support ${own[0].support.toFixed(2)} (IoU with masks)`
     : `${own.length} objects, ${sum} Gaussians`;
   const parts = own.length === 1 ? objects.parts(first).map((id) => ({ id })) : [];
   $("parts-title").hidden = parts.length === 0;
@@ -74,13 +74,14 @@ function select(ids) {
   update();
 }
 
-// Asks for a text as it is seen from here.
+// Queries a text in the current view.
 const ask = (text) => {
   const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
   return postJson("/api/query", { text, camera, candidates: objects.list.length });
 };
 
-// The view to go to for an answer that is not seen from here. A folder of files knows where things are, and not what hides them.
+// Returns the view to go to for an answer that is not visible here, if any. A static folder knows
+// the positions of objects, but not whether they are hidden.
 async function elsewhere(answer) {
   if (!answer.found || answer.seen_best || answer.pixels !== undefined) return answer.seen_best;
   const [{ id }] = answer.objects;
@@ -89,10 +90,10 @@ async function elsewhere(answer) {
 
 const bestView = async (id) => (await getJson(`/api/objects/${id}/view`)).view;
 
-// Nowhere, where no view shows it.
+// Goes to the view of this name; does nothing without a name.
 const lookFrom = (name) => name && stage.lookFrom(scene.views.findIndex((view) => view.name === name));
 
-// How many questions were asked or taken back: an answer to an earlier one comes too late.
+// Number of queries that were started or cancelled. Answers to earlier queries are ignored.
 let questions = 0;
 
 const find = guarded(async (text) => {
@@ -100,7 +101,7 @@ const find = guarded(async (text) => {
   if (!text.trim()) return clear();
   const number = ++questions;
   const isLate = () => number !== questions;
-  say(`looking for "${text}" ...`);
+  say(`searching for "${text}" ...`);
   try {
     const found = await answered(text, isLate);
     if (!isLate()) show(text, found);
@@ -110,7 +111,8 @@ const find = guarded(async (text) => {
   }
 });
 
-// The answer to a text as it is seen from here, or from the view that shows most of it, and which that is.
+// Queries a text in the current view. If its answer is hardly visible, goes to the best view and
+// queries there. Returns the answer, and the best view if it was used.
 async function answered(text, isLate) {
   const answer = await ask(text);
   const best = isLate() ? null : await elsewhere(answer);
@@ -129,12 +131,12 @@ function show(text, { answer, best }) {
   const ms = Math.round(answer.ms.total);
   if (answer.found) {
     const parts = answer.objects.length === 1 ? `#${answer.objects[0].id}` : `${answer.objects.length} objects`;
-    // A folder of files knows what a word means, and not what is seen from here.
+    // Answers of a static folder have no pixels.
     const pixels = answer.pixels === undefined ? "" : `, ${answer.pixels.toLocaleString("en")} pixels here`;
     const gone = best ? `, seen best in ${best}` : "";
     say(`"${text}": ${parts}, score ${answer.score.toFixed(2)}${pixels}${gone} (${ms} ms)`);
   } else {
-    say(`"${text}" is not found in this scene: the nearest object scores ${answer.score.toFixed(2)}, ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
+    say(`"${text}" is not found in this scene: the best object scores ${answer.score.toFixed(2)}, at least ${scene.min_score.toFixed(2)} is needed (${ms} ms)`, true);
   }
   select(answer.objects.map((o) => o.id));
 }
@@ -144,7 +146,7 @@ const nameIt = guarded(async (name) => {
   const taught = await postJson("/api/names", { name, object });
   $("its-name").value = "";
   recent.taught(await getJson("/api/names"));
-  say(`#${object} is called "${taught.name}" from now on: ${taught.views.toLocaleString("en")} pictures of it are known by that name`);
+  say(`#${object} is called "${taught.name}" now; ${taught.views.toLocaleString("en")} embeddings are stored`);
 });
 
 function clear() {
@@ -169,7 +171,7 @@ function step(by) {
 function setCompare(value) {
   stage.compare = Number(value);
   $("compare").value = value;
-  // The photo fits only where it was taken.
+  // The photo fits only its own view.
   if (stage.compare > 0 && stage.camera.moved) stage.lookFrom(stage.index);
   stage.draw();
 }
@@ -196,9 +198,9 @@ function measured() {
 
 const link = guarded(async () => {
   history.replaceState(null, "", linkOf(stage.camera, { text: state.text, mode: stage.mode }));
-  // Browsers hand out their clipboard on the machine itself and over HTTPS.
+  // Browsers allow access to the clipboard only on localhost and over HTTPS.
   const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
-  say(copied ? "the link to this view is copied" : "the link to this view is in the address bar");
+  say(copied ? "the link to this view was copied" : "the link to this view is in the address bar");
 });
 
 const followed = guarded(async () => {
@@ -208,7 +210,7 @@ const followed = guarded(async () => {
   if (objects) await fulfil();
 });
 
-// Asks what the link wants to know.
+// Queries the text of the link.
 async function fulfil() {
   const text = state.wish;
   state.wish = null;
@@ -330,7 +332,7 @@ function listen() {
   };
 }
 
-// The one thing that several rays of the camera show.
+// Selects the object that several rays of the camera hit.
 const together = guarded(async (rays) => {
   const number = ++questions;
   const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
@@ -339,7 +341,7 @@ const together = guarded(async (rays) => {
   const answer = await postJson("/api/query", { point, camera, hidden: [...state.hidden], only: [...state.only] });
   if (number !== questions) return;
   const ids = answer.objects.map((o) => o.id);
-  say(`${rays.length} clicks on one thing: ${ids.map((id) => `#${id}`).join(", ") || "nothing is there"}`);
+  say(`${rays.length} clicks on one object: ${ids.map((id) => `#${id}`).join(", ") || "no object is there"}`);
   select(ids);
 });
 
@@ -348,8 +350,8 @@ async function ready() {
   objects = new Objects(await getJson("/api/objects"), scene.overlaps ?? [], scene.support_share);
   recent.taught(await getJson("/api/names"));
   $("about").textContent = `${scene.gaussians.toLocaleString("en")} Gaussians, ${scene.objects} objects and parts, ${scene.views.length} views; `
-    + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; drawn by ${stage.renderer.name}, `
-    + (scene.shared ? `${scene.shared.words.toLocaleString("en")} words are known` : `answered by ${scene.adapter}`);
+    + `masks: ${scene.segmenter}, embeddings: ${scene.encoder}; rendered by ${stage.renderer.name}, `
+    + (scene.shared ? `${scene.shared.words.toLocaleString("en")} words can be queried` : `queries on ${scene.adapter}`);
   $("text").disabled = false;
   update();
 }
@@ -358,7 +360,7 @@ async function main() {
   scene = await getJson("/api/scene");
   document.title = `${scene.name} - FastLGS`;
   $("name").textContent = scene.name;
-  // Without a program behind the page nothing is exported, and photos stay at home.
+  // A static folder has no exports and no photos.
   $("exports").hidden = Boolean(scene.shared);
   $("compare").hidden = $("photo-label").hidden = !scene.views.some((view) => view.photo);
   stage = new Stage(scene, { stage: $("stage"), canvas: $("canvas"), cameras: $("cameras"), photo: $("photo"), divider: $("divider") }, failed);
@@ -373,12 +375,12 @@ async function main() {
     $("text").disabled = true;
     await follow(training, () => stage.load());
   }
-  // The picture first: what the page tells of objects can wait.
+  // The Gaussians are loaded first; the page can show objects later.
   await stage.load();
   await ready();
   await fulfil();
   if (scene.trained_here) await recall(training);
-  // For programs that drive this page.
+  // For programs that control this page, such as tests.
   window.fastlgs = { stage, state, find };
   document.body.dataset.ready = "true";
 }

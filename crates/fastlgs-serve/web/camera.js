@@ -1,4 +1,4 @@
-// The camera of the page: a pinhole (x right, y down, looking along +z) that turns about a point before it.
+// The camera of the page: a pinhole (x right, y down, looking along +z) that orbits a target point.
 
 const add = (a, b, s = 1) => [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -6,10 +6,10 @@ const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a
 const scaled = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
 const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
-// What lies nearer than this share of the distance at which a view's things are is not shown; and so near one may come.
+// Smallest distance for overlays and for zooming, relative to the distance of the view's subject.
 const NEAREST = 0.002;
 
-// Turns v about a unit axis (Rodrigues).
+// Rotates v about a unit axis by an angle in radians (Rodrigues).
 function turned(v, axis, angle) {
   const c = Math.cos(angle), s = Math.sin(angle);
   return add(add(scaled(v, c), cross(axis, v), s), axis, dot(axis, v) * (1 - c));
@@ -20,7 +20,7 @@ export class Camera {
     this.up = unit(up);
   }
 
-  // Takes the place of a view of the scene, whose lens it keeps from then on.
+  // Moves to a view of the scene, and uses its intrinsics from then on.
   lookFrom(view) {
     const m = view.world_to_camera;
     this.right = [m[0], m[4], m[8]];
@@ -37,12 +37,12 @@ export class Camera {
     return add(this.eye, this.forward, this.distance);
   }
 
-  // Where it stands, what it turns about, and which way is down: nine numbers.
+  // Returns nine numbers: position, target point and down direction.
   pose() {
     return [...this.eye, ...this.target(), ...this.down];
   }
 
-  // Takes a pose; whether it is one.
+  // Sets the pose from such numbers. Returns false if they are no valid pose.
   stand(pose) {
     const [eye, target, down] = [pose.slice(0, 3), pose.slice(3, 6), pose.slice(6, 9)];
     const forward = add(target, eye, -1);
@@ -54,7 +54,7 @@ export class Camera {
     return true;
   }
 
-  // Direction in the world of what a place of the canvas shows, one unit deep.
+  // Returns the ray of a canvas position in scene coordinates, with a depth of 1.
   ray(x, y, lens) {
     return add(add(this.forward, this.right, (x - lens.cx) / lens.fx), this.down, (y - lens.cy) / lens.fy);
   }
@@ -64,7 +64,8 @@ export class Camera {
     const both = (v) => turned(turned(v, this.right, pitch), this.up, yaw);
     const steep = (v) => Math.abs(dot(unit(v), this.up));
     const tilted = steep(turned(this.forward, this.right, pitch));
-    // Over the pole everything would stand on its head; a photo that was taken towards it may be left.
+    // Beyond the pole the picture would be upside down. A view that starts closer to the pole may
+    // still turn away.
     if (pitch !== 0 && tilted > Math.max(0.985, steep(this.forward))) return this.turn(yaw, 0);
     [this.forward, this.down] = [unit(both(this.forward)), unit(both(this.down))];
     this.right = unit(cross(this.down, this.forward));
@@ -73,7 +74,7 @@ export class Camera {
     this.moved = true;
   }
 
-  // Moves by parts of the picture's height.
+  // Moves by shares of the image height, at the distance of the target.
   move(x, y) {
     const step = this.distance * this.view.height / this.view.fy;
     this.eye = add(add(this.eye, this.right, -x * step), this.down, -y * step);
@@ -92,7 +93,8 @@ export class Camera {
     return [r[0], d[0], f[0], 0, r[1], d[1], f[1], 0, r[2], d[2], f[2], 0, -dot(r, eye), -dot(d, eye), -dot(f, eye), 1];
   }
 
-  // Focal lengths and principal point for a canvas into which the view's picture is fitted, and where that picture lies in it.
+  // Returns focal lengths and principal point for a canvas into which the view is fitted, and the
+  // rectangle of the view in it, in pixels.
   lens(width, height) {
     const { view } = this;
     const scale = Math.min(width / view.width, height / view.height);
@@ -103,7 +105,8 @@ export class Camera {
     };
   }
 
-  // What the server takes as a camera: the whole canvas, with at most `side` pixels along its longer side.
+  // Returns the camera of the whole canvas for the server, with at most `side` pixels along its
+  // longer side.
   asJson(width, height, side = Infinity) {
     const shrink = Math.min(1, side / Math.max(width, height));
     const size = [width, height].map((n) => Math.max(1, Math.round(n * shrink)));
@@ -116,7 +119,8 @@ export class Camera {
     };
   }
 
-  // Canvas position of a point of the world; nothing behind the camera.
+  // Returns the canvas position of a scene point, or null if it is behind or too close to the
+  // camera.
   project(point, lens) {
     const v = add(point, this.eye, -1);
     const z = dot(v, this.forward);
@@ -124,7 +128,7 @@ export class Camera {
   }
 }
 
-// Apex and corners of a view's frustum in the world, `depth` deep.
+// Returns the apex and the corners of a view's frustum with this depth, in scene coordinates.
 export function frustum(view, depth) {
   const m = view.world_to_camera;
   const toWorld = (p) => {

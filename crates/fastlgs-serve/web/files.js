@@ -1,21 +1,22 @@
-// What server.js is for the program that serves this page, for a folder of files: the scene, and what common words mean in it.
+// Replaces server.js in a static folder: reads the scene, and the answers to common words, from
+// files.
 
-// As src/share.rs writes them: a row a word.
+// Number of objects per row. src/share.rs writes the table, with one row per word.
 const CANDIDATES = 8;
 const ROW = 2 + 3 * CANDIDATES;
-// Suggestions for a word that is not known.
+// Number of suggestions for an unknown text.
 const NEAR = 5;
 
 async function file(path) {
   const response = await fetch(path).catch(() => null);
-  if (!response?.ok) throw new Error(`${path} is missing beside this page; was the whole folder copied?`);
+  if (!response?.ok) throw new Error(`${path} is missing beside this page; copy the whole folder`);
   return response;
 }
 
 export const getJson = async (path) => (await file(`data${path.slice(4)}.json`)).json();
 export const getBytes = async (path) => (await file(`data${path.slice(4)}.bin`)).arrayBuffer();
 export const getBlob = async (path) => (await file(`data${path.slice(4).replace(/png$/, "jpg")}`)).blob();
-export const postBlob = async () => { throw new Error("this page is a folder of files, which cannot render pictures"); };
+export const postBlob = async () => { throw new Error("this page is a static folder, which cannot render pictures"); };
 
 let table;
 
@@ -24,7 +25,7 @@ async function words() {
   return { list: new Map(list.map((word, place) => [word, place])), rows: new DataView(rows) };
 }
 
-// A text as src/session/phrase.rs normalises it, in small letters.
+// Normalises a text like `normalised` of crates/fastlgs/src/session/phrase.rs, in lower case.
 function phrase(text) {
   const invisible = /[\u00ad\u200b-\u200f\u202a-\u202e\u2060-\u2064\ufeff]/g;
   const separators = /["`\u00b4\u00ab\u00bb()[\]{}<>\-_\u2010-\u2015\u2212\u2018-\u201f]|(?<![\p{L}\p{N}])'|'(?![\p{L}\p{N}])/gu;
@@ -33,7 +34,7 @@ function phrase(text) {
   return words.replace(/^((a|an|the) )+(?=.)/, "");
 }
 
-// Letters that must be changed, added or taken away to make one word of another.
+// Returns the edit distance of two words (Levenshtein).
 function distance(a, b) {
   let row = Array.from({ length: b.length + 1 }, (_, k) => k);
   for (let i = 1; i <= a.length; i++) {
@@ -44,7 +45,7 @@ function distance(a, b) {
   return row[b.length];
 }
 
-// Known words for one that is not: those that it contains, then those that are written nearly so.
+// Suggests known words for an unknown text: words in it, then words with similar spelling.
 function near(text, list) {
   const inside = text.split(/\s+/).filter((word) => word !== text && list.has(word));
   const written = [...list.keys()].filter((word) => Math.abs(word.length - text.length) < 4).map((word) => [distance(text, word), word]);
@@ -52,10 +53,10 @@ function near(text, list) {
   return [...new Set([...inside.reverse(), ...written.map(([, word]) => word)])].slice(0, NEAR);
 }
 
-// Answers a text from the table, in the form of the server's answer.
+// Answers a text from the table, in the format of the server.
 export async function postJson(path, { text }) {
   const began = performance.now();
-  // What could not be fetched is fetched again by the next question.
+  // After an error, the next query fetches the table again.
   table ??= words().catch((error) => {
     table = undefined;
     throw error;
@@ -66,7 +67,7 @@ export async function postJson(path, { text }) {
   const place = list.get(plain);
   if (place === undefined) {
     const known = `${list.size.toLocaleString("en")} words`;
-    throw new Error(`this page knows what ${known} mean here, and "${plain}" is none of them; near it: ${near(plain, list).join(", ")}`);
+    throw new Error(`this page answers ${known}, and "${plain}" is not among them; similar words: ${near(plain, list).join(", ")}`);
   }
   const at = ROW * place;
   const candidates = Array.from({ length: CANDIDATES }, (_, k) => {

@@ -1,15 +1,16 @@
-// What all ways of drawing share: the Gaussians' bytes, and the uniform of splat.wgsl.
+// Shared by all renderers: the parser of the Gaussians, and the uniform of splat.wgsl.
 
-export const ROW = 2048; // texels of a row; splat.wgsl has the same number
-export const OBJECT_ROWS = 512; // 256 of states, 256 of colours
+export const ROW = 2048; // texels per row; splat.wgsl must have the same number
+export const OBJECT_ROWS = 512; // 256 rows of states, 256 rows of colours
 export const MODES = { color: 0, relevancy: 1, objects: 2, ids: 3 };
 const MAGIC = 0x53474c46, VERSION = 1, HEADER = 32;
 
-// Reads /api/splats: texels, padded to whole rows, and the means for sorting.
+// Parses the data of /api/splats. Returns the texels, padded to whole rows, and the means for
+// sorting.
 export function parseSplats(buffer) {
   const [magic, version, count, shDegree, texels] = new Uint32Array(buffer, 0, 5);
   const [colorRange, shRange] = new Float32Array(buffer, 20, 2);
-  if (magic !== MAGIC || version !== VERSION) throw new Error("the server's Gaussians are of another version; reload the page");
+  if (magic !== MAGIC || version !== VERSION) throw new Error("the Gaussians have another version of the format; reload the page");
   const rows = Math.max(1, Math.ceil(count * texels / ROW));
   const data = new Uint32Array(rows * ROW * 4);
   data.set(new Uint32Array(buffer, HEADER));
@@ -19,7 +20,7 @@ export function parseSplats(buffer) {
   return { data, rows, means, count, shDegree, texels, colorRange, shRange };
 }
 
-// The uniform `Frame` of splat.wgsl.
+// Packs the uniform `Frame` of splat.wgsl.
 export function packFrame({ camera, width, height, scene, splats, mode, dim }) {
   const buffer = new ArrayBuffer(128);
   const lens = camera.lens(width, height);

@@ -1,4 +1,4 @@
-// What one sees, as the part of an address after #: a place, or the view that it is the place of, and what was asked.
+// Links to the state of the page: the part of an address after #, with view, camera, text and mode.
 
 const SHOWN = ["relevancy", "objects"];
 
@@ -10,16 +10,17 @@ export function linkOf(camera, { text, mode }) {
   return `#${parts}`;
 }
 
-// Puts the camera where a link says; the link's text and what it shows, if any. A link that cannot be read throws.
+// Sets the camera from a link. Returns the text and mode of the link, if any. Throws if the link is
+// invalid.
 export function follow(hash, stage) {
   const parts = new URLSearchParams(hash.slice(1));
   const name = parts.get("view");
   if (name === null) return {};
   const index = stage.scene.views.findIndex((view) => view.name === name);
-  if (index < 0) throw new Error(`the link leads to the view "${name}", which this scene does not have`);
+  if (index < 0) throw new Error(`the link names the view "${name}", which this scene does not have`);
   stage.lookFrom(index);
   const pose = parts.get("camera")?.split("_").map(Number);
-  if (pose && !stage.camera.stand(pose)) throw new Error("the link's camera cannot be read; this is the view that it was near");
+  if (pose && !stage.camera.stand(pose)) throw new Error("the camera of the link is invalid; its view is shown instead");
   stage.changed();
   return { text: parts.get("text"), mode: SHOWN.find((mode) => mode === parts.get("show")) ?? "color" };
 }

@@ -1,13 +1,14 @@
-// Points of the scene under a pixel, and lengths between them.
+// Surface points under pixels, and lengths between them.
 
-// As src/splats.rs packs them.
+// Range of log-scales, as in src/splats.rs.
 const LOG_SCALE_LOW = -20, LOG_SCALE_RANGE = 30;
-// What lies behind less than this much light counts as seen.
+// The surface is where the transmittance falls below this value.
 const SOLID = 0.5;
-const NEAR = 0.5; // splat.wgsl draws no Gaussian that is nearer than so many of its sizes
-const FAINT = 1 / 255; // nor what adds less than one grey level
+const NEAR = 0.5; // least depth of a drawn Gaussian relative to its size, as in splat.wgsl
+const FAINT = 1 / 255; // least alpha of a drawn Gaussian: one grey level
 
-// The rotation of a Gaussian as a matrix, row by row; unpack_rotation of splat.wgsl tells how it is packed.
+// Returns the rotation of a Gaussian as a matrix, by rows. unpack_rotation of splat.wgsl defines
+// the packing.
 function rotation(low, high) {
   const v = [(low & 0xffff) / 65535, (low >>> 16) / 65535, (high & 0x3fff) / 16383].map((part) => (part * 2 - 1) * Math.SQRT1_2);
   v.splice((high >>> 14) & 3, 0, Math.sqrt(Math.max(1 - v[0] ** 2 - v[1] ** 2 - v[2] ** 2, 0)));
@@ -21,8 +22,8 @@ function rotation(low, high) {
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
-// Where along a ray a Gaussian is densest, and how much light it takes there; nothing where it hardly touches the ray. `pixel` is what
-// a pixel covers at distance 1: nothing is thinner.
+// Returns depth and alpha of a Gaussian where it is densest along a ray, or null if alpha is too
+// small. `pixel` is the width of a pixel at distance 1; scales are at least half a pixel.
 function crossing({ data, texels, means }, i, { eye, forward }, direction, pixel) {
   const at = 4 * texels * i;
   const offset = [0, 1, 2].map((k) => eye[k] - means[3 * i + k]);
@@ -43,7 +44,8 @@ function crossing({ data, texels, means }, i, { eye, forward }, direction, pixel
   return depth > 0 && alpha >= FAINT ? { depth, alpha } : null;
 }
 
-// The point of the surface that a pixel shows; nothing where one looks through the scene. `shown` tells which objects there are.
+// Returns the surface point at a canvas position, or null if there is no surface. `shown` returns
+// whether a Gaussian id is visible.
 export function pointAt(splats, camera, lens, x, y, shown) {
   const direction = camera.ray(x, y, lens);
   const crossings = [];
@@ -60,7 +62,8 @@ export function pointAt(splats, camera, lens, x, y, shown) {
   return null;
 }
 
-// Two points and what lies between them. Scenes that were made from photos have no unit of their own, until a length is known.
+// Measures the length between two points. Scenes from photos have no metric unit until the user
+// enters a real length.
 export class Measure {
   constructor(scene) {
     this.key = `fastlgs unit ${location.pathname} ${scene}`;
@@ -73,7 +76,7 @@ export class Measure {
     }
   }
 
-  // A third point begins anew.
+  // A third point starts a new measurement.
   add(point) {
     this.points = this.points.length === 2 ? [point] : [...this.points, point];
   }
@@ -89,7 +92,8 @@ export class Measure {
     return this.unit ? `${Number((length * this.unit).toPrecision(3))} m` : `${Number(length.toPrecision(3))} units`;
   }
 
-  // The length between the points is `metres` in truth; without a number it is unknown again.
+  // Sets the real length between the points in metres. Without a positive number, the unit becomes
+  // unknown.
   known(metres) {
     const length = this.length();
     this.unit = metres > 0 && length > 0 ? metres / length : null;
@@ -97,7 +101,7 @@ export class Measure {
       if (this.unit) localStorage.setItem(this.key, this.unit);
       else localStorage.removeItem(this.key);
     } catch {
-      // Then it is known until the page is closed.
+      // Without storage, the unit is lost when the page is closed.
     }
   }
 }

@@ -1,11 +1,11 @@
-// Objects as the page knows them: what contains what, and their buttons with pictures.
+// Objects of the page: their hierarchy, and their buttons with pictures.
 
 import { getBlob } from "./server.js";
 
 export class Objects {
   constructor(list, overlaps, supportShare) {
     this.list = list;
-    // What the ids of Gaussians above those of the objects stand for, from small to large.
+    // Overlap lists, for Gaussian ids above the number of objects; each from small to large.
     this.overlaps = overlaps;
     this.supportShare = supportShare;
     this.byId = new Map(list.map((o) => [o.id, o]));
@@ -15,11 +15,12 @@ export class Objects {
     for (const ids of this.children.values()) ids.sort(bySize);
     this.pictures = new Map();
     this.chain = this.chain.bind(this);
-    // All ids that Gaussians have, with the color of the smallest object that each stands for.
+    // All Gaussian ids, each with the colour of its smallest object.
     this.colored = list.concat(overlaps.map(([smallest], k) => ({ id: list.length + 1 + k, color: this.byId.get(smallest).color })));
   }
 
-  // An object and what contains it, from small to large; those that a Gaussian of this id lies in.
+  // Returns the objects of a Gaussian id, from small to large: an object and those that contain it,
+  // or an overlap list.
   chain(id) {
     if (id > this.list.length) return this.overlaps[id - this.list.length - 1] ?? [];
     const chain = [];
@@ -27,7 +28,7 @@ export class Objects {
     return chain;
   }
 
-  // Whether the middle of an object lies in the picture.
+  // Returns whether the centre of an object's box is in the picture.
   isInSight(id, { camera, width, height }) {
     const box = this.byId.get(id).bbox3d;
     const place = box && camera.project(box[0].map((low, k) => (low + box[1][k]) / 2), camera.lens(width, height));
@@ -38,7 +39,8 @@ export class Objects {
     return this.children.get(id) ?? [];
   }
 
-  // Of things that lie in each other, the largest whose support comes near the best (fastlgs_grid::query::pointed).
+  // Returns the largest object of a Gaussian id whose support is close to the best
+  // (fastlgs_grid::query::pointed).
   meant(id) {
     const chain = this.chain(id);
     const support = (id) => this.byId.get(id).support * (1 - this.byId.get(id).share);
@@ -46,7 +48,8 @@ export class Objects {
     return chain.findLast((id) => support(id) >= this.supportShare * best);
   }
 
-  // The next smaller thing around `id` below `selected`; where there is none, the largest again.
+  // Returns the next smaller object of a Gaussian id below `selected`, or starts again at the
+  // largest.
   below(id, selected) {
     const chain = this.chain(id);
     const at = chain.indexOf(selected);
@@ -56,7 +59,7 @@ export class Objects {
   async picture(id) {
     if (!this.pictures.has(id)) {
       const made = getBlob(`/api/objects/${id}/thumbnail.png`).then((blob) => URL.createObjectURL(blob), ({ status }) => {
-        // Whoever lists it again asks again, unless there is none.
+        // After an error, the next listing tries again, unless there is no picture (404).
         if (status !== 404) this.pictures.delete(id);
         return null;
       });
@@ -83,11 +86,11 @@ export class Objects {
         const meter = document.createElement("meter");
         meter.className = "score";
         Object.assign(meter, { min: 0, max: 1, low: minScore, high: minScore, optimum: 1, value: score });
-        meter.setAttribute("aria-label", `relevancy ${score.toFixed(2)}`);
+        meter.setAttribute("aria-label", `score ${score.toFixed(2)}`);
         button.append(meter);
       }
       button.addEventListener("click", () => choose(id));
-      // Only what comes into sight is asked for.
+      // Fetches the picture only when the button becomes visible.
       new IntersectionObserver(async (entries, observer) => {
         if (!entries.some((entry) => entry.isIntersecting)) return;
         observer.disconnect();

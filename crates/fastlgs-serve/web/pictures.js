@@ -1,8 +1,8 @@
-// Shows pictures that the server renders, where the browser can draw nothing itself.
+// Renderer that shows pictures of the server, for browsers without a GPU.
 
 import { postBlob, postJson } from "./server.js";
 
-// Longer side of the pictures, in pixels: what a server without a GPU still draws quickly.
+// Longer side of the pictures in pixels. A server without a GPU renders this size quickly.
 const SIDE = 640;
 
 export async function openPictures(canvas) {
@@ -27,7 +27,7 @@ export async function openPictures(canvas) {
     setSplats() {},
     setObjects() {},
     setOrder() {},
-    // Only the newest frame is asked for while one is on its way.
+    // While one frame is being fetched, only the newest of the others is kept.
     draw(frame) {
       next = { ...frame, camera: Object.assign(Object.create(Object.getPrototypeOf(frame.camera)), frame.camera) };
       if (busy) return drawn;

@@ -1,9 +1,9 @@
-// Texts that were asked before, newest first, and names that were taught: both are offered while one types.
+// Suggestions for the text field: earlier texts, newest first, then taught names.
 
 const MOST = 40;
 
 export class Recent {
-  // `list` is the datalist of the text's field. The browser keeps the texts of each scene.
+  // `list` is the datalist of the text field. The browser stores the texts of each scene.
   constructor(scene, list) {
     this.key = `fastlgs texts ${location.pathname} ${scene}`;
     this.list = list;
@@ -21,7 +21,7 @@ export class Recent {
     try {
       localStorage.setItem(this.key, JSON.stringify(this.texts));
     } catch {
-      // A browser that keeps nothing still offers what was asked since the page was opened.
+      // Without storage, only texts since the page was opened are suggested.
     }
     this.show();
   }

@@ -1,4 +1,4 @@
-// Which way of drawing is taken.
+// Choice of the renderer.
 
 import { openWebGpu } from "./webgpu.js";
 import { openWebGl2 } from "./webgl2.js";
@@ -6,8 +6,10 @@ import { openPictures } from "./pictures.js";
 
 const WAYS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openPictures]];
 
-// The first way that this browser can go, or the one that is wished for. A browser without a GPU draws slower than the server, so
-// it gets pictures unless something else is wished for, or unless it is `alone`: no server renders any.
+// Opens the renderer named `wish`, or the first that works in this browser.
+//
+// Browsers without a GPU show pictures of the server, which renders faster, unless `wish` names
+// another renderer. With `alone`, no server renders pictures.
 export async function openRenderer(canvas, wish, alone) {
   const reasons = [];
   for (const [name, open] of WAYS) {

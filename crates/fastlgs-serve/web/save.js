@@ -1,4 +1,4 @@
-// Gives a blob to the user as a file.
+// Downloads a blob as a file.
 export function save(blob, name) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);

@@ -1,8 +1,8 @@
-// Sentences with numbers that people can read.
+// Formats the numbers in messages.
 
 const GROUPED = new Intl.NumberFormat("en");
 const ROUNDED = new Intl.NumberFormat("en", { maximumSignificantDigits: 3 });
-// Numbers that stand alone: those in names of files, addresses and quoted texts stay as they are.
+// Matches separate numbers. Those in file names, addresses and quoted texts stay as they are.
 const ALONE = /(?<![\w./'"-])\d+(\.\d+)?(?![\w/'"-]|\.\w)/g;
 
 export const readable = (sentence) => sentence

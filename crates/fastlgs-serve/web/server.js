@@ -1,8 +1,8 @@
-// Requests to the program that serves this page.
+// Requests to the server of this page.
 
 const address = new URL(location.href);
 const given = address.searchParams.get("token");
-// The token must not stay where others can read it over one's shoulder; a page that is loaded again knows it still.
+// Removes the token from the visible address. Session storage keeps it for reloads.
 if (given) {
   remembered((place) => place.setItem("token", given));
   address.searchParams.delete("token");
@@ -11,7 +11,7 @@ if (given) {
 
 const token = given ?? remembered((place) => place.getItem("token"));
 
-// What the browser keeps for this tab; nothing where it keeps nothing.
+// Uses the session storage; returns null if the browser has none.
 function remembered(use) {
   try {
     return use(sessionStorage);
@@ -25,7 +25,7 @@ async function request(path, options = {}) {
   if (token) headers.Authorization = `Bearer ${token}`;
   let response;
   try {
-    // Relative to the page, which a proxy may show below a prefix.
+    // Relative to the page, because a proxy may add a path prefix.
     response = await fetch(new URL(path.slice(1), document.baseURI), { ...options, headers });
   } catch {
     throw new Error("the server does not answer; is fastlgs still running?");

@@ -1,4 +1,4 @@
-// A worker that sorts Gaussians from far to near: a counting sort by 16 bits of depth.
+// Worker that sorts Gaussians from far to near, by a counting sort over 16 bits of depth.
 
 const STEPS = 1 << 16;
 let means = new Float32Array();
@@ -13,7 +13,7 @@ onmessage = ({ data }) => {
   const depths = new Float32Array(count);
   let near = Infinity, far = -Infinity, kept = 0;
   for (let i = 0; i < count; i++) {
-    // Rounded as it is kept, so that none lies beyond near or far.
+    // Rounded to float32 like the stored depth, so that no depth is outside near and far.
     const depth = depths[i] = Math.fround(x * means[3 * i] + y * means[3 * i + 1] + z * means[3 * i + 2] + w);
     if (depth > 0) {
       kept++;
@@ -21,7 +21,7 @@ onmessage = ({ data }) => {
       if (depth > far) far = depth;
     }
   }
-  // Even steps of log(depth): what is near needs finer ones.
+  // Equal steps of log(depth), which are finer close to the camera.
   const range = Math.max(Math.log(far / near), 1e-12);
   const step = (depth) => Math.min(STEPS - 1, Math.floor(Math.log(far / depth) / range * STEPS));
   const starts = new Uint32Array(STEPS + 1);

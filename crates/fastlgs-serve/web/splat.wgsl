@@ -1,10 +1,15 @@
-// Draws one Gaussian as a quad, for browsers: WebGPU takes this with what it imports, WebGL2 its translation (build.rs).
-// The picture is that of shaders/project.wgsl and shaders/blend.wgsl, from which its geometry and colour come.
+// Draws one Gaussian as a quad, for browsers. WebGPU runs this shader with its imports, WebGL2 a
+// translation of it (build.rs). Geometry and colour are those of shaders/project.wgsl and
+// shaders/blend.wgsl.
 //
-// splats   [n][2 + ceil(rest / 4)] texels of four u32, row by row (src/serve/splats.rs):
-//          (mean.xyz, log-scales xy) (log-scale z and opacity, colour, rotation, rotation and object id) (SH coefficients ...)
-// objects  [512][256] texels: rows 0..256 the state of the Gaussians' id = 256 row + column (an object, or a list of objects): relevancy, selected, hidden;
-//          rows 256.. its colour
+// splats   [n][2 + ceil(rest / 4)] texels of four u32 in row-major order (src/splats.rs):
+//          (mean xyz, log-scales xy)
+//          (log-scale z and opacity, colour, rotation, rotation and object id)
+//          (SH coefficients ...)
+// objects  [512][256] texels; a Gaussian id is 256 * row + column, and identifies an object
+//          or a list of overlapping objects:
+//          rows 0..256  state of the id: relevancy, selected, hidden
+//          rows 256..   colour of the id
 #import view
 #import rotation
 #import covariance
@@ -12,13 +17,15 @@
 
 struct Frame {
     world_to_camera: mat4x4<f32>,
-    // Position of the camera in the world; w: 1 where opacity is lowered by what dilation adds (2-D Mip filter).
+    // Camera position in scene coordinates; w is 1 if opacity compensates dilation (2-D Mip
+    // filter).
     camera: vec4<f32>,
     // Focal lengths and principal point in pixels.
     lens: vec4<f32>,
-    // Pixels along x and y; largest coefficient of colour, and of the SH coefficients above degree 0.
+    // Width and height in pixels; largest coefficient of SH degree 0, and of higher degrees.
     size: vec4<f32>,
-    // What is drawn; SH degree; 1 where what is not selected is dimmed; texels of a Gaussian.
+    // Mode (COLOR to IDS); SH degree; 1 to dim Gaussians that are not selected; texels per
+    // Gaussian.
     mode: vec4<u32>,
 }
 
@@ -35,15 +42,16 @@ const LOG_SCALE_RANGE: f32 = 30.0;
 @group(0) @binding(1) var splats: texture_2d<u32>;
 @group(0) @binding(2) var objects: texture_2d<f32>;
 
-fn texel(number: u32) -> vec4<u32> {
-    return textureLoad(splats, vec2<i32>(i32(number % ROW), i32(number / ROW)), 0);
+fn texel(plane_index: u32) -> vec4<u32> {
+    return textureLoad(splats, vec2<i32>(i32(plane_index % ROW), i32(plane_index / ROW)), 0);
 }
 
 fn unit10(bits: u32) -> vec3<f32> {
     return vec3<f32>(vec3<u32>(bits, bits >> 10u, bits >> 20u) & vec3<u32>(1023u)) / 511.5 - 1.0;
 }
 
-// The three smallest components in 16, 16 and 14 bits, and in two bits which one is the largest; (w, x, y, z).
+// Unpacks a quaternion (w, x, y, z): the three smallest components in 16, 16 and 14 bits, and the
+// index of the largest in two bits.
 fn unpack_rotation(low: u32, high: u32) -> vec4<f32> {
     let whole = vec3<f32>(f32(low & 0xffffu) / 65535.0, f32(low >> 16u) / 65535.0, f32(high & 0x3fffu) / 16383.0);
     let v = (whole * 2.0 - 1.0) * 0.70710678;
@@ -65,7 +73,7 @@ fn color_of(first: u32, packed: u32, direction: vec3<f32>) -> vec3<f32> {
     return max(color, vec3<f32>(0.0));
 }
 
-// The turbo colour map (Mikhailov 2019) by its author's polynomial, as fastlgs_core::turbo has it.
+// The turbo colour map (Mikhailov 2019) as its author's polynomial, same as fastlgs_core::turbo.
 fn turbo(x: f32) -> vec3<f32> {
     let low = vec4<f32>(1.0, x, x * x, x * x * x);
     let high = vec2<f32>(x * x * x * x, x * x * x * x * x);
@@ -76,8 +84,8 @@ fn turbo(x: f32) -> vec3<f32> {
     ), vec3<f32>(0.0), vec3<f32>(1.0));
 }
 
-// What a Gaussian of an object looks like in the current mode.
-fn shown(color: vec3<f32>, id: u32) -> vec3<f32> {
+// Returns the colour of a Gaussian with this id in the current mode.
+fn inside_image(color: vec3<f32>, id: u32) -> vec3<f32> {
     let at = vec2<i32>(i32(id & 255u), i32(id >> 8u));
     let state = textureLoad(objects, at, 0);
     switch frame.mode.x {
@@ -94,13 +102,13 @@ fn shown(color: vec3<f32>, id: u32) -> vec3<f32> {
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    // Place in the ellipse, in standard deviations.
+    // Position in the ellipse, in standard deviations.
     @location(0) place: vec2<f32>,
     @location(1) @interpolate(flat) color: vec4<f32>,
 }
 
 @vertex
-fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Corner {
+fn corner(@builtin(vertex_index) plane_index: u32, @location(0) gaussian: u32) -> Corner {
     var out = Corner(vec4<f32>(2.0, 2.0, 0.0, 1.0), vec2<f32>(0.0), vec4<f32>(0.0));
     let first = gaussian * frame.mode.w;
     let a = texel(first);
@@ -129,7 +137,7 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
     if !(opacity >= ALPHA_MIN) {
         return out;
     }
-    // Half axes of the ellipse on which alpha falls to ALPHA_MIN.
+    // Semi-axes of the ellipse on which alpha equals ALPHA_MIN.
     let middle = 0.5 * (cov.x + cov.z);
     let spread = length(vec2<f32>(0.5 * (cov.x - cov.z), cov.y));
     var axis = vec2<f32>(1.0, 0.0);
@@ -139,13 +147,13 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
         axis = vec2<f32>(0.0, 1.0);
     }
     let reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
-    out.place = reach * (vec2<f32>(f32(number & 1u), f32(number >> 1u)) * 2.0 - 1.0);
+    out.place = reach * (vec2<f32>(f32(plane_index & 1u), f32(plane_index >> 1u)) * 2.0 - 1.0);
     let long = sqrt(middle + spread) * out.place.x * axis;
     let short = sqrt(max(middle - spread, 0.01)) * out.place.y * vec2<f32>(-axis.y, axis.x);
     let pixel = view.focal * t.xy / t.z + view.centre + long + short;
     out.position = vec4<f32>(pixel / frame.size.xy * vec2<f32>(2.0, -2.0) + vec2<f32>(-1.0, 1.0), 0.0, 1.0);
     let color = color_of(first, b.y, normalize(mean - frame.camera.xyz));
-    out.color = vec4<f32>(shown(color, id), min(opacity, ALPHA_MAX));
+    out.color = vec4<f32>(inside_image(color, id), min(opacity, ALPHA_MAX));
     return out;
 }
 
@@ -153,7 +161,7 @@ fn corner(@builtin(vertex_index) number: u32, @location(0) gaussian: u32) -> Cor
 fn pixel(in: Corner) -> @location(0) vec4<f32> {
     let alpha = in.color.a * exp(-0.5 * dot(in.place, in.place));
     if frame.mode.x == IDS {
-        // No blending: what was drawn last and is solid enough is what one points at.
+        // No blending: the id is that of the nearest Gaussian with an alpha of at least 0.5.
         if alpha < 0.5 {
             discard;
         }

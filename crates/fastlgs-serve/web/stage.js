@@ -1,4 +1,4 @@
-// The picture: canvas, camera, hands on it, and what lies over it (cameras of the photos, the photo itself).
+// The picture: canvas, camera, mouse and touch input, and overlays (cameras, measurement, photo).
 
 import { Camera, frustum } from "./camera.js";
 import { Measure, pointAt } from "./measure.js";
@@ -6,7 +6,7 @@ import { OBJECT_ROWS, parseSplats } from "./frame.js";
 import { openRenderer } from "./renderer.js";
 import { getBlob, getBytes } from "./server.js";
 
-// More pixels than this, along the longer side, are not drawn: software rasterisers would crawl.
+// Largest longer side of the canvas in pixels. Software rasterisers are too slow for more.
 const MOST_PIXELS = 1280;
 
 export class Stage {
@@ -26,7 +26,7 @@ export class Stage {
   }
 
   async open(wish) {
-    // Nobody renders pictures of a scene in training, or of one in a folder of files.
+    // No pictures are rendered during training, and a static folder has no server.
     const alone = this.scene.stage === "training" || Boolean(this.scene.shared);
     this.renderer = await openRenderer(this.elements.canvas, wish, alone);
     this.renderer.lost.then(() => this.failed(new Error("the browser lost its graphics device; reload the page")));
@@ -37,7 +37,7 @@ export class Stage {
     this.resize();
   }
 
-  // Fetches the Gaussians; also those of a scene that grows.
+  // Fetches the Gaussians; called again when a scene in training has new ones.
   async load() {
     if (this.renderer.name === "pictures") return this.drawNow();
     this.splats = parseSplats(await getBytes("/api/splats"));
@@ -67,7 +67,7 @@ export class Stage {
     return this.settle();
   }
 
-  // Draws once the order of the Gaussians fits the camera.
+  // Redraws. The returned promise resolves when a frame with sorted Gaussians was drawn.
   settle() {
     const settled = new Promise((done) => (this.settled = [...(this.settled ?? []), done]));
     this.changed();
@@ -81,7 +81,7 @@ export class Stage {
       else this.sort();
     }
     this.draw();
-    // Nothing to sort, nothing to wait for.
+    // Without Gaussians there is nothing to sort.
     if (!this.splats?.count) this.finish();
   }
 
@@ -93,7 +93,7 @@ export class Stage {
   }
 
   sorted({ order, number }) {
-    // An order of Gaussians that were replaced meanwhile fits no longer.
+    // Ignores the order of Gaussians that were replaced meanwhile.
     if (number === this.loading) {
       this.renderer.setOrder(order);
       this.ordered = true;
@@ -129,14 +129,14 @@ export class Stage {
   drawNow() {
     if (!this.camera.view || !(this.splats || this.renderer.name === "pictures")) return;
     const drawn = this.renderer.draw(this.frame());
-    // How long one waits after opening the page, in milliseconds.
+    // Time from opening the page to the first picture, in milliseconds.
     if (this.ordered || this.renderer.name === "pictures") Promise.resolve(drawn).then(() => (this.firstPicture ??= performance.now()));
     this.drawOver();
     this.placePhoto();
     return drawn;
   }
 
-  // The picture as a PNG, as it is drawn now.
+  // Returns the current picture as a PNG blob.
   async snapshot() {
     await this.drawNow();
     return new Promise((done) => this.elements.canvas.toBlob(done, "image/png"));
@@ -147,7 +147,7 @@ export class Stage {
     this.draw();
   }
 
-  // What is selected, hidden, shown alone and relevant; see app.js.
+  // Sets the selected, hidden, isolated and relevant objects; see app.js.
   setObjects(objects) {
     this.objects = objects;
     this.renderer.setObjects(this.objectBytes());
@@ -158,7 +158,7 @@ export class Stage {
     const bytes = new Uint8Array(4 * 256 * OBJECT_ROWS);
     const { list, selected, scores, members } = this.objects;
     for (const { id, color } of [{ id: 0, color: [0, 0, 0] }, ...list]) {
-      // Relevant, selected or hidden is also what lies in a thing that is.
+      // Parts inherit relevancy, selection and visibility from the objects that contain them.
       const around = members(id);
       const score = Math.max(0, ...around.map((above) => scores.get(above) ?? 0));
       const lit = around.some((above) => selected.has(above));
@@ -168,7 +168,7 @@ export class Stage {
     return bytes;
   }
 
-  // Whether an object is shown, with what it lies in.
+  // Returns whether the Gaussians of an id are visible.
   isShown(id) {
     const { hidden, only, members } = this.objects;
     const around = members(id);
@@ -176,7 +176,7 @@ export class Stage {
     return !any(hidden) && (only.size === 0 || any(only));
   }
 
-  // What lies over the picture: the photos' cameras, and what is measured.
+  // Draws the overlays: the cameras of the photos, and the measurement.
   drawOver() {
     const context = this.elements.cameras.getContext("2d");
     context.clearRect(0, 0, this.width, this.height);
@@ -200,7 +200,7 @@ export class Stage {
     context.moveTo(...a);
     context.lineTo(...b);
     context.stroke();
-    // Dark around the letters, so that they can be read on anything.
+    // Dark outline, so that the text is readable on any background.
     const middle = [(a[0] + b[0]) / 2 + 8 * this.ratio, (a[1] + b[1]) / 2 - 8 * this.ratio];
     context.strokeStyle = "#000";
     context.strokeText(this.measure.text(), ...middle);
@@ -225,7 +225,7 @@ export class Stage {
     }
   }
 
-  // The photo lies over the picture while the camera stands where it was taken.
+  // Shows the photo over the picture while the camera is at its pose.
   placePhoto() {
     const { photo, divider } = this.elements;
     const view = this.camera.view;
@@ -242,7 +242,7 @@ export class Stage {
     Object.assign(divider.style, { left: css(at), top: css(picture.top), height: css(picture.height) });
   }
 
-  // Fetches the photo of a view, unless another one is wanted by the time it comes.
+  // Fetches the photo of a view. Ignores it if another photo was requested meanwhile.
   async fetchPhoto(view) {
     const own = this.photo = { view, there: false };
     try {
@@ -261,7 +261,7 @@ export class Stage {
   listen() {
     const { canvas } = this.elements;
     const pointers = new Map();
-    // A hand that clicks trembles: so far, in parts of the picture's height, nothing moves.
+    // Movements up to this share of the image height still count as a click.
     const STILL = 0.01;
     let dragging = false;
     const place = (event) => [event.offsetX * this.ratio, event.offsetY * this.ratio];
@@ -304,18 +304,19 @@ export class Stage {
     }, { passive: false });
   }
 
-  // The point of the scene at a place of the canvas. Who is given pictures fetches the Gaussians for this.
+  // Returns the surface point at a canvas position. The `pictures` renderer fetches the Gaussians
+  // for this.
   async point(x, y) {
     const splats = this.splats ?? (this.fetched ??= parseSplats(await getBytes("/api/splats")));
     return pointAt(splats, this.camera, this.camera.lens(this.width, this.height), x, y, (id) => this.isShown(id));
   }
 
-  // Clicks that follow each other `together` are on one thing.
+  // Handles a click. With `together`, it belongs to the same object as the click before.
   async click(x, y, together = false) {
     if (this.measure.on) {
       try {
         const point = await this.point(x, y);
-        if (!point) throw new Error("nothing is there that could be measured");
+        if (!point) throw new Error("there is no surface at this point; click another one");
         this.measure.add(point);
         this.measured();
       } catch (error) {
@@ -336,17 +337,17 @@ export class Stage {
     try {
       const within = (v, size) => Math.min(Math.max(Math.floor(v), 0), size - 1);
       const place = [within(x, this.width), within(y, this.height)];
-      // As rays: what a selection brings up may take room from the canvas.
+      // Stored as rays, because the selection panel may change the size of the canvas.
       const lens = this.camera.lens(this.width, this.height);
       const ray = [(place[0] + 0.5 - lens.cx) / lens.fx, (place[1] + 0.5 - lens.cy) / lens.fy];
       const from = this.camera.pose().join();
       this.clicks = together && this.clickedFrom === from ? [...this.clicks, ray] : [ray];
       this.clickedFrom = from;
-      // Only the program that serves the page weighs several.
+      // Only the server can combine several clicks.
       if (this.clicks.length > 1 && !this.scene.shared) return this.pickedTogether(this.clicks);
       const own = this.clicks;
       const id = await this.renderer.pick(this.frame(), ...place);
-      // Unless there was another click, or something else was asked, meanwhile.
+      // Ignored if there was another click or query meanwhile.
       if (this.clicks === own) this.picked(id);
     } catch (error) {
       this.failed(error);

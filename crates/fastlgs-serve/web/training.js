@@ -1,31 +1,31 @@
-// A scene that grows: its curves, and new Gaussians when the server has made a picture of it.
+// A scene in training: its curves, and new Gaussians when the server has a new snapshot.
 
 import { getJson } from "./server.js";
 
 const EVERY_MS = 1000;
 
-// Follows a run until the scene can be asked; `grown` is called when there are new Gaussians.
+// Polls a run until the scene answers queries. Calls `grown` when there are new Gaussians.
 export async function follow(elements, grown) {
   elements.training.hidden = false;
   let revision = 0;
   for (;;) {
     try {
       const progress = await getJson("/api/training");
-      show(elements, progress, "steps are done; objects come next, then questions can be asked");
+      show(elements, progress, "training is done, objects are being found");
       if (progress.revision !== revision) {
         await grown();
         revision = progress.revision;
       }
       if ((await getJson("/api/scene")).stage === "ready") return;
     } catch (error) {
-      // A machine that slept or a server that is busy answers again.
+      // After an error, such as a busy server, the next poll tries again.
       elements.text.textContent = `${error.message}; trying again`;
     }
     await new Promise((done) => setTimeout(done, EVERY_MS));
   }
 }
 
-// The curves of a run that is over.
+// Shows the curves of a finished run.
 export async function recall(elements) {
   elements.training.hidden = false;
   show(elements, await getJson("/api/training"), "trained");
@@ -36,16 +36,16 @@ function show(elements, { curve, iterations, finished }, over) {
   const state = finished ? over : `step ${last?.iteration ?? 0} of ${iterations}`;
   elements.text.textContent = last
     ? `${state}: ${last.gaussians.toLocaleString("en")} Gaussians, ${last.psnr.toFixed(1)} dB, ${Math.round(last.seconds)} s`
-    : "the first steps are on their way";
+    : "training is starting";
   const points = (of) => curve.filter((p) => of(p) !== null && Number.isFinite(of(p))).map((p) => [p.iteration, of(p)]);
   plot(elements.loss, "loss", iterations, [["", points((p) => p.loss)]]);
-  plot(elements.psnr, "PSNR in dB, blue: held out", iterations, [
+  plot(elements.psnr, "PSNR in dB (blue: held out)", iterations, [
     ["", points((p) => p.psnr)],
     ["held-out", points((p) => p.psnr_held_out)],
   ]);
 }
 
-// Lines in a box of 300 x 90.
+// Draws curves into a box of 300 x 90 units.
 function plot(svg, title, most, lines) {
   const values = lines.flatMap(([, points]) => points.map((p) => p[1]));
   const low = Math.min(...values), high = Math.max(...values);

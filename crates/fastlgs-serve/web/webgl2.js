@@ -1,8 +1,10 @@
-// Draws by WebGL2, with the shaders that the build translated from splat.wgsl. Their names of things are naga's.
+// WebGL2 renderer, with the shaders that the build translates from splat.wgsl. Names of uniforms
+// are those of naga.
 
 import { OBJECT_ROWS, ROW, packFrame } from "./frame.js";
 
-// Whether the browser would draw without a GPU. Asked of another canvas, as a canvas keeps its first context for good.
+// Returns whether WebGL2 runs without a GPU. Tests another canvas, because a canvas keeps its first
+// context.
 function isSlow() {
   const gl = document.createElement("canvas").getContext("webgl2", { failIfMajorPerformanceCaveat: true });
   const names = gl?.getExtension("WEBGL_debug_renderer_info");
@@ -49,7 +51,7 @@ export async function openWebGl2(canvas, evenSlow) {
   };
   texture(0);
   texture(1);
-  // Blending goes through 16-bit floats where there are such, for the reason that present.wgsl gives.
+  // Blends in 16-bit floats if the browser has them; present.wgsl gives the reason.
   const floats = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
   const target = () => ({ buffer: gl.createRenderbuffer(), frame: gl.createFramebuffer() });
   const [ids, picture] = [target(), target()];
@@ -97,7 +99,7 @@ export async function openWebGl2(canvas, evenSlow) {
       gl.blitFramebuffer(...all, ...all, gl.COLOR_BUFFER_BIT, gl.NEAREST);
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     },
-    // The Gaussians' id at a pixel of the canvas, which stands for the objects there.
+    // Returns the Gaussian id at a pixel of the canvas; it identifies the objects there.
     async pick(frame, x, y) {
       bind(ids, gl.RGBA8, frame);
       gl.disable(gl.BLEND);

@@ -1,12 +1,12 @@
-// Draws by WebGPU.
+// WebGPU renderer.
 
 import { OBJECT_ROWS, ROW, packFrame } from "./frame.js";
 
 export async function openWebGpu(canvas, evenSlow) {
   const adapter = await navigator.gpu?.requestAdapter();
-  if (!adapter) throw new Error("no adapter");
+  if (!adapter) throw new Error("no WebGPU adapter");
   if (adapter.info.isFallbackAdapter && !evenSlow) throw new Error("only a software adapter");
-  // A row of the texture holds so many Gaussians that large scenes need all rows there are.
+  // Requests the largest textures: their width is fixed, so large scenes need many rows.
   const { maxTextureDimension2D } = adapter.limits;
   const device = await adapter.requestDevice({ requiredLimits: { maxTextureDimension2D } });
   const format = navigator.gpu.getPreferredCanvasFormat();
@@ -34,7 +34,7 @@ export async function openWebGpu(canvas, evenSlow) {
     pipeline({ format: "rgba8unorm" }),
     device.createRenderPipelineAsync({ layout: "auto", vertex: { module: present }, fragment: { module: present, targets: [{ format }] } }),
   ]);
-  // Only now: a canvas that has a WebGPU context can have no other.
+  // Only after success: a canvas with a WebGPU context cannot get another context.
   const context = canvas.getContext("webgpu");
   context.configure({ device, format, alphaMode: "opaque" });
 
@@ -45,7 +45,7 @@ export async function openWebGpu(canvas, evenSlow) {
   const states = texture("rgba8unorm", OBJECT_ROWS, 256);
   let splatTexture, order, orderLength = 0, group, splats, picture, shown;
 
-  // The picture in floats, as large as the canvas.
+  // Resizes the float texture of the picture to the canvas.
   function resize({ width, height }) {
     if (picture?.width === width && picture.height === height) return;
     picture?.destroy();
@@ -103,7 +103,7 @@ export async function openWebGpu(canvas, evenSlow) {
       last.end();
       device.queue.submit([encoder.finish()]);
     },
-    // The Gaussians' id at a pixel of the canvas, which stands for the objects there.
+    // Returns the Gaussian id at a pixel of the canvas; it identifies the objects there.
     async pick(frame, x, y) {
       device.queue.writeBuffer(uniform, 0, packFrame({ ...frame, mode: "ids", splats }));
       const target = device.createTexture({

@@ -17,12 +17,28 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let texts: Vec<&str> = words.iter().map(String::as_str).collect();
     let texts = OfflineText::load()?.embed(&texts)?;
 
-    let masks = OfflineSegmenter::load()?.segment(photo, &pixels)?.painted(Level::Whole);
+    let masks = OfflineSegmenter::load()?
+        .segment(photo, &pixels)?
+        .painted(Level::Whole);
     let embeddings = Conse::load()?.embed_masks(photo, &pixels, &masks)?;
-    for (label, (embedding, area)) in embeddings.iter().zip(masks.areas().into_iter().skip(1)).enumerate() {
+    for (label, (embedding, area)) in embeddings
+        .iter()
+        .zip(masks.areas().into_iter().skip(1))
+        .enumerate()
+    {
         let cosine = |text: &Vec<f32>| text.iter().zip(embedding).map(|(a, b)| a * b).sum::<f32>();
-        let best = texts.iter().map(cosine).enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).expect("there are words");
-        println!("region {:3}, {area:6} pixels: {} ({:.2})", label + 1, words[best.0], best.1);
+        let best = texts
+            .iter()
+            .map(cosine)
+            .enumerate()
+            .max_by(|a, b| a.1.total_cmp(&b.1))
+            .expect("there are words");
+        println!(
+            "region {:3}, {area:6} pixels: {} ({:.2})",
+            label + 1,
+            words[best.0],
+            best.1
+        );
     }
     Ok(())
 }

@@ -15,9 +15,11 @@ pub const COUNT: usize = 64;
 /// Mean projection of 3,086 masks of three scenes. Subtracting it removes what all cut-outs share.
 /// It belongs to the axes of `Appearance::new`.
 const MEAN: [f32; COUNT] = [
-    -2.2, 24.2, -18.5, -5.7, -3.5, 28.2, 37.6, -2.6, 18.4, 14.4, 6.7, -39.7, -7.8, 3.9, 35.8, 34.5, -6.3, -49.0, -14.6, 9.1, -3.4, -19.4,
-    -16.1, -17.6, -11.8, 32.5, -31.7, 0.3, 3.4, -13.7, -27.3, -3.5, -9.6, -38.9, 13.2, 11.0, -4.6, -15.1, -26.1, -32.9, 34.4, -10.0, -13.6,
-    -24.8, 22.6, 19.0, 14.1, 2.9, -32.0, -27.3, 34.8, -5.2, -26.5, 21.7, -38.6, 10.3, 12.2, 39.5, 0.1, 13.7, -4.1, 1.2, -0.4, -12.4,
+    -2.2, 24.2, -18.5, -5.7, -3.5, 28.2, 37.6, -2.6, 18.4, 14.4, 6.7, -39.7, -7.8, 3.9, 35.8, 34.5,
+    -6.3, -49.0, -14.6, 9.1, -3.4, -19.4, -16.1, -17.6, -11.8, 32.5, -31.7, 0.3, 3.4, -13.7, -27.3,
+    -3.5, -9.6, -38.9, 13.2, 11.0, -4.6, -15.1, -26.1, -32.9, 34.4, -10.0, -13.6, -24.8, 22.6,
+    19.0, 14.1, 2.9, -32.0, -27.3, 34.8, -5.2, -26.5, 21.7, -38.6, 10.3, 12.2, 39.5, 0.1, 13.7,
+    -4.1, 1.2, -0.4, -12.4,
 ];
 
 /// Weight of the cosine of appearances, relative to that of ConSE embeddings. Appearance alone does
@@ -31,16 +33,22 @@ impl Appearance {
     /// Makes the axes of `classes` classes, with a fixed seed.
     pub fn new(classes: usize) -> Self {
         let mut rng = Rng::new(0, "likeness");
-        Self((0..classes).map(|_| std::array::from_fn(|_| rng.normal())).collect())
+        Self(
+            (0..classes)
+                .map(|_| std::array::from_fn(|_| rng.normal()))
+                .collect(),
+        )
     }
 
     /// Returns the appearance of class logits. The inner product of two appearances is [`WEIGHT`]
     /// times their cosine.
-    pub fn of(&self, logits: &[f32]) -> [f32; COUNT] {
+    pub fn project(&self, logits: &[f32]) -> [f32; COUNT] {
         let mean = logits.iter().sum::<f32>() / logits.len().max(1) as f32;
         let mut sum = MEAN.map(|m| -m);
         for (logit, axes) in logits.iter().zip(&self.0) {
-            sum.iter_mut().zip(axes).for_each(|(s, a)| *s += (logit - mean) * a);
+            sum.iter_mut()
+                .zip(axes)
+                .for_each(|(s, a)| *s += (logit - mean) * a);
         }
         normalise(&mut sum);
         sum.map(|v| v * WEIGHT.sqrt())
@@ -48,15 +56,15 @@ impl Appearance {
 }
 
 /// Returns the values of an offline embedding that are compared with texts: all but the appearance.
-pub fn words(embedding: &mut [f32]) -> &mut [f32] {
+pub fn text_part(embedding: &mut [f32]) -> &mut [f32] {
     let count = embedding.len().saturating_sub(COUNT);
     &mut embedding[..count]
 }
 
 /// Returns an offline embedding with its appearance set to zero, so that only the values shared
 /// with texts count.
-pub fn for_words(mut embedding: Vec<f32>) -> Vec<f32> {
-    let count = words(&mut embedding).len();
+pub fn without_appearance(mut embedding: Vec<f32>) -> Vec<f32> {
+    let count = text_part(&mut embedding).len();
     embedding[count..].fill(0.0);
     embedding
 }
@@ -70,24 +78,36 @@ mod tests {
         let appearance = Appearance::new(1000);
         let mut rng = Rng::new(3, "logits");
         let mut logits = || -> Vec<f32> { (0..1000).map(|_| 3.0 * rng.normal()).collect() };
-        let dot = |a: [f32; COUNT], b: [f32; COUNT]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
+        let dot =
+            |a: [f32; COUNT], b: [f32; COUNT]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
         let (a, b) = (logits(), logits());
         let raised: Vec<f32> = a.iter().map(|v| v + 2.0).collect();
-        assert!((dot(appearance.of(&a), appearance.of(&raised)) - WEIGHT).abs() < 1e-4);
-        assert!(dot(appearance.of(&a), appearance.of(&b)) < 0.6 * WEIGHT, "{}", dot(appearance.of(&a), appearance.of(&b)));
+        assert!((dot(appearance.project(&a), appearance.project(&raised)) - WEIGHT).abs() < 1e-4);
+        assert!(
+            dot(appearance.project(&a), appearance.project(&b)) < 0.6 * WEIGHT,
+            "{}",
+            dot(appearance.project(&a), appearance.project(&b))
+        );
     }
 
     #[test]
     fn the_mean_is_of_these_axes() {
         let axes = Appearance::new(1000).0;
         let sum: f32 = axes.iter().flatten().sum();
-        assert!((axes[0][0] - -1.09525).abs() < 1e-5 && (sum - 311.36).abs() < 0.05, "{} {sum}: the axes have changed, so MEAN must be measured again", axes[0][0]);
+        assert!(
+            (axes[0][0] - -1.09525).abs() < 1e-5 && (sum - 311.36).abs() < 0.05,
+            "{} {sum}: the axes have changed, so MEAN must be measured again",
+            axes[0][0]
+        );
     }
 
     #[test]
     fn what_is_for_words_has_no_appearance() {
         let whole: Vec<f32> = (1..=COUNT + 3).map(|v| v as f32).collect();
-        let worded = for_words(whole.clone());
-        assert_eq!((&worded[..3], &worded[3..]), (&whole[..3], [0.0; COUNT].as_slice()));
+        let worded = without_appearance(whole.clone());
+        assert_eq!(
+            (&worded[..3], &worded[3..]),
+            (&whole[..3], [0.0; COUNT].as_slice())
+        );
     }
 }

@@ -18,18 +18,67 @@ struct Attribute {
 /// Basic colour terms (Berlin & Kay 1969) with their focal colours, and wood, which is also
 /// recognised by its colours.
 const ATTRIBUTES: [Attribute; 12] = [
-    Attribute { words: &["red", "crimson", "scarlet"], colors: &[[45.0, 65.0, 45.0], [35.0, 50.0, 30.0], [25.0, 38.0, 20.0]] },
-    Attribute { words: &["orange"], colors: &[[65.0, 42.0, 65.0]] },
-    Attribute { words: &["yellow", "golden"], colors: &[[85.0, 0.0, 75.0], [70.0, 5.0, 60.0]] },
-    Attribute { words: &["green"], colors: &[[50.0, -45.0, 35.0], [35.0, -20.0, 22.0], [65.0, -25.0, 35.0]] },
-    Attribute { words: &["blue"], colors: &[[35.0, 15.0, -50.0], [55.0, -5.0, -35.0], [25.0, 5.0, -25.0]] },
-    Attribute { words: &["purple", "violet"], colors: &[[35.0, 35.0, -35.0], [40.0, 20.0, -20.0], [25.0, 22.0, -18.0]] },
-    Attribute { words: &["pink"], colors: &[[70.0, 40.0, 5.0], [82.0, 20.0, 5.0]] },
-    Attribute { words: &["brown"], colors: &[[35.0, 15.0, 22.0], [25.0, 10.0, 14.0], [48.0, 17.0, 28.0]] },
-    Attribute { words: &["black"], colors: &[[6.0, 0.0, 0.0], [16.0, 0.0, 0.0]] },
-    Attribute { words: &["white"], colors: &[[97.0, 0.0, 0.0], [88.0, 0.0, 4.0]] },
-    Attribute { words: &["gray", "grey", "silver"], colors: &[[52.0, 0.0, 0.0], [36.0, 0.0, 0.0], [70.0, 0.0, 0.0]] },
-    Attribute { words: &["wooden", "wood"], colors: &[[35.0, 15.0, 22.0], [48.0, 17.0, 28.0], [62.0, 12.0, 30.0], [25.0, 10.0, 14.0]] },
+    Attribute {
+        words: &["red", "crimson", "scarlet"],
+        colors: &[[45.0, 65.0, 45.0], [35.0, 50.0, 30.0], [25.0, 38.0, 20.0]],
+    },
+    Attribute {
+        words: &["orange"],
+        colors: &[[65.0, 42.0, 65.0]],
+    },
+    Attribute {
+        words: &["yellow", "golden"],
+        colors: &[[85.0, 0.0, 75.0], [70.0, 5.0, 60.0]],
+    },
+    Attribute {
+        words: &["green"],
+        colors: &[
+            [50.0, -45.0, 35.0],
+            [35.0, -20.0, 22.0],
+            [65.0, -25.0, 35.0],
+        ],
+    },
+    Attribute {
+        words: &["blue"],
+        colors: &[[35.0, 15.0, -50.0], [55.0, -5.0, -35.0], [25.0, 5.0, -25.0]],
+    },
+    Attribute {
+        words: &["purple", "violet"],
+        colors: &[
+            [35.0, 35.0, -35.0],
+            [40.0, 20.0, -20.0],
+            [25.0, 22.0, -18.0],
+        ],
+    },
+    Attribute {
+        words: &["pink"],
+        colors: &[[70.0, 40.0, 5.0], [82.0, 20.0, 5.0]],
+    },
+    Attribute {
+        words: &["brown"],
+        colors: &[[35.0, 15.0, 22.0], [25.0, 10.0, 14.0], [48.0, 17.0, 28.0]],
+    },
+    Attribute {
+        words: &["black"],
+        colors: &[[6.0, 0.0, 0.0], [16.0, 0.0, 0.0]],
+    },
+    Attribute {
+        words: &["white"],
+        colors: &[[97.0, 0.0, 0.0], [88.0, 0.0, 4.0]],
+    },
+    Attribute {
+        words: &["gray", "grey", "silver"],
+        colors: &[[52.0, 0.0, 0.0], [36.0, 0.0, 0.0], [70.0, 0.0, 0.0]],
+    },
+    Attribute {
+        words: &["wooden", "wood"],
+        colors: &[
+            [35.0, 15.0, 22.0],
+            [48.0, 17.0, 28.0],
+            [62.0, 12.0, 30.0],
+            [25.0, 10.0, 14.0],
+        ],
+    },
 ];
 
 /// Number of attributes; each is one value of an embedding.
@@ -43,7 +92,7 @@ const MASK_WEIGHT: f32 = 0.1;
 const WEIGHT: f32 = 0.25;
 /// Cosine that unrelated masks gain because they have the named colour. Adding it to the baseline
 /// makes absent names with a colour score like those without.
-const ADVANTAGE: f32 = 0.08;
+const COLOR_BASELINE_SHIFT: f32 = 0.08;
 
 /// Returns the index of the basic colour whose focal colours are nearest to a Lab colour.
 fn nearest(color: [f32; 3]) -> usize {
@@ -53,13 +102,23 @@ fn nearest(color: [f32; 3]) -> usize {
         0.5 * l * l + a * a + b * b
     };
     let basic = ATTRIBUTES[..COUNT - 1].iter().enumerate();
-    let best = basic.map(|(k, attribute)| (attribute.colors.iter().map(distance).fold(f32::INFINITY, f32::min), k));
+    let best = basic.map(|(k, attribute)| {
+        (
+            attribute
+                .colors
+                .iter()
+                .map(distance)
+                .fold(f32::INFINITY, f32::min),
+            k,
+        )
+    });
     best.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(0, |b| b.1)
 }
 
 /// Returns whether a Lab colour may be that of wood.
 fn wooden(color: [f32; 3]) -> bool {
-    let near = |focal: &[f32; 3]| (0..3).map(|k| (color[k] - focal[k]).powi(2)).sum::<f32>() < 18.0 * 18.0;
+    let near =
+        |focal: &[f32; 3]| (0..3).map(|k| (color[k] - focal[k]).powi(2)).sum::<f32>() < 18.0 * 18.0;
     ATTRIBUTES[COUNT - 1].colors.iter().any(near)
 }
 
@@ -72,19 +131,26 @@ pub fn of_masks(photo: &RgbImage, masks: &LabelMap) -> Vec<[f32; COUNT]> {
         if label == 0 {
             continue;
         }
-        let color = lab(photo.get_pixel(x * photo.width() / masks.width, y * photo.height() / masks.height).0);
+        let color = lab(photo
+            .get_pixel(
+                x * photo.width() / masks.width,
+                y * photo.height() / masks.height,
+            )
+            .0);
         counts[label - 1][nearest(color)] += 1.0;
         counts[label - 1][COUNT - 1] += f32::from(u8::from(wooden(color)));
         areas[label - 1] += 1.0;
     }
-    let share = |(counts, area): ([f32; COUNT], f32)| counts.map(|n| MASK_WEIGHT * (n / area.max(1.0) - NEUTRAL));
+    let share = |(counts, area): ([f32; COUNT], f32)| {
+        counts.map(|n| MASK_WEIGHT * (n / area.max(1.0) - NEUTRAL))
+    };
     counts.into_iter().zip(areas).map(share).collect()
 }
 
 /// Returns by how much a text raises the cosine of unrelated masks: 0 if it names no attribute.
-pub fn advantage(text: &str) -> f32 {
+pub fn baseline_shift(text: &str) -> f32 {
     let named = of_text(text).0.iter().any(|n| *n > 0.0);
-    if named { ADVANTAGE } else { 0.0 }
+    if named { COLOR_BASELINE_SHIFT } else { 0.0 }
 }
 
 /// Returns the attributes that a text names, and the text without them. If nothing else is left,
@@ -94,14 +160,24 @@ pub fn of_text(text: &str) -> ([f32; COUNT], String) {
     let mut rest = Vec::new();
     for word in text.split_whitespace() {
         let plain = word.to_lowercase();
-        match ATTRIBUTES.iter().position(|a| a.words.contains(&plain.as_str())) {
+        match ATTRIBUTES
+            .iter()
+            .position(|a| a.words.contains(&plain.as_str()))
+        {
             Some(k) => named[k] = 1.0,
             None => rest.push(word),
         }
     }
     let count = named.iter().sum::<f32>().max(1.0);
     let named = named.map(|n: f32| n / count * WEIGHT / MASK_WEIGHT);
-    (named, if rest.is_empty() { text.to_owned() } else { rest.join(" ") })
+    (
+        named,
+        if rest.is_empty() {
+            text.to_owned()
+        } else {
+            rest.join(" ")
+        },
+    )
 }
 
 #[cfg(test)]
@@ -114,18 +190,32 @@ mod tests {
 
     #[test]
     fn colours_are_found_and_taken_from_the_text() {
-        let photo = RgbImage::from_fn(4, 1, |x, _| image::Rgb([[200, 20, 30], [90, 60, 130], [110, 75, 45], [10, 10, 12]][x as usize]));
-        let masks = LabelMap { width: 4, height: 1, labels: vec![1, 2, 3, 4] };
+        let photo = RgbImage::from_fn(4, 1, |x, _| {
+            image::Rgb([[200, 20, 30], [90, 60, 130], [110, 75, 45], [10, 10, 12]][x as usize])
+        });
+        let masks = LabelMap {
+            width: 4,
+            height: 1,
+            labels: vec![1, 2, 3, 4],
+        };
         let attributes = of_masks(&photo, &masks);
-        for (k, text) in ["red curtain", "purple cloth", "wooden shield", "black pot"].into_iter().enumerate() {
+        for (k, text) in ["red curtain", "purple cloth", "wooden shield", "black pot"]
+            .into_iter()
+            .enumerate()
+        {
             let (named, rest) = of_text(text);
             assert_eq!(Some(rest.as_str()), text.split(' ').nth(1));
-            let best = (0..4).max_by(|a, b| dot(&attributes[*a], &named).total_cmp(&dot(&attributes[*b], &named)));
+            let best = (0..4).max_by(|a, b| {
+                dot(&attributes[*a], &named).total_cmp(&dot(&attributes[*b], &named))
+            });
             assert_eq!(best, Some(k), "{text}");
             assert!((dot(&attributes[k], &named) - WEIGHT * (1.0 - NEUTRAL)).abs() < 1e-5);
         }
         assert_eq!(of_text("fox"), ([0.0; COUNT], "fox".to_owned()));
         assert_eq!(of_text("Red").1, "Red");
-        assert_eq!(["fox", "purple umbrella", "Red"].map(advantage), [0.0, ADVANTAGE, ADVANTAGE]);
+        assert_eq!(
+            ["fox", "purple umbrella", "Red"].map(baseline_shift),
+            [0.0, COLOR_BASELINE_SHIFT, COLOR_BASELINE_SHIFT]
+        );
     }
 }

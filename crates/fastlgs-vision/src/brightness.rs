@@ -5,17 +5,17 @@ use nalgebra::{DMatrix, DVector};
 use std::collections::BTreeSet;
 
 /// Smallest number of matches from which the brightness of two photos is compared.
-const FEW: usize = 8;
+const MIN_MATCHES: usize = 8;
 /// Values up to this one (of 255) do not count: ratios of nearly black values are unreliable.
 const DARK: f32 = 8.0;
 /// Values from this one on (of 255) do not count: they may be clipped at white.
 const CLIPPED: f32 = 250.0;
 /// Weight, in matches, of the prior that a photo is as bright as it looks. It decides for photos
 /// and groups that no match connects to the others.
-const HOLD: f32 = 1e-2;
+const APPEARANCE_PRIOR_WEIGHT: f32 = 1e-2;
 /// Weight, in matches, of the prior that all channels of a photo change alike. It decides for a
 /// channel that is clipped at white.
-const TOGETHER: f32 = 1.0;
+const CHANNEL_PRIOR_WEIGHT: f32 = 1.0;
 
 fn median(values: &mut [f32]) -> Option<f32> {
     values.sort_by(f32::total_cmp);
@@ -40,64 +40,104 @@ type Difference = (usize, usize, f32, f32);
 pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
     let of_channel = |c: usize| -> Vec<Difference> {
         let difference = |m: &PairMatches| {
-            let both = m.pairs.iter().map(|&(i, j)| (f32::from(colors[m.a][i][c]), f32::from(colors[m.b][j][c])));
-            let telling = |(a, b): &(f32, f32)| a.min(*b) > DARK && a.max(*b) < CLIPPED;
-            let mut stops: Vec<f32> = both.filter(telling).map(|(a, b)| (a / b).log2()).collect();
+            let both = m
+                .pairs
+                .iter()
+                .map(|&(i, j)| (f32::from(colors[m.a][i][c]), f32::from(colors[m.b][j][c])));
+            let usable = |(a, b): &(f32, f32)| a.min(*b) > DARK && a.max(*b) < CLIPPED;
+            let mut stops: Vec<f32> = both.filter(usable).map(|(a, b)| (a / b).log2()).collect();
             let count = stops.len();
-            if count < FEW { None } else { median(&mut stops).map(|stops| (m.a, m.b, stops, count as f32)) }
+            if count < MIN_MATCHES {
+                None
+            } else {
+                median(&mut stops).map(|stops| (m.a, m.b, stops, count as f32))
+            }
         };
         matches.iter().filter_map(difference).collect()
     };
     let channels: [Vec<Difference>; 3] = std::array::from_fn(of_channel);
-    let spread = |differences: &Vec<Difference>| median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0);
-    let looks = looks(colors);
+    let spread = |differences: &Vec<Difference>| {
+        median(&mut differences.iter().map(|d| d.2.abs()).collect::<Vec<_>>()).unwrap_or(0.0)
+    };
+    let looks = apparent_stops(colors);
     // A photo may look bright only because it shows bright surfaces. Apparent brightness is
     // therefore scaled by the least-squares slope of measured against apparent brightness.
-    let known = consistent(&channels, &DVector::zeros(looks.len()));
-    let told = channels.iter().enumerate().flat_map(|(c, all)| all.iter().flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c)));
-    let told: BTreeSet<usize> = told.collect();
-    let [common, own] = told.iter().fold([0.0, 0.0], |[common, own], &k| [common + known[k] * looks[k], own + looks[k] * looks[k]]);
-    let stops = consistent(&channels, &(looks * (common / own.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)));
+    let measured = consistent(&channels, &DVector::zeros(looks.len()));
+    let measured_indices = channels.iter().enumerate().flat_map(|(c, all)| {
+        all.iter()
+            .flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c))
+    });
+    let told: BTreeSet<usize> = measured_indices.collect();
+    let [common, own] = told.iter().fold([0.0, 0.0], |[common, own], &k| {
+        [common + measured[k] * looks[k], own + looks[k] * looks[k]]
+    });
+    let stops = consistent(
+        &channels,
+        &(looks * (common / own.max(f32::MIN_POSITIVE)).clamp(0.0, 1.0)),
+    );
     Brightness {
         spread_stops: channels.iter().map(spread).fold(0.0, f32::max),
-        gains: (0..colors.len()).map(|photo| [0, 1, 2].map(|c| stops[3 * photo + c].exp2())).collect(),
+        gains: (0..colors.len())
+            .map(|photo| [0, 1, 2].map(|c| stops[3 * photo + c].exp2()))
+            .collect(),
     }
 }
 
 /// Returns by how many stops the key points of each photo look brighter than the mean of all
 /// photos, for each channel: `[photo][3]`.
-fn looks(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
-    let of =
-        |photo: &Vec<[u8; 3]>, c: usize| median(&mut photo.iter().map(|color| f32::from(color[c]).max(1.0).log2()).collect::<Vec<_>>());
+fn apparent_stops(colors: &[Vec<[u8; 3]>]) -> DVector<f32> {
+    let of = |photo: &Vec<[u8; 3]>, c: usize| {
+        median(
+            &mut photo
+                .iter()
+                .map(|color| f32::from(color[c]).max(1.0).log2())
+                .collect::<Vec<_>>(),
+        )
+    };
     let mut looks = DVector::zeros(3 * colors.len());
     for c in 0..3 {
         let of_photos: Vec<Option<f32>> = colors.iter().map(|photo| of(photo, c)).collect();
-        let mean = of_photos.iter().flatten().sum::<f32>() / of_photos.iter().flatten().count().max(1) as f32;
-        of_photos.iter().enumerate().for_each(|(photo, look)| looks[3 * photo + c] = look.map_or(0.0, |look| look - mean));
+        let mean = of_photos.iter().flatten().sum::<f32>()
+            / of_photos.iter().flatten().count().max(1) as f32;
+        of_photos
+            .iter()
+            .enumerate()
+            .for_each(|(photo, look)| looks[3 * photo + c] = look.map_or(0.0, |look| look - mean));
     }
     looks
 }
 
 /// Returns the stops of each photo's channels, `[photo][3]`, that fit all differences best (least
-/// squares). Each channel has a mean of 0. Without differences, `looks` decides.
+/// squares). Each channel has a mean of 0. Without differences, `apparent_stops` decides.
 fn consistent(channels: &[Vec<Difference>; 3], looks: &DVector<f32>) -> DVector<f32> {
-    let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * HOLD;
-    let mut right = looks * HOLD;
+    let mut normal = DMatrix::<f32>::identity(looks.len(), looks.len()) * APPEARANCE_PRIOR_WEIGHT;
+    let mut right = looks * APPEARANCE_PRIOR_WEIGHT;
     let mut differs = |a: usize, b: usize, stops: f32, weight: f32| {
         (normal[(a, a)], normal[(b, b)]) = (normal[(a, a)] + weight, normal[(b, b)] + weight);
         (normal[(a, b)], normal[(b, a)]) = (normal[(a, b)] - weight, normal[(b, a)] - weight);
         (right[a], right[b]) = (right[a] + weight * stops, right[b] - weight * stops);
     };
     for (c, differences) in channels.iter().enumerate() {
-        differences.iter().for_each(|&(a, b, stops, weight)| differs(3 * a + c, 3 * b + c, stops, weight));
+        differences
+            .iter()
+            .for_each(|&(a, b, stops, weight)| differs(3 * a + c, 3 * b + c, stops, weight));
     }
     for red in (0..looks.len()).step_by(3) {
-        [(0, 1), (1, 2), (2, 0)].into_iter().for_each(|(a, b)| differs(red + a, red + b, 0.0, TOGETHER));
+        [(0, 1), (1, 2), (2, 0)]
+            .into_iter()
+            .for_each(|(a, b)| differs(red + a, red + b, 0.0, CHANNEL_PRIOR_WEIGHT));
     }
-    let mut stops = normal.cholesky().map_or_else(|| DVector::zeros(looks.len()), |factors| factors.solve(&right));
+    let mut stops = normal.cholesky().map_or_else(
+        || DVector::zeros(looks.len()),
+        |factors| factors.solve(&right),
+    );
     for c in 0..3 {
         let mean = stops.iter().skip(c).step_by(3).sum::<f32>() / (looks.len() / 3).max(1) as f32;
-        stops.iter_mut().skip(c).step_by(3).for_each(|stops| *stops -= mean);
+        stops
+            .iter_mut()
+            .skip(c)
+            .step_by(3)
+            .for_each(|stops| *stops -= mean);
     }
     stops
 }
@@ -108,22 +148,49 @@ mod tests {
 
     #[test]
     fn half_the_light_is_one_stop() {
-        let photo = |gain: f32| (0..20u8).map(|k| [120 + 3 * k, 100 + k, 140].map(|v| (f32::from(v) * gain) as u8)).collect::<Vec<_>>();
-        let matches = [PairMatches { a: 0, b: 1, pairs: (0..20).map(|k| (k, k)).collect() }];
+        let photo = |gain: f32| {
+            (0..20u8)
+                .map(|k| [120 + 3 * k, 100 + k, 140].map(|v| (f32::from(v) * gain) as u8))
+                .collect::<Vec<_>>()
+        };
+        let matches = [PairMatches {
+            a: 0,
+            b: 1,
+            pairs: (0..20).map(|k| (k, k)).collect(),
+        }];
         let between = |a: f32, b: f32| compare(&[photo(a), photo(b)], &matches);
         assert!((between(1.0, 0.5).spread_stops - 1.0).abs() < 0.03);
         assert!(between(1.0, 1.0).spread_stops < 1e-6);
-        assert_eq!(compare(&[photo(1.0), photo(0.5)], &[]), Brightness { spread_stops: 0.0, gains: vec![[1.0; 3]; 2] });
+        assert_eq!(
+            compare(&[photo(1.0), photo(0.5)], &[]),
+            Brightness {
+                spread_stops: 0.0,
+                gains: vec![[1.0; 3]; 2]
+            }
+        );
         let gains = between(1.0, 0.5).gains;
-        assert!((gains[0][1] - 2.0f32.sqrt()).abs() < 0.02 && (gains[1][1] - 0.5f32.sqrt()).abs() < 0.02, "{gains:?}");
+        assert!(
+            (gains[0][1] - 2.0f32.sqrt()).abs() < 0.02
+                && (gains[1][1] - 0.5f32.sqrt()).abs() < 0.02,
+            "{gains:?}"
+        );
     }
 
     /// Gains of photos of the same twenty points. Each photo matches the next one, but the last one
     /// matches none.
     fn gains_of(light: &[[f32; 3]]) -> Vec<[f32; 3]> {
-        let point = |k: u8, gain: &[f32; 3]| [0, 1, 2].map(|c| ([60 + k, 50 + 2 * k, 70].map(f32::from)[c] * gain[c]) as u8);
-        let colors: Vec<Vec<[u8; 3]>> = light.iter().map(|gain| (0..20).map(|k| point(k, gain)).collect()).collect();
-        let pair = |a: usize| PairMatches { a, b: a + 1, pairs: (0..20).map(|k| (k, k)).collect() };
+        let point = |k: u8, gain: &[f32; 3]| {
+            [0, 1, 2].map(|c| ([60 + k, 50 + 2 * k, 70].map(f32::from)[c] * gain[c]) as u8)
+        };
+        let colors: Vec<Vec<[u8; 3]>> = light
+            .iter()
+            .map(|gain| (0..20).map(|k| point(k, gain)).collect())
+            .collect();
+        let pair = |a: usize| PairMatches {
+            a,
+            b: a + 1,
+            pairs: (0..20).map(|k| (k, k)).collect(),
+        };
         compare(&colors, &(0..light.len() - 2).map(pair).collect::<Vec<_>>()).gains
     }
 
@@ -141,7 +208,13 @@ mod tests {
             let gains = gains_of(&light.map(|gain| [gain; 3]));
             (gains[4][1] / gains[0][1]).log2()
         };
-        let (varying, steady) = (stops([1.0, 2.0, 0.5, 1.5, 0.4]), stops([1.0, 1.0, 1.0, 1.0, 0.4]));
-        assert!((varying - 0.4f32.log2()).abs() < 0.3 && steady.abs() < 0.02, "{varying} {steady}");
+        let (varying, steady) = (
+            stops([1.0, 2.0, 0.5, 1.5, 0.4]),
+            stops([1.0, 1.0, 1.0, 1.0, 0.4]),
+        );
+        assert!(
+            (varying - 0.4f32.log2()).abs() < 0.3 && steady.abs() < 0.02,
+            "{varying} {steady}"
+        );
     }
 }

@@ -19,11 +19,26 @@ const SIZE: usize = 224;
 /// Number of crops or texts in one inference.
 const BATCH: usize = 8;
 /// Prompts of a text; the embeddings of all of them are averaged.
-const TEMPLATES: [&str; 4] = ["{}", "a photo of a {}.", "a photo of the {}.", "a close-up photo of a {}."];
+const TEMPLATES: [&str; 4] = [
+    "{}",
+    "a photo of a {}.",
+    "a photo of the {}.",
+    "a close-up photo of a {}.",
+];
 
 /// Output names that exporters use for the embedding, in order of preference.
-const IMAGE_OUTPUTS: [&str; 4] = ["image_embeds", "image_features", "image_embedding", "embeddings"];
-const TEXT_OUTPUTS: [&str; 4] = ["text_embeds", "text_features", "text_embedding", "embeddings"];
+const IMAGE_OUTPUTS: [&str; 4] = [
+    "image_embeds",
+    "image_features",
+    "image_embedding",
+    "embeddings",
+];
+const TEXT_OUTPUTS: [&str; 4] = [
+    "text_embeds",
+    "text_features",
+    "text_embedding",
+    "embeddings",
+];
 /// Output with SigLIP's embedding. CLIP's output of this name is not yet projected into the joint
 /// space of texts and pictures.
 const POOLED: &str = "pooler_output";
@@ -52,22 +67,47 @@ pub struct ClipText {
 
 /// Reads the JSON file `name` in the model's folder or its parent folder; null if there is none.
 fn settings(model: &Path, name: &str) -> Result<serde_json::Value> {
-    let found = model.ancestors().skip(1).take(2).map(|folder| folder.join(name)).find(|file| file.is_file());
-    Ok(found.map(|file| fs::read_json(&file)).transpose()?.unwrap_or_default())
+    let found = model
+        .ancestors()
+        .skip(1)
+        .take(2)
+        .map(|folder| folder.join(name))
+        .find(|file| file.is_file());
+    Ok(found
+        .map(|file| fs::read_json(&file))
+        .transpose()?
+        .unwrap_or_default())
 }
 
 /// Returns whether the configuration describes a SigLIP model.
 fn is_siglip(configuration: &serde_json::Value) -> bool {
-    configuration["model_type"].as_str().is_some_and(|kind| kind.starts_with("siglip"))
+    configuration["model_type"]
+        .as_str()
+        .is_some_and(|kind| kind.starts_with("siglip"))
 }
 
 /// Returns the embedding output: the first of `names` that exists, SigLIP's pooled output, or the
 /// only output.
-fn embedding_output(model: &Model, names: &[&str], configuration: &serde_json::Value) -> Result<String> {
+fn embedding_output(
+    model: &Model,
+    names: &[&str],
+    configuration: &serde_json::Value,
+) -> Result<String> {
     let pooled = || model.output(&[POOLED]).filter(|_| is_siglip(configuration));
-    let only = || model.outputs.first().filter(|_| model.outputs.len() == 1).map(String::as_str);
+    let only = || {
+        model
+            .outputs
+            .first()
+            .filter(|_| model.outputs.len() == 1)
+            .map(String::as_str)
+    };
     let found = model.output(names).or_else(pooled).or_else(only);
-    found.map(str::to_owned).ok_or_else(|| model.refuse(format!("none of its outputs is an embedding: {}", model.outputs.join(", "))))
+    found.map(str::to_owned).ok_or_else(|| {
+        model.refuse(format!(
+            "none of its outputs is an embedding: {}",
+            model.outputs.join(", ")
+        ))
+    })
 }
 
 impl ClipImage {
@@ -83,23 +123,45 @@ impl ClipImage {
         let model = Model::load(path)?;
         let [slot] = &model.inputs[..] else {
             let names: Vec<&str> = model.inputs.iter().map(|i| i.name.as_str()).collect();
-            return Err(model.refuse(format!("it is not an image tower, which has one input; its inputs are {}", names.join(", "))));
+            return Err(model.refuse(format!(
+                "it is not an image tower, which has one input; its inputs are {}",
+                names.join(", ")
+            )));
         };
         if slot.shape.len() != 4 {
-            return Err(model.refuse(format!("its input '{}' does not take pictures, which have four dimensions", slot.name)));
+            return Err(model.refuse(format!(
+                "its input '{}' does not take pictures, which have four dimensions",
+                slot.name
+            )));
         }
         let (fixed, input) = (slot.shape[2], slot.name.clone());
         let configuration = settings(path, "preprocessor_config.json")?;
         let triple = |name: &str, otherwise: [f32; 3]| {
             let values = configuration[name].as_array().filter(|a| a.len() == 3);
-            values.map_or(otherwise, |a| std::array::from_fn(|k| a[k].as_f64().unwrap_or(f64::from(otherwise[k])) as f32))
+            values.map_or(otherwise, |a| {
+                std::array::from_fn(|k| a[k].as_f64().unwrap_or(f64::from(otherwise[k])) as f32)
+            })
         };
-        let side = |v: &serde_json::Value| v.as_u64().or_else(|| v["height"].as_u64()).or_else(|| v["shortest_edge"].as_u64());
-        let told = side(&configuration["crop_size"]).or_else(|| side(&configuration["size"])).map(|s| s as usize);
+        let side = |v: &serde_json::Value| {
+            v.as_u64()
+                .or_else(|| v["height"].as_u64())
+                .or_else(|| v["shortest_edge"].as_u64())
+        };
+        let configured = side(&configuration["crop_size"])
+            .or_else(|| side(&configuration["size"]))
+            .map(|s| s as usize);
         let output = embedding_output(&model, &IMAGE_OUTPUTS, &settings(path, "config.json")?)?;
         let (mean, deviation) = (triple("image_mean", MEAN), triple("image_std", DEVIATION));
-        let (size, background) = (fixed.or(told).unwrap_or(SIZE), Background::default());
-        Ok(Self { model: Arc::new(model), input, output, size, mean, deviation, background })
+        let (size, background) = (fixed.or(configured).unwrap_or(SIZE), Background::default());
+        Ok(Self {
+            model: Arc::new(model),
+            input,
+            output,
+            size,
+            mean,
+            deviation,
+            background,
+        })
     }
 
     /// Sets the background of masks in their crops.
@@ -114,9 +176,16 @@ impl Encoder for ClipImage {
         "clip"
     }
 
-    fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
+    fn embed_masks(
+        &self,
+        _view: &str,
+        photo: &RgbImage,
+        masks: &LabelMap,
+    ) -> Result<Vec<Vec<f32>>> {
         let boxes = masks.boxes();
-        let present: Vec<u16> = (1..=masks.max()).filter(|l| boxes[usize::from(*l)].is_some()).collect();
+        let present: Vec<u16> = (1..=masks.max())
+            .filter(|l| boxes[usize::from(*l)].is_some())
+            .collect();
         let plane = self.size * self.size;
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         let mut dimension = 0;
@@ -127,10 +196,17 @@ impl Encoder for ClipImage {
             for &label in batch {
                 let bounds = boxes[usize::from(label)].expect("filtered above");
                 let crop = crops::bicubic(photo, masks, label, bounds, self.size, self.background);
-                values.extend(crop.planar.iter().enumerate().map(|(i, v)| (v / 255.0 - self.mean[i / plane]) / self.deviation[i / plane]));
+                values.extend(
+                    crop.planar.iter().enumerate().map(|(i, v)| {
+                        (v / 255.0 - self.mean[i / plane]) / self.deviation[i / plane]
+                    }),
+                );
             }
             let input = Array::new([batch.len(), 3, self.size, self.size], values);
-            let embeddings = self.model.run(vec![(&self.input, input)], &[&self.output])?.remove(0);
+            let embeddings = self
+                .model
+                .run(vec![(&self.input, input)], &[&self.output])?
+                .remove(0);
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
                 return Err(self.model.refuse(format!("for {} crops it returned embeddings of shape {:?}; expected one row for each crop", batch.len(), embeddings.shape)));
             }
@@ -141,7 +217,9 @@ impl Encoder for ClipImage {
                 out[usize::from(*label) - 1] = row;
             }
         }
-        out.iter_mut().filter(|e| e.is_empty()).for_each(|e| e.resize(dimension, 0.0));
+        out.iter_mut()
+            .filter(|e| e.is_empty())
+            .for_each(|e| e.resize(dimension, 0.0));
         Ok(out)
     }
 }
@@ -153,14 +231,30 @@ impl ClipText {
     /// When a file is missing or is not a text tower.
     pub fn load(path: &Path) -> Result<Self> {
         let model = Model::load(path)?;
-        let ids = model.input(&["input_ids", "text", "tokens", "input"]).map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
-        let (ids, context) = ids.ok_or_else(|| model.refuse("it is no text tower: it has no input for token ids"))?;
+        let ids = model
+            .input(&["input_ids", "text", "tokens", "input"])
+            .map(|s| (s.name.clone(), s.shape.last().copied().flatten()));
+        let (ids, context) =
+            ids.ok_or_else(|| model.refuse("it is no text tower: it has no input for token ids"))?;
         let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
         let configuration = settings(path, "config.json")?;
         let output = embedding_output(&model, &TEXT_OUTPUTS, &configuration)?;
-        let told = configuration["text_config"]["max_position_embeddings"].as_u64().map(|longest| longest as usize);
-        let tokens = if is_siglip(&configuration) { Tokens::of_siglip(path)? } else { Tokens::beside(path)? };
-        Ok(Self { context: context.or(told).unwrap_or(tokens.context()), tokens, ids, mask, output, model })
+        let told = configuration["text_config"]["max_position_embeddings"]
+            .as_u64()
+            .map(|longest| longest as usize);
+        let tokens = if is_siglip(&configuration) {
+            Tokens::of_siglip(path)?
+        } else {
+            Tokens::beside(path)?
+        };
+        Ok(Self {
+            context: context.or(told).unwrap_or(tokens.context()),
+            tokens,
+            ids,
+            mask,
+            output,
+            model,
+        })
     }
 
     /// Returns the L2-normalised embeddings of complete sentences.
@@ -172,7 +266,9 @@ impl ClipText {
             for sentence in batch {
                 let row = self.tokens.encode(sentence, self.context)?;
                 let padding = self.tokens.padding(self.mask.is_some());
-                ids.extend((0..self.context).map(|k| row.get(k).copied().unwrap_or(padding) as f32));
+                ids.extend(
+                    (0..self.context).map(|k| row.get(k).copied().unwrap_or(padding) as f32),
+                );
                 mask.extend((0..self.context).map(|k| f32::from(u8::from(k < row.len()))));
             }
             let shape = [batch.len(), self.context];
@@ -184,11 +280,16 @@ impl ClipText {
             if embeddings.shape.len() != 2 || embeddings.shape[0] != batch.len() {
                 return Err(self.model.refuse(format!("for {} texts it returned embeddings of shape {:?}; expected one row for each text", batch.len(), embeddings.shape)));
             }
-            out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(|row| {
-                let mut row = row.to_vec();
-                normalise(&mut row);
-                row
-            }));
+            out.extend(
+                embeddings
+                    .values
+                    .chunks_exact(embeddings.shape[1])
+                    .map(|row| {
+                        let mut row = row.to_vec();
+                        normalise(&mut row);
+                        row
+                    }),
+            );
         }
         Ok(out)
     }
@@ -200,7 +301,9 @@ impl TextEncoder for ClipText {
         let sentences: Vec<String> = texts.iter().flat_map(fill).collect();
         let embeddings = self.sentences(&sentences)?;
         let mean = |rows: &[Vec<f32>]| {
-            let mut sum: Vec<f32> = (0..rows[0].len()).map(|k| rows.iter().map(|r| r[k]).sum()).collect();
+            let mut sum: Vec<f32> = (0..rows[0].len())
+                .map(|k| rows.iter().map(|r| r[k]).sum())
+                .collect();
             normalise(&mut sum);
             sum
         };
@@ -214,12 +317,21 @@ impl TextEncoder for ClipText {
 /// When the lengths differ; the error gives both.
 pub fn check_pair(image: &ClipImage, text: &ClipText) -> Result<()> {
     let gray = RgbImage::from_pixel(8, 8, image::Rgb([127; 3]));
-    let pixel = LabelMap { width: 8, height: 8, labels: vec![1; 64] };
-    let (a, b) = (image.embed_masks("", &gray, &pixel)?[0].len(), text.sentences(&["object".to_owned()])?[0].len());
+    let pixel = LabelMap {
+        width: 8,
+        height: 8,
+        labels: vec![1; 64],
+    };
+    let (a, b) = (
+        image.embed_masks("", &gray, &pixel)?[0].len(),
+        text.sentences(&["object".to_owned()])?[0].len(),
+    );
     if a == b {
         return Ok(());
     }
-    Err(Error::Invalid(format!("the CLIP towers do not belong together: embeddings of the image tower have length {a}, those of the text tower {b}; use two towers of one model")))
+    Err(Error::Invalid(format!(
+        "the CLIP towers do not belong together: embeddings of the image tower have length {a}, those of the text tower {b}; use two towers of one model"
+    )))
 }
 
 #[cfg(test)]
@@ -230,7 +342,10 @@ mod tests {
 
     fn has_runtime() -> bool {
         let found = crate::places::runtime_library().inspect_err(|e| eprintln!("SKIPPED: {e}"));
-        assert!(found.is_ok() || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "FASTLGS_REQUIRE_MODELS is set, but ONNX Runtime is missing");
+        assert!(
+            found.is_ok() || std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(),
+            "FASTLGS_REQUIRE_MODELS is set, but ONNX Runtime is missing"
+        );
         found.is_ok()
     }
 
@@ -242,7 +357,10 @@ mod tests {
         if !has_runtime() {
             return;
         }
-        let (image, text) = (ClipImage::load(&image).unwrap(), ClipText::load(&text).unwrap());
+        let (image, text) = (
+            ClipImage::load(&image).unwrap(),
+            ClipText::load(&text).unwrap(),
+        );
         assert_eq!(image.size, 32);
         check_pair(&image, &text).unwrap();
         // Label 1 is red, label 2 is absent, label 3 is blue. The green between them is in no mask.
@@ -260,12 +378,18 @@ mod tests {
             40..60 => 3,
             _ => 0,
         });
-        let masks = LabelMap { width: 60, height: 40, labels: labels.collect() };
+        let masks = LabelMap {
+            width: 60,
+            height: 40,
+            labels: labels.collect(),
+        };
         let crops = image.embed_masks("", &photo, &masks).unwrap();
         let texts = text.embed(&["red", "green", "blue"]).unwrap();
         let cosine = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
         for (crop, own) in [(0, 0), (2, 2)] {
-            let best = (0..3).max_by(|a, b| cosine(&crops[crop], &texts[*a]).total_cmp(&cosine(&crops[crop], &texts[*b])));
+            let best = (0..3).max_by(|a, b| {
+                cosine(&crops[crop], &texts[*a]).total_cmp(&cosine(&crops[crop], &texts[*b]))
+            });
             assert_eq!(best, Some(own));
             assert!(cosine(&crops[crop], &texts[own]) > 0.9);
         }
@@ -281,14 +405,35 @@ mod tests {
             return;
         }
         let refused = ClipImage::load(&image).err().unwrap().to_string();
-        assert!(refused.contains("vision_model.onnx") && refused.contains("pooler_output"), "{refused}");
+        assert!(
+            refused.contains("vision_model.onnx") && refused.contains("pooler_output"),
+            "{refused}"
+        );
         let write = |name: &str, text: &str| std::fs::write(dir.path().join(name), text).unwrap();
-        write("config.json", r#"{"model_type": "siglip", "text_config": {"max_position_embeddings": 64}}"#);
-        write("preprocessor_config.json", r#"{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}"#);
+        write(
+            "config.json",
+            r#"{"model_type": "siglip", "text_config": {"max_position_embeddings": 64}}"#,
+        );
+        write(
+            "preprocessor_config.json",
+            r#"{"image_mean": [0.5, 0.5, 0.5], "image_std": [0.5, 0.5, 0.5]}"#,
+        );
         let tower = ClipImage::load(&image).unwrap();
-        let masks = LabelMap { width: 20, height: 20, labels: vec![1; 400] };
-        let red = tower.embed_masks("", &RgbImage::from_pixel(20, 20, Rgb([255, 0, 0])), &masks).unwrap().remove(0);
-        assert!(red.iter().zip([2.0, -1.0, -1.0]).all(|(own, wanted)| (own - wanted / 6.0f32.sqrt()).abs() < 0.01), "{red:?}");
+        let masks = LabelMap {
+            width: 20,
+            height: 20,
+            labels: vec![1; 400],
+        };
+        let red = tower
+            .embed_masks("", &RgbImage::from_pixel(20, 20, Rgb([255, 0, 0])), &masks)
+            .unwrap()
+            .remove(0);
+        assert!(
+            red.iter()
+                .zip([2.0, -1.0, -1.0])
+                .all(|(own, wanted)| (own - wanted / 6.0f32.sqrt()).abs() < 0.01),
+            "{red:?}"
+        );
     }
 
     #[test]
@@ -299,7 +444,19 @@ mod tests {
         if !has_runtime() {
             return;
         }
-        assert!(ClipImage::load(&text).err().unwrap().to_string().contains("text.onnx"));
-        assert!(ClipText::load(&image).err().unwrap().to_string().contains("image.onnx"));
+        assert!(
+            ClipImage::load(&text)
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("text.onnx")
+        );
+        assert!(
+            ClipText::load(&image)
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("image.onnx")
+        );
     }
 }

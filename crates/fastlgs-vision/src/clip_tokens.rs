@@ -1,4 +1,7 @@
-//! CLIP's byte-pair tokenizer, from the `tokenizer.json` beside a model, else from the merges that OpenAI published; and SigLIP's, from that file.
+//! Tokenizers of CLIP (byte-pair encoding) and SigLIP.
+//!
+//! CLIP's is read from the `tokenizer.json` beside a model, or built from the merges that OpenAI
+//! published. SigLIP's is read from `tokenizer.json`.
 
 use crate::{Error, Result, places};
 use fastlgs_core::fs;
@@ -8,82 +11,126 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use tokenizers::Tokenizer;
 
-/// Tokens of a text, start and end included, that the published models of CLIP take, and those of SigLIP.
+/// Context length in tokens, including start and end, of the published CLIP and SigLIP models.
 const CONTEXT: [usize; 2] = [77, 64];
-/// Merges of the published vocabulary; the file holds more.
+/// Number of merges in the published vocabulary; the file holds more.
 const MERGES: usize = 49_152 - 256 - 2;
 const START: &str = "<|startoftext|>";
 const END: &str = "<|endoftext|>";
-/// What is one word to the tokenizer: special tokens, English clitics, letters, single digits, other signs.
-const WORDS: &str = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+";
+/// Pattern of one word: special tokens, English clitics, letters, single digits, other characters.
+const WORDS: &str =
+    r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+";
 
-/// Turns texts into token ids.
+/// Converts texts to token ids.
 pub struct Tokens {
     tokenizer: Tokenizer,
     kind: Kind,
 }
 
-/// What stands around the words of a text.
+/// Tokens that are added to the words of a text.
 enum Kind {
-    /// CLIP's start and end.
+    /// Start and end token of CLIP.
     Clip { start: u32, end: u32 },
-    /// What the tokenizer's own rules add, and what fills the rest.
+    /// The rules of `tokenizer.json` add tokens; `padding` fills the rest of the context.
     Siglip { padding: u32 },
 }
 
 impl Tokens {
-    /// The tokenizer that belongs to a model file: `tokenizer.json` in its folder or the one above, else the published
-    /// merges that `models install-offline` keeps.
+    /// Loads the CLIP tokenizer of a model file: `tokenizer.json` in its folder or the one above,
+    /// else the published merges of `models install-offline`.
     ///
     /// # Errors
-    /// When neither is there or they are damaged.
+    /// Both files are missing, or the one that is used is damaged.
     pub fn beside(model: &Path) -> Result<Self> {
         match described(model) {
-            Some(path) => Self::of_clip(Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?, &path),
+            Some(path) => Self::of_clip(
+                Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?,
+                &path,
+            ),
             None => Self::published(&places::offline_dir().join(places::CLIP_MERGES)),
         }
     }
 
-    /// SigLIP's tokenizer beside a model file. What fills the rest of a text is told by the file itself or by `tokenizer_config.json` beside it; else it is
-    /// the token that its rules end a text with, as the published ones have it.
+    /// Loads the SigLIP tokenizer beside a model file.
+    ///
+    /// The padding token is given by `tokenizer.json` or by `tokenizer_config.json` beside it.
+    /// Otherwise it is the last token of an encoded empty text, as in the published models.
     ///
     /// # Errors
-    /// When it is missing or damaged.
+    /// The file is missing or damaged.
     pub fn of_siglip(model: &Path) -> Result<Self> {
-        let missing = || Error::Missing(format!("{}: SigLIP needs its tokenizer.json beside it", model.display()));
+        let missing = || {
+            Error::Missing(format!(
+                "{}: SigLIP needs a tokenizer.json in the folder of the model or the one above",
+                model.display()
+            ))
+        };
         let path = described(model).ok_or_else(missing)?;
         let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?;
         let configuration = path.with_file_name("tokenizer_config.json");
-        let configuration: serde_json::Value = if configuration.is_file() { fs::read_json(&configuration)? } else { json!(null) };
+        let configuration: serde_json::Value = if configuration.is_file() {
+            fs::read_json(&configuration)?
+        } else {
+            json!(null)
+        };
         let token = &configuration["pad_token"];
-        let named = || token.as_str().or_else(|| token["content"].as_str()).and_then(|token| tokenizer.token_to_id(token));
-        let told = tokenizer.get_padding().map(|padding| padding.pad_id).or_else(named);
+        let named = || {
+            token
+                .as_str()
+                .or_else(|| token["content"].as_str())
+                .and_then(|token| tokenizer.token_to_id(token))
+        };
+        let told = tokenizer
+            .get_padding()
+            .map(|padding| padding.pad_id)
+            .or_else(named);
         plain(&mut tokenizer, &path)?;
         let ended = || Some(*tokenizer.encode("", true).ok()?.get_ids().last()?);
-        let padding = told.or_else(ended).ok_or_else(|| bad(&path, "it tells of no token that fills or ends a text"))?;
-        Ok(Self { kind: Kind::Siglip { padding }, tokenizer })
+        let padding = told
+            .or_else(ended)
+            .ok_or_else(|| bad(&path, "it has no padding token and no end token"))?;
+        Ok(Self {
+            kind: Kind::Siglip { padding },
+            tokenizer,
+        })
     }
 
-    /// The published tokenizer from its gzipped list of merges.
+    /// Builds the published CLIP tokenizer from its gzipped list of merges.
     ///
     /// # Errors
-    /// When the file is missing or damaged.
+    /// The file is missing or damaged.
     pub fn published(path: &Path) -> Result<Self> {
         if !path.is_file() {
-            return Err(Error::Missing(format!("{}: no tokenizer; run 'fastlgs models install-offline'", path.display())));
+            return Err(Error::Missing(format!(
+                "{}: the tokenizer is missing; run 'fastlgs models install-offline'",
+                path.display()
+            )));
         }
         let mut text = String::new();
-        GzDecoder::new(fs::read(path)?.as_slice()).read_to_string(&mut text).map_err(|e| bad(path, e))?;
+        GzDecoder::new(fs::read(path)?.as_slice())
+            .read_to_string(&mut text)
+            .map_err(|e| bad(path, e))?;
         let merges: Vec<&str> = text.lines().skip(1).take(MERGES).collect();
         if merges.len() < MERGES {
-            return Err(bad(path, format!("it has {} merges instead of {MERGES}", merges.len())));
+            return Err(bad(
+                path,
+                format!("it has {} merges instead of {MERGES}", merges.len()),
+            ));
         }
-        // Token ids: bytes, bytes that end a word, merged pairs, the two special tokens.
+        // Order of token ids: bytes, bytes at the end of a word, merged pairs, the two special
+        // tokens.
         let bytes = byte_signs();
         let ending = bytes.iter().map(|b| format!("{b}</w>"));
-        let words = bytes.iter().map(char::to_string).chain(ending).chain(merges.iter().map(|m| m.replace(' ', "")));
-        let vocabulary: serde_json::Map<String, serde_json::Value> =
-            words.chain([START, END].map(str::to_owned)).enumerate().map(|(id, word)| (word, json!(id))).collect();
+        let words = bytes
+            .iter()
+            .map(char::to_string)
+            .chain(ending)
+            .chain(merges.iter().map(|m| m.replace(' ', "")));
+        let vocabulary: serde_json::Map<String, serde_json::Value> = words
+            .chain([START, END].map(str::to_owned))
+            .enumerate()
+            .map(|(id, word)| (word, json!(id)))
+            .collect();
         let special = |id: usize, content: &str| json!({ "id": id, "content": content, "special": true, "single_word": false, "lstrip": false, "rstrip": false, "normalized": false });
         let last = vocabulary.len() - 1;
         let description = json!({
@@ -103,26 +150,48 @@ impl Tokens {
                 "fuse_unk": false, "vocab": vocabulary, "merges": merges,
             },
         });
-        Self::of_clip(description.to_string().parse().map_err(|e| bad(path, e))?, path)
+        Self::of_clip(
+            description.to_string().parse().map_err(|e| bad(path, e))?,
+            path,
+        )
     }
 
     fn of_clip(mut tokenizer: Tokenizer, path: &Path) -> Result<Self> {
         plain(&mut tokenizer, path)?;
-        let id = |token: &str| tokenizer.token_to_id(token).ok_or_else(|| bad(path, format!("it has no token {token}")));
-        Ok(Self { kind: Kind::Clip { start: id(START)?, end: id(END)? }, tokenizer })
+        let id = |token: &str| {
+            tokenizer
+                .token_to_id(token)
+                .ok_or_else(|| bad(path, format!("it has no token {token}")))
+        };
+        Ok(Self {
+            kind: Kind::Clip {
+                start: id(START)?,
+                end: id(END)?,
+            },
+            tokenizer,
+        })
     }
 
-    /// Token ids of a text with what stands around it, cut to `context`; the last one stays.
+    /// Returns the token ids of a text with the added tokens, cut to `context`. The last token is
+    /// kept.
     ///
     /// # Errors
-    /// When a text cannot be tokenised.
+    /// The text cannot be tokenised.
     pub fn encode(&self, text: &str, context: usize) -> Result<Vec<u32>> {
-        let encoded =
-            |special| self.tokenizer.encode(text.trim(), special).map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")));
+        let encoded = |special| {
+            self.tokenizer
+                .encode(text.trim(), special)
+                .map_err(|e| Error::Invalid(format!("'{text}' cannot be tokenised: {e}")))
+        };
         Ok(match self.kind {
             Kind::Clip { start, end } => {
                 let encoded = encoded(false)?;
-                let words = encoded.get_ids().iter().copied().filter(|id| *id != start && *id != end).take(context.saturating_sub(2));
+                let words = encoded
+                    .get_ids()
+                    .iter()
+                    .copied()
+                    .filter(|id| *id != start && *id != end)
+                    .take(context.saturating_sub(2));
                 [start].into_iter().chain(words).chain([end]).collect()
             }
             Kind::Siglip { .. } => {
@@ -135,8 +204,10 @@ impl Tokens {
         })
     }
 
-    /// Id that fills the rest of a text, for a model that is told by a mask where the text ends, or is not. OpenAI's models are padded with zeros; those
-    /// that take a mask with the end token, as their tokenizers do.
+    /// Returns the id of the padding token. `masked` is whether the model takes an attention mask.
+    ///
+    /// CLIP models of OpenAI are padded with zeros. Those with an attention mask are padded with
+    /// the end token, as their tokenizers do.
     pub fn padding(&self, masked: bool) -> u32 {
         match self.kind {
             Kind::Clip { end, .. } => u32::from(masked) * end,
@@ -144,18 +215,23 @@ impl Tokens {
         }
     }
 
-    /// Tokens of a text that the published models take.
+    /// Returns the context length of the published models, in tokens.
     pub fn context(&self) -> usize {
         CONTEXT[usize::from(matches!(self.kind, Kind::Siglip { .. }))]
     }
 }
 
-/// The tokenizer's description in a model's folder or the one above.
+/// Returns the path of `tokenizer.json` in the folder of a model or the one above.
 fn described(model: &Path) -> Option<PathBuf> {
-    model.ancestors().skip(1).take(2).map(|folder| folder.join("tokenizer.json")).find(|file| file.is_file())
+    model
+        .ancestors()
+        .skip(1)
+        .take(2)
+        .map(|folder| folder.join("tokenizer.json"))
+        .find(|file| file.is_file())
 }
 
-/// Texts are filled and cut here.
+/// Turns off padding and truncation of the tokenizer; both are done here.
 fn plain(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
     tokenizer.with_padding(None);
     tokenizer.with_truncation(None).map_err(|e| bad(path, e))?;
@@ -163,15 +239,21 @@ fn plain(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
 }
 
 fn bad(path: &Path, reason: impl std::fmt::Display) -> Error {
-    Error::Invalid(format!("{}: not a tokenizer of CLIP or SigLIP ({reason})", path.display()))
+    Error::Invalid(format!(
+        "{}: not a tokenizer of CLIP or SigLIP ({reason})",
+        path.display()
+    ))
 }
 
-/// The printable sign that stands for each byte, in the vocabulary's order: printable bytes stand for themselves, the
-/// others, which follow, for signs from U+0100 on.
+/// Returns the printable character that represents each byte, in the order of the vocabulary.
+/// Printable bytes represent themselves. The others follow, as characters from U+0100 on.
 fn byte_signs() -> Vec<char> {
     let printable = |b: &u8| matches!(b, b'!'..=b'~' | 0xa1..=0xac | 0xae..=0xff);
     let themselves = (0..=u8::MAX).filter(printable).map(char::from);
-    let others = (0..=u8::MAX).filter(|b| !printable(b)).enumerate().filter_map(|(k, _)| char::from_u32(0x100 + k as u32));
+    let others = (0..=u8::MAX)
+        .filter(|b| !printable(b))
+        .enumerate()
+        .filter_map(|(k, _)| char::from_u32(0x100 + k as u32));
     themselves.chain(others).collect()
 }
 
@@ -190,13 +272,19 @@ mod tests {
         }
     }
 
-    /// Ids as published in the documentation of CLIP's implementations.
+    /// Ids as in the documentation of CLIP implementations.
     #[test]
     fn ids_are_the_published_ones() {
         let Some(tokens) = tokens() else { return };
         let words = |text: &str| tokens.encode(text, 77).unwrap();
-        assert_eq!(words("a photo of a cat"), [49406, 320, 1125, 539, 320, 2368, 49407]);
-        assert_eq!(words("  A photo of\n a DOG "), [49406, 320, 1125, 539, 320, 1929, 49407]);
+        assert_eq!(
+            words("a photo of a cat"),
+            [49406, 320, 1125, 539, 320, 2368, 49407]
+        );
+        assert_eq!(
+            words("  A photo of\n a DOG "),
+            [49406, 320, 1125, 539, 320, 1929, 49407]
+        );
         assert_eq!(words("hello world!"), [49406, 3306, 1002, 256, 49407]);
         assert_eq!(words(""), [49406, 49407]);
     }
@@ -204,7 +292,9 @@ mod tests {
     #[test]
     fn long_texts_keep_their_end() {
         let Some(tokens) = tokens() else { return };
-        let long = tokens.encode(&"cat ".repeat(200), tokens.context()).unwrap();
+        let long = tokens
+            .encode(&"cat ".repeat(200), tokens.context())
+            .unwrap();
         assert_eq!((long.len(), long[0], long[76]), (77, 49406, 49407));
     }
 
@@ -212,7 +302,13 @@ mod tests {
     fn siglips_rules_are_in_its_file() {
         let dir = tempfile::tempdir().unwrap();
         let model = dir.path().join("onnx").join("text_model.onnx");
-        assert!(Tokens::of_siglip(&model).err().unwrap().to_string().contains("tokenizer.json"));
+        assert!(
+            Tokens::of_siglip(&model)
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("tokenizer.json")
+        );
         let mut description = json!({
             "version": "1.0",
             "added_tokens": [],
@@ -226,20 +322,41 @@ mod tests {
             },
             "model": { "type": "WordLevel", "unk_token": "<unk>", "vocab": { "<pad>": 0, "</s>": 1, "red": 2, "fox": 3, "<unk>": 4 } },
         });
-        let write = |description: &serde_json::Value| std::fs::write(dir.path().join("tokenizer.json"), description.to_string()).unwrap();
+        let write = |description: &serde_json::Value| {
+            std::fs::write(dir.path().join("tokenizer.json"), description.to_string()).unwrap()
+        };
         write(&description);
-        // The vocabulary has a token "<pad>" that is not the one.
+        // The vocabulary has a token "<pad>" that is not the padding token.
         let tokens = Tokens::of_siglip(&model).unwrap();
-        assert_eq!((tokens.encode(" Red fox", 64).unwrap(), tokens.padding(false), tokens.context()), (vec![2, 3, 1], 1, 64));
-        assert_eq!(tokens.encode("red fox red fox", 3).unwrap(), [2, 3, 1], "a long text keeps its end");
-        std::fs::write(dir.path().join("tokenizer_config.json"), r#"{"pad_token": {"content": "fox"}}"#).unwrap();
+        assert_eq!(
+            (
+                tokens.encode(" Red fox", 64).unwrap(),
+                tokens.padding(false),
+                tokens.context()
+            ),
+            (vec![2, 3, 1], 1, 64)
+        );
+        assert_eq!(
+            tokens.encode("red fox red fox", 3).unwrap(),
+            [2, 3, 1],
+            "a long text keeps its end"
+        );
+        std::fs::write(
+            dir.path().join("tokenizer_config.json"),
+            r#"{"pad_token": {"content": "fox"}}"#,
+        )
+        .unwrap();
         assert_eq!(Tokens::of_siglip(&model).unwrap().padding(false), 3);
         description["padding"] = json!({
             "strategy": { "Fixed": 64 }, "direction": "Right", "pad_to_multiple_of": null, "pad_id": 7, "pad_type_id": 0, "pad_token": "<x>",
         });
         write(&description);
         let tokens = Tokens::of_siglip(&model).unwrap();
-        assert_eq!((tokens.encode("fox", 64).unwrap(), tokens.padding(false)), (vec![3, 1], 7), "filled where it is used, not by the file");
+        assert_eq!(
+            (tokens.encode("fox", 64).unwrap(), tokens.padding(false)),
+            (vec![3, 1], 7),
+            "padding is added by the caller, not by the tokenizer"
+        );
     }
 
     #[test]
@@ -247,6 +364,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("merges.gz");
         std::fs::write(&path, b"no gzip").unwrap();
-        assert!(Tokens::published(&path).err().unwrap().to_string().contains("merges.gz"));
+        assert!(
+            Tokens::published(&path)
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("merges.gz")
+        );
     }
 }

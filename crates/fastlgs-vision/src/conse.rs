@@ -64,21 +64,42 @@ impl Conse {
         let classifier = Model::load_for_each_core(&folder.join("classifier.onnx"))?;
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
-        let projection = class_embeddings.iter().map(|_| std::array::from_fn(|_| rng.normal())).collect();
+        let projection = class_embeddings
+            .iter()
+            .map(|_| std::array::from_fn(|_| rng.normal()))
+            .collect();
         let appearance = Appearance::new(class_embeddings.len());
-        Ok(Self { classifier, class_embeddings, projection, appearance })
+        Ok(Self {
+            classifier,
+            class_embeddings,
+            projection,
+            appearance,
+        })
     }
 
     /// Returns the class logits of each crop, `[crops][1000]`.
     fn logits(&self, crops: &[crops::Crop]) -> Result<Array> {
-        let data = crops.iter().flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0)).collect();
-        Ok(self.classifier.run(vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))], &["logits"])?.remove(0))
+        let data = crops
+            .iter()
+            .flat_map(|c| c.planar.iter().map(|v| (v - 127.0) / 128.0))
+            .collect();
+        Ok(self
+            .classifier
+            .run(
+                vec![("image", Array::new([crops.len(), 3, SIZE, SIZE], data))],
+                &["logits"],
+            )?
+            .remove(0))
     }
 
     /// Returns the L2-normalised ConSE embedding of class probabilities.
     fn embedding(&self, probabilities: &[f32]) -> Vec<f32> {
         let mut order: Vec<usize> = (0..probabilities.len()).collect();
-        order.sort_by(|&a, &b| probabilities[b].total_cmp(&probabilities[a]).then(a.cmp(&b)));
+        order.sort_by(|&a, &b| {
+            probabilities[b]
+                .total_cmp(&probabilities[a])
+                .then(a.cmp(&b))
+        });
         let mut sum = vec![0.0; self.class_embeddings[0].len()];
         for &class in order.iter().take(TOP) {
             for (s, e) in sum.iter_mut().zip(&self.class_embeddings[class]) {
@@ -99,45 +120,83 @@ impl Conse {
         for (i, pixel) in photo.pixels().enumerate() {
             (0..3).for_each(|k| data[k * w * h + i] = (f32::from(pixel[k]) - 127.0) / 128.0);
         }
-        let Array { shape, values: logits } = self.classifier.run(vec![("image", Array::new([1, 3, h, w], data))], &["dense"])?.remove(0);
+        let Array {
+            shape,
+            values: logits,
+        } = self
+            .classifier
+            .run(vec![("image", Array::new([1, 3, h, w], data))], &["dense"])?
+            .remove(0);
         let (classes, rows, columns) = (shape[1], shape[2], shape[3]);
         let cells = rows * columns;
         let mut values = vec![0.0; cells * classes];
         for (k, class) in logits.chunks_exact(cells).enumerate() {
             let mean = class.iter().sum::<f32>() / cells as f32;
-            class.iter().enumerate().for_each(|(cell, v)| values[cell * classes + k] = v - mean);
+            class
+                .iter()
+                .enumerate()
+                .for_each(|(cell, v)| values[cell * classes + k] = v - mean);
         }
-        Ok(DenseMap { columns, rows, channels: classes, values })
+        Ok(DenseMap {
+            columns,
+            rows,
+            channels: classes,
+            values,
+        })
     }
 
     /// Projects a dense map to [`DENSE`] dimensions by a seeded random projection, which preserves
     /// distances approximately.
     pub fn project(&self, map: &DenseMap) -> DenseMap {
         let mut values = vec![0.0; map.columns * map.rows * DENSE];
-        for (cell, out) in map.values.chunks_exact(map.channels).zip(values.chunks_exact_mut(DENSE)) {
+        for (cell, out) in map
+            .values
+            .chunks_exact(map.channels)
+            .zip(values.chunks_exact_mut(DENSE))
+        {
             for (value, axes) in cell.iter().zip(&self.projection) {
                 out.iter_mut().zip(axes).for_each(|(o, a)| *o += value * a);
             }
         }
-        DenseMap { channels: DENSE, values, ..*map }
+        DenseMap {
+            channels: DENSE,
+            values,
+            ..*map
+        }
     }
 
     /// Returns the class logits of each label 1..=max; empty for labels that do not occur.
     ///
     /// Each mask is classified alone and with its surroundings; the result is the mean of both.
     fn mask_logits(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let photo = &exposure::lifted(photo);
+        let photo = &exposure::brightened(photo);
         let boxes = masks.boxes();
-        let present: Vec<(u16, [u32; 4])> = (1..=masks.max()).filter_map(|l| Some((l, boxes[usize::from(l)]?))).collect();
+        let present: Vec<(u16, [u32; 4])> = (1..=masks.max())
+            .filter_map(|l| Some((l, boxes[usize::from(l)]?)))
+            .collect();
         let views = [Surround::Neutral, Surround::Context];
-        let cut = |&(label, bounds): &(u16, [u32; 4])| views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s));
+        let cut = |&(label, bounds): &(u16, [u32; 4])| {
+            views.map(|s| crops::crop(photo, masks, label, bounds, SIZE, s))
+        };
         let of_batch = |batch: &[(u16, [u32; 4])]| -> Result<Vec<Vec<f32>>> {
             let logits = self.logits(&batch.iter().flat_map(cut).collect::<Vec<_>>())?;
             let classes = logits.shape[1];
-            let mean = |pair: &[f32]| -> Vec<f32> { (0..classes).map(|k| 0.5 * (pair[k] + pair[classes + k])).collect() };
-            Ok(logits.values.chunks_exact(views.len() * classes).map(mean).collect())
+            let mean = |pair: &[f32]| -> Vec<f32> {
+                (0..classes)
+                    .map(|k| 0.5 * (pair[k] + pair[classes + k]))
+                    .collect()
+            };
+            Ok(logits
+                .values
+                .chunks_exact(views.len() * classes)
+                .map(mean)
+                .collect())
         };
-        let logits = present.par_chunks(BATCH).map(of_batch).collect::<Result<Vec<_>>>()?.concat();
+        let logits = present
+            .par_chunks(BATCH)
+            .map(of_batch)
+            .collect::<Result<Vec<_>>>()?
+            .concat();
         let mut out = vec![Vec::new(); usize::from(masks.max())];
         for ((label, _), own) in present.iter().zip(logits) {
             out[usize::from(*label) - 1] = own;
@@ -151,13 +210,29 @@ impl Encoder for Conse {
         "offline"
     }
 
-    fn embed_masks(&self, _view: &str, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let colors = attributes::of_masks(&exposure::lifted(photo), masks);
-        let embed = |(logits, colors): (&Vec<f32>, [f32; attributes::COUNT])| match logits.as_slice() {
-            [] => vec![0.0; LENGTH],
-            logits => [self.embedding(&softmax(logits)).as_slice(), &colors, &self.appearance.of(logits)].concat(),
-        };
-        Ok(self.mask_logits(photo, masks)?.iter().zip(colors).map(embed).collect())
+    fn embed_masks(
+        &self,
+        _view: &str,
+        photo: &RgbImage,
+        masks: &LabelMap,
+    ) -> Result<Vec<Vec<f32>>> {
+        let colors = attributes::of_masks(&exposure::brightened(photo), masks);
+        let embed =
+            |(logits, colors): (&Vec<f32>, [f32; attributes::COUNT])| match logits.as_slice() {
+                [] => vec![0.0; LENGTH],
+                logits => [
+                    self.embedding(&softmax(logits)).as_slice(),
+                    &colors,
+                    &self.appearance.project(logits),
+                ]
+                .concat(),
+            };
+        Ok(self
+            .mask_logits(photo, masks)?
+            .iter()
+            .zip(colors)
+            .map(embed)
+            .collect())
     }
 }
 

@@ -16,7 +16,9 @@ impl Hed {
     /// # Errors
     /// When it is not installed.
     pub fn load() -> Result<Self> {
-        Ok(Self(Model::load_for_each_core(&places::offline_dir().join("edges.onnx"))?))
+        Ok(Self(Model::load_for_each_core(
+            &places::offline_dir().join("edges.onnx"),
+        )?))
     }
 
     /// Returns the edge probability of each pixel, row-major.
@@ -31,6 +33,10 @@ impl Hed {
                 data[k * w * h + i] = f32::from(pixel[2 - k]) - MEAN_BGR[k];
             }
         }
-        Ok(self.0.run(vec![("image", Array::new([1, 3, h, w], data))], &["edge"])?.remove(0).values)
+        Ok(self
+            .0
+            .run(vec![("image", Array::new([1, 3, h, w], data))], &["edge"])?
+            .remove(0)
+            .values)
     }
 }

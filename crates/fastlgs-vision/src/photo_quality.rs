@@ -1,39 +1,43 @@
-//! Photos that harm a scene more than they help: blurred ones, and those that repeat their neighbour.
+//! Finds blurred photos and photos that repeat the one before them.
 
 use image::imageops::{FilterType, grayscale, resize};
 use image::{GrayImage, RgbImage};
 
-/// A photo this much less sharp than the middle one is called blurred.
+/// A photo is blurred if its sharpness, relative to the median, is below this value.
 const BLURRED: f32 = 0.2;
-/// What the most blurred photo still counts.
+/// Smallest weight of a photo.
 const LEAST_WEIGHT: f32 = 0.1;
-/// Mean difference of grey values, 0 to 255, below which two photos are the same.
+/// Mean difference of grey values, 0 to 255, below which two thumbnails count as the same photo.
 const SAME: f32 = 1.0;
-/// Side of the pictures in which sameness is looked for.
+/// Side of the thumbnails, in pixels.
 const THUMB: u32 = 32;
 
-/// What a photo looks like, in a few numbers.
+/// Sharpness and thumbnail of a photo.
 #[derive(Clone)]
 pub struct Impression {
-    /// How strong edges are against the picture's contrast; depends on what is shown and how large.
+    /// Mean squared Laplacian divided by the variance of the grey values. It depends on the content
+    /// and its size in the photo.
     pub sharpness: f32,
     thumb: Vec<u8>,
 }
 
 impl Impression {
-    /// Looks at a photo. Sharpness is the mean square of the Laplacian over that of the grey values' spread, so that plain
-    /// and dark photos are not called blurred.
+    /// Measures a photo. Division by the variance keeps plain and dark photos from counting as
+    /// blurred.
     pub fn of(photo: &RgbImage) -> Self {
         Self::of_gray(&grayscale(photo))
     }
 
-    /// The same of a photo without colours.
+    /// Measures a grey photo, as `Self::of`.
     pub fn of_gray(gray: &GrayImage) -> Self {
         let (w, h) = gray.dimensions();
         let at = |x: u32, y: u32| f32::from(gray.get_pixel(x, y)[0]);
         let (mut edges, mut sum, mut squares, mut count) = (0.0f64, 0.0f64, 0.0f64, 1e-6f64);
-        for (x, y) in (1..h.saturating_sub(1)).flat_map(|y| (1..w.saturating_sub(1)).map(move |x| (x, y))) {
-            let laplacian = 4.0 * at(x, y) - at(x - 1, y) - at(x + 1, y) - at(x, y - 1) - at(x, y + 1);
+        for (x, y) in
+            (1..h.saturating_sub(1)).flat_map(|y| (1..w.saturating_sub(1)).map(move |x| (x, y)))
+        {
+            let laplacian =
+                4.0 * at(x, y) - at(x - 1, y) - at(x + 1, y) - at(x, y - 1) - at(x, y + 1);
             edges += f64::from(laplacian * laplacian);
             sum += f64::from(at(x, y));
             squares += f64::from(at(x, y) * at(x, y));
@@ -41,11 +45,14 @@ impl Impression {
         }
         let spread = squares / count - (sum / count).powi(2);
         let thumb = resize(gray, THUMB, THUMB, FilterType::Triangle).into_raw();
-        Self { sharpness: (edges / count / spread.max(1.0)) as f32, thumb }
+        Self {
+            sharpness: (edges / count / spread.max(1.0)) as f32,
+            thumb,
+        }
     }
 }
 
-/// Sharpness of each photo, the middle one's being 1.
+/// Returns the sharpness of each photo, relative to the median.
 fn relative(photos: &[Impression]) -> impl Iterator<Item = f32> {
     let mut all: Vec<f32> = photos.iter().map(|p| p.sharpness).collect();
     all.sort_by(f32::total_cmp);
@@ -53,20 +60,34 @@ fn relative(photos: &[Impression]) -> impl Iterator<Item = f32> {
     photos.iter().map(move |p| p.sharpness / middle)
 }
 
-/// Which photos are blurred, by index.
+/// Returns the indices of blurred photos.
 pub fn blurred(photos: &[Impression]) -> Vec<usize> {
-    relative(photos).enumerate().filter(|s| s.1 < BLURRED).map(|s| s.0).collect()
+    relative(photos)
+        .enumerate()
+        .filter(|s| s.1 < BLURRED)
+        .map(|s| s.0)
+        .collect()
 }
 
-/// How much what each photo shows should count: 1 for the middle one and all that are sharper.
+/// Returns the weight of each photo: its relative sharpness, from `LEAST_WEIGHT` to 1.
 pub fn weights(photos: &[Impression]) -> Vec<f32> {
-    relative(photos).map(|sharpness| sharpness.clamp(LEAST_WEIGHT, 1.0)).collect()
+    relative(photos)
+        .map(|sharpness| sharpness.clamp(LEAST_WEIGHT, 1.0))
+        .collect()
 }
 
-/// Photos that show the same as the one before them.
+/// Returns the indices of photos that repeat the one before them.
 pub fn repeated(photos: &[Impression]) -> Vec<usize> {
-    let difference = |a: &[u8], b: &[u8]| a.iter().zip(b).map(|(x, y)| f32::from(x.abs_diff(*y))).sum::<f32>() / a.len() as f32;
-    (1..photos.len()).filter(|&i| difference(&photos[i - 1].thumb, &photos[i].thumb) < SAME).collect()
+    let difference = |a: &[u8], b: &[u8]| {
+        a.iter()
+            .zip(b)
+            .map(|(x, y)| f32::from(x.abs_diff(*y)))
+            .sum::<f32>()
+            / a.len() as f32
+    };
+    (1..photos.len())
+        .filter(|&i| difference(&photos[i - 1].thumb, &photos[i].thumb) < SAME)
+        .collect()
 }
 
 #[cfg(test)]
@@ -76,8 +97,15 @@ mod tests {
 
     #[test]
     fn the_blurred_and_the_repeated_one_are_found() {
-        let photo =
-            |shift: u32| RgbImage::from_fn(96, 64, |x, y| Rgb([if ((x + 5 * shift) / 9 + y / 7).is_multiple_of(2) { 30 } else { 220 }; 3]));
+        let photo = |shift: u32| {
+            RgbImage::from_fn(96, 64, |x, y| {
+                Rgb([if ((x + 5 * shift) / 9 + y / 7).is_multiple_of(2) {
+                    30
+                } else {
+                    220
+                }; 3])
+            })
+        };
         let mut photos: Vec<RgbImage> = (0..5).map(photo).collect();
         photos[2] = image::imageops::blur(&photos[2], 3.0);
         photos.push(photos[4].clone());
@@ -85,7 +113,10 @@ mod tests {
         assert_eq!(blurred(&seen), [2]);
         assert_eq!(repeated(&seen), [5]);
         let weights = weights(&seen);
-        assert!(weights[2] < BLURRED && [0, 1, 3, 4].iter().all(|&i| weights[i] > 0.9), "{weights:?}");
+        assert!(
+            weights[2] < BLURRED && [0, 1, 3, 4].iter().all(|&i| weights[i] > 0.9),
+            "{weights:?}"
+        );
         assert!(blurred(&[]).is_empty() && repeated(&[]).is_empty());
     }
 }

@@ -1,27 +1,31 @@
-//! Where models lie on this machine, and which files they are.
+//! Paths of the models and of ONNX Runtime on this machine, and file digests.
 
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 
-/// CLIP's published merges, for text towers that come without tokenizer.
+/// File name of CLIP's published BPE merges, for text towers without a tokenizer file.
 pub const CLIP_MERGES: &str = "bpe_simple_vocab_16e6.txt.gz";
 
-/// What is computed once from the classes' names, beside the offline models.
+/// File name of the class-name embeddings, stored beside the offline models.
 pub(crate) const NAMES: &str = "names.safetensors";
 
-/// Folder of the Python environment that finds poses.
+/// Returns the folder of the Python environment with pycolmap.
 pub(crate) fn poses_venv() -> PathBuf {
     cache_dir().join("poses-venv")
 }
 
-/// The Python in it.
+/// Returns the Python interpreter of `poses_venv`.
 pub(crate) fn poses_python() -> PathBuf {
-    poses_venv().join(if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" })
+    poses_venv().join(if cfg!(windows) {
+        "Scripts/python.exe"
+    } else {
+        "bin/python"
+    })
 }
 
-/// Folder of the converted offline models.
+/// Returns the folder of the converted offline models.
 pub fn offline_dir() -> PathBuf {
     cache_dir().join("offline")
 }
@@ -35,33 +39,46 @@ pub(crate) const RUNTIME: &str = if cfg!(windows) {
     "libonnxruntime.so"
 };
 
-/// The ONNX Runtime shared library: `ORT_DYLIB_PATH`, else the one that `install-offline` unpacked; this program itself where it is
-/// linked in.
+/// Returns the path of the ONNX Runtime shared library: `ORT_DYLIB_PATH`, or the one that
+/// `install-offline` unpacked. If ONNX Runtime is linked in, it is the path of this program.
 ///
 /// # Errors
-/// When there is none.
+/// The file does not exist.
 pub fn runtime_library() -> Result<PathBuf> {
     if !cfg!(feature = "load-ort") {
-        return std::env::current_exe().map_err(|e| Error::Missing(format!("this program's own file: {e}")));
+        return std::env::current_exe().map_err(|e| {
+            Error::Missing(format!(
+                "the path of this program cannot be determined: {e}"
+            ))
+        });
     }
     let installed = cache_dir().join(RUNTIME);
     let path = std::env::var_os("ORT_DYLIB_PATH").map_or(installed, PathBuf::from);
     if path.is_file() {
         return Ok(path);
     }
-    Err(Error::Missing(format!("{}: ONNX Runtime is not installed; run 'fastlgs models install-offline'", path.display())))
+    Err(Error::Missing(format!(
+        "{}: ONNX Runtime is not installed; run 'fastlgs models install-offline'",
+        path.display()
+    )))
 }
 
-/// Length and SHA-256 (hexadecimal) of a file.
+/// Returns the length in bytes and the SHA-256 (hexadecimal) of a file.
 ///
 /// # Errors
-/// When it cannot be read.
+/// The file cannot be read.
 pub fn digest(path: &Path) -> Result<(u64, String)> {
     let mut hash = Sha256::new();
     let file = std::fs::File::open(path).map_err(fastlgs_core::Error::io(path))?;
-    let bytes = std::io::copy(&mut std::io::BufReader::with_capacity(1 << 16, file), &mut HashWriter(&mut hash));
+    let bytes = std::io::copy(
+        &mut std::io::BufReader::with_capacity(1 << 16, file),
+        &mut HashWriter(&mut hash),
+    );
     let bytes = bytes.map_err(fastlgs_core::Error::io(path))?;
-    Ok((bytes, hash.finalize().iter().map(|b| format!("{b:02x}")).collect()))
+    Ok((
+        bytes,
+        hash.finalize().iter().map(|b| format!("{b:02x}")).collect(),
+    ))
 }
 
 struct HashWriter<'a>(&'a mut Sha256);

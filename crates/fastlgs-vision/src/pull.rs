@@ -1,7 +1,8 @@
-//! `models pull`: named ONNX exports of SAM and CLIP, over HTTPS.
+//! `models pull`: downloads named ONNX exports of SAM and CLIP over HTTPS.
 //!
-//! What a file must be comes from the host itself: large files of a model repository lie behind pointers (Git LFS) that
-//! name their length and SHA-256. What was pulled is recorded in `pulled.json`, and a later pull must give the same.
+//! The host announces length and SHA-256 of large files: a model repository stores them behind Git
+//! LFS pointers. `pulled.json` records each downloaded file, and a later download must match this
+//! record.
 
 use crate::places::digest;
 use crate::{Error, Result};
@@ -14,10 +15,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use ureq::Agent;
 
-/// Where the repositories lie, unless a mirror is named.
+/// Default host of the repositories.
 pub const HOST: &str = "https://huggingface.co";
 
-/// What a model is for.
+/// Purpose of a model pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
@@ -30,9 +31,9 @@ pub enum Role {
 /// A pair of models that can be pulled.
 #[derive(Clone, Copy, Debug, serde::Serialize)]
 pub struct Named {
-    /// Name on the command line.
+    /// Name by which users select it.
     pub name: &'static str,
-    /// What it is for.
+    /// Purpose of the pair.
     pub role: Role,
     /// Repository of the exports.
     pub repository: &'static str,
@@ -40,140 +41,228 @@ pub struct Named {
     pub licence: &'static str,
 }
 
-/// All that are known.
+/// All model pairs that can be pulled.
 pub const NAMED: [Named; 5] = [
-    Named { name: "slimsam", role: Role::Sam, repository: "Xenova/slimsam-77-uniform", licence: "Apache-2.0" },
-    Named { name: "sam-vit-b", role: Role::Sam, repository: "Xenova/sam-vit-base", licence: "Apache-2.0" },
-    Named { name: "clip-vit-b16", role: Role::Clip, repository: "Xenova/clip-vit-base-patch16", licence: "MIT" },
-    Named { name: "clip-vit-b32", role: Role::Clip, repository: "Xenova/clip-vit-base-patch32", licence: "MIT" },
-    Named { name: "clip-vit-l14", role: Role::Clip, repository: "Xenova/clip-vit-large-patch14", licence: "MIT" },
+    Named {
+        name: "slimsam",
+        role: Role::Sam,
+        repository: "Xenova/slimsam-77-uniform",
+        licence: "Apache-2.0",
+    },
+    Named {
+        name: "sam-vit-b",
+        role: Role::Sam,
+        repository: "Xenova/sam-vit-base",
+        licence: "Apache-2.0",
+    },
+    Named {
+        name: "clip-vit-b16",
+        role: Role::Clip,
+        repository: "Xenova/clip-vit-base-patch16",
+        licence: "MIT",
+    },
+    Named {
+        name: "clip-vit-b32",
+        role: Role::Clip,
+        repository: "Xenova/clip-vit-base-patch32",
+        licence: "MIT",
+    },
+    Named {
+        name: "clip-vit-l14",
+        role: Role::Clip,
+        repository: "Xenova/clip-vit-large-patch14",
+        licence: "MIT",
+    },
 ];
 
 impl Named {
-    /// The model of that name.
+    /// Returns the model pair of that name.
     ///
     /// # Errors
-    /// An unknown name; the message lists those that are known.
+    /// An unknown name; the message lists all names.
     pub fn find(name: &str) -> Result<Self> {
         NAMED.into_iter().find(|n| n.name == name).ok_or_else(|| {
             let known: Vec<&str> = NAMED.iter().map(|n| n.name).collect();
-            Error::Missing(format!("no model '{name}'; there are: {}", known.join(", ")))
+            Error::Missing(format!(
+                "unknown model '{name}'; the available models are: {}",
+                known.join(", ")
+            ))
         })
     }
 
-    /// Files of the repository: the two models first.
+    /// Returns the files to pull from the repository, the two models first.
     pub fn files(&self) -> &'static [&'static str] {
         match self.role {
-            Role::Sam => &["onnx/vision_encoder.onnx", "onnx/prompt_encoder_mask_decoder.onnx"],
-            Role::Clip => &["onnx/vision_model.onnx", "onnx/text_model.onnx", "tokenizer.json", "preprocessor_config.json"],
+            Role::Sam => &[
+                "onnx/vision_encoder.onnx",
+                "onnx/prompt_encoder_mask_decoder.onnx",
+            ],
+            Role::Clip => &[
+                "onnx/vision_model.onnx",
+                "onnx/text_model.onnx",
+                "tokenizer.json",
+                "preprocessor_config.json",
+            ],
         }
     }
 
-    /// The folder that it is pulled into.
+    /// Returns the folder that the files are pulled into.
     pub fn folder(&self) -> PathBuf {
         fs::cache_dir().join("models").join(self.name)
     }
 
-    /// Encoder and decoder, or image and text tower, once they were pulled.
+    /// Returns the paths of encoder and decoder, or of image and text tower.
     ///
     /// # Errors
-    /// When they were not.
+    /// A file that was not pulled; the message says how to pull it.
     pub fn pair(&self) -> Result<[PathBuf; 2]> {
         let pair = [0, 1].map(|k| self.folder().join(self.files()[k]));
         match pair.iter().find(|p| !p.is_file()) {
             None => Ok(pair),
             Some(missing) => {
                 let (name, missing) = (self.name, missing.display());
-                Err(Error::Missing(format!("{missing}: not there; run 'fastlgs models pull {name}', or name your own files")))
+                Err(Error::Missing(format!(
+                    "{missing}: file not found; run 'fastlgs models pull {name}', or give the paths of your own files"
+                )))
             }
         }
     }
 }
 
-/// What a file must be, as far as it is known.
+/// Expected length and SHA-256 of a file; `None` if unknown.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Expected {
     bytes: Option<u64>,
     sha256: Option<String>,
 }
 
-/// How often a transfer that broke off is taken up again.
+/// Number of attempts per file. Each continues the previous one.
 const TRIES: usize = 4;
-/// Longest pointer of a large file.
+/// Largest size of a Git LFS pointer, in bytes.
 const POINTER: u64 = 1024;
 
-/// Where files come from and go to.
+/// HTTP client, repository URL and target folder of a download.
 struct Puller<'a> {
     agent: Agent,
     base: String,
     folder: &'a Path,
 }
 
-/// Gets all files of a model that are not there yet; `say` is told file, bytes done and bytes in all. Returns what is there.
-/// A proxy is taken from the environment (`HTTPS_PROXY`, `ALL_PROXY`).
+/// Downloads all files of a model that are missing or damaged, and returns the records of all its
+/// files.
+/// `say` receives the file, the bytes done and the total bytes. The proxy comes from the
+/// environment (`HTTPS_PROXY`, `ALL_PROXY`).
 ///
 /// # Errors
-/// When the host cannot be reached, breaks off again and again, or sends something else; what was there before stays.
-pub fn pull(model: &Named, host: &str, folder: &Path, mut say: impl FnMut(&str, u64, Option<u64>)) -> Result<BTreeMap<String, ModelFile>> {
-    let config =
-        Agent::config_builder().timeout_connect(Some(Duration::from_secs(20))).timeout_recv_response(Some(Duration::from_secs(60)));
-    let puller = Puller { agent: config.build().into(), base: format!("{}/{}", host.trim_end_matches('/'), model.repository), folder };
+/// The host cannot be reached, breaks off repeatedly, or sends an unexpected file. Existing files
+/// are kept.
+pub fn pull(
+    model: &Named,
+    host: &str,
+    folder: &Path,
+    mut say: impl FnMut(&str, u64, Option<u64>),
+) -> Result<BTreeMap<String, ModelFile>> {
+    let config = Agent::config_builder()
+        .timeout_connect(Some(Duration::from_secs(20)))
+        .timeout_recv_response(Some(Duration::from_secs(60)));
+    let puller = Puller {
+        agent: config.build().into(),
+        base: format!("{}/{}", host.trim_end_matches('/'), model.repository),
+        folder,
+    };
     let record = folder.join("pulled.json");
-    let mut pulled: BTreeMap<String, ModelFile> = if record.is_file() { fs::read_json(&record)? } else { BTreeMap::new() };
+    let mut pulled: BTreeMap<String, ModelFile> = if record.is_file() {
+        fs::read_json(&record)?
+    } else {
+        BTreeMap::new()
+    };
     for &file in model.files() {
         let path = folder.join(file);
         if let Some(known) = pulled.get(file).filter(|_| path.is_file()) {
             if digest(&path)? == (known.bytes, known.sha256.clone()) {
                 continue;
             }
-            tracing::warn!("{}: damaged since it was pulled; pulling it again", path.display());
+            tracing::warn!(
+                "{}: the file has changed since it was pulled; pulling it again",
+                path.display()
+            );
         }
         let mut expected = puller.pointer(file)?;
-        // What was right once is right again, whatever a mirror says.
+        // The record of an earlier download takes precedence over what a mirror announces.
         if let Some(known) = pulled.get(file) {
-            expected = Expected { bytes: Some(known.bytes), sha256: Some(known.sha256.clone()) };
+            expected = Expected {
+                bytes: Some(known.bytes),
+                sha256: Some(known.sha256.clone()),
+            };
         }
         let partial = puller.fetch(file, &expected, &mut say)?;
         let (bytes, sha256) = digest(&partial)?;
         std::fs::rename(&partial, &path).map_err(CoreError::io(&path))?;
-        pulled.insert(file.to_owned(), ModelFile { path, bytes, sha256 });
+        pulled.insert(
+            file.to_owned(),
+            ModelFile {
+                path,
+                bytes,
+                sha256,
+            },
+        );
         fs::write_json(&record, &pulled)?;
     }
     Ok(pulled)
 }
 
 impl Puller<'_> {
-    /// What the host says of a large file.
+    /// Fetches the Git LFS pointer of a file. Returns empty expectations if there is none.
     fn pointer(&self, file: &str) -> Result<Expected> {
         let url = format!("{}/raw/main/{file}", self.base);
         let answer = self.agent.get(&url).call();
         let mut text = String::new();
         match answer {
-            Ok(answer) => drop(answer.into_body().into_reader().take(POINTER).read_to_string(&mut text)),
+            Ok(answer) => drop(
+                answer
+                    .into_body()
+                    .into_reader()
+                    .take(POINTER)
+                    .read_to_string(&mut text),
+            ),
             Err(ureq::Error::StatusCode(_)) => return Ok(Expected::default()),
             Err(e) => return Err(unreachable(&url, &e)),
         }
         if !text.starts_with("version https://git-lfs") {
             return Ok(Expected::default());
         }
-        let field = |name: &str| text.lines().find_map(|l| l.strip_prefix(name)).map(|v| v.trim().to_owned());
-        Ok(Expected { bytes: field("size ").and_then(|v| v.parse().ok()), sha256: field("oid sha256:") })
+        let field = |name: &str| {
+            text.lines()
+                .find_map(|l| l.strip_prefix(name))
+                .map(|v| v.trim().to_owned())
+        };
+        Ok(Expected {
+            bytes: field("size ").and_then(|v| v.parse().ok()),
+            sha256: field("oid sha256:"),
+        })
     }
 
-    /// Brings a file to a temporary name and checks it there.
-    fn fetch(&self, file: &str, expected: &Expected, say: &mut impl FnMut(&str, u64, Option<u64>)) -> Result<PathBuf> {
+    /// Downloads a file to `FILE.partial`, checks it, and returns that path.
+    fn fetch(
+        &self,
+        file: &str,
+        expected: &Expected,
+        say: &mut impl FnMut(&str, u64, Option<u64>),
+    ) -> Result<PathBuf> {
         let partial = self.folder.join(format!("{file}.partial"));
         let parent = partial.parent().unwrap_or(self.folder);
         std::fs::create_dir_all(parent).map_err(CoreError::io(parent))?;
         let url = format!("{}/resolve/main/{file}", self.base);
         let mut reason = String::new();
         for _ in 0..TRIES {
-            match self.continue_file(&url, &partial, |done, total| say(file, done, expected.bytes.or(total)))? {
+            match self.continue_file(&url, &partial, |done, total| {
+                say(file, done, expected.bytes.or(total))
+            })? {
                 Ended::Whole => {
                     if let Err(why) = check(file, &partial, expected) {
                         let _ = std::fs::remove_file(&partial);
                         return Err(Error::Missing(format!(
-                            "{url}: {why}; nothing was installed; try another --base-url, or get the file by hand"
+                            "{url}: {why}; the file was not installed; try another mirror with --base-url, or download the file manually"
                         )));
                     }
                     return Ok(partial);
@@ -182,12 +271,17 @@ impl Puller<'_> {
             }
         }
         Err(Error::Missing(format!(
-            "{url}: the transfer broke off {TRIES} times ({reason}); run the command again to go on where it stopped"
+            "{url}: the transfer broke off {TRIES} times ({reason}); run the command again to resume it"
         )))
     }
 
-    /// Takes up a transfer where it stopped.
-    fn continue_file(&self, url: &str, partial: &Path, mut say: impl FnMut(u64, Option<u64>)) -> Result<Ended> {
+    /// Resumes a transfer after the bytes that are already in `partial`.
+    fn continue_file(
+        &self,
+        url: &str,
+        partial: &Path,
+        mut say: impl FnMut(u64, Option<u64>),
+    ) -> Result<Ended> {
         let have = std::fs::metadata(partial).map_or(0, |m| m.len());
         let mut request = self.agent.get(url);
         if have > 0 {
@@ -195,32 +289,49 @@ impl Puller<'_> {
         }
         let answer = match request.call() {
             Ok(answer) => answer,
-            // Nothing is left beyond what there is: it is whole, or too long and will fail its check.
+            // The host has no bytes beyond those in the file. The file is complete, or too long and
+            // fails its check.
             Err(ureq::Error::StatusCode(416)) => return Ok(Ended::Whole),
             Err(ureq::Error::StatusCode(code)) => {
-                return Err(Error::Missing(format!("{url}: the host answered {code}; is it a mirror of {HOST}?")));
+                return Err(Error::Missing(format!(
+                    "{url}: the host answered with status {code}; check that it is a mirror of {HOST}"
+                )));
             }
             Err(e) if have > 0 => return Ok(Ended::BrokeOff(e.to_string())),
             Err(e) => return Err(unreachable(url, &e)),
         };
         let goes_on = answer.status() == 206;
         let mut done = if goes_on { have } else { 0 };
-        let length = answer.headers().get("content-length").and_then(|v| v.to_str().ok()?.parse::<u64>().ok());
+        let length = answer
+            .headers()
+            .get("content-length")
+            .and_then(|v| v.to_str().ok()?.parse::<u64>().ok());
         let total = length.map(|l| l + done);
-        let file = OpenOptions::new().create(true).write(true).append(goes_on).truncate(!goes_on).open(partial);
+        let file = OpenOptions::new()
+            .create(true)
+            .write(true)
+            .append(goes_on)
+            .truncate(!goes_on)
+            .open(partial);
         let mut file = file.map_err(CoreError::io(partial))?;
         let mut reader = answer.into_body().into_reader();
         let mut buffer = vec![0; 1 << 16];
         loop {
             match reader.read(&mut buffer) {
                 Ok(0) => break,
-                Ok(n) => file.write_all(&buffer[..n]).map_err(CoreError::io(partial))?,
+                Ok(n) => file
+                    .write_all(&buffer[..n])
+                    .map_err(CoreError::io(partial))?,
                 Err(e) => return Ok(Ended::BrokeOff(e.to_string())),
             }
             done = file.metadata().map_err(CoreError::io(partial))?.len();
             say(done, total);
         }
-        Ok(if total.is_none_or(|t| t == done) { Ended::Whole } else { Ended::BrokeOff("it ended early".to_owned()) })
+        Ok(if total.is_none_or(|t| t == done) {
+            Ended::Whole
+        } else {
+            Ended::BrokeOff("the host sent fewer bytes than announced".to_owned())
+        })
     }
 }
 
@@ -231,24 +342,40 @@ enum Ended {
 }
 
 fn unreachable(url: &str, e: &ureq::Error) -> Error {
-    Error::Missing(format!("{url}: cannot be reached ({e}); check the connection or HTTPS_PROXY, or name a mirror with --base-url"))
+    Error::Missing(format!(
+        "{url}: cannot be reached ({e}); check the connection or HTTPS_PROXY, or name a mirror with --base-url"
+    ))
 }
 
-/// Whether a file is what it should be; else what is wrong.
+/// Checks length, SHA-256 and first bytes of a file. The error is the reason for a message.
 fn check(file: &str, path: &Path, expected: &Expected) -> Result<(), String> {
     let (bytes, sha256) = digest(path).map_err(|e| e.to_string())?;
     if expected.bytes.is_some_and(|b| b != bytes) {
-        return Err(format!("it is {bytes} bytes long instead of {}", expected.bytes.unwrap_or(0)));
+        return Err(format!(
+            "it is {bytes} bytes long instead of {}",
+            expected.bytes.unwrap_or(0)
+        ));
     }
     if expected.sha256.as_ref().is_some_and(|s| *s != sha256) {
-        return Err(format!("its SHA-256 is {sha256}, not what was announced"));
+        return Err(format!(
+            "its SHA-256 is {sha256}, which is not the expected one"
+        ));
     }
     let mut start = [0; 2];
-    let read = std::fs::File::open(path).and_then(|mut f| f.read(&mut start)).unwrap_or(0);
-    // An ONNX file begins with its version (field 1, a number), JSON with a bracket.
-    let plausible =
-        if file.ends_with(".onnx") { read == 2 && start[0] == 0x08 && start[1] < 0x40 } else { matches!(start[0], b'{' | b'[') };
-    if plausible { Ok(()) } else { Err("it is something else than a model (a page that asks for something?)".to_owned()) }
+    let read = std::fs::File::open(path)
+        .and_then(|mut f| f.read(&mut start))
+        .unwrap_or(0);
+    // An ONNX file begins with its version (protobuf field 1, an integer); JSON with a bracket.
+    let plausible = if file.ends_with(".onnx") {
+        read == 2 && start[0] == 0x08 && start[1] < 0x40
+    } else {
+        matches!(start[0], b'{' | b'[')
+    };
+    if plausible {
+        Ok(())
+    } else {
+        Err("it is neither an ONNX nor a JSON file; the host may have sent a web page".to_owned())
+    }
 }
 
 #[cfg(test)]
@@ -259,15 +386,15 @@ mod tests {
     use std::net::{TcpListener, TcpStream};
     use std::sync::{Arc, Mutex};
 
-    /// What the local host does wrong.
+    /// Faults of the local test host.
     #[derive(Clone, Copy, PartialEq)]
     enum Manner {
         Good,
-        /// Breaks off the first transfer of every file halfway.
+        /// Closes the first transfer of every file halfway.
         BreaksOff,
-        /// Announces more than it sends, always.
+        /// Always announces more bytes than it sends.
         LiesAboutLength,
-        /// Sends a page instead.
+        /// Sends an HTML page instead of the file.
         SendsPage,
         /// Sends a changed file of the right length.
         SendsOther,
@@ -276,32 +403,57 @@ mod tests {
     }
 
     fn content(file: &str) -> Vec<u8> {
-        if file.ends_with(".onnx") { [&[8, 8][..], &vec![7; 300_000], file.as_bytes()].concat() } else { b"{}".to_vec() }
+        if file.ends_with(".onnx") {
+            [&[8, 8][..], &vec![7; 300_000], file.as_bytes()].concat()
+        } else {
+            b"{}".to_vec()
+        }
     }
 
     fn answer(mut stream: TcpStream, manner: Manner, asked: &Mutex<Vec<String>>) {
-        let mut lines = BufReader::new(stream.try_clone().unwrap()).lines().map_while(|l| l.ok());
+        let mut lines = BufReader::new(stream.try_clone().unwrap())
+            .lines()
+            .map_while(|l| l.ok());
         let request = lines.next().unwrap_or_default();
         let headers: Vec<String> = lines.take_while(|l| !l.is_empty()).collect();
         let path = request.split(' ').nth(1).unwrap_or_default().to_owned();
-        let range = headers.iter().find_map(|h| h.to_lowercase().strip_prefix("range: bytes=")?.strip_suffix('-')?.parse::<usize>().ok());
+        let range = headers.iter().find_map(|h| {
+            h.to_lowercase()
+                .strip_prefix("range: bytes=")?
+                .strip_suffix('-')?
+                .parse::<usize>()
+                .ok()
+        });
         let again = {
             let mut asked = asked.lock().unwrap();
             asked.push(format!("{path} {range:?}"));
-            asked.iter().filter(|p| p.starts_with(&format!("{path} "))).count() > 1
+            asked
+                .iter()
+                .filter(|p| p.starts_with(&format!("{path} ")))
+                .count()
+                > 1
         };
         let file = path.split_once("/main/").map(|p| p.1).unwrap_or_default();
         let mut body = content(file);
         let mut respond = |status: &str, length: usize, body: &[u8]| {
-            let _ = write!(stream, "HTTP/1.1 {status}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n");
+            let _ = write!(
+                stream,
+                "HTTP/1.1 {status}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n"
+            );
             let _ = stream.write_all(body);
         };
         if manner == Manner::NotFound {
             return respond("404 Not Found", 0, b"");
         }
         if path.contains("/raw/") {
-            let hash = Sha256::digest(&body).iter().map(|b| format!("{b:02x}")).collect::<String>();
-            let pointer = format!("version https://git-lfs.github.com/spec/v1\noid sha256:{hash}\nsize {}\n", body.len());
+            let hash = Sha256::digest(&body)
+                .iter()
+                .map(|b| format!("{b:02x}"))
+                .collect::<String>();
+            let pointer = format!(
+                "version https://git-lfs.github.com/spec/v1\noid sha256:{hash}\nsize {}\n",
+                body.len()
+            );
             return respond("200 OK", pointer.len(), pointer.as_bytes());
         }
         match manner {
@@ -310,7 +462,11 @@ mod tests {
             _ => {}
         }
         let from = range.unwrap_or(0).min(body.len());
-        let status = if range.is_some() { "206 Partial Content" } else { "200 OK" };
+        let status = if range.is_some() {
+            "206 Partial Content"
+        } else {
+            "200 OK"
+        };
         let rest = &body[from..];
         match manner {
             Manner::BreaksOff if !again => respond(status, rest.len(), &rest[..rest.len() / 2]),
@@ -319,19 +475,32 @@ mod tests {
         }
     }
 
-    /// A host on this machine; gives its address and what it was asked.
+    /// Starts a host on this machine. Returns its address and the log of requests.
     fn host(manner: Manner) -> (String, Arc<Mutex<Vec<String>>>) {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = format!("http://{}", listener.local_addr().unwrap());
         let asked = Arc::new(Mutex::new(Vec::new()));
         let log = asked.clone();
-        std::thread::spawn(move || listener.incoming().flatten().for_each(|stream| answer(stream, manner, &log)));
+        std::thread::spawn(move || {
+            listener
+                .incoming()
+                .flatten()
+                .for_each(|stream| answer(stream, manner, &log))
+        });
         (address, asked)
     }
 
-    fn try_pull(manner: Manner, folder: &Path) -> (Result<BTreeMap<String, ModelFile>>, Vec<String>) {
+    fn try_pull(
+        manner: Manner,
+        folder: &Path,
+    ) -> (Result<BTreeMap<String, ModelFile>>, Vec<String>) {
         let (address, asked) = host(manner);
-        let result = pull(&Named::find("slimsam").unwrap(), &address, folder, |_, _, _| {});
+        let result = pull(
+            &Named::find("slimsam").unwrap(),
+            &address,
+            folder,
+            |_, _, _| {},
+        );
         let asked = asked.lock().unwrap().clone();
         (result, asked)
     }
@@ -344,7 +513,11 @@ mod tests {
         let file = "onnx/vision_encoder.onnx";
         assert_eq!(std::fs::read(dir.path().join(file)).unwrap(), content(file));
         let (pulled, asked) = try_pull(Manner::NotFound, dir.path());
-        assert_eq!((pulled.unwrap().len(), asked.len()), (2, 0), "nothing is asked for twice");
+        assert_eq!(
+            (pulled.unwrap().len(), asked.len()),
+            (2, 0),
+            "complete files must not be requested again"
+        );
         std::fs::write(dir.path().join(file), b"damaged").unwrap();
         try_pull(Manner::Good, dir.path()).0.unwrap();
         assert_eq!(std::fs::read(dir.path().join(file)).unwrap(), content(file));
@@ -355,7 +528,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let (pulled, asked) = try_pull(Manner::BreaksOff, dir.path());
         assert_eq!(pulled.unwrap().len(), 2);
-        assert!(asked.iter().any(|a| a.contains("/resolve/") && a.contains("Some(15")), "half is asked for: {asked:?}");
+        assert!(
+            asked
+                .iter()
+                .any(|a| a.contains("/resolve/") && a.contains("Some(15")),
+            "the second half must be requested: {asked:?}"
+        );
     }
 
     #[test]
@@ -368,12 +546,22 @@ mod tests {
         ] {
             let dir = tempfile::tempdir().unwrap();
             let error = try_pull(manner, dir.path()).0.unwrap_err().to_string();
-            assert!(error.contains(said) && error.contains("vision_encoder.onnx"), "{error}");
+            assert!(
+                error.contains(said) && error.contains("vision_encoder.onnx"),
+                "{error}"
+            );
             assert!(!dir.path().join("onnx/vision_encoder.onnx").exists());
         }
         let dir = tempfile::tempdir().unwrap();
-        let nowhere = pull(&NAMED[0], "http://127.0.0.1:1", dir.path(), |_, _, _| {}).unwrap_err().to_string();
+        let nowhere = pull(&NAMED[0], "http://127.0.0.1:1", dir.path(), |_, _, _| {})
+            .unwrap_err()
+            .to_string();
         assert!(nowhere.contains("cannot be reached"), "{nowhere}");
-        assert!(Named::find("sam9").unwrap_err().to_string().contains("slimsam"));
+        assert!(
+            Named::find("sam9")
+                .unwrap_err()
+                .to_string()
+                .contains("slimsam")
+        );
     }
 }

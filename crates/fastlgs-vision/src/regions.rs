@@ -1,17 +1,27 @@
-//! A region hierarchy from an edge map: watershed basins merged in the order of their dissimilarity.
+//! Builds a region hierarchy from an edge map: watershed basins are merged in ascending order of
+//! dissimilarity.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
 
-/// Grows basins from the minima of `edges` (row-major, 0..1); returns basin numbers 0.. and how many there are.
+/// Grows basins from the minima of `edges` (row-major, 0 to 1). Returns the basin of each pixel,
+/// from 0, and the number of basins.
 pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize) {
     const NONE: u32 = u32::MAX;
-    let level: Vec<u32> = edges.iter().map(|e| (e.clamp(0.0, 1.0) * 255.0) as u32).collect();
+    let level: Vec<u32> = edges
+        .iter()
+        .map(|e| (e.clamp(0.0, 1.0) * 255.0) as u32)
+        .collect();
     let near = |p: usize| {
         let (x, y) = (p % width, p / width);
-        [(x > 0).then(|| p - 1), (x + 1 < width).then(|| p + 1), (y > 0).then(|| p - width), (y + 1 < height).then(|| p + width)]
-            .into_iter()
-            .flatten()
+        [
+            (x > 0).then(|| p - 1),
+            (x + 1 < width).then(|| p + 1),
+            (y > 0).then(|| p - width),
+            (y + 1 < height).then(|| p + width),
+        ]
+        .into_iter()
+        .flatten()
     };
     let mut basin = vec![NONE; level.len()];
     let mut count = 0;
@@ -40,7 +50,8 @@ pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize
             count += 1;
         }
     }
-    // Flood upwards; ties in order of arrival, so that the result is deterministic.
+    // Flood in ascending order of edge strength. Ties are resolved by order of insertion, so the
+    // result is deterministic.
     let mut queue = BinaryHeap::new();
     let mut arrival = 0u64;
     for p in 0..level.len() {
@@ -64,15 +75,15 @@ pub fn watershed(edges: &[f32], width: usize, height: usize) -> (Vec<u32>, usize
 /// A node of the merge tree: a basin or the union of two nodes.
 #[derive(Clone, Debug)]
 pub struct Node {
-    /// Pixels.
+    /// Area in pixels.
     pub area: f32,
-    /// Sum of the pixels' features (colour, texture, meaning).
+    /// Sum of the pixels' features (colour and dense embedding).
     pub feature: Vec<f32>,
-    /// Dissimilarity at which the node came to be; 0 for basins.
+    /// Dissimilarity at which its children merged; 0 for basins.
     pub height: f32,
-    /// The two nodes it was made of.
+    /// The two nodes that merged into it; `None` for basins.
     pub children: Option<[usize; 2]>,
-    /// Node that swallowed it.
+    /// Node that it was merged into.
     pub parent: Option<usize>,
 }
 
@@ -89,9 +100,11 @@ struct Border {
 }
 
 impl Hierarchy {
-    /// Merges basins until one is left. `features` holds `dimension` values a pixel.
+    /// Merges adjacent basins until none are left to merge. `features` holds `dimension` values per
+    /// pixel.
     ///
-    /// `dissimilarity(edge, a, b)`: mean edge on the common border, and both nodes.
+    /// `dissimilarity(edge, a, b)` receives the mean edge strength on the common border, and both
+    /// nodes. It must not be negative.
     pub fn build(
         basins: &[u32],
         count: usize,
@@ -101,15 +114,28 @@ impl Hierarchy {
         dimension: usize,
         dissimilarity: impl Fn(f32, &Node, &Node) -> f32,
     ) -> Self {
-        let empty = Node { area: 0.0, feature: vec![0.0; dimension], height: 0.0, children: None, parent: None };
+        let empty = Node {
+            area: 0.0,
+            feature: vec![0.0; dimension],
+            height: 0.0,
+            children: None,
+            parent: None,
+        };
         let mut nodes = vec![empty; count];
         let mut borders: Vec<BTreeMap<usize, Border>> = vec![BTreeMap::new(); count];
         for (p, &b) in basins.iter().enumerate() {
             let node = &mut nodes[b as usize];
             node.area += 1.0;
-            node.feature.iter_mut().zip(&features[p * dimension..]).for_each(|(s, v)| *s += v);
+            node.feature
+                .iter_mut()
+                .zip(&features[p * dimension..])
+                .for_each(|(s, v)| *s += v);
             let right = (p % width + 1 < width).then_some(p + 1);
-            for q in [right, Some(p + width)].into_iter().flatten().filter(|&q| q < basins.len()) {
+            for q in [right, Some(p + width)]
+                .into_iter()
+                .flatten()
+                .filter(|&q| q < basins.len())
+            {
                 let (a, b) = (basins[p] as usize, basins[q] as usize);
                 if a != b {
                     for (x, y) in [(a, b), (b, a)] {
@@ -120,9 +146,10 @@ impl Hierarchy {
                 }
             }
         }
-        let cost =
-            |nodes: &[Node], border: Border, a: usize, b: usize| dissimilarity(border.strength / border.length, &nodes[a], &nodes[b]);
-        // Positive floats order like their bits.
+        let cost = |nodes: &[Node], border: Border, a: usize, b: usize| {
+            dissimilarity(border.strength / border.length, &nodes[a], &nodes[b])
+        };
+        // Non-negative floats sort like their bit patterns.
         let mut queue = BinaryHeap::new();
         for a in 0..count {
             for (&b, &border) in borders[a].range(a + 1..) {
@@ -134,9 +161,22 @@ impl Hierarchy {
                 continue;
             }
             let merged = nodes.len();
-            let feature = nodes[a].feature.iter().zip(&nodes[b].feature).map(|(x, y)| x + y).collect();
-            let height = f32::from_bits(bits).max(nodes[a].height).max(nodes[b].height);
-            nodes.push(Node { area: nodes[a].area + nodes[b].area, feature, height, children: Some([a, b]), parent: None });
+            let feature = nodes[a]
+                .feature
+                .iter()
+                .zip(&nodes[b].feature)
+                .map(|(x, y)| x + y)
+                .collect();
+            let height = f32::from_bits(bits)
+                .max(nodes[a].height)
+                .max(nodes[b].height);
+            nodes.push(Node {
+                area: nodes[a].area + nodes[b].area,
+                feature,
+                height,
+                children: Some([a, b]),
+                parent: None,
+            });
             nodes[a].parent = Some(merged);
             nodes[b].parent = Some(merged);
             let mut around = std::mem::take(&mut borders[a]);
@@ -151,14 +191,18 @@ impl Hierarchy {
                 borders[other].remove(&a);
                 borders[other].remove(&b);
                 borders[other].insert(merged, border);
-                queue.push(Reverse((cost(&nodes, border, other, merged).to_bits(), other, merged)));
+                queue.push(Reverse((
+                    cost(&nodes, border, other, merged).to_bits(),
+                    other,
+                    merged,
+                )));
             }
             borders.push(around);
         }
         Self { nodes }
     }
 
-    /// Basins below a node.
+    /// Returns the basins below a node.
     pub fn leaves(&self, node: usize) -> Vec<usize> {
         let (mut stack, mut out) = (vec![node], Vec::new());
         while let Some(n) = stack.pop() {
@@ -170,16 +214,23 @@ impl Hierarchy {
         out
     }
 
-    /// All nodes of at least `least` pixels, large ones first, but of those that lie in each other and have more than the share `alike` of their pixels
-    /// in common only the one that stands for the longest span of dissimilarity.
+    /// Returns the nodes of at least `least` pixels, in descending order of area.
+    /// Of nested nodes whose area ratio is above `alike`, only the one with the longest span of
+    /// dissimilarity is kept.
     pub fn lasting(&self, least: f32, alike: f32) -> Vec<usize> {
         let area = |i: usize| self.nodes[i].area;
-        let span = |i: usize| self.nodes[i].parent.map_or(0.0, |p| self.nodes[p].height - self.nodes[i].height);
+        let span = |i: usize| {
+            self.nodes[i]
+                .parent
+                .map_or(0.0, |p| self.nodes[p].height - self.nodes[i].height)
+        };
         let upwards = |i: usize| std::iter::successors(Some(i), |i| self.nodes[*i].parent);
-        let mut order: Vec<usize> = (0..self.nodes.len()).filter(|i| area(*i) >= least).collect();
+        let mut order: Vec<usize> = (0..self.nodes.len())
+            .filter(|i| area(*i) >= least)
+            .collect();
         order.sort_by(|a, b| span(*b).total_cmp(&span(*a)).then(a.cmp(b)));
         let mut kept = vec![false; self.nodes.len()];
-        // By node: the largest kept one in it.
+        // Area of the largest kept node inside each node.
         let mut largest = vec![0.0f32; self.nodes.len()];
         for &i in &order {
             let around = upwards(i).skip(1).find(|j| kept[*j]);
@@ -193,10 +244,14 @@ impl Hierarchy {
         order
     }
 
-    /// Whether each node lies in one of `cut`, and is none of them.
+    /// Returns for each node whether it is a strict descendant of a node of `cut`.
     pub fn is_below(&self, cut: &[usize]) -> Vec<bool> {
         let mut below = vec![false; self.nodes.len()];
-        let mut stack: Vec<usize> = cut.iter().flat_map(|i| self.nodes[*i].children).flatten().collect();
+        let mut stack: Vec<usize> = cut
+            .iter()
+            .flat_map(|i| self.nodes[*i].children)
+            .flatten()
+            .collect();
         while let Some(i) = stack.pop() {
             below[i] = true;
             stack.extend(self.nodes[i].children.into_iter().flatten());
@@ -204,7 +259,8 @@ impl Hierarchy {
         below
     }
 
-    /// Disjoint nodes that cover the picture with the largest total `value` (dynamic programming from the leaves).
+    /// Returns disjoint nodes that cover the image with the largest total `value` (dynamic
+    /// programming from the leaves).
     pub fn best_cut(&self, value: impl Fn(usize) -> f32) -> Vec<usize> {
         // Children precede their parents.
         let mut best = vec![0.0f32; self.nodes.len()];
@@ -219,7 +275,9 @@ impl Hierarchy {
                 whole[i] = false;
             }
         }
-        let mut stack: Vec<usize> = (0..self.nodes.len()).filter(|&i| self.nodes[i].parent.is_none()).collect();
+        let mut stack: Vec<usize> = (0..self.nodes.len())
+            .filter(|&i| self.nodes[i].parent.is_none())
+            .collect();
         let mut cut = Vec::new();
         while let Some(i) = stack.pop() {
             match self.nodes[i].children {
@@ -249,17 +307,39 @@ mod tests {
             .collect();
         let (basins, count) = watershed(&edges, w, h);
         assert_eq!(count, 3);
-        let tree = Hierarchy::build(&basins, count, w, &edges, &vec![0.0; w * h], 1, |edge, _, _| edge);
+        let tree = Hierarchy::build(
+            &basins,
+            count,
+            w,
+            &edges,
+            &vec![0.0; w * h],
+            1,
+            |edge, _, _| edge,
+        );
         assert_eq!(tree.nodes.len(), 5);
         let first = &tree.nodes[3];
-        assert!((first.height - 0.3).abs() < 1e-3 && first.area >= 19.0 * 12.0, "the weak wall falls first");
+        assert!(
+            (first.height - 0.3).abs() < 1e-3 && first.area >= 19.0 * 12.0,
+            "regions must merge across the weak wall first"
+        );
         let cut = tree.best_cut(|i| if i == 3 { 5.0 } else { 1.0 });
         assert_eq!(cut.len(), 2);
         assert!(cut.contains(&3));
         let below = tree.is_below(&cut);
-        assert_eq!((below.iter().filter(|b| **b).count(), below[3], below[4]), (2, false, false));
+        assert_eq!(
+            (below.iter().filter(|b| **b).count(), below[3], below[4]),
+            (2, false, false)
+        );
         assert_eq!(tree.lasting(1.0, 0.85).len(), 5);
-        assert_eq!(tree.lasting(1.5 * 120.0, 0.85), [4, 3], "large ones first");
-        assert_eq!(tree.lasting(1.5 * 120.0, 0.5), [3], "the whole picture never stood for long");
+        assert_eq!(
+            tree.lasting(1.5 * 120.0, 0.85),
+            [4, 3],
+            "nodes must be sorted by descending area"
+        );
+        assert_eq!(
+            tree.lasting(1.5 * 120.0, 0.5),
+            [3],
+            "the root spans no range of dissimilarity"
+        );
     }
 }

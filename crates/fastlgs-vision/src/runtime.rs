@@ -1,4 +1,5 @@
-//! ONNX Runtime, loaded at run time from a shared library, or linked in (`--features download-ort`).
+//! Runs ONNX models. ONNX Runtime is loaded from a shared library, or linked in with the feature
+//! `download-ort`.
 
 use crate::{Error, Result, places};
 use half::f16;
@@ -10,19 +11,27 @@ use std::sync::Mutex;
 
 static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
 
-/// The process-wide environment, opened on first use.
+/// Returns the process-wide environment, and creates it on first use.
 fn environment() -> Result<Environment> {
     let mut slot = ENVIRONMENT.lock().expect("no panic while holding the lock");
     if let Some(environment) = slot.as_ref() {
         return Ok(environment.clone());
     }
     let library = places::runtime_library()?;
-    let failed = |e: &dyn std::fmt::Display| Error::Missing(format!("{}: ONNX Runtime cannot be loaded: {e}", library.display()));
+    let failed = |e: &dyn std::fmt::Display| {
+        Error::Missing(format!(
+            "{}: ONNX Runtime cannot be loaded: {e}",
+            library.display()
+        ))
+    };
     #[cfg(feature = "load-ort")]
     let builder = ort::init_from(&library).map_err(|e| failed(&e))?;
     #[cfg(not(feature = "load-ort"))]
     let builder = ort::init();
-    let environment = builder.with_name("fastlgs").build().map_err(|e| failed(&e))?;
+    let environment = builder
+        .with_name("fastlgs")
+        .build()
+        .map_err(|e| failed(&e))?;
     Ok(slot.insert(environment).clone())
 }
 
@@ -30,7 +39,7 @@ fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Values of a tensor with their shape, row-major. Whole numbers are held as floats, which is exact up to 2^24.
+/// A tensor: shape and row-major values. Integers are stored as floats, which is exact up to 2^24.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Array {
     /// Length of each dimension.
@@ -40,18 +49,21 @@ pub struct Array {
 }
 
 impl Array {
-    /// An array of `shape`.
+    /// Creates an array of `shape`; `values` are row-major.
     pub fn new(shape: impl Into<Vec<usize>>, values: Vec<f32>) -> Self {
-        Self { shape: shape.into(), values }
+        Self {
+            shape: shape.into(),
+            values,
+        }
     }
 }
 
-/// What a model takes under a name.
+/// An input of a model.
 #[derive(Clone, Debug)]
 pub struct Slot {
     /// Name of the input.
     pub name: String,
-    /// Length of each dimension; `None` where any is fine.
+    /// Length of each dimension; `None` if it is variable.
     pub shape: Vec<Option<usize>>,
     kind: TensorElementType,
 }
@@ -60,11 +72,11 @@ pub struct Slot {
 #[derive(Debug)]
 pub struct Model {
     name: String,
-    /// Its inputs.
+    /// Inputs of the model.
     pub inputs: Vec<Slot>,
-    /// Names of its outputs.
+    /// Names of the outputs.
     pub outputs: Vec<String>,
-    /// One, or one a core; whoever comes takes one that is free.
+    /// One session, or one per core. A run uses one that is free.
     sessions: Vec<Mutex<Session>>,
 }
 
@@ -72,13 +84,13 @@ impl Model {
     /// Loads an ONNX file; each run uses as many threads as the machine has cores.
     ///
     /// # Errors
-    /// When the file or ONNX Runtime is missing, or it is no model.
+    /// The file or ONNX Runtime is missing, or the file is not a valid model.
     pub fn load(path: &Path) -> Result<Self> {
         Self::with_sessions(path, 1, cores())
     }
 
-    /// Loads a small ONNX file once a core, for runs that are done at the same time on one thread each: what surrounds them then fills the cores
-    /// as well.
+    /// Loads a small ONNX file once per core, for parallel runs with one thread each. The code
+    /// around the runs then uses all cores as well.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -89,64 +101,117 @@ impl Model {
     fn with_sessions(path: &Path, count: usize, threads: usize) -> Result<Self> {
         let name = path.display().to_string();
         if !path.is_file() {
-            let mend = "'fastlgs models install-offline' gets the offline models, 'fastlgs models pull NAME' the others";
-            return Err(Error::Missing(format!("{name}: no such model; {mend}")));
+            let mend = "run 'fastlgs models install-offline' for the offline models, or 'fastlgs models pull NAME' for the others";
+            return Err(Error::Missing(format!(
+                "{name}: model file not found; {mend}"
+            )));
         }
-        let failed = |e: &dyn std::fmt::Display| Error::Inference { model: name.clone(), reason: e.to_string() };
+        let failed = |e: &dyn std::fmt::Display| Error::Inference {
+            model: name.clone(),
+            reason: e.to_string(),
+        };
         let environment = environment()?;
         let open = || -> Result<Session> {
-            let mut builder =
-                Session::builder(&environment).map_err(|e| failed(&e))?.with_intra_threads(threads).map_err(|e| failed(&e))?;
+            let mut builder = Session::builder(&environment)
+                .map_err(|e| failed(&e))?
+                .with_intra_threads(threads)
+                .map_err(|e| failed(&e))?;
             builder.commit_from_file(path).map_err(|e| failed(&e))
         };
         let sessions = (0..count).map(|_| open()).collect::<Result<Vec<_>>>()?;
         let session = &sessions[0];
         let slot = |outlet: &ort::value::Outlet| match outlet.dtype() {
             ValueType::Tensor { ty, shape, .. } => {
-                let shape = shape.iter().map(|d| usize::try_from(*d).ok().filter(|d| *d > 0)).collect();
-                Ok(Slot { name: outlet.name().to_owned(), shape, kind: *ty })
+                let shape = shape
+                    .iter()
+                    .map(|d| usize::try_from(*d).ok().filter(|d| *d > 0))
+                    .collect();
+                Ok(Slot {
+                    name: outlet.name().to_owned(),
+                    shape,
+                    kind: *ty,
+                })
             }
-            _ => Err(failed(&format!("its input '{}' is no tensor", outlet.name()))),
+            _ => Err(failed(&format!(
+                "its input '{}' is not a tensor",
+                outlet.name()
+            ))),
         };
-        let inputs = session.inputs().iter().map(slot).collect::<Result<Vec<_>>>()?;
-        let outputs = session.outputs().iter().map(|o| o.name().to_owned()).collect();
-        Ok(Self { inputs, outputs, sessions: sessions.into_iter().map(Mutex::new).collect(), name })
+        let inputs = session
+            .inputs()
+            .iter()
+            .map(slot)
+            .collect::<Result<Vec<_>>>()?;
+        let outputs = session
+            .outputs()
+            .iter()
+            .map(|o| o.name().to_owned())
+            .collect();
+        Ok(Self {
+            inputs,
+            outputs,
+            sessions: sessions.into_iter().map(Mutex::new).collect(),
+            name,
+        })
     }
 
-    /// The input of one of these names.
+    /// Returns the first input that has one of these names.
     pub fn input(&self, names: &[&str]) -> Option<&Slot> {
-        self.inputs.iter().find(|slot| names.contains(&slot.name.as_str()))
+        self.inputs
+            .iter()
+            .find(|slot| names.contains(&slot.name.as_str()))
     }
 
-    /// The output of one of these names, earlier names first.
+    /// Returns the output that has one of these names; earlier names take precedence.
     pub fn output(&self, names: &[&str]) -> Option<&str> {
-        names.iter().find_map(|name| self.outputs.iter().find(|o| o == name)).map(String::as_str)
+        names
+            .iter()
+            .find_map(|name| self.outputs.iter().find(|o| o == name))
+            .map(String::as_str)
     }
 
-    /// That this model cannot be used, and why.
+    /// Returns an error that names this model and the reason.
     pub fn refuse(&self, reason: impl Into<String>) -> Error {
-        Error::Inference { model: self.name.clone(), reason: reason.into() }
+        Error::Inference {
+            model: self.name.clone(),
+            reason: reason.into(),
+        }
     }
 
-    /// Runs on inputs, which are converted to the types that the model wants; returns the named outputs as floats.
+    /// Runs the model and returns the named outputs as floats. Inputs are converted to the element
+    /// types of the model.
     ///
     /// # Errors
-    /// When ONNX Runtime refuses, or a name or type is unknown.
+    /// An unknown name, an unsupported type, or an error of ONNX Runtime.
     pub fn run(&self, inputs: Vec<(&str, Array)>, outputs: &[&str]) -> Result<Vec<Array>> {
         let failed = |e: ort::Error| self.refuse(e.to_string());
         let mut values = Vec::new();
         for (name, array) in inputs {
-            let slot = self.input(&[name]).ok_or_else(|| self.refuse(format!("it has no input '{name}'")))?;
+            let slot = self
+                .input(&[name])
+                .ok_or_else(|| self.refuse(format!("it has no input '{name}'")))?;
             values.push((name.to_owned(), self.tensor(slot, array)?));
         }
-        let free = self.sessions.iter().find_map(|session| session.try_lock().ok());
-        let mut session = free.unwrap_or_else(|| self.sessions[0].lock().expect("no panic while holding the lock"));
+        let free = self
+            .sessions
+            .iter()
+            .find_map(|session| session.try_lock().ok());
+        let mut session = free.unwrap_or_else(|| {
+            self.sessions[0]
+                .lock()
+                .expect("no panic while holding the lock")
+        });
         let found = session.run(values).map_err(failed)?;
         let array = |name: &&str| {
-            let value = found.get(*name).ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;
+            let value = found
+                .get(*name)
+                .ok_or_else(|| self.refuse(format!("it has no output '{name}'")))?;
             let lengths = |shape: &[i64]| shape.iter().map(|d| *d as usize).collect::<Vec<_>>();
             if let Ok((shape, data)) = value.try_extract_tensor::<f16>() {
-                return Ok(Array::new(lengths(shape), data.iter().map(|v| v.to_f32()).collect()));
+                return Ok(Array::new(
+                    lengths(shape),
+                    data.iter().map(|v| v.to_f32()).collect(),
+                ));
             }
             let (shape, data) = value.try_extract_tensor::<f32>().map_err(failed)?;
             Ok(Array::new(lengths(shape), data.to_vec()))
@@ -157,19 +222,29 @@ impl Model {
     fn tensor(&self, slot: &Slot, Array { shape, values }: Array) -> Result<DynValue> {
         let value = match slot.kind {
             TensorElementType::Float32 => Tensor::from_array((shape, values)).map(Tensor::into_dyn),
-            TensorElementType::Float16 => {
-                Tensor::from_array((shape, values.iter().map(|v| f16::from_f32(*v)).collect::<Vec<_>>())).map(Tensor::into_dyn)
-            }
+            TensorElementType::Float16 => Tensor::from_array((
+                shape,
+                values.iter().map(|v| f16::from_f32(*v)).collect::<Vec<_>>(),
+            ))
+            .map(Tensor::into_dyn),
             TensorElementType::Int64 => {
-                Tensor::from_array((shape, values.iter().map(|v| *v as i64).collect::<Vec<_>>())).map(Tensor::into_dyn)
+                Tensor::from_array((shape, values.iter().map(|v| *v as i64).collect::<Vec<_>>()))
+                    .map(Tensor::into_dyn)
             }
             TensorElementType::Int32 => {
-                Tensor::from_array((shape, values.iter().map(|v| *v as i32).collect::<Vec<_>>())).map(Tensor::into_dyn)
+                Tensor::from_array((shape, values.iter().map(|v| *v as i32).collect::<Vec<_>>()))
+                    .map(Tensor::into_dyn)
             }
             TensorElementType::Uint8 => {
-                Tensor::from_array((shape, values.iter().map(|v| *v as u8).collect::<Vec<_>>())).map(Tensor::into_dyn)
+                Tensor::from_array((shape, values.iter().map(|v| *v as u8).collect::<Vec<_>>()))
+                    .map(Tensor::into_dyn)
             }
-            other => return Err(self.refuse(format!("its input '{}' has the type {other}, which is not supported", slot.name))),
+            other => {
+                return Err(self.refuse(format!(
+                    "its input '{}' has the type {other}, which is not supported",
+                    slot.name
+                )));
+            }
         };
         value.map_err(|e| self.refuse(e.to_string()))
     }

@@ -1,6 +1,8 @@
-//! Poses for photos that come without: structure from motion by COLMAP (Schoenberger & Frahm 2016). pycolmap, which `models install-offline`
-//! installs, places photos by key points that are found and matched here, all at once (GLOMAP, Pan et al. 2024) and one by one; an installed
-//! `colmap` program does everything by itself.
+//! Structure from motion with COLMAP (Schoenberger & Frahm 2016), for photos without poses.
+//!
+//! pycolmap, which `models install-offline` installs, computes poses from key points that are found
+//! and matched here. It runs both the global mapper (GLOMAP, Pan et al. 2024) and the incremental
+//! one. An installed `colmap` program runs all stages itself.
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
@@ -8,7 +10,7 @@ use crate::printed::lines;
 use crate::tracks::PairMatches;
 use crate::{Error, Result, places};
 use fastlgs_core::dataset::{self, colmap, is_photo};
-use fastlgs_core::image_io::WayUp;
+use fastlgs_core::image_io::OrientationRule;
 use fastlgs_core::{Camera, fs, image_io};
 use glam::Mat4;
 use rayon::prelude::*;
@@ -20,75 +22,112 @@ use std::process::{Command, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::Duration;
 
-/// One camera took all photos of a size; its lens has one radial term, which the photos then lose.
+/// COLMAP's camera model, with one radial distortion term. All photos of one size share a camera.
 const CAMERA_MODEL: &str = "SIMPLE_RADIAL";
-/// Up to so many photos each is matched with each.
+/// Largest number of photos for which all pairs are matched.
 const EXHAUSTIVE: usize = 120;
-/// Above, each is matched with so many that follow it, in the order of their names, and with those at distances of powers of two.
+/// With more photos, each is matched with this many that follow it by name, and with those at
+/// distances of powers of two.
 const FOLLOWING: usize = 12;
-/// And so many photos, spread over all, each with each: they close loops.
+/// In addition, all pairs of this many evenly spread photos are matched, to close loops.
 const SPREAD: usize = 40;
-/// Longer side of the photos on which key points are found.
+/// Largest longer side, in pixels, of the images for key point detection.
 const SIDE: u32 = 1000;
-/// Fewest matches of a pair that is verified.
+/// Smallest number of matches of a pair that is passed to COLMAP.
 const FEW: usize = 15;
 
 const RECONSTRUCT: &str = include_str!("../assets/reconstruct.py");
 
-/// What there is to run.
+/// Program that computes poses.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Tool {
-    /// A Python that has pycolmap.
+    /// Path of a Python interpreter with pycolmap.
     Pycolmap(PathBuf),
-    /// The program `colmap`.
+    /// Path of the program `colmap`.
     Colmap(PathBuf),
 }
 
 impl Tool {
-    /// The pycolmap that was installed with the offline models, else a `python3` that can import it, else `colmap` on the path; with
-    /// `program`, `colmap` alone.
+    /// Finds the tool: the pycolmap of the offline models, else a `python3` that can import it,
+    /// else `colmap` on the path. With `program`, only `colmap` is considered.
     ///
     /// # Errors
-    /// When there is none; the message says how to get one.
+    /// No tool is installed; the message says how to install one.
     pub fn find(program: bool) -> Result<Self> {
-        let folders: Vec<PathBuf> = std::env::var_os("PATH").map(|p| std::env::split_paths(&p).collect()).unwrap_or_default();
+        let folders: Vec<PathBuf> = std::env::var_os("PATH")
+            .map(|p| std::env::split_paths(&p).collect())
+            .unwrap_or_default();
         let on_path = |name: &str| folders.iter().map(|f| f.join(name)).find(|p| p.is_file());
-        let imports = |python: &PathBuf| Command::new(python).args(["-c", "import pycolmap"]).output().is_ok_and(|o| o.status.success());
-        let pythons = std::iter::once(places::poses_python()).chain(on_path("python3")).filter(|p| p.is_file() && !program);
+        let imports = |python: &PathBuf| {
+            Command::new(python)
+                .args(["-c", "import pycolmap"])
+                .output()
+                .is_ok_and(|o| o.status.success())
+        };
+        let pythons = std::iter::once(places::poses_python())
+            .chain(on_path("python3"))
+            .filter(|p| p.is_file() && !program);
         let pycolmap = pythons.into_iter().find(imports).map(Self::Pycolmap);
         pycolmap.or_else(|| on_path("colmap").map(Self::Colmap)).ok_or_else(|| {
             let mend =
-                "run 'fastlgs models install-offline', which installs pycolmap, or install COLMAP ('apt-get install colmap'), or add poses";
-            Error::Missing(format!("the photos have no poses, and nothing is there to find them: {mend}"))
+                "run 'fastlgs models install-offline', which installs pycolmap, or install COLMAP ('apt-get install colmap'), or provide poses with the photos";
+            Error::Missing(format!("the photos have no poses, and no program that computes poses is installed: {mend}"))
         })
     }
 }
 
-/// The photos in a folder, sorted by name.
+/// Returns the photos in a folder, sorted by name.
 ///
 /// # Errors
-/// When there are fewer than three; the message names what was not read.
+/// Fewer than three photos; the message names files that were not read.
 pub fn photos_in(images: &Path) -> Result<Vec<PathBuf>> {
     let entries = images.read_dir().map_err(fastlgs_core::Error::io(images))?;
-    let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_photo(p)).collect();
+    let mut files: Vec<PathBuf> = entries
+        .flatten()
+        .map(|e| e.path())
+        .filter(|p| is_photo(p))
+        .collect();
     files.sort();
     if files.len() < 3 {
         let folders = dataset::folders_within(images);
-        let below =
-            (!folders.is_empty()).then(|| format!("photos in folders within it are not read ({}): move them up", folders.join(", ")));
-        let why: String = dataset::passed_over(images).into_iter().chain(below).map(|reason| format!("; {reason}")).collect();
-        return Err(Error::Invalid(format!("{}: {} photos; poses need at least 3{why}", images.display(), files.len())));
+        let below = (!folders.is_empty()).then(|| {
+            format!(
+                "photos in subfolders are not read ({}): move them into this folder",
+                folders.join(", ")
+            )
+        });
+        let why: String = dataset::unreadable_images_warning(images)
+            .into_iter()
+            .chain(below)
+            .map(|reason| format!("; {reason}"))
+            .collect();
+        return Err(Error::Invalid(format!(
+            "{}: {} photos found; computing poses needs at least 3{why}",
+            images.display(),
+            files.len()
+        )));
     }
     Ok(files)
 }
 
-/// Finds the poses of photos of one folder. Returns the folder of the COLMAP model that explains most photos; it lies in the folder `work`,
-/// which is emptied first. `say` receives each stage and what the tool prints, at least once a second; it answers whether to continue.
+/// Computes the poses of the photos of one folder. Returns the folder of the largest COLMAP model.
+/// The result lies in the folder `work`, which is emptied first. `say` receives the stage and the
+/// latest output of the tool, at least once a second. It returns whether to continue.
 ///
 /// # Errors
-/// When the tool fails, no photo could be placed, or `say` ended it; what the tool said last is in the message.
-pub fn reconstruct(tool: &Tool, files: &[PathBuf], work: &Path, seed: u64, say: impl Fn(&str, &str) -> bool + Sync) -> Result<PathBuf> {
-    let images = files.first().and_then(|file| file.parent()).unwrap_or(Path::new("."));
+/// The tool fails, no photo could be placed, or `say` cancelled the work. The message contains the
+/// last output of the tool.
+pub fn reconstruct(
+    tool: &Tool,
+    files: &[PathBuf],
+    work: &Path,
+    seed: u64,
+    say: impl Fn(&str, &str) -> bool + Sync,
+) -> Result<PathBuf> {
+    let images = files
+        .first()
+        .and_then(|file| file.parent())
+        .unwrap_or(Path::new("."));
     let _ = std::fs::remove_dir_all(work);
     let models = work.join("sparse");
     std::fs::create_dir_all(&models).map_err(fastlgs_core::Error::io(&models))?;
@@ -101,18 +140,22 @@ pub fn reconstruct(tool: &Tool, files: &[PathBuf], work: &Path, seed: u64, say: 
     }
     largest_model(&models).ok_or_else(|| {
         let images = images.display();
-        Error::Invalid(format!("{images}: COLMAP could place no photo; are they sharp and do neighbours overlap?"))
+        Error::Invalid(format!("{images}: COLMAP could place no photo; check that the photos are sharp and that neighbouring photos overlap"))
     })
 }
 
-/// By pycolmap, from what was planned in the work folder.
+/// Runs pycolmap on the input files in the work folder.
 fn by_script(python: &Path, work: &Path, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let script = work.join("reconstruct.py");
     std::fs::write(&script, RECONSTRUCT).map_err(fastlgs_core::Error::io(&script))?;
-    run(Command::new(python).arg(&script).arg(work), "structure from motion", say)
+    run(
+        Command::new(python).arg(&script).arg(work),
+        "structure from motion",
+        say,
+    )
 }
 
-/// Everything by COLMAP's own stages.
+/// Runs all stages with the `colmap` program.
 fn by_program(
     program: &Path,
     images: &Path,
@@ -121,30 +164,52 @@ fn by_program(
     files: &[PathBuf],
     say: &impl Fn(&str, &str) -> bool,
 ) -> Result<()> {
-    let matcher = if files.len() <= EXHAUSTIVE { "exhaustive_matcher" } else { "sequential_matcher" };
-    // One camera for photos of several sizes, and COLMAP passes over all that are not like the first.
-    let sizes: BTreeSet<_> = files.iter().filter_map(|file| image_io::dimensions(file).ok()).collect();
+    let matcher = if files.len() <= EXHAUSTIVE {
+        "exhaustive_matcher"
+    } else {
+        "sequential_matcher"
+    };
+    // With a single camera, COLMAP skips photos whose size differs from that of the first.
+    let sizes: BTreeSet<_> = files
+        .iter()
+        .filter_map(|file| image_io::dimensions(file).ok())
+        .collect();
     let single = if sizes.len() <= 1 { "1" } else { "0" };
-    let one_camera = ["--ImageReader.single_camera", single, "--ImageReader.camera_model", CAMERA_MODEL];
-    let stages: [(&str, &str, &[&str]); 3] =
-        [("features", "feature_extractor", &one_camera), ("matches", matcher, &[]), ("mapping", "mapper", &[])];
+    let one_camera = [
+        "--ImageReader.single_camera",
+        single,
+        "--ImageReader.camera_model",
+        CAMERA_MODEL,
+    ];
+    let stages: [(&str, &str, &[&str]); 3] = [
+        ("features", "feature_extractor", &one_camera),
+        ("matches", matcher, &[]),
+        ("mapping", "mapper", &[]),
+    ];
     let list = work.join("photos.txt");
-    let names: String = files.iter().filter_map(|file| file.file_name()).map(|name| format!("{}\n", name.to_string_lossy())).collect();
+    let names: String = files
+        .iter()
+        .filter_map(|file| file.file_name())
+        .map(|name| format!("{}\n", name.to_string_lossy()))
+        .collect();
     std::fs::write(&list, names).map_err(fastlgs_core::Error::io(&list))?;
     for (stage, name, options) in stages {
         let mut command = Command::new(program);
-        command.arg(name).arg("--database_path").arg(work.join("database.db"));
+        command
+            .arg(name)
+            .arg("--database_path")
+            .arg(work.join("database.db"));
         if name != matcher {
             command.arg("--image_path").arg(images);
         }
         if name == "feature_extractor" {
-            // Else masks and other pictures below the folder would be photos.
+            // Without this list, COLMAP would read masks and other images in subfolders as photos.
             command.arg("--image_list_path").arg(&list);
         }
         if name == "mapper" {
             command.arg("--output_path").arg(models);
         }
-        // Without a display COLMAP must not ask for a graphics card; how it is told depends on its version.
+        // Without a display, COLMAP must not use a GPU. The option's name depends on its version.
         if let Some(option) = known_option(program, name, &USE_GPU) {
             command.args([option, "0"]);
         }
@@ -153,23 +218,39 @@ fn by_program(
     Ok(())
 }
 
-/// Options of COLMAP 3 and 4 that ask for a graphics card.
-const USE_GPU: [&str; 4] =
-    ["--SiftExtraction.use_gpu", "--FeatureExtraction.use_gpu", "--SiftMatching.use_gpu", "--FeatureMatching.use_gpu"];
+/// Options of COLMAP 3 and 4 that enable the GPU.
+const USE_GPU: [&str; 4] = [
+    "--SiftExtraction.use_gpu",
+    "--FeatureExtraction.use_gpu",
+    "--SiftMatching.use_gpu",
+    "--FeatureMatching.use_gpu",
+];
 
-/// The first of these options that the program's help for a stage names.
+/// Returns the first of these options that the program's help for a stage contains.
 fn known_option(program: &Path, stage: &str, options: &[&'static str]) -> Option<&'static str> {
-    let help = Command::new(program).args([stage, "--help"]).output().ok()?;
+    let help = Command::new(program)
+        .args([stage, "--help"])
+        .output()
+        .ok()?;
     let text = [help.stdout, help.stderr].concat();
     let text = String::from_utf8_lossy(&text);
     options.iter().copied().find(|option| text.contains(option))
 }
 
-/// Finds and matches key points, and leaves them in the work folder as `reconstruct.py` reads them.
-fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) -> bool + Sync)) -> Result<()> {
+/// Finds and matches key points, and writes the input files of `reconstruct.py` into the work
+/// folder.
+fn plan(
+    files: &[PathBuf],
+    work: &Path,
+    seed: u64,
+    say: &(impl Fn(&str, &str) -> bool + Sync),
+) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
-        going(say("features", &path.file_name().unwrap_or_default().to_string_lossy()))?;
-        let photo = image_io::load_photo(path, WayUp::Upright)?.pixels;
+        going(say(
+            "features",
+            &path.file_name().unwrap_or_default().to_string_lossy(),
+        ))?;
+        let photo = image_io::load_photo(path, OrientationRule::Upright)?.pixels;
         let scale = (f64::from(SIDE) / f64::from(photo.width().max(photo.height()))).min(1.0);
         let size = |n: u32| ((f64::from(n) * scale).round() as u32).max(1);
         let small = image_io::resize(&photo, size(photo.width()), size(photo.height()));
@@ -179,7 +260,12 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) ->
     let photos = files.par_iter().map(found).collect::<Result<Vec<_>>>()?;
     let points: Vec<&Keypoints> = photos.iter().map(|p| &p.2).collect();
     let pairs = matched(&points, say)?;
-    let name = |path: &PathBuf| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name = |path: &PathBuf| {
+        path.file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned()
+    };
     let image = |(path, (width, height, points)): (&PathBuf, &(u32, u32, Keypoints))| {
         let path_text = std::path::absolute(path).unwrap_or_else(|_| path.clone());
         json!({ "name": name(path), "path": path_text, "width": width, "height": height, "keypoints": points.positions.len() })
@@ -188,8 +274,15 @@ fn plan(files: &[PathBuf], work: &Path, seed: u64, say: &(impl Fn(&str, &str) ->
     write_plan(work, images, &points, &pairs, seed)
 }
 
-/// Leaves photos, key points and matches in the work folder as `reconstruct.py` reads them.
-fn write_plan(work: &Path, images: Vec<serde_json::Value>, points: &[&Keypoints], pairs: &[PairMatches], seed: u64) -> Result<()> {
+/// Writes photos, key points and matches into the work folder, in the format that `reconstruct.py`
+/// reads.
+fn write_plan(
+    work: &Path,
+    images: Vec<serde_json::Value>,
+    points: &[&Keypoints],
+    pairs: &[PairMatches],
+    seed: u64,
+) -> Result<()> {
     let plan = json!({
         "images": images,
         "pairs": pairs.iter().map(|m| json!({ "a": m.a, "b": m.b, "matches": m.pairs.len() })).collect::<Vec<_>>(),
@@ -197,17 +290,27 @@ fn write_plan(work: &Path, images: Vec<serde_json::Value>, points: &[&Keypoints]
         "camera_model": CAMERA_MODEL,
     });
     fs::write_json(&work.join("features.json"), &plan)?;
-    let points = points.iter().flat_map(|p| &p.positions).flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
-    let matched = pairs.iter().flat_map(|m| &m.pairs).flat_map(|(i, j)| [*i as u32, *j as u32]);
+    let points = points
+        .iter()
+        .flat_map(|p| &p.positions)
+        .flat_map(|p| [p.x.to_bits(), p.y.to_bits()]);
+    let matched = pairs
+        .iter()
+        .flat_map(|m| &m.pairs)
+        .flat_map(|(i, j)| [*i as u32, *j as u32]);
     let bytes: Vec<u8> = points.chain(matched).flat_map(u32::to_le_bytes).collect();
-    Ok(fs::write_atomic(&work.join("features.bin"), |file| file.write_all(&bytes))?)
+    Ok(fs::write_atomic(&work.join("features.bin"), |file| {
+        file.write_all(&bytes)
+    })?)
 }
 
-/// Poses of photos whose lenses are known, found anew by what their key points show, in a frame and a unit of their own; nothing for photos that
-/// could not be placed. `photos` are their files; in the folder `work`, which is emptied, the tool keeps what it needs.
+/// Computes new poses of photos with known intrinsics, from their key points. Returns a
+/// world-to-camera matrix per photo, or `None` for photos that could not be placed.
+/// Origin and scale of the poses are arbitrary. `photos` are the image files. The folder `work` is
+/// emptied first, and the tool stores its files there.
 ///
 /// # Errors
-/// When the tool fails, or `say` ended it.
+/// The tool fails, or `say` cancelled the work.
 pub fn placed_anew(
     python: &Path,
     photos: &[PathBuf],
@@ -228,30 +331,55 @@ pub fn placed_anew(
             "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
         })
     };
-    let images = photos.iter().zip(cameras).zip(points.iter().copied()).map(image).collect();
+    let images = photos
+        .iter()
+        .zip(cameras)
+        .zip(points.iter().copied())
+        .map(image)
+        .collect();
     write_plan(work, images, &points, &pairs, seed)?;
     by_script(python, work, &say)?;
-    // Rows of [R t], of the model that explains most.
+    // Rows of [R t] per photo, from the model with the most photos.
     let rows: Vec<Option<[[f32; 4]; 3]>> = fs::read_json(&work.join("poses.json"))?;
-    let pose = |[x, y, z]: [[f32; 4]; 3]| Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose();
+    let pose = |[x, y, z]: [[f32; 4]; 3]| {
+        Mat4::from_cols_array_2d(&[x, y, z, [0.0, 0.0, 0.0, 1.0]]).transpose()
+    };
     let found: Vec<Option<Mat4>> = rows.into_iter().map(|rows| rows.map(pose)).collect();
-    if found.len() == cameras.len() { Ok(found) } else { Err(Error::Invalid("structure from motion lost count of its photos".to_owned())) }
+    if found.len() == cameras.len() {
+        Ok(found)
+    } else {
+        Err(Error::Invalid(
+            "structure from motion returned poses for another number of photos".to_owned(),
+        ))
+    }
 }
 
-/// Matches of the photos' key points, where there are enough.
-fn matched(points: &[&Keypoints], say: &(impl Fn(&str, &str) -> bool + Sync)) -> Result<Vec<PairMatches>> {
+/// Matches the key points of photo pairs. Pairs with fewer than `FEW` matches are left out.
+fn matched(
+    points: &[&Keypoints],
+    say: &(impl Fn(&str, &str) -> bool + Sync),
+) -> Result<Vec<PairMatches>> {
     let of_pair = |(a, b): (usize, usize)| {
         going(say("matches", ""))?;
-        Ok(PairMatches { a, b, pairs: matches(points[a], points[b]) })
+        Ok(PairMatches {
+            a,
+            b,
+            pairs: matches(points[a], points[b]),
+        })
     };
-    let all = pairs(points.len()).into_par_iter().map(of_pair).collect::<Result<Vec<_>>>()?;
+    let all = pairs(points.len())
+        .into_par_iter()
+        .map(of_pair)
+        .collect::<Result<Vec<_>>>()?;
     Ok(all.into_iter().filter(|m| m.pairs.len() >= FEW).collect())
 }
 
-/// Which photos are matched, by their places in the order of names.
+/// Returns the pairs of photos to match, as indices in the order of names.
 fn pairs(count: usize) -> Vec<(usize, usize)> {
     if count <= EXHAUSTIVE {
-        return (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))).collect();
+        return (0..count)
+            .flat_map(|a| (a + 1..count).map(move |b| (a, b)))
+            .collect();
     }
     let mut pairs = BTreeSet::new();
     for a in 0..count {
@@ -259,32 +387,63 @@ fn pairs(count: usize) -> Vec<(usize, usize)> {
         pairs.extend(near.map(|d| (a, a + d)).filter(|p| p.1 < count));
     }
     let spread: Vec<usize> = (0..SPREAD).map(|k| k * count / SPREAD).collect();
-    pairs.extend(spread.iter().flat_map(|&a| spread.iter().filter(move |b| a < **b).map(move |&b| (a, b))));
+    pairs.extend(
+        spread
+            .iter()
+            .flat_map(|&a| spread.iter().filter(move |b| a < **b).map(move |&b| (a, b))),
+    );
     pairs.into_iter().collect()
 }
 
-/// COLMAP may leave several models: the one whose list of photos is longest counts.
+/// Returns the model with the largest `images.bin`. COLMAP may write several models.
 fn largest_model(models: &Path) -> Option<PathBuf> {
-    let folders = models.read_dir().ok()?.flatten().map(|e| e.path()).filter(|p| colmap::is_model(p));
-    folders.max_by_key(|p| (std::fs::metadata(p.join("images.bin")).map_or(0, |m| m.len()), std::cmp::Reverse(p.clone())))
+    let folders = models
+        .read_dir()
+        .ok()?
+        .flatten()
+        .map(|e| e.path())
+        .filter(|p| colmap::is_model(p));
+    folders.max_by_key(|p| {
+        (
+            std::fs::metadata(p.join("images.bin")).map_or(0, |m| m.len()),
+            std::cmp::Reverse(p.clone()),
+        )
+    })
 }
 
-/// An error where the search for poses was ended.
+/// Returns an error if the callback cancelled the search for poses.
 fn going(on: bool) -> Result<()> {
-    if on { Ok(()) } else { Err(Error::Invalid("the search for poses was ended".to_owned())) }
+    if on {
+        Ok(())
+    } else {
+        Err(Error::Invalid(
+            "the search for poses was cancelled".to_owned(),
+        ))
+    }
 }
 
-/// How long a tool may be silent before `say` is asked again whether to go on.
+/// Longest time between two calls of `say` while a tool prints nothing.
 const SILENT: Duration = Duration::from_secs(1);
 
-/// Runs one stage and passes on what it prints.
+/// Runs one stage and passes its output to `say`.
 fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let name = command.get_program().to_string_lossy().into_owned();
-    let failed = |reason: String| Error::Missing(format!("{name} failed while finding poses ({stage}): {reason}"));
+    let failed = |reason: String| {
+        Error::Missing(format!(
+            "{name} failed while finding poses ({stage}): {reason}"
+        ))
+    };
     going(say(stage, ""))?;
-    // Both streams are read, so that neither fills up and stops the tool.
-    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(|e| failed(e.to_string()))?;
-    let errors = child.stderr.take().map(|stream| std::thread::spawn(move || lines(stream).last()));
+    // Both streams are read, so that a full pipe does not block the tool.
+    let mut child = command
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .map_err(|e| failed(e.to_string()))?;
+    let errors = child
+        .stderr
+        .take()
+        .map(|stream| std::thread::spawn(move || lines(stream).last()));
     let (speaker, printed) = mpsc::channel();
     if let Some(stream) = child.stdout.take() {
         std::thread::spawn(move || lines(stream).try_for_each(|line| speaker.send(line)));
@@ -308,7 +467,11 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) ->
     }
     let status = child.wait().map_err(|e| failed(e.to_string()))?;
     let complaint = errors.and_then(|thread| thread.join().ok().flatten());
-    if status.success() { Ok(()) } else { Err(failed(complaint.unwrap_or(last))) }
+    if status.success() {
+        Ok(())
+    } else {
+        Err(failed(complaint.unwrap_or(last)))
+    }
 }
 
 #[cfg(all(test, unix))]
@@ -317,10 +480,17 @@ mod tests {
     use std::os::unix::fs::PermissionsExt;
     use std::sync::Mutex;
 
-    /// A stand-in for COLMAP: notes how it was called, and its mapper leaves two models.
+    /// Creates a fake `colmap` that logs its arguments and then runs `script`.
     fn stand_in(dir: &Path, script: &str) -> Tool {
         let path = dir.join("colmap");
-        std::fs::write(&path, format!("#!/bin/sh\necho \"$@\" >> {}/calls\n{script}", dir.display())).unwrap();
+        std::fs::write(
+            &path,
+            format!(
+                "#!/bin/sh\necho \"$@\" >> {}/calls\n{script}",
+                dir.display()
+            ),
+        )
+        .unwrap();
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o755)).unwrap();
         Tool::Colmap(path)
     }
@@ -345,16 +515,28 @@ mod tests {
         let photos = photos(dir.path(), 4);
         let stages = Mutex::new(Vec::new());
         let work = dir.path().join("work");
-        let model = reconstruct(&stand_in(dir.path(), MAPPER), &photos, &work, 0, |stage, _| {
-            stages.lock().unwrap().push(stage.to_owned());
-            true
-        })
+        let model = reconstruct(
+            &stand_in(dir.path(), MAPPER),
+            &photos,
+            &work,
+            0,
+            |stage, _| {
+                stages.lock().unwrap().push(stage.to_owned());
+                true
+            },
+        )
         .unwrap();
         stages.lock().unwrap().dedup();
         assert_eq!(*stages.lock().unwrap(), ["features", "matches", "mapping"]);
-        assert_eq!(std::fs::metadata(model.join("images.bin")).unwrap().len(), 11);
+        assert_eq!(
+            std::fs::metadata(model.join("images.bin")).unwrap().len(),
+            11
+        );
         let calls = std::fs::read_to_string(dir.path().join("calls")).unwrap();
-        assert!(calls.contains("exhaustive_matcher") && calls.contains("single_camera 1"), "{calls}");
+        assert!(
+            calls.contains("exhaustive_matcher") && calls.contains("single_camera 1"),
+            "{calls}"
+        );
         assert!(calls.contains("--SiftExtraction.use_gpu 0"), "{calls}");
     }
 
@@ -362,18 +544,40 @@ mod tests {
     fn failures_are_told_in_the_tools_words() {
         let dir = tempfile::tempdir().unwrap();
         let broken = stand_in(dir.path(), "echo 'cannot open display' >&2; exit 1");
-        let error = reconstruct(&broken, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| true).unwrap_err().to_string();
-        assert!(error.contains("cannot open display") && error.contains("features"), "{error}");
+        let error = reconstruct(
+            &broken,
+            &photos(dir.path(), 4),
+            &dir.path().join("work"),
+            0,
+            |_, _| true,
+        )
+        .unwrap_err()
+        .to_string();
+        assert!(
+            error.contains("cannot open display") && error.contains("features"),
+            "{error}"
+        );
         let nothing = stand_in(dir.path(), "exit 0");
         assert!(
-            reconstruct(&nothing, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| true)
-                .unwrap_err()
-                .to_string()
-                .contains("place no photo")
+            reconstruct(
+                &nothing,
+                &photos(dir.path(), 4),
+                &dir.path().join("work"),
+                0,
+                |_, _| true
+            )
+            .unwrap_err()
+            .to_string()
+            .contains("place no photo")
         );
         let few = tempfile::tempdir().unwrap();
         (0..2).for_each(|k| std::fs::write(few.path().join(format!("{k}.jpg")), b"").unwrap());
-        assert!(photos_in(few.path()).unwrap_err().to_string().contains("at least 3"));
+        assert!(
+            photos_in(few.path())
+                .unwrap_err()
+                .to_string()
+                .contains("at least 3")
+        );
     }
 
     #[test]
@@ -381,8 +585,15 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let asleep = stand_in(dir.path(), "[ \"$2\" = --help ] || exec sleep 600");
         let began = std::time::Instant::now();
-        let error = reconstruct(&asleep, &photos(dir.path(), 4), &dir.path().join("work"), 0, |_, _| began.elapsed() < SILENT).unwrap_err();
-        assert!(error.to_string().contains("ended"), "{error}");
+        let error = reconstruct(
+            &asleep,
+            &photos(dir.path(), 4),
+            &dir.path().join("work"),
+            0,
+            |_, _| began.elapsed() < SILENT,
+        )
+        .unwrap_err();
+        assert!(error.to_string().contains("cancelled"), "{error}");
         assert!(began.elapsed() < 10 * SILENT);
     }
 
@@ -390,8 +601,19 @@ mod tests {
     fn many_photos_are_matched_with_neighbours_and_across_loops() {
         assert_eq!(pairs(4), [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]);
         let many = pairs(300);
-        assert!(many.contains(&(10, 11)) && many.contains(&(10, 22)) && many.contains(&(10, 138)), "neighbours, and powers of two");
-        assert!(many.contains(&(0, 292)), "the first and the last of those that are spread");
-        assert!(many.len() < 20 * 300 + SPREAD * SPREAD / 2, "{} pairs of {}", many.len(), 300 * 299 / 2);
+        assert!(
+            many.contains(&(10, 11)) && many.contains(&(10, 22)) && many.contains(&(10, 138)),
+            "neighbours and distances of powers of two must be matched"
+        );
+        assert!(
+            many.contains(&(0, 292)),
+            "the first and the last of the spread photos must be matched"
+        );
+        assert!(
+            many.len() < 20 * 300 + SPREAD * SPREAD / 2,
+            "{} pairs of {}",
+            many.len(),
+            300 * 299 / 2
+        );
     }
 }

@@ -1,5 +1,8 @@
-//! Plane sweep (Collins 1996; depth maps merged as by Schoenberger et al. 2016): a point wherever photos with known poses agree on the
-//! depth of a patch, so that training starts with surfaces also between the key points.
+//! Plane sweep stereo: computes initial points from photos with known poses, so that training also
+//! starts with surfaces between key points.
+//!
+//! Depth maps as by Collins 1996, merged as by Schoenberger et al. 2016: a point needs a depth on
+//! which several photos agree.
 
 use crate::tracks::Track;
 use fastlgs_core::dataset::SfmPoint;
@@ -8,42 +11,46 @@ use glam::{Mat3, Vec2, Vec3};
 use image::RgbImage;
 use rayon::prelude::*;
 
-/// Longer side of the swept photos: one point a pixel of these is as dense as a start needs.
+/// Longer side of the swept photos, in pixels. One point per pixel of these is dense enough for
+/// initialisation.
 const SIDE: u32 = 240;
-/// Depths that are tried, uniform in 1 / depth.
+/// Number of depth planes, uniform in 1 / depth.
 const PLANES: usize = 96;
-/// Photos that each is compared with.
+/// Number of neighbours that each photo is compared with.
 const NEIGHBOURS: usize = 4;
-/// Angles, in degrees, under which a neighbour may see what a photo sees: less tells no depth, more leaves of most patches nothing that is alike. The
-/// nearest come first, so that wide ones count where photos are few: at 30 degrees, twelve photos of the generated table gave 489 points, and now 3,362.
+/// Allowed parallax of a neighbour, in degrees. Smaller angles do not determine depth; at larger
+/// ones most patches look different. Neighbours with the smallest parallax are taken first, so
+/// large angles matter only if photos are few.
 const PARALLAX: [f32; 2] = [2.0, 60.0];
-/// Half the side of a patch.
+/// Radius of a patch in pixels; its side is 2 * HALF + 1.
 const HALF: usize = 3;
-/// Correlation from which a patch is recognised.
+/// Smallest correlation of an accepted depth.
 const ALIKE: f32 = 0.7;
-/// By how much it has to exceed that at any other depth.
+/// Smallest difference between the best correlation and that at any other depth.
 const UNIQUE: f32 = 0.05;
-/// Planes around the best that are the same depth still.
+/// Planes up to this distance from the best one count as the same depth.
 const NEAR: usize = 3;
-/// Least deviation of a patch's grey values, of 255: less is noise.
+/// Smallest standard deviation of a patch, in grey values of 255. Smaller ones are noise.
 const TEXTURE: f32 = 3.0;
-/// Other photos that have to find the same depth, within a pixel.
+/// Number of other photos that must find the same depth, within one pixel.
 const WITNESSES: usize = 2;
-/// A point speaks for the pixels around it up to this distance, where these lie as deep but for this share.
+/// A point replaces other points within `SPACING` pixels if their relative depth difference is
+/// below `SAME_DEPTH`.
 const SPACING: usize = 1;
 const SAME_DEPTH: f32 = 0.05;
-/// Fewest tracks of a photo that tell between which depths to look.
+/// Smallest number of tracks that determine the depth range of a photo.
 const FEW: usize = 10;
-/// Share of the tracks' nearest and farthest depths that is not trusted, and how much room is left beyond the others.
+/// Share of the nearest and farthest track depths that is ignored, and the factor by which the
+/// remaining range is extended.
 const OUTLIERS: f32 = 0.02;
 const ROOM: f32 = 1.3;
 
-/// A swept photo.
+/// A swept photo: grey values 0 to 255, colours and camera at reduced size.
 struct View {
     camera: Camera,
     grey: Vec<f32>,
     color: RgbImage,
-    /// Nearest and farthest depth.
+    /// Nearest and farthest depth, in scene units; `None` without tracks.
     bounds: Option<[f32; 2]>,
 }
 
@@ -56,18 +63,24 @@ impl View {
         self.camera.height as usize
     }
 
-    /// The world's point at a depth before the middle of a pixel.
+    /// Returns the world position at a depth along the ray through a pixel's centre.
     fn point(&self, pixel: usize, depth: f32) -> Vec3 {
-        let middle = Vec2::new((pixel % self.width()) as f32 + 0.5, (pixel / self.width()) as f32 + 0.5);
-        self.camera.world_to_camera.inverse().transform_point3(self.camera.ray(middle) * depth)
+        let middle = Vec2::new(
+            (pixel % self.width()) as f32 + 0.5,
+            (pixel / self.width()) as f32 + 0.5,
+        );
+        self.camera
+            .world_to_camera
+            .inverse()
+            .transform_point3(self.camera.ray(middle) * depth)
     }
 }
 
-/// Points of the surfaces that the photos of `cameras` agree on; `tracks` tell between which depths to look. `advance` is called after
-/// each photo.
+/// Returns surface points on which the photos of `cameras` agree. `tracks` determine the depth
+/// range of each photo. `advance` is called after each photo.
 ///
 /// # Errors
-/// What `photo` fails with, and what `advance` returns.
+/// Errors of `photo` and of `advance`.
 pub fn points<E: Send>(
     cameras: &[Camera],
     tracks: &[Track],
@@ -78,10 +91,22 @@ pub fn points<E: Send>(
     let view = |(camera, bounds): (&Camera, Option<[f32; 2]>)| {
         let camera = &camera.shrunk_to(SIDE);
         let color = image_io::resize(&photo(camera)?, camera.width, camera.height);
-        let grey = color.pixels().map(|p| 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2])).collect();
-        Ok(View { camera: camera.clone(), grey, color, bounds })
+        let grey = color
+            .pixels()
+            .map(|p| 0.299 * f32::from(p[0]) + 0.587 * f32::from(p[1]) + 0.114 * f32::from(p[2]))
+            .collect();
+        Ok(View {
+            camera: camera.clone(),
+            grey,
+            color,
+            bounds,
+        })
     };
-    let views: Vec<View> = cameras.par_iter().zip(bounds).map(view).collect::<Result<_, E>>()?;
+    let views: Vec<View> = cameras
+        .par_iter()
+        .zip(bounds)
+        .map(view)
+        .collect::<Result<_, E>>()?;
     let neighbours: Vec<Vec<usize>> = (0..views.len()).map(|v| neighbours(&views, v)).collect();
     let depths = (0..views.len()).into_par_iter().map(|v| {
         let depths = depths(&views, v, &neighbours[v]);
@@ -91,14 +116,24 @@ pub fn points<E: Send>(
     Ok(merged(&views, &neighbours, &depths))
 }
 
-/// Between which depths each camera sees tracks; where it sees too few, between which it would see all.
+/// Returns the depth range of each camera from its tracks. With too few of its own, it uses all
+/// tracks in front of the camera.
 fn bounds(cameras: &[Camera], tracks: &[Track]) -> Vec<Option<[f32; 2]>> {
     let mut own: Vec<Vec<f32>> = vec![Vec::new(); cameras.len()];
     let depth = |view: usize, p: Vec3| cameras[view].world_to_camera.transform_point3(p).z;
     for track in tracks {
-        track.seen.iter().for_each(|&(view, _)| own[view].push(depth(view, track.position)));
+        track
+            .seen
+            .iter()
+            .for_each(|&(view, _)| own[view].push(depth(view, track.position)));
     }
-    let all = |view: usize| tracks.iter().map(|t| depth(view, t.position)).filter(|z| *z > 0.0).collect::<Vec<_>>();
+    let all = |view: usize| {
+        tracks
+            .iter()
+            .map(|t| depth(view, t.position))
+            .filter(|z| *z > 0.0)
+            .collect::<Vec<_>>()
+    };
     let of = |(view, mut depths): (usize, Vec<f32>)| {
         if depths.len() < FEW {
             depths = all(view);
@@ -111,52 +146,87 @@ fn bounds(cameras: &[Camera], tracks: &[Track]) -> Vec<Option<[f32; 2]>> {
     own.into_iter().enumerate().map(of).collect()
 }
 
-/// The nearest photos from which a view's middle is seen under a telling angle.
+/// Returns the neighbours of a view, sorted by parallax at the centre of its depth range.
+/// Neighbours outside `PARALLAX` are left out.
 fn neighbours(views: &[View], view: usize) -> Vec<usize> {
     let own = &views[view];
-    let Some([near, far]) = own.bounds else { return Vec::new() };
+    let Some([near, far]) = own.bounds else {
+        return Vec::new();
+    };
     let middle = own.camera.centre() + own.camera.forward() * (near * far).sqrt();
-    let angle = |other: &View| (own.camera.centre() - middle).angle_between(other.camera.centre() - middle).to_degrees();
-    let turned = |other: &View| own.camera.forward().angle_between(other.camera.forward()).to_degrees();
+    let angle = |other: &View| {
+        (own.camera.centre() - middle)
+            .angle_between(other.camera.centre() - middle)
+            .to_degrees()
+    };
+    let turned = |other: &View| {
+        own.camera
+            .forward()
+            .angle_between(other.camera.forward())
+            .to_degrees()
+    };
     let telling = |&(_, angle): &(usize, f32)| (PARALLAX[0]..PARALLAX[1]).contains(&angle);
     let others = (0..views.len()).filter(|&v| v != view && turned(&views[v]) < PARALLAX[1]);
-    let mut others: Vec<(usize, f32)> = others.map(|v| (v, angle(&views[v]))).filter(telling).collect();
+    let mut others: Vec<(usize, f32)> = others
+        .map(|v| (v, angle(&views[v])))
+        .filter(telling)
+        .collect();
     others.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
     others.into_iter().take(NEIGHBOURS).map(|o| o.0).collect()
 }
 
-/// Depth of each pixel where the patch around it is found in the neighbours at one depth alone; else 0.
+/// Returns the depth of each pixel whose patch is found in the neighbours at exactly one depth; 0
+/// for other pixels.
 fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
     let own = &views[view];
     let (w, h) = (own.width(), own.height());
     let mut out = vec![0.0; w * h];
-    let (Some([near, far]), true) = (own.bounds, neighbours.len() >= WITNESSES) else { return out };
+    let (Some([near, far]), true) = (own.bounds, neighbours.len() >= WITNESSES) else {
+        return out;
+    };
     let inverse = |plane: f32| 1.0 / far + (1.0 / near - 1.0 / far) * plane / (PLANES - 1) as f32;
     let patches = Patches::of(&own.grey, w, h);
     let mut work = Work::new(w * h);
-    // [plane][pixel]: the mean of the two neighbours that see a patch best, as others may not see it at all.
+    // `[plane][pixel]`: mean of the two best neighbours. The others may be occluded.
     let mut scores = vec![-1.0f32; PLANES * w * h];
     for (plane, scores) in scores.chunks_exact_mut(w * h).enumerate() {
         let mut second = vec![-1.0f32; w * h];
         for &other in neighbours {
-            warp(own, &views[other], 1.0 / inverse(plane as f32), &mut work.warped);
+            warp(
+                own,
+                &views[other],
+                1.0 / inverse(plane as f32),
+                &mut work.warped,
+            );
             correlate(&own.grey, &patches, w, h, &mut work);
             for ((best, second), score) in scores.iter_mut().zip(&mut second).zip(&work.score) {
                 *second = second.max(score.min(*best));
                 *best = best.max(*score);
             }
         }
-        scores.iter_mut().zip(second).for_each(|(best, second)| *best = 0.5 * (*best + second));
+        scores
+            .iter_mut()
+            .zip(second)
+            .for_each(|(best, second)| *best = 0.5 * (*best + second));
     }
     for (pixel, depth) in out.iter_mut().enumerate() {
         let score = |plane: usize| scores[plane * w * h + pixel];
-        let best = (0..PLANES).max_by(|a, b| score(*a).total_cmp(&score(*b))).unwrap_or(0);
-        let elsewhere = (0..PLANES).filter(|p| p.abs_diff(best) > NEAR).map(score).fold(-1.0, f32::max);
-        if best == 0 || best == PLANES - 1 || score(best) < ALIKE || score(best) - elsewhere < UNIQUE || patches.deviation[pixel] < TEXTURE
+        let best = (0..PLANES)
+            .max_by(|a, b| score(*a).total_cmp(&score(*b)))
+            .unwrap_or(0);
+        let elsewhere = (0..PLANES)
+            .filter(|p| p.abs_diff(best) > NEAR)
+            .map(score)
+            .fold(-1.0, f32::max);
+        if best == 0
+            || best == PLANES - 1
+            || score(best) < ALIKE
+            || score(best) - elsewhere < UNIQUE
+            || patches.deviation[pixel] < TEXTURE
         {
             continue;
         }
-        // The top of the parabola through three planes.
+        // Vertex of the parabola through the scores of three planes.
         let [before, top, after] = [score(best - 1), score(best), score(best + 1)];
         let shift = 0.5 * (before - after) / (before - 2.0 * top + after).min(-1e-6);
         *depth = 1.0 / inverse(best as f32 + shift.clamp(-0.5, 0.5));
@@ -164,7 +234,7 @@ fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
     out
 }
 
-/// Means and deviations of the patches of a photo.
+/// Mean and standard deviation of the patch around each pixel.
 struct Patches {
     mean: Vec<f32>,
     deviation: Vec<f32>,
@@ -176,14 +246,21 @@ impl Patches {
         work.warped.copy_from_slice(grey);
         let (mut mean, mut square) = (vec![0.0; grey.len()], vec![0.0; grey.len()]);
         boxed(&work.warped, w, h, &mut work.rows, &mut mean);
-        work.product.iter_mut().zip(grey).for_each(|(p, g)| *p = g * g);
+        work.product
+            .iter_mut()
+            .zip(grey)
+            .for_each(|(p, g)| *p = g * g);
         boxed(&work.product, w, h, &mut work.rows, &mut square);
-        let deviation = mean.iter().zip(&square).map(|(m, s)| (s - m * m).max(0.0).sqrt()).collect();
+        let deviation = mean
+            .iter()
+            .zip(&square)
+            .map(|(m, s)| (s - m * m).max(0.0).sqrt())
+            .collect();
         Self { mean, deviation }
     }
 }
 
-/// Planes that are used again and again.
+/// Reusable buffers, one value per pixel.
 struct Work {
     warped: Vec<f32>,
     product: Vec<f32>,
@@ -197,15 +274,26 @@ struct Work {
 impl Work {
     fn new(pixels: usize) -> Self {
         let plane = || vec![0.0; pixels];
-        Self { warped: plane(), product: plane(), rows: plane(), mean: plane(), square: plane(), cross: plane(), score: plane() }
+        Self {
+            warped: plane(),
+            product: plane(),
+            rows: plane(),
+            mean: plane(),
+            square: plane(),
+            cross: plane(),
+            score: plane(),
+        }
     }
 }
 
-/// What `other` shows at a depth before each pixel of `own`; not a number outside.
+/// Warps `other` into `own` for a plane at `depth`: grey values, NaN outside of `other`.
 fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
     let relative = other.camera.world_to_camera * own.camera.world_to_camera.inverse();
-    // A ray r (z = 1) of own, at this depth, is seen along R r + t / depth.
-    let (turn, shift) = (Mat3::from_mat4(relative), relative.w_axis.truncate() / depth);
+    // A ray r (z = 1) of `own` at this depth has the direction R r + t / depth in `other`.
+    let (turn, shift) = (
+        Mat3::from_mat4(relative),
+        relative.w_axis.truncate() / depth,
+    );
     let (w, h) = (other.width(), other.height());
     let step = turn * (own.camera.ray(Vec2::new(1.0, 0.0)) - own.camera.ray(Vec2::ZERO));
     for (y, row) in out.chunks_exact_mut(own.width()).enumerate() {
@@ -213,7 +301,11 @@ fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
         for (x, value) in row.iter_mut().enumerate() {
             let q = first + x as f32 * step;
             let p = other.camera.to_pixel(q) - 0.5;
-            let inside = q.z > 0.0 && p.x >= 0.0 && p.y >= 0.0 && p.x < (w - 1) as f32 && p.y < (h - 1) as f32;
+            let inside = q.z > 0.0
+                && p.x >= 0.0
+                && p.y >= 0.0
+                && p.x < (w - 1) as f32
+                && p.y < (h - 1) as f32;
             if !inside {
                 *value = f32::NAN;
                 continue;
@@ -221,33 +313,54 @@ fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
             let (x0, y0) = (p.x as usize, p.y as usize);
             let (u, v) = (p.x - x0 as f32, p.y - y0 as f32);
             let at = y0 * w + x0;
-            let [a, b, c, d] = [other.grey[at], other.grey[at + 1], other.grey[at + w], other.grey[at + w + 1]];
+            let [a, b, c, d] = [
+                other.grey[at],
+                other.grey[at + 1],
+                other.grey[at + w],
+                other.grey[at + w + 1],
+            ];
             *value = (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v;
         }
     }
 }
 
 vectorised! {
-    /// Correlation of each patch of `grey` with that of `work.warped` into `work.score`: 1 where they are alike, -1 where one is cut off.
+    /// Writes the normalised correlation of each patch of `grey` and `work.warped` into
+    /// `work.score`: 1 if they are equal, -1 if a patch is cut off.
     fn correlate(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Work) = correlate_body
 }
 
 #[inline(always)]
-fn correlate_body<const FMA: bool>(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Work) {
+fn correlate_body<const FMA: bool>(
+    grey: &[f32],
+    patches: &Patches,
+    w: usize,
+    h: usize,
+    work: &mut Work,
+) {
     boxed(&work.warped, w, h, &mut work.rows, &mut work.mean);
-    work.product.iter_mut().zip(&work.warped).for_each(|(p, v)| *p = v * v);
+    work.product
+        .iter_mut()
+        .zip(&work.warped)
+        .for_each(|(p, v)| *p = v * v);
     boxed(&work.product, w, h, &mut work.rows, &mut work.square);
-    work.product.iter_mut().zip(&work.warped).zip(grey).for_each(|((p, v), g)| *p = v * g);
+    work.product
+        .iter_mut()
+        .zip(&work.warped)
+        .zip(grey)
+        .for_each(|((p, v), g)| *p = v * g);
     boxed(&work.product, w, h, &mut work.rows, &mut work.cross);
     for p in 0..w * h {
         let covariance = work.cross[p] - work.mean[p] * patches.mean[p];
-        let deviation = (work.square[p] - work.mean[p] * work.mean[p]).max(0.25).sqrt();
+        let deviation = (work.square[p] - work.mean[p] * work.mean[p])
+            .max(0.25)
+            .sqrt();
         let score = covariance / (deviation * patches.deviation[p].max(0.5));
         work.score[p] = if score.is_nan() { -1.0 } else { score };
     }
 }
 
-/// Means over patches; not a number where a patch is cut off.
+/// Computes the mean over each patch; NaN if the patch is cut off.
 #[inline(always)]
 fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
     const SIDES: usize = 2 * HALF + 1;
@@ -272,7 +385,8 @@ fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
     }
 }
 
-/// One point for what several depth maps agree on, and none for what is seen again from elsewhere or beside it.
+/// Returns one point for each surface position on which several depth maps agree. Pixels that a
+/// point covers, in any view, create no further point.
 fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec<SfmPoint> {
     let mut used: Vec<Vec<bool>> = depths.iter().map(|d| vec![false; d.len()]).collect();
     let mut out = Vec::new();
@@ -284,11 +398,19 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
             let point = view.point(pixel, depths[v][pixel]);
             let (mut sum, mut seen_by) = (point, vec![v as u32]);
             for &other in &neighbours[v] {
-                let Some((there, _)) = views[other].camera.see(point) else { continue };
+                let Some((there, _)) = views[other].camera.pixel_and_depth(point) else {
+                    continue;
+                };
                 let seen = views[other].point(there, depths[other][there]);
-                let apart = (pixel as isize - view.camera.see(seen).map_or(-1, |s| s.0 as isize)).unsigned_abs();
-                // The same pixel, or one that touches it.
-                let touches = [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
+                let apart = (pixel as isize
+                    - view
+                        .camera
+                        .pixel_and_depth(seen)
+                        .map_or(-1, |s| s.0 as isize))
+                .unsigned_abs();
+                // The same pixel, or an adjacent one.
+                let touches =
+                    [0, 1, view.width() - 1, view.width(), view.width() + 1].contains(&apart);
                 if depths[other][there] > 0.0 && touches {
                     sum += seen;
                     seen_by.push(other as u32);
@@ -296,18 +418,32 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
             }
             if seen_by.len() > WITNESSES {
                 let position = sum / seen_by.len() as f32;
-                let color = view.color.get_pixel((pixel % view.width()) as u32, (pixel / view.width()) as u32).0;
-                out.push(SfmPoint { position, color, seen_by });
-                views.iter().zip(depths).zip(&mut used).for_each(|((view, depths), used)| cover(view, depths, position, used));
+                let color = view
+                    .color
+                    .get_pixel((pixel % view.width()) as u32, (pixel / view.width()) as u32)
+                    .0;
+                out.push(SfmPoint {
+                    position,
+                    color,
+                    seen_by,
+                });
+                views
+                    .iter()
+                    .zip(depths)
+                    .zip(&mut used)
+                    .for_each(|((view, depths), used)| cover(view, depths, position, used));
             }
         }
     }
     out
 }
 
-/// Marks the pixels around a point that lie about as deep as it: a point a pixel would be denser than a start needs.
+/// Marks the pixels around a point that have about its depth. One point per pixel would be denser
+/// than needed.
 fn cover(view: &View, depths: &[f32], point: Vec3, used: &mut [bool]) {
-    let Some((pixel, depth)) = view.camera.see(point) else { return };
+    let Some((pixel, depth)) = view.camera.pixel_and_depth(point) else {
+        return;
+    };
     let (x, y) = (pixel % view.width(), pixel / view.width());
     for y in y.saturating_sub(SPACING)..(y + SPACING + 1).min(view.height()) {
         for x in x.saturating_sub(SPACING)..(x + SPACING + 1).min(view.width()) {
@@ -321,15 +457,19 @@ fn cover(view: &View, depths: &[f32], point: Vec3, used: &mut [bool]) {
 mod tests {
     use super::*;
 
-    /// Grey of a point of a wall: waves of several lengths.
+    /// Grey value at a point of a textured wall: waves of several lengths.
     fn texture(p: Vec3) -> f32 {
-        let wave = |k: f32| (k * p.x + 0.7 * k * p.y).sin() * (0.6 * k * p.y - 0.3 * k * p.x + k).cos();
+        let wave =
+            |k: f32| (k * p.x + 0.7 * k * p.y).sin() * (0.6 * k * p.y - 0.3 * k * p.x + k).cos();
         127.0 + 40.0 * wave(7.0) + 30.0 * wave(19.0) + 25.0 * wave(41.0)
     }
 
-    /// A photo of the wall z = 0, of which the part right of x = 1 is bare.
+    /// Renders a photo of the wall z = 0. It has no texture where x > 1.
     fn photo(camera: &Camera) -> RgbImage {
-        let (eye, turn) = (camera.centre(), Mat3::from_mat4(camera.world_to_camera).transpose());
+        let (eye, turn) = (
+            camera.centre(),
+            Mat3::from_mat4(camera.world_to_camera).transpose(),
+        );
         RgbImage::from_fn(camera.width, camera.height, |x, y| {
             let ray = turn * camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5));
             let p = eye - ray * (eye.z / ray.z);
@@ -341,28 +481,50 @@ mod tests {
     #[test]
     fn a_wall_is_found_where_it_has_texture() {
         let eye = |k: usize| Vec3::new(-1.0 + 0.5 * k as f32, 0.3, 4.0);
-        let cameras: Vec<Camera> = (0..5).map(|k| Camera::look_at(&k.to_string(), eye(k), Vec3::ZERO, Vec3::Y, 160, 120, 0.8)).collect();
-        // Tracks tell no more than about how far the wall is.
-        let track =
-            |k: usize| Track { seen: (0..5).map(|v| (v, k)).collect(), position: Vec3::new(0.1 * k as f32 - 1.0, 0.0, 0.0), error: 0.5 };
+        let cameras: Vec<Camera> = (0..5)
+            .map(|k| Camera::look_at(&k.to_string(), eye(k), Vec3::ZERO, Vec3::Y, 160, 120, 0.8))
+            .collect();
+        // The tracks only determine the depth range.
+        let track = |k: usize| Track {
+            seen: (0..5).map(|v| (v, k)).collect(),
+            position: Vec3::new(0.1 * k as f32 - 1.0, 0.0, 0.0),
+            error: 0.5,
+        };
         let tracks: Vec<Track> = (0..20).map(track).collect();
         let found = points(&cameras, &tracks, |c| Ok::<_, ()>(photo(c)), || Ok(())).unwrap();
         assert!(found.len() > 1000, "{} points", found.len());
         let near = found.iter().filter(|p| p.position.z.abs() < 0.05).count();
-        assert!(near as f32 > 0.98 * found.len() as f32, "{near} of {} points lie on the wall", found.len());
+        assert!(
+            near as f32 > 0.98 * found.len() as f32,
+            "{near} of {} points lie on the wall",
+            found.len()
+        );
         let bare = found.iter().filter(|p| p.position.x > 1.1).count();
-        assert!(bare < found.len() / 50, "{bare} points where there is nothing to see");
+        assert!(
+            bare < found.len() / 50,
+            "{bare} points on the part without texture"
+        );
         let shows = |p: &SfmPoint, view: u32| {
             let camera = &cameras[view as usize];
             let pixel = camera.to_pixel(camera.world_to_camera.transform_point3(p.position));
             (0.0..160.0).contains(&pixel.x) && (0.0..120.0).contains(&pixel.y)
         };
-        assert!(found.iter().all(|p| p.seen_by.len() > WITNESSES && p.seen_by.iter().all(|view| shows(p, *view))), "who agreed sees it");
-        let right = |p: &&SfmPoint| (f32::from(p.color[0]) - texture(p.position)).abs() < 25.0;
-        assert!(found.iter().filter(right).count() as f32 > 0.95 * found.len() as f32, "points have the wall's colours");
         assert!(
-            points(&cameras, &[], |c| Ok::<_, ()>(photo(c)), || Ok(())).unwrap().is_empty(),
-            "without tracks nothing tells where to look"
+            found.iter().all(
+                |p| p.seen_by.len() > WITNESSES && p.seen_by.iter().all(|view| shows(p, *view))
+            ),
+            "each photo in seen_by must see the point"
+        );
+        let right = |p: &&SfmPoint| (f32::from(p.color[0]) - texture(p.position)).abs() < 25.0;
+        assert!(
+            found.iter().filter(right).count() as f32 > 0.95 * found.len() as f32,
+            "points must have the colours of the wall"
+        );
+        assert!(
+            points(&cameras, &[], |c| Ok::<_, ()>(photo(c)), || Ok(()))
+                .unwrap()
+                .is_empty(),
+            "without tracks there is no depth range and no point"
         );
     }
 }

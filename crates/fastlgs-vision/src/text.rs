@@ -1,4 +1,4 @@
-//! The offline text tower: all-MiniLM-L6-v2.
+//! The offline text encoder: all-MiniLM-L6-v2.
 
 use crate::appearance;
 use crate::attributes;
@@ -9,21 +9,23 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use tokenizers::Tokenizer;
 
-/// Longest text in tokens.
+/// Largest length of a text in tokens; longer texts are truncated.
 const MAX_TOKENS: usize = 128;
-/// Texts that are remembered: six megabytes.
+/// Largest number of cached embeddings: 6 MB.
 const REMEMBERED: usize = 4096;
 
 /// all-MiniLM-L6-v2 (mean pooling, 384 dimensions).
 pub struct MiniLm {
     model: Model,
     tokenizer: Tokenizer,
-    /// What texts mean that were asked for alone. In company they may differ in the last digit, and no answer should hang on what was asked before.
+    /// Cache of embeddings that were computed alone. In a batch, an embedding may differ in the
+    /// last digit, and results must not depend on earlier queries.
     known: Mutex<HashMap<String, Vec<f32>>>,
 }
 
 impl MiniLm {
-    /// That of this process, loaded by whoever asks first: scenes that are opened one after the other share it with what it remembers.
+    /// Returns the encoder of this process, and loads it on first use. All scenes of the process
+    /// share it and its cache.
     ///
     /// # Errors
     /// As [`Self::load`].
@@ -36,19 +38,29 @@ impl MiniLm {
         Ok(shared.insert(Arc::new(Self::load()?)).clone())
     }
 
-    /// Loads it from the cache folder.
+    /// Loads the encoder from the cache folder.
     ///
     /// # Errors
-    /// When it is not installed.
+    /// A file that is missing or invalid.
     pub fn load() -> Result<Self> {
         let folder = places::offline_dir();
         let model = Model::load(&folder.join("text.onnx"))?;
         let path = folder.join("tokenizer.json");
-        let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;
+        let mut tokenizer = Tokenizer::from_file(&path)
+            .map_err(|e| Error::Missing(format!("{}: {e}", path.display())))?;
         tokenizer.with_padding(None);
-        let truncation = tokenizers::TruncationParams { max_length: MAX_TOKENS, ..Default::default() };
-        tokenizer.with_truncation(Some(truncation)).map_err(|e| Error::Invalid(format!("{}: {e}", path.display())))?;
-        Ok(Self { model, tokenizer, known: Mutex::default() })
+        let truncation = tokenizers::TruncationParams {
+            max_length: MAX_TOKENS,
+            ..Default::default()
+        };
+        tokenizer
+            .with_truncation(Some(truncation))
+            .map_err(|e| Error::Invalid(format!("{}: {e}", path.display())))?;
+        Ok(Self {
+            model,
+            tokenizer,
+            known: Mutex::default(),
+        })
     }
 }
 
@@ -74,9 +86,17 @@ impl TextEncoder for MiniLm {
                 mask.extend((0..length).map(|k| f32::from(u8::from(k < row.len()))));
             }
             let shape = [batch.len(), length];
-            let inputs = vec![("ids", Array::new(shape, ids)), ("mask", Array::new(shape, mask))];
+            let inputs = vec![
+                ("ids", Array::new(shape, ids)),
+                ("mask", Array::new(shape, mask)),
+            ];
             let embeddings = self.model.run(inputs, &["embedding"])?.remove(0);
-            out.extend(embeddings.values.chunks_exact(embeddings.shape[1]).map(<[f32]>::to_vec));
+            out.extend(
+                embeddings
+                    .values
+                    .chunks_exact(embeddings.shape[1])
+                    .map(<[f32]>::to_vec),
+            );
         }
         if let ([text], [embedding]) = (texts, out.as_slice()) {
             let mut known = known();
@@ -89,14 +109,15 @@ impl TextEncoder for MiniLm {
     }
 }
 
-/// Texts of the offline encoder: what they mean by MiniLM, and the colours and materials that they name.
+/// Text encoder of the offline models: MiniLM embedding, then the colours and materials that the
+/// text names, then zeros for appearance.
 pub struct OfflineText(Arc<MiniLm>);
 
 impl OfflineText {
-    /// With MiniLM from the cache folder, which is loaded once a process.
+    /// Uses MiniLM from the cache folder, which is loaded once per process.
     ///
     /// # Errors
-    /// When it is not installed.
+    /// A file that is missing or invalid.
     pub fn load() -> Result<Self> {
         Ok(Self(MiniLm::shared()?))
     }
@@ -104,24 +125,35 @@ impl OfflineText {
 
 impl TextEncoder for OfflineText {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
-        let (named, rest): (Vec<_>, Vec<String>) = texts.iter().map(|t| attributes::of_text(t)).unzip();
-        // "orange juice" and "golden retriever" are more than juice and retriever of a colour: half of the meaning is that of the whole phrase.
+        let (named, rest): (Vec<_>, Vec<String>) =
+            texts.iter().map(|t| attributes::of_text(t)).unzip();
+        // "orange juice" is more than orange-coloured juice. If a text names an attribute, its
+        // embedding is the mean direction of the text with and without that name.
         let colored: Vec<usize> = (0..texts.len()).filter(|k| rest[*k] != texts[*k]).collect();
-        let mut meanings = self.0.embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
-        let whole = self.0.embed(&colored.iter().map(|k| texts[*k]).collect::<Vec<_>>())?;
+        let mut meanings = self
+            .0
+            .embed(&rest.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let whole = self
+            .0
+            .embed(&colored.iter().map(|k| texts[*k]).collect::<Vec<_>>())?;
         for (k, whole) in colored.into_iter().zip(whole) {
-            meanings[k].iter_mut().zip(whole).for_each(|(rest, whole)| *rest += whole);
+            meanings[k]
+                .iter_mut()
+                .zip(whole)
+                .for_each(|(rest, whole)| *rest += whole);
             normalise(&mut meanings[k]);
         }
         Ok(meanings
             .into_iter()
             .zip(named)
-            .map(|(meaning, named)| [meaning.as_slice(), &named, &[0.0; appearance::COUNT]].concat())
+            .map(|(meaning, named)| {
+                [meaning.as_slice(), &named, &[0.0; appearance::COUNT]].concat()
+            })
             .collect())
     }
 
     fn advantage(&self, text: &str) -> f32 {
-        attributes::advantage(text)
+        attributes::baseline_shift(text)
     }
 }
 
@@ -136,20 +168,49 @@ mod tests {
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
             Err(e) => return eprintln!("SKIPPED: {e}"),
         };
-        let embedded = text.embed(&["orange juice", "juice", "golden retriever", "yellow retriever"]).unwrap();
+        let embedded = text
+            .embed(&[
+                "orange juice",
+                "juice",
+                "golden retriever",
+                "yellow retriever",
+            ])
+            .unwrap();
         let ends = embedded[0].len() - appearance::COUNT;
         let meaning = |k: usize| &embedded[k][..ends - attributes::COUNT];
         let named = |k: usize| &embedded[k][ends - attributes::COUNT..ends];
-        let cosine = |a: usize, b: usize| meaning(a).iter().zip(meaning(b)).map(|(x, y)| x * y).sum::<f32>();
+        let cosine = |a: usize, b: usize| {
+            meaning(a)
+                .iter()
+                .zip(meaning(b))
+                .map(|(x, y)| x * y)
+                .sum::<f32>()
+        };
         assert!((0..4).all(|k| (cosine(k, k) - 1.0).abs() < 1e-4));
-        assert!(cosine(0, 1) < 0.99 && cosine(2, 3) < 0.99, "{} {}", cosine(0, 1), cosine(2, 3));
-        assert!(named(1).iter().all(|named| *named == 0.0) && named(0).iter().any(|named| *named > 0.0));
-        assert!(embedded.iter().all(|e| e[ends..].iter().all(|v| *v == 0.0)), "words look like nothing");
-        // What is remembered is what a fresh one says.
+        assert!(
+            cosine(0, 1) < 0.99 && cosine(2, 3) < 0.99,
+            "{} {}",
+            cosine(0, 1),
+            cosine(2, 3)
+        );
+        assert!(
+            named(1).iter().all(|named| *named == 0.0) && named(0).iter().any(|named| *named > 0.0)
+        );
+        assert!(
+            embedded.iter().all(|e| e[ends..].iter().all(|v| *v == 0.0)),
+            "texts must have no appearance values"
+        );
+        // Cached embeddings must equal those of a newly loaded encoder.
         let fresh = MiniLm::load().unwrap();
         for texts in [["juice"], ["a bowl of ripe oranges"], ["juice"]] {
             assert_eq!(text.0.embed(&texts).unwrap(), fresh.embed(&texts).unwrap());
         }
-        assert_eq!((fresh.known.lock().unwrap().len(), fresh.embed(&["juice", "tea"]).unwrap().len()), (2, 2));
+        assert_eq!(
+            (
+                fresh.known.lock().unwrap().len(),
+                fresh.embed(&["juice", "tea"]).unwrap().len()
+            ),
+            (2, 2)
+        );
     }
 }

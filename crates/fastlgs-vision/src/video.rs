@@ -1,4 +1,5 @@
-//! Photos from a video: its sharp frames, as many of them as neighbours need to know each other again. ffmpeg decodes.
+//! Selects photos from a video: sharp frames, dense enough that neighbouring photos can be matched.
+//! ffmpeg decodes the video.
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
@@ -13,57 +14,90 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::thread::JoinHandle;
 
-/// Frames of a second that are looked at.
+/// Frames per second that are examined.
 const RATE: u32 = 15;
-/// Of so many frames in a row the sharpest one may become a photo.
+/// Number of consecutive frames of which only the sharpest is a candidate.
 const WINDOW: usize = 3;
-/// Longer side of the pictures on which frames are compared.
+/// Largest longer side, in pixels, of the images on which frames are compared.
 const SIDE: u32 = 480;
-/// Two neighbouring photos share at least this much of the key points that two frames in a row share.
+/// Smallest share of matched key points of neighbouring photos, relative to the largest share of
+/// consecutive candidates.
 const SHARED: f32 = 2.0 / 3.0;
-/// A frame this much less sharp than those before it is blurred.
+/// A candidate is blurred if its sharpness, relative to the median of recent candidates, is below
+/// this value.
 const BLURRED: f32 = 0.4;
-/// After so many blurred ones what is seen is not blurred but plain.
+/// After this many consecutive blurred candidates, the next one is accepted: the content is plain
+/// rather than blurred. Also the number of recent candidates of the median.
 const PATIENCE: usize = 10;
-/// Most photos: those of a longer video are thinned out.
+/// Largest number of photos. More are thinned out evenly.
 const MOST: usize = 300;
 
-/// Whether a file's ending is that of a video.
+/// Returns whether the file extension is that of a video.
 pub fn is_video(path: &Path) -> bool {
-    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
-    matches!(ending.as_str(), "mp4" | "mov" | "m4v" | "mkv" | "webm" | "avi")
+    let ending = path
+        .extension()
+        .and_then(|e| e.to_str())
+        .unwrap_or_default()
+        .to_ascii_lowercase();
+    matches!(
+        ending.as_str(),
+        "mp4" | "mov" | "m4v" | "mkv" | "webm" | "avi"
+    )
 }
 
-/// Writes the photos that a video is worth into the new folder `images` as JPEG files, in its order. `say` is told the seconds that were looked at and the
-/// photos that were chosen, and may stop the work by an error. Returns how many photos there are.
+/// Writes selected frames of a video as JPEG files into the new folder `images`, in order of time.
+/// Returns their number.
+/// `say` receives the seconds examined and the number of selected frames; its error stops the work.
 ///
 /// # Errors
-/// When ffmpeg is missing or cannot read the video, and when the video hardly moves.
-pub fn photos<E: From<Error>>(video: &Path, images: &Path, say: impl Fn(f64, usize) -> Result<(), E>) -> Result<usize, E> {
+/// ffmpeg is missing or cannot read the video, or the video has fewer than three different views.
+pub fn photos<E: From<Error>>(
+    video: &Path,
+    images: &Path,
+    say: impl Fn(f64, usize) -> Result<(), E>,
+) -> Result<usize, E> {
     let frames = choose(video, say)?;
     Ok(write(video, frames, images)?)
 }
 
-/// Writes these frames of a video, and returns how many they are.
+/// Writes the given frames of a video, and returns their number.
 fn write(video: &Path, frames: Vec<u32>, images: &Path) -> Result<usize> {
     if frames.len() < 3 {
         return Err(Error::Invalid(format!(
-            "{}: {} different views; the camera must move around what it shows, for at least some seconds",
+            "{}: only {} different views found, at least 3 are needed; move the camera around the scene for several seconds",
             video.display(),
             frames.len()
         )));
     }
     let frames = thinned(frames, MOST);
     std::fs::create_dir_all(images).map_err(fastlgs_core::Error::io(images))?;
-    let these = frames.iter().map(|n| format!("eq(n,{n})")).collect::<Vec<_>>().join("+");
-    // Times without gaps: else frames would be repeated to fill them.
-    // By way of RGB: JPEG has one matrix of colours, videos have several.
+    let these = frames
+        .iter()
+        .map(|n| format!("eq(n,{n})"))
+        .collect::<Vec<_>>()
+        .join("+");
+    // Continuous time stamps: with gaps, ffmpeg would repeat frames.
+    // Conversion through RGB: JPEG has one colour matrix, videos have several.
     let filter = format!("fps={RATE},select='{these}',setpts=N/({RATE}*TB),format=rgb24");
-    Ffmpeg::start(video, images, &filter, &["-r", &RATE.to_string(), "-pix_fmt", "yuvj420p", "-q:v", "2", "%04d.jpg"])?.finish()?;
+    Ffmpeg::start(
+        video,
+        images,
+        &filter,
+        &[
+            "-r",
+            &RATE.to_string(),
+            "-pix_fmt",
+            "yuvj420p",
+            "-q:v",
+            "2",
+            "%04d.jpg",
+        ],
+    )?
+    .finish()?;
     Ok(frames.len())
 }
 
-/// What ffprobe says about the pictures of a video.
+/// Properties of a video stream, as ffprobe reports them; empty if unknown.
 #[derive(Default, Deserialize)]
 struct Stream {
     #[serde(default)]
@@ -83,29 +117,61 @@ struct Probe {
 }
 
 impl Stream {
-    /// Asks ffprobe; as if nothing were known where it is missing or fails, since ffmpeg names what is wrong.
+    /// Runs ffprobe. If it is missing or fails, all properties are empty; ffmpeg then reports the
+    /// error.
     fn of(video: &Path) -> Self {
         let entries = "stream=color_transfer,color_primaries,color_space,sample_aspect_ratio";
         let mut command = Command::new("ffprobe");
-        command.args(["-v", "error", "-select_streams", "v:0", "-show_entries", entries, "-of", "json"]).arg(video);
-        let output = command.output().map(|output| output.stdout).unwrap_or_default();
-        serde_json::from_slice::<Probe>(&output).unwrap_or_default().streams.into_iter().next().unwrap_or_default()
+        command
+            .args([
+                "-v",
+                "error",
+                "-select_streams",
+                "v:0",
+                "-show_entries",
+                entries,
+                "-of",
+                "json",
+            ])
+            .arg(video);
+        let output = command
+            .output()
+            .map(|output| output.stdout)
+            .unwrap_or_default();
+        serde_json::from_slice::<Probe>(&output)
+            .unwrap_or_default()
+            .streams
+            .into_iter()
+            .next()
+            .unwrap_or_default()
     }
 
-    /// Filters that make of its pictures what a camera for photos would have taken: bright parts of HDR (HLG, PQ) mapped to standard range, with white
-    /// at 203 cd/m2 (ITU-R BT.2408), and square pixels.
+    /// Returns ffmpeg filters that convert HDR (HLG, PQ) to standard range, with white at 203 cd/m2
+    /// (ITU-R BT.2408), and that make pixels square.
     fn corrections(&self) -> String {
         let mut filters = Vec::new();
         if matches!(self.color_transfer.as_str(), "arib-std-b67" | "smpte2084") {
             let known = |tag: &str| !matches!(tag, "" | "unknown" | "unspecified" | "reserved");
-            let primaries = if known(&self.color_primaries) { "" } else { ":pin=bt2020" };
-            let matrix = if known(&self.color_space) { "" } else { ":min=bt2020nc" };
+            let primaries = if known(&self.color_primaries) {
+                ""
+            } else {
+                ":pin=bt2020"
+            };
+            let matrix = if known(&self.color_space) {
+                ""
+            } else {
+                ":min=bt2020nc"
+            };
             filters.push(format!(
                 "zscale=t=linear:npl=203{primaries}{matrix},format=gbrpf32le,zscale=p=bt709,tonemap=clip,\
                  zscale=t=bt709:m=bt709:r=tv,format=yuv420p"
             ));
         }
-        let sides: Option<Vec<u32>> = self.sample_aspect_ratio.split(':').map(|side| side.parse().ok()).collect();
+        let sides: Option<Vec<u32>> = self
+            .sample_aspect_ratio
+            .split(':')
+            .map(|side| side.parse().ok())
+            .collect();
         if let Some([width, height]) = sides.as_deref()
             && width != height
             && *width > 0
@@ -117,45 +183,79 @@ impl Stream {
     }
 }
 
-/// ffmpeg at work on a video.
+/// A running ffmpeg process.
 struct Ffmpeg<'a> {
     video: &'a Path,
     child: Child,
-    /// Reads what it complains of, so that a full pipe does not stop it, and gives the last line.
+    /// Reads the error output, so that a full pipe does not block ffmpeg. Returns its last line.
     complaint: JoinHandle<Option<String>>,
 }
 
 impl<'a> Ffmpeg<'a> {
-    /// Sends the pictures of a video through a filter; outputs without a folder are written to `folder`.
+    /// Starts ffmpeg with a video filter. Relative output paths are relative to `folder`.
     fn start(video: &'a Path, folder: &Path, filter: &str, output: &[&str]) -> Result<Self> {
         let absolute = std::path::absolute(video).map_err(fastlgs_core::Error::io(video))?;
         let filter = format!("{}{filter}", Stream::of(&absolute).corrections());
         let mut command = Command::new("ffmpeg");
-        command.args(["-nostdin", "-v", "error", "-i"]).arg(absolute).args(["-map", "0:v:0", "-vf", &filter]).args(output);
-        let mut child = command.current_dir(folder).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().map_err(|_| {
-            let mend = "install it ('apt-get install ffmpeg'), or give a folder of photos";
-            Error::Missing(format!("{}: videos are read by ffmpeg, which cannot be started; {mend}", video.display()))
-        })?;
+        command
+            .args(["-nostdin", "-v", "error", "-i"])
+            .arg(absolute)
+            .args(["-map", "0:v:0", "-vf", &filter])
+            .args(output);
+        let mut child = command
+            .current_dir(folder)
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(|_| {
+                let mend = "install it ('apt-get install ffmpeg'), or give a folder of photos";
+                Error::Missing(format!(
+                    "{}: reading videos needs ffmpeg, which cannot be started; {mend}",
+                    video.display()
+                ))
+            })?;
         let errors = child.stderr.take();
         let complaint = std::thread::spawn(move || lines(errors?).last());
-        Ok(Self { video, child, complaint })
+        Ok(Self {
+            video,
+            child,
+            complaint,
+        })
     }
 
-    /// Waits for its end; an error has its last line.
+    /// Waits for the process. An error contains the last line of its error output.
     fn finish(mut self) -> Result<()> {
         let ended = self.child.wait();
         if ended.is_ok_and(|status| status.success()) {
             return Ok(());
         }
-        let reason = self.complaint.join().ok().flatten().unwrap_or_else(|| "it was broken off".to_owned());
-        Err(Error::Invalid(format!("{}: ffmpeg cannot read this video: {reason}", self.video.display())))
+        let reason = self
+            .complaint
+            .join()
+            .ok()
+            .flatten()
+            .unwrap_or_else(|| "it was stopped".to_owned());
+        Err(Error::Invalid(format!(
+            "{}: ffmpeg cannot read this video: {reason}",
+            self.video.display()
+        )))
     }
 }
 
-/// The numbers of the frames that become photos.
-fn choose<E: From<Error>>(video: &Path, say: impl Fn(f64, usize) -> Result<(), E>) -> Result<Vec<u32>, E> {
-    let filter = format!("fps={RATE},scale='if(gt(iw,ih),min({SIDE},iw),-2)':'if(gt(iw,ih),-2,min({SIDE},ih))'");
-    let mut ffmpeg = Ffmpeg::start(video, Path::new("."), &filter, &["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"])?;
+/// Returns the numbers of the selected frames, counted at `RATE` frames per second.
+fn choose<E: From<Error>>(
+    video: &Path,
+    say: impl Fn(f64, usize) -> Result<(), E>,
+) -> Result<Vec<u32>, E> {
+    let filter = format!(
+        "fps={RATE},scale='if(gt(iw,ih),min({SIDE},iw),-2)':'if(gt(iw,ih),-2,min({SIDE},ih))'"
+    );
+    let mut ffmpeg = Ffmpeg::start(
+        video,
+        Path::new("."),
+        &filter,
+        &["-f", "image2pipe", "-c:v", "pgm", "-pix_fmt", "gray", "-"],
+    )?;
     let mut chooser = Chooser::default();
     let mut look = |stream| -> Result<(), E> {
         let mut stream = BufReader::new(stream);
@@ -177,18 +277,22 @@ fn choose<E: From<Error>>(video: &Path, say: impl Fn(f64, usize) -> Result<(), E
     Ok(chooser.chosen)
 }
 
-/// The next picture of a stream of portable grey maps; nothing at its end.
+/// Reads the next image of a stream of portable grey maps (PGM); `None` at its end.
 fn pgm(stream: &mut impl Read) -> Option<GrayImage> {
     if word(stream)? != "P5" {
         return None;
     }
-    let [width, height, most] = [word(stream)?, word(stream)?, word(stream)?].map(|n| n.parse::<u32>().unwrap_or(0));
+    let [width, height, most] =
+        [word(stream)?, word(stream)?, word(stream)?].map(|n| n.parse::<u32>().unwrap_or(0));
     let mut pixels = vec![0; width as usize * height as usize];
-    stream.read_exact(&mut pixels).ok().filter(|()| most == 255)?;
+    stream
+        .read_exact(&mut pixels)
+        .ok()
+        .filter(|()| most == 255)?;
     GrayImage::from_raw(width, height, pixels)
 }
 
-/// The next word of a header, with the one white space after it.
+/// Reads the next word of a header and the white space after it.
 fn word(stream: &mut impl Read) -> Option<String> {
     let (mut word, mut byte) = (String::new(), [0]);
     loop {
@@ -200,7 +304,7 @@ fn word(stream: &mut impl Read) -> Option<String> {
     }
 }
 
-/// Evenly spread ones of a list that is too long.
+/// Returns at most `most` elements, evenly spread over the list.
 fn thinned(list: Vec<u32>, most: usize) -> Vec<u32> {
     if list.len() <= most {
         return list;
@@ -208,50 +312,65 @@ fn thinned(list: Vec<u32>, most: usize) -> Vec<u32> {
     (0..most).map(|k| list[k * list.len() / most]).collect()
 }
 
-/// A frame that may become a photo.
+/// A frame that may be selected.
 struct Candidate {
     number: u32,
     points: Keypoints,
 }
 
-/// Chooses frames as they come.
+/// Selects frames from a stream.
 #[derive(Default)]
 struct Chooser {
-    /// The last frames, of which the sharpest becomes a candidate.
+    /// The latest frames (number, sharpness, pixels). The sharpest one becomes a candidate.
     window: Vec<(u32, f32, GrayImage)>,
-    /// How sharp the last candidates were.
+    /// Sharpness of recent candidates.
     sharpness: VecDeque<f32>,
-    /// Blurred candidates in a row.
+    /// Number of consecutive blurred candidates.
     blurred: usize,
-    /// Key points of the last photo.
+    /// Key points of the last selected frame.
     last: Option<Keypoints>,
-    /// The latest candidate that shares enough with it.
+    /// Latest candidate that shares enough key points with the last selected frame.
     near: Option<Candidate>,
-    /// The largest share of key points that a candidate and the next one had in common.
+    /// Largest share of matched key points between a selected frame and the next candidate.
     usual: f32,
-    /// Frames that become photos.
+    /// Numbers of the selected frames.
     chosen: Vec<u32>,
 }
 
 impl Chooser {
     fn see(&mut self, number: u32, frame: GrayImage) -> Result<()> {
-        self.window.push((number, Impression::of_gray(&frame).sharpness, frame));
-        if self.window.len() == WINDOW { self.close_window() } else { Ok(()) }
+        self.window
+            .push((number, Impression::of_gray(&frame).sharpness, frame));
+        if self.window.len() == WINDOW {
+            self.close_window()
+        } else {
+            Ok(())
+        }
     }
 
-    /// What is left is looked at, and the last view that shares enough with the last photo ends the list.
+    /// Processes the remaining frames, and selects the last candidate that shares enough with the
+    /// last selected frame.
     fn end(&mut self) -> Result<()> {
         self.close_window()?;
-        self.chosen.extend(self.near.take().map(|candidate| candidate.number));
+        self.chosen
+            .extend(self.near.take().map(|candidate| candidate.number));
         Ok(())
     }
 
     fn close_window(&mut self) -> Result<()> {
-        let sharpest = std::mem::take(&mut self.window).into_iter().max_by(|a, b| a.1.total_cmp(&b.1));
-        let Some((number, sharpness, frame)) = sharpest else { return Ok(()) };
+        let sharpest = std::mem::take(&mut self.window)
+            .into_iter()
+            .max_by(|a, b| a.1.total_cmp(&b.1));
+        let Some((number, sharpness, frame)) = sharpest else {
+            return Ok(());
+        };
         let mut before: Vec<f32> = self.sharpness.iter().copied().collect();
         before.sort_by(f32::total_cmp);
-        if before.get(before.len() / 2).is_some_and(|usual| sharpness < BLURRED * usual) && self.blurred < PATIENCE {
+        if before
+            .get(before.len() / 2)
+            .is_some_and(|usual| sharpness < BLURRED * usual)
+            && self.blurred < PATIENCE
+        {
             self.blurred += 1;
             return Ok(());
         }
@@ -268,9 +387,12 @@ impl Chooser {
         Ok(())
     }
 
-    /// A photo as soon as the next candidate would share too little with the one before.
+    /// Selects the previous candidate as soon as the next one shares too few key points with the
+    /// last selected frame.
     fn consider(&mut self, candidate: Candidate) {
-        let Some(last) = &self.last else { return self.take(candidate) };
+        let Some(last) = &self.last else {
+            return self.take(candidate);
+        };
         let shared = share(last, &candidate.points);
         if self.near.is_none() {
             self.usual = self.usual.max(shared);
@@ -291,7 +413,7 @@ impl Chooser {
     }
 }
 
-/// Share of two frames' key points that are the same.
+/// Returns the number of matches divided by the smaller number of key points.
 fn share(a: &Keypoints, b: &Keypoints) -> f32 {
     let fewer = a.positions.len().min(b.positions.len());
     matches(a, b).len() as f32 / fewer.max(1) as f32
@@ -303,15 +425,26 @@ mod tests {
     use fastlgs_core::rng::Rng;
     use image::imageops;
 
-    /// A wall of blots.
+    /// Returns an image with random blots.
     fn wall(width: u32, height: u32) -> GrayImage {
         let mut rng = Rng::new(3, "wall");
         let mut wall = GrayImage::from_pixel(width, height, image::Luma([128]));
         for _ in 0..width * height / 200 {
-            let (x, y, r) = (rng.range(0.0, width as f32), rng.range(0.0, height as f32), rng.range(2.0, 7.0));
+            let (x, y, r) = (
+                rng.range(0.0, width as f32),
+                rng.range(0.0, height as f32),
+                rng.range(2.0, 7.0),
+            );
             let value = rng.range(0.0, 255.0) as u8;
-            for (px, py) in (0..15).flat_map(|i| (0..15).map(move |k| (x + i as f32 - 7.0, y + k as f32 - 7.0))) {
-                if (px - x).hypot(py - y) < r && px >= 0.0 && py >= 0.0 && px < width as f32 && py < height as f32 {
+            for (px, py) in
+                (0..15).flat_map(|i| (0..15).map(move |k| (x + i as f32 - 7.0, y + k as f32 - 7.0)))
+            {
+                if (px - x).hypot(py - y) < r
+                    && px >= 0.0
+                    && py >= 0.0
+                    && px < width as f32
+                    && py < height as f32
+                {
                     wall.put_pixel(px as u32, py as u32, image::Luma([value]));
                 }
             }
@@ -319,12 +452,16 @@ mod tests {
         imageops::blur(&wall, 0.8)
     }
 
-    /// Runs ffmpeg; false where it is missing or lacks what is asked for.
+    /// Runs ffmpeg; returns false if it is missing or fails.
     fn ffmpeg(arguments: &[&str]) -> bool {
-        Command::new("ffmpeg").args(["-nostdin", "-v", "error", "-y"]).args(arguments).status().is_ok_and(|status| status.success())
+        Command::new("ffmpeg")
+            .args(["-nostdin", "-v", "error", "-y"])
+            .args(arguments)
+            .status()
+            .is_ok_and(|status| status.success())
     }
 
-    /// The first frame that becomes a photo of a video.
+    /// Returns the first written photo of a video.
     fn first_photo(video: &Path) -> image::RgbImage {
         let images = video.with_extension("images");
         write(video, vec![0, 2, 4], &images).unwrap();
@@ -336,7 +473,12 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         let wide = at("wide.mkv");
-        let source = ["-f", "lavfi", "-i", "testsrc2=size=160x120:rate=15:duration=1"];
+        let source = [
+            "-f",
+            "lavfi",
+            "-i",
+            "testsrc2=size=160x120:rate=15:duration=1",
+        ];
         let made = |filter: &str, codec: &[&str], path: &Path| {
             let output = path.to_string_lossy().into_owned();
             ffmpeg(&[source.as_slice(), &["-vf", filter], codec, &[&output]].concat())
@@ -356,38 +498,77 @@ mod tests {
             let up = format!(
                 "{tagged},zscale=t=linear:npl=203,format=gbrpf32le,zscale=p=bt2020:t={transfer}:m=bt2020nc:r=tv:npl=203,format=yuv420p10le"
             );
-            let tags = ["-c:v", "ffv1", "-color_trc", transfer, "-color_primaries", "bt2020", "-colorspace", "bt2020nc"];
+            let tags = [
+                "-c:v",
+                "ffv1",
+                "-color_trc",
+                transfer,
+                "-color_primaries",
+                "bt2020",
+                "-colorspace",
+                "bt2020nc",
+            ];
             if !made(&up, &tags, &path) {
                 println!("skipped: ffmpeg has no zscale");
                 return;
             }
             let shown = first_photo(&path);
-            let squares = shown.as_raw().iter().zip(truth.as_raw()).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2)).sum::<f64>();
+            let squares = shown
+                .as_raw()
+                .iter()
+                .zip(truth.as_raw())
+                .map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2))
+                .sum::<f64>();
             let psnr = -10.0 * (squares / truth.as_raw().len() as f64 / 255.0f64.powi(2)).log10();
-            // As it is stored it is at 12 dB; what is left is the loss of colours out of range.
-            assert!(psnr > 22.0, "{tag}: {psnr} dB from the colours before");
+            // Without conversion it is 12 dB. The rest is the loss of out-of-gamut colours.
+            assert!(
+                psnr > 22.0,
+                "{tag}: PSNR of {psnr} dB to the original colours"
+            );
         }
     }
 
     #[test]
     fn neighbours_share_two_thirds_and_blurred_frames_are_passed_over() {
         let wall = wall(900, 160);
-        // The camera goes along the wall by two pixels a frame and shows 240 of it, stands still for a while, and shakes now and then.
-        let at = |frame: u32| 2 * if frame < 100 { frame } else { frame.saturating_sub(60).max(100) };
+        // The camera moves along the wall by two pixels per frame and shows 240 of its pixels. It
+        // pauses once, and its frames are blurred for a while.
+        let at = |frame: u32| {
+            2 * if frame < 100 {
+                frame
+            } else {
+                frame.saturating_sub(60).max(100)
+            }
+        };
         let shaken = |frame: u32| (40..55).contains(&frame);
         let mut chooser = Chooser::default();
         for frame in 0..300 {
             let sharp = imageops::crop_imm(&wall, at(frame), 0, 240, 160).to_image();
-            chooser.see(frame, if shaken(frame) { imageops::blur(&sharp, 3.0) } else { sharp }).unwrap();
+            chooser
+                .see(
+                    frame,
+                    if shaken(frame) {
+                        imageops::blur(&sharp, 3.0)
+                    } else {
+                        sharp
+                    },
+                )
+                .unwrap();
         }
         chooser.end().unwrap();
         let chosen = &chooser.chosen;
         println!("chosen: {chosen:?}");
         assert!(chosen.iter().all(|frame| !shaken(*frame)));
-        let steps: Vec<u32> = chosen.windows(2).map(|pair| at(pair[1]) - at(pair[0])).collect();
-        // A third of 240 pixels, less what is seen from the border only.
+        let steps: Vec<u32> = chosen
+            .windows(2)
+            .map(|pair| at(pair[1]) - at(pair[0]))
+            .collect();
+        // A third of 240 pixels, with a tolerance for key points lost near the border.
         assert!(steps.iter().all(|step| *step <= 84), "{steps:?}");
-        assert!(steps[..steps.len() - 1].iter().all(|step| *step >= 40), "{steps:?}");
+        assert!(
+            steps[..steps.len() - 1].iter().all(|step| *step >= 40),
+            "{steps:?}"
+        );
         assert!((6..13).contains(&chosen.len()), "{chosen:?}");
     }
 
@@ -405,9 +586,14 @@ mod tests {
 
     #[test]
     fn grey_maps_follow_each_other() {
-        let mut stream = std::io::Cursor::new(b"P5\n2 1\n255\n\x01\x02P5\n2 1\n255\n\x20\x0aP5\n2".to_vec());
+        let mut stream =
+            std::io::Cursor::new(b"P5\n2 1\n255\n\x01\x02P5\n2 1\n255\n\x20\x0aP5\n2".to_vec());
         assert_eq!(pgm(&mut stream).unwrap().into_raw(), [1, 2]);
-        assert_eq!(pgm(&mut stream).unwrap().into_raw(), [32, 10], "white space may be a pixel");
+        assert_eq!(
+            pgm(&mut stream).unwrap().into_raw(),
+            [32, 10],
+            "bytes that are white space must be read as pixels"
+        );
         assert!(pgm(&mut stream).is_none());
     }
 }

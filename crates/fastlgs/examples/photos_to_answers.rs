@@ -1,4 +1,5 @@
-//! The whole way in one program: posed photos to a scene, and a text to the pixels that it names.
+//! Runs the whole pipeline: makes a scene from photos with poses, and finds the pixels of an object
+//! by a text.
 //!
 //! `cargo run --release -p fastlgs --example photos_to_answers -- PHOTOS SCENE TEXT`
 
@@ -8,7 +9,7 @@ use fastlgs::session::ask::Ask;
 use fastlgs::{Run, Session, preprocess, train};
 use fastlgs_grid::query::QueryConfig;
 
-/// Says which stage begins, and what is wrong.
+/// Prints the name of each stage, and warnings.
 struct Stages;
 
 impl Sink for Stages {
@@ -27,21 +28,55 @@ fn main() -> fastlgs::Result<()> {
         println!("usage: photos_to_answers PHOTOS SCENE TEXT");
         return Ok(());
     };
-    let run = Run { progress: &Stages, ..Run::silent("auto", 0) };
+    let run = Run {
+        progress: &Stages,
+        ..Run::silent("auto", 0)
+    };
     let found = fastlgs::preprocess(
-        &preprocess::Config { photos: photos.into(), output: scene.into(), max_side: 320, ..Default::default() },
+        &preprocess::Config {
+            photos: photos.into(),
+            output: scene.into(),
+            max_side: 320,
+            ..Default::default()
+        },
         &run,
     )?;
-    println!("{} photos, {} masks, {} points", found.photos, found.masks, found.points);
-    let made = fastlgs::train(&train::Config { scene: scene.into(), iterations: Some(600), ..Default::default() }, &run)?;
-    println!("{} Gaussians, {} objects, {:.1} dB on held-out views", made.gaussians, made.objects, made.psnr_held_out.unwrap_or(f64::NAN));
+    println!(
+        "{} photos, {} masks, {} points",
+        found.photos, found.masks, found.points
+    );
+    let made = fastlgs::train(
+        &train::Config {
+            scene: scene.into(),
+            iterations: Some(600),
+            ..Default::default()
+        },
+        &run,
+    )?;
+    println!(
+        "{} Gaussians, {} objects, {:.1} dB on held-out views",
+        made.gaussians,
+        made.objects,
+        made.psnr_held_out.unwrap_or(f64::NAN)
+    );
 
     let mut session = Session::open(scene.as_ref(), "auto")?;
     let (camera, grid) = (session.cameras[0].clone(), session.grid()?);
     let field = session.field(&camera, None)?;
-    let question = Question { ask: &Ask::Text(text.clone()), negatives: &[], config: QueryConfig::default(), dilate: None, candidates: 3 };
+    let question = Question {
+        ask: &Ask::Text(text.clone()),
+        negatives: &[],
+        config: QueryConfig::default(),
+        dilate: None,
+        candidates: 3,
+    };
     let (answer, report) = question.put(&session, &grid, &field, &camera, 0.0)?;
     let pixels = answer.mask.iter().filter(|m| **m).count();
-    println!("{text}: {}, score {:.2}, {pixels} pixels of {}", if report.found { "found" } else { "not found" }, report.score, report.view);
+    println!(
+        "{text}: {}, score {:.2}, {pixels} pixels of {}",
+        if report.found { "found" } else { "not found" },
+        report.score,
+        report.view
+    );
     Ok(())
 }

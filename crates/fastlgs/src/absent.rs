@@ -46,4 +46,6 @@ pub(crate) const ABSENT: [&str; 40] = [
 
 /// Words that are put before absent names. The colour of a present object must not make an absent
 /// name match.
-pub(crate) const COLORS: [&str; 8] = ["red", "blue", "green", "purple", "white", "black", "brown", "wooden"];
+pub(crate) const COLORS: [&str; 8] = [
+    "red", "blue", "green", "purple", "white", "black", "brown", "wooden",
+];

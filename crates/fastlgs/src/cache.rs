@@ -27,7 +27,7 @@ pub fn key(parts: &[&[u8]]) -> Key {
 /// Length of the file name of a result: 16 bytes of its fingerprint in hexadecimal digits.
 const NAME_LENGTH: usize = 32;
 /// Bytes of unused results that are kept in any case.
-const IDLE: u64 = 256 << 20;
+const MIN_UNUSED_BYTES: u64 = 256 << 20;
 
 /// The cache of a scene, with files `SCENE/cache/STAGE/FINGERPRINT`.
 pub struct Cache {
@@ -40,7 +40,11 @@ pub struct Cache {
 impl Cache {
     /// Returns the cache of a scene folder.
     pub fn new(folder: &SceneFolder) -> Self {
-        Self { root: folder.root.join("cache"), used: Mutex::default(), counts: Mutex::default() }
+        Self {
+            root: folder.root.join("cache"),
+            used: Mutex::default(),
+            counts: Mutex::default(),
+        }
     }
 
     /// Returns the cached result of these inputs and this version of the program. If there is none,
@@ -48,13 +52,26 @@ impl Cache {
     ///
     /// # Errors
     /// Errors of `make`, or a file that cannot be written.
-    pub fn get<T: Serialize + DeserializeOwned>(&self, stage: &'static str, inputs: &Key, make: impl FnOnce() -> Result<T>) -> Result<T> {
+    pub fn get<T: Serialize + DeserializeOwned>(
+        &self,
+        stage: &'static str,
+        inputs: &Key,
+        make: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
         let key = key(&[env!("CARGO_PKG_VERSION").as_bytes(), inputs]);
-        let name: String = key[..NAME_LENGTH / 2].iter().map(|b| format!("{b:02x}")).collect();
+        let name: String = key[..NAME_LENGTH / 2]
+            .iter()
+            .map(|b| format!("{b:02x}"))
+            .collect();
         let path = self.root.join(stage).join(name);
         // An unreadable file counts as missing.
-        let known = std::fs::read(&path).ok().and_then(|bytes| postcard::from_bytes(&bytes).ok());
-        self.used.lock().expect("no panic while holding the lock").insert(path.clone());
+        let known = std::fs::read(&path)
+            .ok()
+            .and_then(|bytes| postcard::from_bytes(&bytes).ok());
+        self.used
+            .lock()
+            .expect("no panic while holding the lock")
+            .insert(path.clone());
         let mut counts = self.counts.lock().expect("no panic while holding the lock");
         let [there, all] = counts.entry(stage).or_default();
         *all += 1;
@@ -71,28 +88,45 @@ impl Cache {
 
     /// Returns by stage the number of results found, and the number of results requested.
     pub fn counts(&self) -> BTreeMap<&'static str, [usize; 2]> {
-        self.counts.lock().expect("no panic while holding the lock").clone()
+        self.counts
+            .lock()
+            .expect("no panic while holding the lock")
+            .clone()
     }
 
     /// Removes results that this run did not use, oldest first. The rest takes no more bytes than
-    /// the used results, or than [`IDLE`] if that is more. So a trial with another segmenter keeps
+    /// the used results, or than [`MIN_UNUSED_BYTES`] if that is more. So a trial with another segmenter keeps
     /// the earlier results.
     pub fn tidy(&self) {
-        self.tidy_to(IDLE);
+        self.tidy_to(MIN_UNUSED_BYTES);
     }
 
     fn tidy_to(&self, least: u64) {
         let used = self.used.lock().expect("no panic while holding the lock");
-        let stages = std::fs::read_dir(&self.root).into_iter().flatten().flatten();
-        let files = stages.flat_map(|stage| std::fs::read_dir(stage.path()).into_iter().flatten().flatten());
+        let stages = std::fs::read_dir(&self.root)
+            .into_iter()
+            .flatten()
+            .flatten();
+        let files = stages.flat_map(|stage| {
+            std::fs::read_dir(stage.path())
+                .into_iter()
+                .flatten()
+                .flatten()
+        });
         // Other files in these folders are not results.
         let ours = |file: &std::fs::DirEntry| {
             let name = file.file_name();
             name.len() == NAME_LENGTH && name.as_encoded_bytes().iter().all(u8::is_ascii_hexdigit)
         };
-        let known = files.filter(ours).filter_map(|file| Some((file.path(), file.metadata().ok()?)));
+        let known = files
+            .filter(ours)
+            .filter_map(|file| Some((file.path(), file.metadata().ok()?)));
         let (in_use, mut idle): (Vec<_>, Vec<_>) = known.partition(|(path, _)| used.contains(path));
-        let room = in_use.iter().map(|(_, about)| about.len()).sum::<u64>().max(least);
+        let room = in_use
+            .iter()
+            .map(|(_, about)| about.len())
+            .sum::<u64>()
+            .max(least);
         // The newest first.
         idle.sort_by_key(|(path, about)| (std::cmp::Reverse(about.modified().ok()), path.clone()));
         let mut taken = 0;
@@ -121,7 +155,10 @@ mod tests {
             cache.get("stage", &key(&[input.as_bytes()]), make).unwrap()
         };
         let cache = Cache::new(&SceneFolder::new(dir.path()));
-        assert_eq!((ask(&cache, "one"), ask(&cache, "three"), ask(&cache, "one")), (vec![3], vec![5], vec![3]));
+        assert_eq!(
+            (ask(&cache, "one"), ask(&cache, "three"), ask(&cache, "one")),
+            (vec![3], vec![5], vec![3])
+        );
         assert_eq!((*made.borrow(), cache.counts()["stage"]), (2, [1, 3]));
         // A run that uses one of two results keeps the other. A run that uses one of many does not
         // keep all.
@@ -129,9 +166,15 @@ mod tests {
             let cache = Cache::new(&SceneFolder::new(dir.path()));
             ask(&cache, input);
             cache.tidy_to(0);
-            std::fs::read_dir(dir.path().join("cache/stage")).unwrap().count()
+            std::fs::read_dir(dir.path().join("cache/stage"))
+                .unwrap()
+                .count()
         };
-        assert_eq!(rest("one"), 2, "unused results may take as many bytes as used ones");
+        assert_eq!(
+            rest("one"),
+            2,
+            "unused results may take as many bytes as used ones"
+        );
         let cache = Cache::new(&SceneFolder::new(dir.path()));
         (0..8).for_each(|k| drop(ask(&cache, &"x".repeat(10 + k))));
         assert_eq!((rest("one"), *made.borrow()), (2, 10));

@@ -1,13 +1,13 @@
 //! Measures the calibration of an encoder on generated scenes and on labelled scenes.
 
 use crate::absent::{ABSENT, COLORS};
-use crate::calibrations::{self, Calibrations, Kept, beside};
+use crate::calibrations::{self, CalibrationFile, Calibrations, calibration_path};
 use crate::error::{Context, bail};
 use crate::eval::best_object;
 use crate::eyes::{EncoderKind, Eyes};
 use crate::{Result, Run, Session, masks};
 use fastlgs_core::labels::LabelledView;
-use fastlgs_core::synth::{Kind, Thing, World};
+use fastlgs_core::synth::{Kind, SceneObject, World};
 use fastlgs_core::{LabelMap, fs};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use fastlgs_grid::grid::Object;
@@ -54,8 +54,8 @@ const SIZE: (u32, u32) = (480, 360);
 const LEAST_AREA: f32 = 0.0005;
 
 /// A generated scene: its true objects, and their embeddings.
-struct Known {
-    things: Vec<Thing>,
+struct GeneratedScene {
+    things: Vec<SceneObject>,
     grid: Grid,
 }
 
@@ -76,23 +76,43 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
     let encoders = Background::ALL.map(|background| tower.clone().with_background(background));
     let texts = eyes.text_encoder()?;
     let pictures = models::pictures_dir();
-    let mut worlds = TABLES.iter().map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed)).collect::<Result<Vec<_>, _>>()?;
+    let mut worlds = TABLES
+        .iter()
+        .map(|seed| Kind::Table.world(&pictures, VIEWS, SIZE, *seed))
+        .collect::<Result<Vec<_>, _>>()?;
     // The room needs pictures that may not be installed; the tables do not.
     worlds.extend(Kind::Room.world(&pictures, VIEWS, SIZE, 0).ok());
     let work = run.work("calibrate", (worlds.len() * VIEWS) as u64);
-    let mut known: Vec<Vec<Known>> = Background::ALL.map(|_| Vec::new()).into();
+    let mut known: Vec<Vec<GeneratedScene>> = Background::ALL.map(|_| Vec::new()).into();
     for world in worlds {
-        seen(&world, &encoders, || work.advance())?.into_iter().zip(&mut known).for_each(|(seen, known)| known.push(seen));
+        embed_world(&world, &encoders, || work.advance())?
+            .into_iter()
+            .zip(&mut known)
+            .for_each(|(seen, known)| known.push(seen));
     }
     let canonical = texts.embed(&CANONICAL)?;
     let anything = Calibration::CLIP.anything;
     let query = |text: &str| -> Result<TextQuery> {
         let anything = anything + texts.advantage(text);
-        Ok(TextQuery { canonical: canonical.clone(), anything, ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP) })
+        Ok(TextQuery {
+            canonical: canonical.clone(),
+            min_canonical: anything,
+            ..TextQuery::new(texts.embed(&[text])?, Calibration::CLIP)
+        })
     };
-    let there = |name: &str| known[0].iter().flat_map(|k| &k.things).any(|t| t.name.contains(name));
-    let absent = absent_where(there);
-    let blind = || format!("{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP", image_tower.display());
+    let is_present = |name: &str| {
+        known[0]
+            .iter()
+            .flat_map(|k| &k.things)
+            .any(|t| t.name.contains(name))
+    };
+    let absent = absent_where(is_present);
+    let blind = || {
+        format!(
+            "{}: the encoder cannot distinguish the generated objects by their names; check that it is an image tower of CLIP",
+            image_tower.display()
+        )
+    };
     let (mut calibrations, mut separation) = (BTreeMap::new(), BTreeMap::new());
     for (background, known) in Background::ALL.into_iter().zip(&known) {
         let named = by_names(known, &absent, query)?;
@@ -104,10 +124,21 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
         }
     }
     // `max_by` returns the last of equal values; in reverse order that is grey.
-    let (background, _) = separation.iter().rev().max_by(|a, b| a.1.total_cmp(b.1)).with_context(blind)?;
+    let (background, _) = separation
+        .iter()
+        .rev()
+        .max_by(|a, b| a.1.total_cmp(b.1))
+        .with_context(blind)?;
     let (background, Calibrations { texts, pictures }) = (*background, calibrations[background]);
-    let kept = beside(&image_tower);
-    fs::write_json(&kept, &Kept { sha256: calibrations::sums(&eyes.files()?), background, calibrations })?;
+    let kept = calibration_path(&image_tower);
+    fs::write_json(
+        &kept,
+        &CalibrationFile {
+            sha256: calibrations::sums(&eyes.files()?),
+            background,
+            calibrations,
+        },
+    )?;
     Ok(Report {
         background,
         separation,
@@ -121,20 +152,35 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
 }
 
 /// Renders a generated scene and embeds its objects by their exact masks, once for each encoder.
-fn seen(world: &World, encoders: &[ClipImage], advance: impl Fn() -> Result<()>) -> Result<Vec<Known>> {
-    let things = world.things.clone();
-    let chain =
-        |id: u16| std::iter::successors(Some(id).filter(|id| *id > 0), |id| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0));
+fn embed_world(
+    world: &World,
+    encoders: &[ClipImage],
+    advance: impl Fn() -> Result<()>,
+) -> Result<Vec<GeneratedScene>> {
+    let things = world.objects.clone();
+    let chain = |id: u16| {
+        std::iter::successors(Some(id).filter(|id| *id > 0), |id| {
+            Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0)
+        })
+    };
     let depth = |id: u16| chain(id).count();
     let depths = (1..=things.len() as u16).map(depth).max().unwrap_or(0);
     let mut found: Vec<Vec<Mask>> = vec![Vec::new(); encoders.len()];
     for (index, camera) in world.cameras.iter().enumerate() {
         let view = world.render(index, 2);
         for layer in 1..=depths {
-            let labels = view.instances.labels.iter().map(|id| chain(*id).find(|a| depth(*a) == layer).unwrap_or(0)).collect();
-            let map = LabelMap { labels, ..view.instances };
+            let labels = view
+                .instances
+                .labels
+                .iter()
+                .map(|id| chain(*id).find(|a| depth(*a) == layer).unwrap_or(0))
+                .collect();
+            let map = LabelMap {
+                labels,
+                ..view.instances
+            };
             for (encoder, found) in encoders.iter().zip(&mut found) {
-                let masks = masks::described(&camera.name, &view.photo, index, &map, encoder)?;
+                let masks = masks::descriptors(&camera.name, &view.photo, index, &map, encoder)?;
                 found.extend(masks.into_iter().filter(|m| m.area >= LEAST_AREA));
             }
         }
@@ -143,23 +189,35 @@ fn seen(world: &World, encoders: &[ClipImage], advance: impl Fn() -> Result<()>)
     let known = |found: Vec<Mask>| {
         let object_of: Vec<u16> = found.iter().map(|m| m.label).collect();
         let mut grid = Grid::build(&found, &object_of, vec![Vec3::ZERO; things.len()]);
-        grid.objects.iter_mut().zip(&things).for_each(|(object, thing)| object.parent = thing.parent);
-        Known { things: things.clone(), grid }
+        grid.objects
+            .iter_mut()
+            .zip(&things)
+            .for_each(|(object, thing)| object.parent = thing.parent);
+        GeneratedScene {
+            things: things.clone(),
+            grid,
+        }
     };
     Ok(found.into_iter().map(known).collect())
 }
 
-impl Known {
+impl GeneratedScene {
     /// Returns the objects that have embeddings, with their names.
     fn objects(&self) -> impl Iterator<Item = (&Object, &str)> {
-        let named = self.grid.objects.iter().zip(self.things.iter().map(|t| t.name.as_str()));
+        let named = self
+            .grid
+            .objects
+            .iter()
+            .zip(self.things.iter().map(|t| t.name.as_str()));
         named.filter(|(object, _)| !object.embeddings.is_empty())
     }
 
     /// Returns the objects that neither contain object `of` nor are part of it.
     fn others(&self, of: u16) -> impl Iterator<Item = &Object> {
         let related = self.grid.related(of);
-        self.objects().map(|o| o.0).filter(move |o| !related[usize::from(o.id) - 1])
+        self.objects()
+            .map(|o| o.0)
+            .filter(move |o| !related[usize::from(o.id) - 1])
     }
 }
 
@@ -177,72 +235,127 @@ pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples
         let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
         let field = scene.field(&camera, None)?;
         for label in &view.labels {
-            let (iou, _, id) = best_object(&grid, &field, &view.mask(label, camera.width, camera.height));
-            let Some(own) = seen().find(|o| o.id == id && iou >= SAME) else { continue };
+            let (iou, _, id) = best_object(
+                &grid,
+                &field,
+                &view.mask(label, camera.width, camera.height),
+            );
+            let Some(own) = seen().find(|o| o.id == id && iou >= MIN_LABEL_IOU) else {
+                continue;
+            };
             let query = scene.text_query(&label.category)?;
             let related = grid.related(id);
-            tell(&mut samples, &query, own, seen().filter(|o| !related[usize::from(o.id) - 1]));
+            add_sample(
+                &mut samples,
+                &query,
+                own,
+                seen().filter(|o| !related[usize::from(o.id) - 1]),
+            );
         }
     }
-    let there = |name: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.contains(name));
+    let there = |name: &str| {
+        views
+            .iter()
+            .flat_map(|v| &v.labels)
+            .any(|l| l.category.contains(name))
+    };
     for text in absent_where(there) {
-        samples.absent.extend(query::best(&grid, &scene.text_query(&text)?));
+        samples
+            .absent
+            .extend(query::best(&grid, &scene.text_query(&text)?));
     }
     Ok(samples)
 }
 
-/// Returns the absent names for which `there` is false, each by itself and with a colour. The
+/// Returns the absent names for which `is_present` is false, each by itself and with a colour. The
 /// colour of a present object must not make an absent name match.
 fn absent_where(there: impl Fn(&str) -> bool) -> Vec<String> {
-    let absent = ABSENT.into_iter().filter(|name| !there(name)).zip(COLORS.into_iter().cycle());
-    absent.flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")]).collect()
+    let absent = ABSENT
+        .into_iter()
+        .filter(|name| !there(name))
+        .zip(COLORS.into_iter().cycle());
+    absent
+        .flat_map(|(name, color)| [name.to_owned(), format!("{color} {name}")])
+        .collect()
 }
 
 /// Least IoU of an object with a label to count as the labelled object.
-const SAME: f64 = 0.5;
+const MIN_LABEL_IOU: f64 = 0.5;
 
 /// Adds a sample: the mean cosines of a query with its target and with other objects.
-fn tell<'a>(samples: &mut Samples, query: &TextQuery, own: &Object, others: impl Iterator<Item = &'a Object>) {
+fn add_sample<'a>(
+    samples: &mut Samples,
+    query: &TextQuery,
+    own: &Object,
+    others: impl Iterator<Item = &'a Object>,
+) {
     if let Some(cosine) = query::mean_cosine(own, query) {
-        samples.tell(cosine, &others.filter_map(|other| query::mean_cosine(other, query)).collect::<Vec<_>>());
+        samples.add_name(
+            cosine,
+            &others
+                .filter_map(|other| query::mean_cosine(other, query))
+                .collect::<Vec<_>>(),
+        );
     }
 }
 
 /// Returns samples of texts: names of objects, compared with all objects; and absent names,
 /// compared with all scenes.
-fn by_names(known: &[Known], absent: &[String], query: impl Fn(&str) -> Result<TextQuery>) -> Result<Samples> {
+fn by_names(
+    known: &[GeneratedScene],
+    absent: &[String],
+    query: impl Fn(&str) -> Result<TextQuery>,
+) -> Result<Samples> {
     let mut samples = Samples::default();
     for scene in known {
         for (object, name) in scene.objects() {
-            tell(&mut samples, &query(name)?, object, scene.others(object.id));
+            add_sample(&mut samples, &query(name)?, object, scene.others(object.id));
         }
     }
     for name in absent {
         let query = query(name)?;
-        samples.absent.extend(known.iter().filter_map(|scene| query::best(&scene.grid, &query)));
+        samples.absent.extend(
+            known
+                .iter()
+                .filter_map(|scene| query::best(&scene.grid, &query)),
+        );
     }
     Ok(samples)
 }
 
 /// Returns samples of pictures: one view of each object, compared with its other views and with
 /// other objects. Absent samples are all views of an object, compared with scenes that lack it.
-fn by_examples<'a>(known: &'a [Known]) -> Samples {
+fn by_examples<'a>(known: &'a [GeneratedScene]) -> Samples {
     let mut samples = Samples::default();
-    let shown = |object: &Object| TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP);
+    let shown = |object: &Object| {
+        TextQuery::of_examples(vec![object.embeddings[0].clone()], Calibration::CLIP)
+    };
     // A taught name also keeps all embeddings of its object.
-    let whole = |object: &Object| TextQuery::of_examples(object.embeddings.clone(), Calibration::CLIP);
-    let several = |scene: &'a Known| scene.objects().filter(|(object, _)| object.embeddings.len() > 1);
+    let all_views_query =
+        |object: &Object| TextQuery::of_examples(object.embeddings.clone(), Calibration::CLIP);
+    let several = |scene: &'a GeneratedScene| {
+        scene
+            .objects()
+            .filter(|(object, _)| object.embeddings.len() > 1)
+    };
     for scene in known {
         for (object, _) in several(scene) {
             let query = shown(object);
-            let rest = Object { embeddings: object.embeddings[1..].to_vec(), areas: object.areas[1..].to_vec(), ..object.clone() };
-            tell(&mut samples, &query, &rest, scene.others(object.id));
+            let rest = Object {
+                embeddings: object.embeddings[1..].to_vec(),
+                areas: object.areas[1..].to_vec(),
+                ..object.clone()
+            };
+            add_sample(&mut samples, &query, &rest, scene.others(object.id));
         }
     }
     for scene in known {
         for (object, name) in several(scene) {
-            let lack = |other: &&Known| other.things.iter().all(|t| t.name != name);
-            let best = known.iter().filter(lack).filter_map(|other| query::best(&other.grid, &whole(object)));
+            let lack = |other: &&GeneratedScene| other.things.iter().all(|t| t.name != name);
+            let best = known
+                .iter()
+                .filter(lack)
+                .filter_map(|other| query::best(&other.grid, &all_views_query(object)));
             samples.absent.extend(best);
         }
     }

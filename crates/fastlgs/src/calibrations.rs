@@ -24,7 +24,7 @@ pub struct Calibrations {
 
 /// Calibration file beside a model, with the hashes of the towers for which it is valid.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Kept {
+pub(crate) struct CalibrationFile {
     /// SHA-256 of image and text tower.
     pub sha256: [String; 2],
     /// Background around masks with which names separate objects best.
@@ -35,16 +35,26 @@ pub(crate) struct Kept {
 
 /// Returns the SHA-256 of image and text tower among model files; empty if one is missing.
 pub(crate) fn sums(files: &BTreeMap<String, ModelFile>) -> [String; 2] {
-    ["clip_image", "clip_text"].map(|role| files.get(role).map(|file| file.sha256.clone()).unwrap_or_default())
+    ["clip_image", "clip_text"].map(|role| {
+        files
+            .get(role)
+            .map(|file| file.sha256.clone())
+            .unwrap_or_default()
+    })
 }
 
 /// Reads the calibration file of these towers; `None` if there is none, or none for these hashes.
-fn kept(files: &BTreeMap<String, ModelFile>) -> Option<Kept> {
-    let path = beside(&files.get("clip_image")?.path);
-    let kept = path.is_file().then(|| fs::read_json::<Kept>(&path))?;
+fn read_calibration(files: &BTreeMap<String, ModelFile>) -> Option<CalibrationFile> {
+    let path = calibration_path(&files.get("clip_image")?.path);
+    let kept = path
+        .is_file()
+        .then(|| fs::read_json::<CalibrationFile>(&path))?;
     // A file that cannot be parsed comes from another version, whose values are not comparable.
     if kept.is_err() {
-        tracing::warn!("{}: another version wrote this calibration, so it is ignored; run 'fastlgs models calibrate' again", path.display());
+        tracing::warn!(
+            "{}: another version wrote this calibration, so it is ignored; run 'fastlgs models calibrate' again",
+            path.display()
+        );
     }
     kept.ok().filter(|kept| kept.sha256 == sums(files))
 }
@@ -67,38 +77,53 @@ pub(crate) fn background_of(manifest: &Manifest) -> Result<Background> {
 pub(crate) fn word_of(background: Background) -> String {
     match background {
         Background::Grey => String::new(),
-        other => serde_json::to_value(other).ok().and_then(|word| Some(word.as_str()?.to_owned())).unwrap_or_default(),
+        other => serde_json::to_value(other)
+            .ok()
+            .and_then(|word| Some(word.as_str()?.to_owned()))
+            .unwrap_or_default(),
     }
 }
 
 /// Returns whether a readable calibration file lies beside an image tower.
 pub fn is_measured(image_tower: &Path) -> bool {
-    fs::read_json::<Kept>(&beside(image_tower)).is_ok()
+    fs::read_json::<CalibrationFile>(&calibration_path(image_tower)).is_ok()
 }
 
 /// Returns the best measured background for these towers; the default without calibration file.
 pub(crate) fn best_background(files: &BTreeMap<String, ModelFile>) -> Background {
-    kept(files).map(|kept| kept.background).unwrap_or_default()
+    read_calibration(files)
+        .map(|kept| kept.background)
+        .unwrap_or_default()
 }
 
 /// Returns the path of the calibration file of a CLIP image tower.
-pub fn beside(image_tower: &Path) -> PathBuf {
+pub fn calibration_path(image_tower: &Path) -> PathBuf {
     image_tower.with_extension("calibration.json")
 }
 
 impl Calibrations {
     /// Calibrations of the offline encoder.
-    pub const OFFLINE: Self = Self { texts: Calibration::OFFLINE, pictures: Calibration::OFFLINE_PICTURES };
+    pub const OFFLINE: Self = Self {
+        texts: Calibration::OFFLINE,
+        pictures: Calibration::OFFLINE_PICTURES,
+    };
 
     /// Assumed calibrations of a CLIP without calibration file.
-    pub const CLIP: Self = Self { texts: Calibration::CLIP, pictures: Calibration::CLIP_PICTURES };
+    pub const CLIP: Self = Self {
+        texts: Calibration::CLIP,
+        pictures: Calibration::CLIP_PICTURES,
+    };
 
     /// Returns the calibrations of the encoder that made a scene's embeddings.
     pub fn of(manifest: &Manifest) -> Self {
         if manifest.encoder == OFFLINE {
             return Self::OFFLINE;
         }
-        let known = background_of(manifest).ok().and_then(|background| kept(&manifest.models)?.calibrations.remove(&background));
+        let known = background_of(manifest).ok().and_then(|background| {
+            read_calibration(&manifest.models)?
+                .calibrations
+                .remove(&background)
+        });
         known.unwrap_or(Self::CLIP)
     }
 }

@@ -10,7 +10,7 @@ pub(crate) fn path(folder: &SceneFolder) -> PathBuf {
 }
 
 /// Returns whether there is a checkpoint to resume from.
-pub(crate) fn is_begun(folder: &SceneFolder) -> bool {
+pub(crate) fn can_resume(folder: &SceneFolder) -> bool {
     path(folder).with_extension("json").is_file()
 }
 

@@ -2,7 +2,7 @@
 
 use crate::objects::{self, Config, Mapped};
 use crate::{Result, Run};
-use fastlgs_core::gaussians::{CLEAR, sigmoid};
+use fastlgs_core::gaussians::{TRANSPARENT_LOGIT, sigmoid};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::hull::{self, Hull, Outline};
 use fastlgs_raster::density::State;
@@ -11,17 +11,17 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Longer side of the images in which transparent objects are searched, in pixels.
-const SIDE: u32 = 480;
+const SEARCH_SIDE: u32 = 480;
 /// Largest number of views in the search; they are spread evenly over all views.
-const ASKED: usize = 200;
+const MAX_SEARCH_VIEWS: usize = 200;
 /// Opacity of a transparent Gaussian, as a logit.
-const LOGIT: f32 = 1.25 * CLEAR;
+const LOGIT: f32 = 1.25 * TRANSPARENT_LOGIT;
 /// Transmittance from which a pixel counts as empty.
-const NOTHING: f32 = 0.5;
+const EMPTY_TRANSMITTANCE: f32 = 0.5;
 
 /// Returns whether a Gaussian is transparent.
 pub fn is_clear(scene: &Gaussians, gaussian: usize) -> bool {
-    scene.opacity_logits[gaussian] <= CLEAR
+    scene.opacity_logits[gaussian] <= TRANSPARENT_LOGIT
 }
 
 /// Returns the number of transparent Gaussians.
@@ -47,27 +47,55 @@ pub fn take(scene: &mut Gaussians) -> Gaussians {
 
 /// Removes transparent Gaussians that belong to no object.
 pub fn keep_owned(scene: &mut Gaussians) {
-    retain(scene, |scene, i| !is_clear(scene, i) || scene.object_ids[i] > 0);
+    retain(scene, |scene, i| {
+        !is_clear(scene, i) || scene.object_ids[i] > 0
+    });
 }
 
 /// Maps masks to objects as [`objects::map`] does, transparent objects included. Writes the object
 /// maps.
-pub fn map(scene: &mut Gaussians, folder: &SceneFolder, training: &[Camera], config: &Config, run: &Run) -> Result<Mapped> {
+pub fn map(
+    scene: &mut Gaussians,
+    folder: &SceneFolder,
+    training: &[Camera],
+    config: &Config,
+    run: &Run,
+) -> Result<Mapped> {
     forget(scene);
     let mapped = objects::map(scene, folder, training, config, run)?;
     let (lists, mut left) = (mapped.chosen.lists(), Vec::with_capacity(training.len()));
-    objects::write_maps(scene, folder, training, &mapped, config.antialias, run, |camera, shown| {
-        left.push(unexplained(folder, camera, shown, &lists, config)?);
-        Ok(())
-    })?;
-    let Some(with_clear) = add(scene, folder, training, left, config, run)? else { return Ok(mapped) };
-    objects::write_maps(scene, folder, training, &with_clear, config.antialias, run, |_, _| Ok(()))?;
+    objects::write_maps(
+        scene,
+        folder,
+        training,
+        &mapped,
+        config.antialias,
+        run,
+        |camera, shown| {
+            left.push(unexplained(folder, camera, shown, &lists, config)?);
+            Ok(())
+        },
+    )?;
+    let Some(with_clear) = add(scene, folder, training, left, config, run)? else {
+        return Ok(mapped);
+    };
+    objects::write_maps(
+        scene,
+        folder,
+        training,
+        &with_clear,
+        config.antialias,
+        run,
+        |_, _| Ok(()),
+    )?;
     Ok(with_clear)
 }
 
 /// Removes Gaussians with an alpha below 1/255: transparent ones of an earlier run, and faded ones.
 fn forget(scene: &mut Gaussians) {
-    retain(scene, |scene, i| 255.0 * sigmoid(scene.opacity_logits[i]) >= 1.0);
+    retain(scene, |scene, i| {
+        255.0 * sigmoid(scene.opacity_logits[i]) >= 1.0
+    });
 }
 
 /// Adds transparent Gaussians where `unexplained` masks of the views agree, and maps the objects
@@ -89,10 +117,22 @@ fn add(
     loop {
         let mapped = objects::map(scene, folder, training, config, run)?;
         let lists = mapped.chosen.lists();
-        let lists: Vec<&[u16]> = scene.object_ids.iter().map(|id| lists[usize::from(*id)].as_slice()).collect();
-        let kept: Vec<Vec<usize>> = places.iter().map(|places| own(&lists, places.clone())).collect();
+        let lists: Vec<&[u16]> = scene
+            .object_ids
+            .iter()
+            .map(|id| lists[usize::from(*id)].as_slice())
+            .collect();
+        let kept: Vec<Vec<usize>> = places
+            .iter()
+            .map(|places| gaussians_of_object(&lists, places.clone()))
+            .collect();
         let all: Vec<usize> = (0..shown).chain(kept.iter().flatten().copied()).collect();
-        tracing::debug!(hulls = places.len(), put = scene.len() - shown, kept = all.len() - shown, "transparent Gaussians");
+        tracing::debug!(
+            hulls = places.len(),
+            put = scene.len() - shown,
+            kept = all.len() - shown,
+            "transparent Gaussians"
+        );
         if all.len() == scene.len() {
             return Ok(Some(mapped));
         }
@@ -111,46 +151,101 @@ fn add(
 }
 
 /// Returns the pixels of a view that have masks, but none that an object fits. The result is scaled
-/// to at most [`SIDE`] pixels. `shown` is the object map of the view, and `lists` holds the objects
+/// to at most [`SEARCH_SIDE`] pixels. `shown` is the object map of the view, and `lists` holds the objects
 /// of each id.
-fn unexplained(folder: &SceneFolder, camera: &Camera, shown: &LabelMap, lists: &[Vec<u16>], config: &Config) -> Result<Vec<bool>> {
-    let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, config.objects.min_support);
-    let small = camera.shrunk_to(SIDE);
+fn unexplained(
+    folder: &SceneFolder,
+    camera: &Camera,
+    shown: &LabelMap,
+    lists: &[Vec<u16>],
+    config: &Config,
+) -> Result<Vec<bool>> {
+    let pixels = hull::unexplained(
+        &objects::atoms(folder, camera)?,
+        shown,
+        lists,
+        config.objects.min_support,
+    );
+    let small = camera.shrunk_to(SEARCH_SIDE);
     let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
     let columns = |x| at(x, camera.width, small.width);
-    let rows = (0..small.height).map(|y| camera.width as usize * at(y, camera.height, small.height));
-    Ok(rows.flat_map(|row| (0..small.width).map(move |x| row + columns(x))).map(|pixel| pixels[pixel]).collect())
+    let rows =
+        (0..small.height).map(|y| camera.width as usize * at(y, camera.height, small.height));
+    Ok(rows
+        .flat_map(|row| (0..small.width).map(move |x| row + columns(x)))
+        .map(|pixel| pixels[pixel])
+        .collect())
 }
 
 /// Returns the visual hulls of unexplained masks; none if fewer than `min_views` views have any.
-fn hulls(scene: &Gaussians, training: &[Camera], unexplained: Vec<Vec<bool>>, config: &Config, run: &Run) -> Result<Vec<Hull>> {
-    if unexplained.iter().filter(|view| view.contains(&true)).count() < config.objects.min_views {
+fn hulls(
+    scene: &Gaussians,
+    training: &[Camera],
+    unexplained: Vec<Vec<bool>>,
+    config: &Config,
+    run: &Run,
+) -> Result<Vec<Hull>> {
+    if unexplained
+        .iter()
+        .filter(|view| view.contains(&true))
+        .count()
+        < config.objects.min_views
+    {
         return Ok(Vec::new());
     }
     let mut engine = fastlgs_raster::open_engine(run.device)?;
     engine.set_state(&State::of(scene))?;
     let outline = |(camera, inside): (&Camera, Vec<bool>)| -> Result<Outline> {
-        let camera = camera.shrunk_to(SIDE);
+        let camera = camera.shrunk_to(SEARCH_SIDE);
         let depth = depth(engine.as_mut(), scene, &camera, config.antialias)?;
-        Ok(Outline { camera, inside, depth })
+        Ok(Outline {
+            camera,
+            inside,
+            depth,
+        })
     };
-    let every = training.len().div_ceil(ASKED);
-    let views = training.iter().zip(unexplained).step_by(every).map(outline).collect::<Result<Vec<_>>>()?;
+    let every = training.len().div_ceil(MAX_SEARCH_VIEWS);
+    let views = training
+        .iter()
+        .zip(unexplained)
+        .step_by(every)
+        .map(outline)
+        .collect::<Result<Vec<_>>>()?;
     Ok(hull::hulls(&views, config.objects.min_views))
 }
 
 /// Renders the depth of each pixel; infinite where the pixel is empty.
-fn depth(engine: &mut dyn Engine, scene: &Gaussians, camera: &Camera, antialias: bool) -> Result<Vec<f32>> {
-    let view = View { depth_as_feature: 1, antialias: u32::from(antialias), ..View::new(camera, scene.len(), 0) };
+fn depth(
+    engine: &mut dyn Engine,
+    scene: &Gaussians,
+    camera: &Camera,
+    antialias: bool,
+) -> Result<Vec<f32>> {
+    let view = View {
+        depth_as_feature: 1,
+        antialias: u32::from(antialias),
+        ..View::new(camera, scene.len(), 0)
+    };
     let frame = engine.render(view, Channels::Feature)?;
-    let of_pixel = |(z, through): (&f32, &f32)| if *through < NOTHING { z / (1.0 - through) } else { f32::INFINITY };
-    Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(of_pixel).collect())
+    let of_pixel = |(z, through): (&f32, &f32)| {
+        if *through < EMPTY_TRANSMITTANCE {
+            z / (1.0 - through)
+        } else {
+            f32::INFINITY
+        }
+    };
+    Ok(frame
+        .channels(3, 4)
+        .iter()
+        .zip(frame.channels(6, 7))
+        .map(of_pixel)
+        .collect())
 }
 
 /// Adds the transparent Gaussians of a hull to a scene, and returns their indices.
 fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
     let first = scene.len();
-    for place in &hull.places {
+    for place in &hull.points {
         scene.push_sphere(*place, 0.5 * hull.spacing, sigmoid(LOGIT), [0.5; 3]);
         scene.opacity_logits[scene.means.len() - 1] = LOGIT;
     }
@@ -160,14 +255,27 @@ fn put(scene: &mut Gaussians, hull: &Hull) -> Range<usize> {
 /// Returns the Gaussians of a hull (`places`) that belong to its object; none if it has no object.
 /// Hull and object must each contain more than half of the other. `lists` holds the objects of each
 /// Gaussian.
-fn own(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
+fn gaussians_of_object(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
     let mut held: BTreeMap<u16, usize> = BTreeMap::new();
-    places.clone().flat_map(|place| lists[place]).for_each(|object| *held.entry(*object).or_default() += 1);
+    places
+        .clone()
+        .flat_map(|place| lists[place])
+        .for_each(|object| *held.entry(*object).or_default() += 1);
     // Nested objects can each contain more than half of the hull: take the smallest.
     let all = |object: u16| lists.iter().filter(|list| list.contains(&object)).count();
-    let most = held.into_iter().filter(|(_, common)| 2 * common > places.len()).map(|(object, common)| (all(object), common, object));
-    let object = most.min().filter(|(all, common, _)| 2 * common > *all).map(|found| found.2);
-    object.map_or_else(Vec::new, |object| places.filter(|place| lists[*place].contains(&object)).collect())
+    let most = held
+        .into_iter()
+        .filter(|(_, common)| 2 * common > places.len())
+        .map(|(object, common)| (all(object), common, object));
+    let object = most
+        .min()
+        .filter(|(all, common, _)| 2 * common > *all)
+        .map(|found| found.2);
+    object.map_or_else(Vec::new, |object| {
+        places
+            .filter(|place| lists[*place].contains(&object))
+            .collect()
+    })
 }
 
 #[cfg(test)]
@@ -189,20 +297,32 @@ mod tests {
         }
         let cameras = (0..12).map(|k| {
             let around = 3.0 * Vec2::from_angle(std::f32::consts::TAU * k as f32 / 12.0);
-            Camera::look_at(&format!("{k:02}.png"), Vec3::new(around.x, 0.4, around.y), Vec3::ZERO, Vec3::Y, 160, 120, 0.8)
+            Camera::look_at(
+                &format!("{k:02}.png"),
+                Vec3::new(around.x, 0.4, around.y),
+                Vec3::ZERO,
+                Vec3::Y,
+                160,
+                120,
+                0.8,
+            )
         });
         let cameras: Vec<Camera> = cameras.collect();
         for camera in &cameras {
             let half = Vec3::new(0.5, 0.5, 0.05);
             let to_world = camera.world_to_camera.inverse();
-            let pane = RunLengths::of(160, 120, |x, y| {
-                let direction = to_world.transform_vector3(camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)));
+            let pane = RunLengths::from_fn(160, 120, |x, y| {
+                let direction = to_world
+                    .transform_vector3(camera.ray(Vec2::new(x as f32 + 0.5, y as f32 + 0.5)));
                 let [a, b] = [-half, half].map(|corner| (corner - camera.centre()) / direction);
                 a.min(b).max_element() < a.max(b).min_element()
             });
-            MaskList { masks: vec![Mask::new(Level::Whole, pane)], ..MaskList::new(160, 120) }
-                .save(&folder.masks_path(&camera.name))
-                .unwrap();
+            MaskList {
+                masks: vec![Mask::new(Level::Whole, pane)],
+                ..MaskList::new(160, 120)
+            }
+            .save(&folder.masks_path(&camera.name))
+            .unwrap();
         }
         (scene, cameras)
     }
@@ -212,21 +332,56 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let (mut scene, cameras) = scene(&folder);
-        let (wall, config) = (scene.clone(), Config { objects: fastlgs_grid::objects::Config::default(), antialias: false });
-        let run = Run { seed: 0, device: "cpu", progress: &Silent };
+        let (wall, config) = (
+            scene.clone(),
+            Config {
+                objects: fastlgs_grid::objects::Config::default(),
+                antialias: false,
+            },
+        );
+        let run = Run {
+            seed: 0,
+            device: "cpu",
+            progress: &Silent,
+        };
         let mapped = objects::map(&mut scene, &folder, &cameras, &config, &run).unwrap();
-        assert!(mapped.chosen.support.is_empty(), "no part of the wall is in most of the masks");
-        let left = |camera: &Camera| unexplained(&folder, camera, &LabelMap::new(160, 120), &mapped.chosen.lists(), &config).unwrap();
+        assert!(
+            mapped.chosen.support.is_empty(),
+            "no part of the wall is in most of the masks"
+        );
+        let left = |camera: &Camera| {
+            unexplained(
+                &folder,
+                camera,
+                &LabelMap::new(160, 120),
+                &mapped.chosen.lists(),
+                &config,
+            )
+            .unwrap()
+        };
         let left = cameras.iter().map(left).collect();
-        let mapped = add(&mut scene, &folder, &cameras, left, &config, &run).unwrap().expect("a pane");
-        let supports: Vec<f32> = mapped.chosen.support.iter().map(|support| support.iou).collect();
+        let mapped = add(&mut scene, &folder, &cameras, left, &config, &run)
+            .unwrap()
+            .expect("a pane");
+        let supports: Vec<f32> = mapped
+            .chosen
+            .support
+            .iter()
+            .map(|support| support.iou)
+            .collect();
         assert!(supports.len() == 1 && supports[0] > 0.7, "{supports:?}");
         assert_eq!(scene.means[..wall.len()], wall.means);
         assert!(scene.len() > wall.len() && count(&scene) == scene.len() - wall.len());
-        assert!(scene.object_ids[wall.len()..].iter().all(|id| *id > 0), "Gaussians without an object are removed");
+        assert!(
+            scene.object_ids[wall.len()..].iter().all(|id| *id > 0),
+            "Gaussians without an object are removed"
+        );
         let mut rest = scene.clone();
         let taken = take(&mut rest);
-        assert_eq!((rest.means, taken.means.as_slice()), (wall.means.clone(), &scene.means[wall.len()..]));
+        assert_eq!(
+            (rest.means, taken.means.as_slice()),
+            (wall.means.clone(), &scene.means[wall.len()..])
+        );
         *scene.object_ids.last_mut().unwrap() = 0;
         let all = scene.len();
         keep_owned(&mut scene);

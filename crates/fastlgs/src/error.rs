@@ -75,7 +75,10 @@ impl<T, E: Into<Error>> Context<T> for Result<T, E> {
     }
 
     fn with_context<S: Display>(self, what: impl FnOnce() -> S) -> Result<T> {
-        self.map_err(|source| Error::While { what: what().to_string(), source: Box::new(source.into()) })
+        self.map_err(|source| Error::While {
+            what: what().to_string(),
+            source: Box::new(source.into()),
+        })
     }
 }
 

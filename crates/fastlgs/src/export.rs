@@ -65,7 +65,7 @@ pub struct SceneReport {
     /// Bytes per value of each group in a small folder; `None` for a file.
     pub bytes_a_value: Option<BTreeMap<String, u8>>,
     /// Mean PSNR of the held-out views in dB; `None` if their photos are missing.
-    pub psnr_held_out: Loss,
+    pub psnr_held_out: BeforeAfter,
     /// Mean PSNR of renders of the output against renders of the scene, in dB.
     pub psnr_against_original: f64,
     /// Name of the device.
@@ -74,7 +74,7 @@ pub struct SceneReport {
 
 /// PSNR before and after the export, in dB.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub struct Loss {
+pub struct BeforeAfter {
     /// PSNR of the scene.
     pub before: Option<f64>,
     /// PSNR of the output.
@@ -87,11 +87,19 @@ const PRECISION_VIEWS: usize = 4;
 const PRECISION_LOSS: f64 = 0.01;
 
 /// Files and folders of a small folder, besides the manifest.
-const LEFT: [&str; 4] = ["scene.safetensors", "grid.json", "grid.safetensors", "cameras"];
+const REPLACED: [&str; 4] = [
+    "scene.safetensors",
+    "grid.json",
+    "grid.safetensors",
+    "cameras",
+];
 
 /// Returns whether a path denotes a folder: one exists there, or the path ends with a separator.
 pub fn names_folder(path: &Path) -> bool {
-    path.as_os_str().to_string_lossy().ends_with(std::path::MAIN_SEPARATOR) || path.is_dir()
+    path.as_os_str()
+        .to_string_lossy()
+        .ends_with(std::path::MAIN_SEPARATOR)
+        || path.is_dir()
 }
 
 /// Exports a trained scene to `config.output`.
@@ -103,9 +111,17 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         let folder = SceneFolder::open(&config.scene)?;
         let cameras = folder.cameras()?;
         camera_path::write(&config.output, &cameras, &folder.manifest()?.frame)?;
-        return Ok(Report::Path { scene: config.scene.clone(), output: config.output.clone(), frames: cameras.len() });
+        return Ok(Report::Path {
+            scene: config.scene.clone(),
+            output: config.output.clone(),
+            frames: cameras.len(),
+        });
     }
-    let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    let ending = config
+        .output
+        .extension()
+        .and_then(|e| e.to_str())
+        .unwrap_or_default();
     let folder = names_folder(&config.output);
     let file = !folder && selection::ENDINGS.contains(&ending);
     if !folder && !file && !ending.is_empty() {
@@ -117,9 +133,16 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
     let mut scene = Session::open(&config.scene, run.device)?;
     let held_out = scene.manifest.held_out(&scene.cameras);
     // Without held-out views, one training view measures the loss.
-    let shown = if held_out.is_empty() { scene.cameras.iter().take(1).cloned().collect() } else { held_out.clone() };
+    let shown = if held_out.is_empty() {
+        scene.cameras.iter().take(1).cloned().collect()
+    } else {
+        held_out.clone()
+    };
     let before = pictures(&mut scene, &shown)?;
-    let degree = config.sh_degree.unwrap_or(scene.gaussians.sh_degree).min(scene.gaussians.sh_degree);
+    let degree = config
+        .sh_degree
+        .unwrap_or(scene.gaussians.sh_degree)
+        .min(scene.gaussians.sh_degree);
     if degree < scene.gaussians.sh_degree {
         scene.show(scene.gaussians.clone().with_sh_degree(degree))?;
     }
@@ -134,7 +157,16 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         (written, None)
     } else {
         let (written, precision) = small_folder(&mut scene, &config.output)?;
-        (written, Some(precision.by_group().into_iter().map(|(group, bytes)| (group.to_owned(), bytes)).collect()))
+        (
+            written,
+            Some(
+                precision
+                    .by_group()
+                    .into_iter()
+                    .map(|(group, bytes)| (group.to_owned(), bytes))
+                    .collect(),
+            ),
+        )
     };
     scene.show(written)?;
     let after = pictures(&mut scene, &shown)?;
@@ -148,7 +180,10 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         gaussians: scene.gaussians.len(),
         sh_degree: scene.gaussians.sh_degree,
         bytes_a_value: precision,
-        psnr_held_out: Loss { before: against_photos(&scene, &held_out, &before)?, after: against_photos(&scene, &held_out, &after)? },
+        psnr_held_out: BeforeAfter {
+            before: against_photos(&scene, &held_out, &before)?,
+            after: against_photos(&scene, &held_out, &after)?,
+        },
         psnr_against_original: same.iter().sum::<f64>() / same.len().max(1) as f64,
         adapter: scene.engine.name(),
     })))
@@ -156,12 +191,17 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
 
 /// Renders the colours of views, `[3][h][w]` each.
 fn pictures(scene: &mut Session, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
-    views.iter().map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec())).collect()
+    views
+        .iter()
+        .map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec()))
+        .collect()
 }
 
 /// Returns whether the photos of all views exist. An exported scene has none.
 fn have_photos(scene: &Session, views: &[Camera]) -> bool {
-    views.iter().all(|view| scene.folder.photo_path(&view.name).is_file())
+    views
+        .iter()
+        .all(|view| scene.folder.photo_path(&view.name).is_file())
 }
 
 /// Returns the mean PSNR of renders against photos in dB, over the pixels that count; `None` if
@@ -170,7 +210,10 @@ fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> R
     if !have_photos(scene, views) {
         return Ok(None);
     }
-    let background = train::Background { color: scene.trained.background, learn: false };
+    let background = train::Background {
+        color: scene.trained.background,
+        learn: false,
+    };
     let mut each = Vec::new();
     for (camera, picture) in views.iter().zip(pictures) {
         let target = train::target(&scene.folder, camera, None, &background)?;
@@ -183,7 +226,11 @@ fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> R
 /// are missing.
 fn precision(scene: &mut Session) -> Result<Precision> {
     let training = scene.manifest.training(&scene.cameras);
-    let views: Vec<Camera> = training.iter().step_by(training.len().div_ceil(PRECISION_VIEWS).max(1)).cloned().collect();
+    let views: Vec<Camera> = training
+        .iter()
+        .step_by(training.len().div_ceil(PRECISION_VIEWS).max(1))
+        .cloned()
+        .collect();
     let original = scene.gaussians.clone();
     let before = pictures(scene, &views)?;
     if against_photos(scene, &views, &before)?.is_none() {
@@ -192,7 +239,8 @@ fn precision(scene: &mut Session) -> Result<Precision> {
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
         scene.show(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
-        against_photos(scene, &views, &pictures)?.context("the photos of the scene are missing now; run 'fastlgs preprocess' again")
+        against_photos(scene, &views, &pictures)?
+            .context("the photos of the scene are missing now; run 'fastlgs preprocess' again")
     })?;
     scene.show(original)?;
     Ok(chosen)
@@ -205,16 +253,30 @@ fn precision(scene: &mut Session) -> Result<Precision> {
 /// The folder is a trained scene, or the features of the scene are not the codes of its objects.
 fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precision)> {
     if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
-        bail!("{}: this folder is the scene itself; choose another folder", root.display());
+        bail!(
+            "{}: this folder is the scene itself; choose another folder",
+            root.display()
+        );
     }
     let folder = SceneFolder::new(root);
     let _lock = SceneLock::take(root, "export")?;
     if folder.manifest().is_ok() && !folder.is_compact() {
-        bail!("{}: this folder is a trained scene, not an export; choose a new folder", root.display());
+        bail!(
+            "{}: this folder is a trained scene, not an export; choose a new folder",
+            root.display()
+        );
     }
     let grid = scene.grid()?;
-    if scene.gaussians.object_ids.iter().zip(&scene.gaussians.features).any(|(id, f)| grid.code_of(*id) != *f) {
-        bail!("the features of the scene were trained by gradient descent, and a small folder cannot store them; export FILE.ply instead");
+    if scene
+        .gaussians
+        .object_ids
+        .iter()
+        .zip(&scene.gaussians.features)
+        .any(|(id, f)| grid.code_of(*id) != *f)
+    {
+        bail!(
+            "the features of the scene were trained by gradient descent, and a small folder cannot store them; export FILE.ply instead"
+        );
     }
     let precision = precision(scene)?;
     let staged = StagedOutput::new(&folder, "export")?;
@@ -229,13 +291,20 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
     grid.save(&staged.folder)?;
     staged.folder.save_cameras(&scene.cameras)?;
     // The export contains no other files of the scene.
-    let manifest = Manifest { files: Default::default(), ..scene.manifest.clone() };
-    staged.publish(&folder, &LEFT, [], &manifest)?;
+    let manifest = Manifest {
+        files: Default::default(),
+        ..scene.manifest.clone()
+    };
+    staged.publish(&folder, &REPLACED, [], &manifest)?;
     let mut written = folder.gaussians()?;
     grid.set_codes(&mut written);
     Ok((written, precision))
 }
 
 fn bytes_of(path: &Path) -> u64 {
-    if path.is_dir() { crate::session::bytes(path) } else { std::fs::metadata(path).map_or(0, |m| m.len()) }
+    if path.is_dir() {
+        crate::session::bytes(path)
+    } else {
+        std::fs::metadata(path).map_or(0, |m| m.len())
+    }
 }

@@ -10,8 +10,8 @@ use fastlgs_vision::import::{self, Import, Lens};
 use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
-    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder, appearance, clip, conse, models, places,
-    segmenter,
+    ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder,
+    appearance, clip, conse, models, places, segmenter,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -98,13 +98,22 @@ pub struct Eyes {
     #[cfg_attr(feature = "clap", arg(long, value_delimiter = ',', default_value = "whole,part,subpart", value_parser = ["whole", "part", "subpart"]))]
     pub levels: Vec<String>,
     /// SAM model, by its name in `models pull`.
-    #[cfg_attr(feature = "clap", arg(long, default_value = "slimsam", value_name = "NAME"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, default_value = "slimsam", value_name = "NAME")
+    )]
     pub sam: String,
     /// ONNX file of SAM's image encoder, instead of --sam.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_decoder"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "FILE", requires = "sam_decoder")
+    )]
     pub sam_encoder: Option<PathBuf>,
     /// ONNX file of SAM's prompt decoder, instead of --sam.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "sam_encoder"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "FILE", requires = "sam_encoder")
+    )]
     pub sam_decoder: Option<PathBuf>,
     /// Settings with which SAM segments a photo. Default: meta, but langsplat with `make --effort
     /// like-paper`.
@@ -120,10 +129,16 @@ pub struct Eyes {
     #[cfg_attr(feature = "clap", arg(long))]
     pub sam_stability: Option<f32>,
     /// CLIP model, by its name in `models pull`.
-    #[cfg_attr(feature = "clap", arg(long, default_value = "clip-vit-b16", value_name = "NAME"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, default_value = "clip-vit-b16", value_name = "NAME")
+    )]
     pub clip: String,
     /// ONNX file of CLIP's image tower, instead of --clip.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", requires = "clip_text"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "FILE", requires = "clip_text")
+    )]
     pub clip_image: Option<PathBuf>,
     /// ONNX file of CLIP's text tower, instead of --clip. With imported embeddings: the tower that
     /// belongs to them.
@@ -161,7 +176,10 @@ impl Eyes {
             ("--sam-iou", self.sam_iou.is_some()),
             ("--sam-stability", self.sam_stability.is_some()),
         ];
-        if let Some((option, _)) = of_sam.iter().find(|(_, is_set)| *is_set && self.segmenter != SegmenterKind::Sam) {
+        if let Some((option, _)) = of_sam
+            .iter()
+            .find(|(_, is_set)| *is_set && self.segmenter != SegmenterKind::Sam)
+        {
             bail!("{option} is for SAM: add --segmenter sam");
         }
         if self.encoder != EncoderKind::Clip && self.clip_image.is_some() {
@@ -184,8 +202,14 @@ impl Eyes {
     pub(crate) fn clip_files(&self) -> Result<[PathBuf; 2]> {
         Ok(match (&self.clip_image, &self.clip_text) {
             (Some(image), Some(text)) => [image.clone(), text.clone()],
-            (None, Some(text)) => bail!("{}: a text tower needs the image tower that belongs to it: --clip-image FILE", text.display()),
-            (Some(image), None) => bail!("{}: an image tower needs the text tower that belongs to it: --clip-text FILE", image.display()),
+            (None, Some(text)) => bail!(
+                "{}: a text tower needs the image tower that belongs to it: --clip-image FILE",
+                text.display()
+            ),
+            (Some(image), None) => bail!(
+                "{}: an image tower needs the text tower that belongs to it: --clip-text FILE",
+                image.display()
+            ),
             (None, None) => Named::find(&self.clip)?.pair()?,
         })
     }
@@ -204,7 +228,11 @@ impl Eyes {
     }
 
     /// Loads the segmenter. Imported masks are read beside `photos` and undistorted by `lenses`.
-    pub fn segmenter(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Segmenter>> {
+    pub fn segmenter(
+        &self,
+        photos: &Path,
+        lenses: &BTreeMap<String, Lens>,
+    ) -> Result<Box<dyn Segmenter>> {
         Ok(match self.segmenter {
             SegmenterKind::Sam => {
                 let [encoder, decoder] = self.sam_files()?;
@@ -216,9 +244,16 @@ impl Eyes {
     }
 
     /// Loads the image encoder. Imported embeddings are read beside `photos`.
-    pub fn encoder(&self, photos: &Path, lenses: &BTreeMap<String, Lens>) -> Result<Box<dyn Encoder>> {
+    pub fn encoder(
+        &self,
+        photos: &Path,
+        lenses: &BTreeMap<String, Lens>,
+    ) -> Result<Box<dyn Encoder>> {
         Ok(match self.encoder {
-            EncoderKind::Clip => Box::new(self.clip_image()?.with_background(calibrations::best_background(&self.files()?))),
+            EncoderKind::Clip => Box::new(
+                self.clip_image()?
+                    .with_background(calibrations::best_background(&self.files()?)),
+            ),
             EncoderKind::Import => Box::new(Import::open(photos, lenses.clone())?),
             EncoderKind::Offline => Box::new(Conse::load()?),
         })
@@ -238,7 +273,9 @@ impl Eyes {
         Ok(match (self.encoder, &self.clip_text) {
             (EncoderKind::Clip, _) => Box::new(ClipText::load(&self.clip_files()?[1])?),
             (EncoderKind::Import, Some(text)) => Box::new(ClipText::load(text)?),
-            (EncoderKind::Import, None) => bail!("imported embeddings need the text tower that belongs to them: --clip-text FILE"),
+            (EncoderKind::Import, None) => bail!(
+                "imported embeddings need the text tower that belongs to them: --clip-text FILE"
+            ),
             (EncoderKind::Offline, _) => Box::new(OfflineText::load()?),
         })
     }
@@ -250,7 +287,14 @@ impl Eyes {
             // Do not resolve links: other files of the model lie beside the link.
             let path = std::path::absolute(&path).unwrap_or(path);
             let (bytes, sha256) = places::digest(&path)?;
-            files.insert(role.to_owned(), ModelFile { path, bytes, sha256 });
+            files.insert(
+                role.to_owned(),
+                ModelFile {
+                    path,
+                    bytes,
+                    sha256,
+                },
+            );
             Ok(())
         };
         if self.segmenter == SegmenterKind::Sam {
@@ -278,10 +322,23 @@ impl Eyes {
             SegmenterKind::Sam => {
                 // Only the files of SAM: masks do not depend on the encoder.
                 let files = self.files()?;
-                let sums: Vec<&str> = files.iter().filter(|(role, _)| role.starts_with("sam")).map(|(_, f)| f.sha256.as_str()).collect();
-                Some(format!("sam {} {:?} {}", sam::VERSION, self.sam_config(), sums.join(" ")))
+                let sums: Vec<&str> = files
+                    .iter()
+                    .filter(|(role, _)| role.starts_with("sam"))
+                    .map(|(_, f)| f.sha256.as_str())
+                    .collect();
+                Some(format!(
+                    "sam {} {:?} {}",
+                    sam::VERSION,
+                    self.sam_config(),
+                    sums.join(" ")
+                ))
             }
-            SegmenterKind::Offline => Some(format!("offline {} {}", segmenter::VERSION, models::offline_stamp())),
+            SegmenterKind::Offline => Some(format!(
+                "offline {} {}",
+                segmenter::VERSION,
+                models::offline_stamp()
+            )),
         })
     }
 
@@ -294,27 +351,47 @@ impl Eyes {
 /// Returns the identity of the encoder of a scene. Embeddings are comparable if they have the same
 /// identity: same model files, same background around masks.
 pub(crate) fn identity_of(manifest: &Manifest) -> String {
-    let file = |role: &str| manifest.models.get(role).map(|file| format!("clip {} {}", file.sha256, manifest.crops).trim_end().to_owned());
+    let file = |role: &str| {
+        manifest.models.get(role).map(|file| {
+            format!("clip {} {}", file.sha256, manifest.crops)
+                .trim_end()
+                .to_owned()
+        })
+    };
     match manifest.encoder.as_str() {
         calibrations::OFFLINE => format!("offline {}", conse::VERSION),
-        other => file("clip_image").or_else(|| file("clip_text")).unwrap_or_else(|| other.to_owned()),
+        other => file("clip_image")
+            .or_else(|| file("clip_text"))
+            .unwrap_or_else(|| other.to_owned()),
     }
 }
 
 /// Returns an embedding for comparisons with texts: components that count only between pictures are
 /// set to 0.
-pub fn for_words(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
-    if manifest.encoder == calibrations::OFFLINE { appearance::for_words(embedding) } else { embedding }
+pub fn for_texts(manifest: &Manifest, embedding: Vec<f32>) -> Vec<f32> {
+    if manifest.encoder == calibrations::OFFLINE {
+        appearance::without_appearance(embedding)
+    } else {
+        embedding
+    }
 }
 
 /// Returns the components of an embedding that are compared with texts.
-pub fn words<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32] {
-    if manifest.encoder == calibrations::OFFLINE { appearance::words(embedding) } else { embedding }
+pub fn text_components<'a>(manifest: &Manifest, embedding: &'a mut [f32]) -> &'a mut [f32] {
+    if manifest.encoder == calibrations::OFFLINE {
+        appearance::text_part(embedding)
+    } else {
+        embedding
+    }
 }
 
 /// Returns whether `embeddings` are comparable with those of a scene's encoder. `encoder` is the
 /// identity of what made them; empty if unknown.
-pub(crate) fn is_current<'a>(manifest: &Manifest, encoder: &str, mut embeddings: impl Iterator<Item = &'a Vec<f32>>) -> bool {
+pub(crate) fn is_current<'a>(
+    manifest: &Manifest,
+    encoder: &str,
+    mut embeddings: impl Iterator<Item = &'a Vec<f32>>,
+) -> bool {
     // The encoder is unknown: only embeddings of the offline encoder can be checked, by their
     // length.
     if encoder.is_empty() {
@@ -329,7 +406,11 @@ pub(crate) fn is_current<'a>(manifest: &Manifest, encoder: &str, mut embeddings:
 /// # Errors
 /// Another encoder, or another version of it, made them, so that they are not comparable.
 pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> Result<()> {
-    if !is_current(manifest, &grid.encoder, grid.objects.iter().flat_map(|o| &o.embeddings)) {
+    if !is_current(
+        manifest,
+        &grid.encoder,
+        grid.objects.iter().flat_map(|o| &o.embeddings),
+    ) {
         let root = folder.root.display();
         bail!(
             "{root}: another encoder than the scene's, or another version of it, embedded its objects; \
@@ -343,13 +424,23 @@ pub fn check_version(manifest: &Manifest, grid: &Grid, folder: &SceneFolder) -> 
 ///
 /// # Errors
 /// The manifest names none, or size or SHA-256 of the file differ.
-fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
+fn recorded_model<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
     let what = role.replace('_', " ");
     let file = manifest.models.get(role).with_context(|| format!("scene.json does not name the {what} that the scene was made with; run 'fastlgs preprocess' again"))?;
-    let bytes = std::fs::metadata(&file.path).with_context(|| format!("the {what} of the scene cannot be opened, {}", file.path.display()))?.len();
+    let bytes = std::fs::metadata(&file.path)
+        .with_context(|| {
+            format!(
+                "the {what} of the scene cannot be opened, {}",
+                file.path.display()
+            )
+        })?
+        .len();
     // Compare the size first, because hashing is slow.
     if bytes != file.bytes || places::digest(&file.path)?.1 != file.sha256 {
-        bail!("{}: this is not the {what} that the scene was made with, because its content differs; restore the original file", file.path.display());
+        bail!(
+            "{}: this is not the {what} that the scene was made with, because its content differs; restore the original file",
+            file.path.display()
+        );
     }
     Ok(&file.path)
 }
@@ -358,55 +449,94 @@ fn remembered<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
 pub fn encoder_of(folder: &SceneFolder, manifest: &Manifest) -> Result<Box<dyn Encoder>> {
     Ok(match manifest.encoder.as_str() {
         "offline" => Box::new(Conse::load()?),
-        "clip" => Box::new(ClipImage::load(remembered(manifest, "clip_image")?)?.with_background(calibrations::background_of(manifest)?)),
-        "import" => Box::new(Recorded::load(folder, manifest)?),
-        other => bail!("the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"),
+        "clip" => Box::new(
+            ClipImage::load(recorded_model(manifest, "clip_image")?)?
+                .with_background(calibrations::background_of(manifest)?),
+        ),
+        "import" => Box::new(ImportedEmbeddings::load(folder, manifest)?),
+        other => bail!(
+            "the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"
+        ),
     })
 }
 
 /// Loads the text tower of the encoder that made a scene's embeddings. `clip_text` replaces the
 /// CLIP tower that the manifest names.
-pub fn text_encoder_of(manifest: &Manifest, clip_text: Option<&Path>) -> Result<Box<dyn TextEncoder>> {
+pub fn text_encoder_of(
+    manifest: &Manifest,
+    clip_text: Option<&Path>,
+) -> Result<Box<dyn TextEncoder>> {
     Ok(match (manifest.encoder.as_str(), clip_text) {
         ("offline", _) => Box::new(OfflineText::load()?),
         (_, Some(path)) => Box::new(ClipText::load(path)?),
-        ("clip", None) => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
-        ("import", None) if manifest.models.contains_key("clip_text") => Box::new(ClipText::load(remembered(manifest, "clip_text")?)?),
-        ("import", None) => bail!("the scene's embeddings were imported: name the text tower that belongs to them with --clip-text FILE"),
-        (other, None) => bail!("the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"),
+        ("clip", None) => Box::new(ClipText::load(recorded_model(manifest, "clip_text")?)?),
+        ("import", None) if manifest.models.contains_key("clip_text") => {
+            Box::new(ClipText::load(recorded_model(manifest, "clip_text")?)?)
+        }
+        ("import", None) => bail!(
+            "the scene's embeddings were imported: name the text tower that belongs to them with --clip-text FILE"
+        ),
+        (other, None) => bail!(
+            "the embeddings of the scene come from the encoder '{other}', which this version does not know; update FastLGS"
+        ),
     })
 }
 
 /// Encoder that returns the imported embeddings in the scene folder: each mask gets that of the
 /// imported mask that fits it.
-struct Recorded {
+struct ImportedEmbeddings {
     folder: SceneFolder,
     views: Vec<Camera>,
     masks: Vec<Mask>,
 }
 
-impl Recorded {
+impl ImportedEmbeddings {
     fn load(folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
         let views = manifest.training(&folder.cameras()?);
-        Ok(Self { folder: folder.clone(), views, masks: evidence::load_masks(folder)?.0 })
+        Ok(Self {
+            folder: folder.clone(),
+            views,
+            masks: evidence::load_masks(folder)?.0,
+        })
     }
 }
 
-impl Encoder for Recorded {
+impl Encoder for ImportedEmbeddings {
     fn name(&self) -> &'static str {
         "import"
     }
 
-    fn embed_masks(&self, view: &str, _photo: &RgbImage, masks: &LabelMap) -> fastlgs_vision::Result<Vec<Vec<f32>>> {
+    fn embed_masks(
+        &self,
+        view: &str,
+        _photo: &RgbImage,
+        masks: &LabelMap,
+    ) -> fastlgs_vision::Result<Vec<Vec<f32>>> {
         let index = self.views.iter().position(|camera| camera.name == view);
         let Some(camera) = index.map(|i| &self.views[i]) else {
-            return Err(fastlgs_vision::Error::Missing(format!("the view '{view}' is not a training view")));
+            return Err(fastlgs_vision::Error::Missing(format!(
+                "the view '{view}' is not a training view"
+            )));
         };
         let mut whole = MaskList::new(camera.width, camera.height);
-        let labels = whole.add(Level::Whole, &self.folder.masks(camera)?.painted(Level::Whole));
-        let row = |label: u16| self.masks.iter().find(|m| Some(m.view) == index && m.label == label).map(|m| m.embedding.clone());
+        let labels = whole.add(
+            Level::Whole,
+            &self.folder.masks(camera)?.painted(Level::Whole),
+        );
+        let row = |label: u16| {
+            self.masks
+                .iter()
+                .find(|m| Some(m.view) == index && m.label == label)
+                .map(|m| m.embedding.clone())
+        };
         let dimension = self.masks.first().map_or(0, |m| m.embedding.len());
-        let fitting = import::fitting(masks, &whole).into_iter();
-        Ok(fitting.map(|place| place.and_then(|p| row(labels[p])).unwrap_or_else(|| vec![0.0; dimension])).collect())
+        let fitting = import::best_matches(masks, &whole).into_iter();
+        Ok(fitting
+            .map(|place| {
+                place
+                    .and_then(|p| row(labels[p]))
+                    .unwrap_or_else(|| vec![0.0; dimension])
+            })
+            .collect())
     }
 }

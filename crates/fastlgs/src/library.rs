@@ -115,26 +115,49 @@ impl Search {
         let started = Instant::now();
         let (trained, skipped) = scenes_below(root)?;
         for row in &skipped {
-            run.warn(&format!("{}: left out: {}", row.scene, row.why));
+            run.warn(&format!(
+                "{}: this scene is not searched: {}",
+                row.scene, row.why
+            ));
         }
-        let Some((first, manifest)) = trained.first() else { bail!("{}: this folder contains no trained scenes; train one first", root.display()) };
+        let Some((first, manifest)) = trained.first() else {
+            bail!(
+                "{}: this folder contains no trained scenes; train one first",
+                root.display()
+            )
+        };
         let work = run.work("library", trained.len() as u64);
         let load = |(path, manifest): &(String, Manifest)| -> Result<Opened> {
             work.advance()?;
             let folder = SceneFolder::new(root.join(path));
-            let grid = Grid::load(&folder).with_context(|| format!("{path}: its object table cannot be read; train it again"))?;
+            let grid = Grid::load(&folder).with_context(|| {
+                format!("{path}: the object table cannot be read; train this scene again")
+            })?;
             eyes::check_version(manifest, &grid, &folder)?;
-            Ok(Opened { path: path.clone(), grid })
+            Ok(Opened {
+                path: path.clone(),
+                grid,
+            })
         };
         let scenes = trained.iter().map(load).collect::<Result<Vec<_>>>()?;
         let load_ms = started.elapsed().as_secs_f64() * 1e3;
-        let texts = Texts::load(&SceneFolder::new(root.join(first)), manifest, config.clip_text.as_deref())?;
-        let search = Self { config, texts, scenes, skipped, load_ms };
+        let texts = Texts::load(
+            &SceneFolder::new(root.join(first)),
+            manifest,
+            config.clip_text.as_deref(),
+        )?;
+        let search = Self {
+            config,
+            texts,
+            scenes,
+            skipped,
+            load_ms,
+        };
         search.ask("warm up")?;
         Ok(search)
     }
 
-    /// Returns the scenes that contain what `text` names: each scene answers by itself.
+    /// Returns the best scenes for a text. Each scene is queried on its own.
     ///
     /// # Errors
     /// A text that cannot be embedded.
@@ -143,26 +166,46 @@ impl Search {
         let embedded = Embedded::words(text, &self.texts, &self.config.negatives)?;
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
-        let config = QueryConfig { false_alarms: self.config.false_alarms, ..QueryConfig::default() };
+        let config = QueryConfig {
+            false_alarms: self.config.false_alarms,
+            ..QueryConfig::default()
+        };
         let row = |scene: &Opened| -> Option<Row> {
             let answer = embedded.find(&scene.grid, &config);
             let object = answer.targets.first().or(answer.ranked.first())?.id;
             let support = scene.grid.objects[usize::from(object) - 1].support;
             let score = query::best_score(&answer.ranked);
-            Some(Row { scene: scene.path.clone(), object, score, support, found: !answer.targets.is_empty() })
+            Some(Row {
+                scene: scene.path.clone(),
+                object,
+                score,
+                support,
+                found: !answer.targets.is_empty(),
+            })
         };
         let mut rows: Vec<Row> = self.scenes.par_iter().filter_map(row).collect();
         rows.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.scene.cmp(&b.scene)));
         rows.truncate(self.config.scenes);
         let search_ms = started.elapsed().as_secs_f64() * 1e3;
-        let objects = self.scenes.iter().map(|scene| scene.grid.objects.len()).sum();
+        let objects = self
+            .scenes
+            .iter()
+            .map(|scene| scene.grid.objects.len())
+            .sum();
         Ok(Report {
             text: text.to_owned(),
             found: rows.iter().any(|r| r.found),
             scenes: rows,
-            searched: Searched { scenes: self.scenes.len(), objects },
+            searched: Searched {
+                scenes: self.scenes.len(),
+                objects,
+            },
             skipped: self.skipped.clone(),
-            ms: Milliseconds { load: self.load_ms, encode: encode_ms, search: search_ms },
+            ms: Milliseconds {
+                load: self.load_ms,
+                encode: encode_ms,
+                search: search_ms,
+            },
         })
     }
 }
@@ -178,11 +221,15 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
     folders.sort();
     let (mut scenes, mut skipped): (Vec<Scene>, Vec<Skipped>) = (Vec::new(), Vec::new());
     for folder in folders {
-        let path = folder.strip_prefix(root).unwrap_or(&folder).to_string_lossy().into_owned();
+        let path = folder
+            .strip_prefix(root)
+            .unwrap_or(&folder)
+            .to_string_lossy()
+            .into_owned();
         let manifest = SceneFolder::new(&folder).manifest();
         let why = match &manifest {
             Err(error) => Some(error.to_string()),
-            Ok(own) => match train::Report::of(own, &folder) {
+            Ok(own) => match train::Report::from_manifest(own, &folder) {
                 Err(error) => Some(error.to_string()),
                 Ok(None) => Some("it was never trained".to_owned()),
                 Ok(Some(_)) => {
@@ -197,14 +244,18 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
         };
         match (why, manifest) {
             (None, Ok(manifest)) => scenes.push((path, manifest)),
-            (why, _) => skipped.push(Skipped { scene: path, why: why.unwrap_or_default() }),
+            (why, _) => skipped.push(Skipped {
+                scene: path,
+                why: why.unwrap_or_default(),
+            }),
         }
     }
     Ok((scenes, skipped))
 }
 
 fn collect(folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Result<()> {
-    let entries = std::fs::read_dir(folder).with_context(|| format!("{}: the library's folder cannot be read", folder.display()))?;
+    let entries = std::fs::read_dir(folder)
+        .with_context(|| format!("{}: the library's folder cannot be read", folder.display()))?;
     for entry in entries {
         let entry = entry?;
         let path = entry.path();

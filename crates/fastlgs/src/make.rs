@@ -27,7 +27,10 @@ pub struct Config {
 
 impl Default for Config {
     fn default() -> Self {
-        Self { preprocess: preprocess::Config::default(), effort: train::Preset::Quick }
+        Self {
+            preprocess: preprocess::Config::default(),
+            effort: train::Preset::Quick,
+        }
     }
 }
 
@@ -57,15 +60,29 @@ pub struct Report {
 /// # Errors
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
 pub fn make(config: &Config, run: &Run) -> Result<Report> {
-    let train = train::Config { scene: config.preprocess.output.clone(), preset: config.effort, ..Default::default() };
+    let train = train::Config {
+        scene: config.preprocess.output.clone(),
+        preset: config.effort,
+        ..Default::default()
+    };
     let mut preprocess = config.preprocess.clone();
     if config.effort == train::Preset::LikePaper {
-        preprocess.eyes.sam_preset.get_or_insert(SamPreset::LangSplat);
+        preprocess
+            .eyes
+            .sam_preset
+            .get_or_insert(SamPreset::LangSplat);
     }
     let (state, train) = scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
-    Ok(Report { state, photos: [manifest.training(&cameras).len(), manifest.held_out(&cameras).len()], train })
+    Ok(Report {
+        state,
+        photos: [
+            manifest.training(&cameras).len(),
+            manifest.held_out(&cameras).len(),
+        ],
+        train,
+    })
 }
 
 /// Makes a scene with all options of both stages; `runs` holds the run of each. `train.scene` must
@@ -73,25 +90,58 @@ pub fn make(config: &Config, run: &Run) -> Result<Report> {
 ///
 /// # Errors
 /// Those of both stages.
-pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run; 2]) -> Result<(State, train::Report)> {
+pub fn scene(
+    preprocess: &preprocess::Config,
+    train: &train::Config,
+    runs: [&Run; 2],
+) -> Result<(State, train::Report)> {
     let photos = &preprocess.photos;
-    let photos = photos.canonicalize().with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
+    let photos = photos
+        .canonicalize()
+        .with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
     let seeds = runs.map(|run| run.seed);
     // Leave out the paths of the scene, because a scene may be moved.
-    let how = preprocess::Config { photos: photos.clone(), output: PathBuf::new(), ..preprocess.clone() };
-    let how = json!([how, train::Config { scene: PathBuf::new(), ..train.clone() }]);
+    let how = preprocess::Config {
+        photos: photos.clone(),
+        output: PathBuf::new(),
+        ..preprocess.clone()
+    };
+    let how = json!([
+        how,
+        train::Config {
+            scene: PathBuf::new(),
+            ..train.clone()
+        }
+    ]);
     check_apart(&photos, &preprocess.output)?;
     let folder = SceneFolder::new(&preprocess.output);
-    let made = json!([env!("CARGO_PKG_VERSION"), conse::VERSION, seeds, how, files(&photos)?]);
-    let known = folder.manifest().ok().filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
-    let whole = [folder.ply_path(), folder.root.join("grid.json")].iter().all(|file| file.is_file());
-    if let Some(report) = known.as_ref().filter(|_| whole).map(|known| train::Report::of(known, &folder.root)).transpose()?.flatten() {
+    let made = json!([
+        env!("CARGO_PKG_VERSION"),
+        conse::VERSION,
+        seeds,
+        how,
+        files(&photos)?
+    ]);
+    let known = folder
+        .manifest()
+        .ok()
+        .filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
+    let is_complete = [folder.ply_path(), folder.root.join("grid.json")]
+        .iter()
+        .all(|file| file.is_file());
+    if let Some(report) = known
+        .as_ref()
+        .filter(|_| is_complete)
+        .map(|known| train::Report::from_manifest(known, &folder.root))
+        .transpose()?
+        .flatten()
+    {
         return Ok((State::Kept, report));
     }
     let lock = SceneLock::take(&preprocess.output, "make")?;
     // An interrupted preprocessing continues by the cache, an interrupted training by its
     // checkpoint.
-    let begun = known.is_some() && checkpoints::is_begun(&folder);
+    let begun = known.is_some() && checkpoints::can_resume(&folder);
     if !begun {
         checkpoints::forget(&folder);
         crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
@@ -99,7 +149,14 @@ pub fn scene(preprocess: &preprocess::Config, train: &train::Config, runs: [&Run
         manifest.notes.insert(train::MADE.to_owned(), made.clone());
         folder.save_manifest(&manifest)?;
     }
-    let report = train::train_locked(&train::Config { resume: begun || train.resume, ..train.clone() }, &lock, runs[1])?;
+    let report = train::train_locked(
+        &train::Config {
+            resume: begun || train.resume,
+            ..train.clone()
+        },
+        &lock,
+        runs[1],
+    )?;
     let mut manifest = folder.manifest()?;
     // Record the photos as they were before training: later changes are not in the scene.
     manifest.notes.insert(train::MADE.to_owned(), made);
@@ -119,8 +176,17 @@ fn files(folder: &Path) -> Result<Value> {
         let entry = entry.map_err(refused)?;
         let name = entry.file_name().to_string_lossy().into_owned();
         // Follow links, which are common in folders of photos.
-        let Some(about) = std::fs::metadata(entry.path()).ok().filter(|_| !name.starts_with('.')) else { continue };
-        let value = if about.is_dir() { files(&entry.path())? } else { fingerprint(&entry.path())? };
+        let Some(about) = std::fs::metadata(entry.path())
+            .ok()
+            .filter(|_| !name.starts_with('.'))
+        else {
+            continue;
+        };
+        let value = if about.is_dir() {
+            files(&entry.path())?
+        } else {
+            fingerprint(&entry.path())?
+        };
         found.insert(name, value);
     }
     Ok(Value::Object(found))

@@ -1,4 +1,4 @@
-//! Names that the user has taught: examples under a name, to which every scene of the same encoder answers.
+//! Taught names: examples of objects under a name, for all scenes with the same encoder.
 
 use crate::Result;
 use crate::error::{Context, bail};
@@ -7,14 +7,14 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What one lesson showed.
+/// An example of a taught name.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Example {
-    /// The encoder that embedded it.
+    /// Identity of the encoder that embedded it.
     pub encoder: String,
-    /// Where it was seen.
+    /// Source: an object of a scene, or a picture file.
     pub from: String,
-    /// Embeddings, one a view.
+    /// Embeddings, one for each view.
     pub embeddings: Vec<Vec<f32>>,
 }
 
@@ -23,66 +23,89 @@ pub struct Example {
 #[serde(transparent)]
 pub struct Names(BTreeMap<String, Vec<Example>>);
 
-/// A name as it is kept: without capitals and superfluous spaces.
+/// Normalises a name: lower case, and one space between words.
 pub(crate) fn plain(name: &str) -> String {
-    name.split_whitespace().collect::<Vec<_>>().join(" ").to_lowercase()
+    name.split_whitespace()
+        .collect::<Vec<_>>()
+        .join(" ")
+        .to_lowercase()
 }
 
 impl Names {
-    /// The file that keeps them.
+    /// Returns the path of the user's file of names.
     pub fn path() -> PathBuf {
         fs::data_dir().join("names.json")
     }
 
-    /// The user's names; none where nothing was taught yet.
+    /// Loads the user's names; none if there is no file.
     ///
     /// # Errors
     /// A file that cannot be read.
     pub fn load() -> Result<Self> {
         let path = Self::path();
-        if path.exists() { Self::read(&path) } else { Ok(Self::default()) }
+        if path.exists() {
+            Self::read(&path)
+        } else {
+            Ok(Self::default())
+        }
     }
 
-    /// Changes the user's names; whoever else does waits, so that no lesson is lost.
+    /// Changes the user's names under a lock, so that no simultaneous change is lost. Returns the
+    /// result of `change`.
     ///
     /// # Errors
-    /// A file that cannot be read or written, and what `change` returns; the names then stay as they were.
+    /// A file that cannot be read or written, or an error of `change`. The names then remain
+    /// unchanged.
     pub fn change<T>(change: impl FnOnce(&mut Self) -> Result<T>) -> Result<T> {
         let path = Self::path();
-        let _alone = fs::locked(&path)?;
+        let _alone = fs::acquire_lock(&path)?;
         let mut names = Self::load()?;
         let out = change(&mut names)?;
         names.write(&path)?;
         Ok(out)
     }
 
-    /// The names of a file that [`Self::write`] wrote.
+    /// Reads the names of a file that [`Self::write`] wrote.
     ///
     /// # Errors
-    /// A file that cannot be read, or holds something else.
+    /// A file that cannot be read, or has other contents.
     pub fn read(path: &Path) -> Result<Self> {
-        let names: Self = fs::read_json(path).with_context(|| format!("{}: no names that were exported", path.display()))?;
-        let finite = |e: &Example| !e.embeddings.is_empty() && e.embeddings.iter().flatten().all(|v| v.is_finite());
-        if let Some((name, _)) = names.0.iter().find(|(name, examples)| plain(name) != **name || !examples.iter().all(finite)) {
-            bail!("{}: the name '{name}' is damaged; take it out of the file, or move the file away", path.display());
+        let names: Self = fs::read_json(path).with_context(|| {
+            format!(
+                "{}: this is not a file that 'fastlgs names export' wrote",
+                path.display()
+            )
+        })?;
+        let finite = |e: &Example| {
+            !e.embeddings.is_empty() && e.embeddings.iter().flatten().all(|v| v.is_finite())
+        };
+        if let Some((name, _)) = names
+            .0
+            .iter()
+            .find(|(name, examples)| plain(name) != **name || !examples.iter().all(finite))
+        {
+            bail!(
+                "{}: the entry of the name '{name}' is damaged; remove it from the file, or move the file away",
+                path.display()
+            );
         }
         Ok(names)
     }
 
-    /// Writes them to a file.
+    /// Writes the names to a file.
     ///
     /// # Errors
-    /// The system's refusal; what was there before then stays.
+    /// The file cannot be written. Its earlier contents then remain.
     pub fn write(&self, path: &Path) -> Result<()> {
         Ok(fs::write_json(path, self)?)
     }
 
-    /// The examples of a name, if it was taught.
+    /// Returns the examples of a name; `None` if it was not taught.
     pub fn of(&self, name: &str) -> Option<&[Example]> {
         self.0.get(&plain(name)).map(Vec::as_slice)
     }
 
-    /// Adds an example, unless it is there already.
+    /// Adds an example to a name, unless the name already has it.
     pub fn add(&mut self, name: &str, example: Example) {
         let examples = self.0.entry(plain(name)).or_default();
         if !examples.contains(&example) {
@@ -90,27 +113,31 @@ impl Names {
         }
     }
 
-    /// Adds the examples of others; how many names came.
+    /// Adds all examples of `others`, and returns the number of their names.
     pub fn extend(&mut self, others: Self) -> usize {
         let count = others.0.len();
         for (name, examples) in others.0 {
-            examples.into_iter().for_each(|example| self.add(&name, example));
+            examples
+                .into_iter()
+                .for_each(|example| self.add(&name, example));
         }
         count
     }
 
-    /// Forgets a name.
+    /// Removes a name and its examples.
     ///
     /// # Errors
-    /// A name that was never taught.
+    /// A name that was not taught.
     pub fn remove(&mut self, name: &str) -> Result<()> {
         match self.0.remove(&plain(name)) {
             Some(_) => Ok(()),
-            None => bail!("'{name}' was never taught; 'fastlgs names list' shows what was"),
+            None => {
+                bail!("'{name}' was never taught; run 'fastlgs names list' to see all taught names")
+            }
         }
     }
 
-    /// What a list shows: each name with its examples.
+    /// Returns one row for each name, sorted by name.
     pub fn rows(&self) -> Vec<Row> {
         let row = |(name, examples): (&String, &Vec<Example>)| Row {
             name: name.clone(),
@@ -127,11 +154,11 @@ impl Names {
 pub struct Row {
     /// The name.
     pub name: String,
-    /// Lessons.
+    /// Number of examples.
     pub examples: usize,
-    /// Their embeddings.
+    /// Number of embeddings of all examples.
     pub views: usize,
-    /// Where they were seen.
+    /// Source of each example.
     pub from: Vec<String>,
 }
 
@@ -141,7 +168,11 @@ mod tests {
 
     #[test]
     fn names_are_kept_without_capitals_and_forgotten_by_name() {
-        let example = |from: &str| Example { encoder: "offline".into(), from: from.into(), embeddings: vec![vec![0.6, 0.8]] };
+        let example = |from: &str| Example {
+            encoder: "offline".into(),
+            from: from.into(),
+            embeddings: vec![vec![0.6, 0.8]],
+        };
         let mut names = Names::default();
         names.add("Lis  rudy", example("a"));
         names.add("lis rudy", example("a"));
@@ -155,8 +186,23 @@ mod tests {
         assert_eq!(others, names);
         assert_eq!(names.rows()[0].from, ["a", "b"]);
         names.remove("Lis rudy").expect("it was taught");
-        assert!(names.remove("lis rudy").expect_err("gone").to_string().contains("never taught"));
-        std::fs::write(&path, "{\"a\": [{\"encoder\": \"\", \"from\": \"\", \"embeddings\": []}]}").expect("a file");
-        assert!(Names::read(&path).expect_err("damaged").to_string().contains("'a' is damaged"));
+        assert!(
+            names
+                .remove("lis rudy")
+                .expect_err("gone")
+                .to_string()
+                .contains("never taught")
+        );
+        std::fs::write(
+            &path,
+            "{\"a\": [{\"encoder\": \"\", \"from\": \"\", \"embeddings\": []}]}",
+        )
+        .expect("a file");
+        assert!(
+            Names::read(&path)
+                .expect_err("damaged")
+                .to_string()
+                .contains("'a' is damaged")
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Which folders a stage may write, and the lock that lets one run at a time write a scene.
+//! Checks output folders, and locks a scene so that only one run writes it.
 
 use crate::Result;
 use crate::error::{Context, bail};
@@ -10,58 +10,82 @@ use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
 use std::path::{Component, Path, PathBuf};
 
-/// The lock file in a scene's folder. It also marks the folder of a first run that was killed as ours.
+/// Lock file in a scene folder. It also marks a folder that a killed first run created.
 const LOCK: &str = "scene.lock";
-/// How a lock file of ours begins.
+/// First word of a lock file.
 const MARK: &str = "FastLGS";
 
-/// While it lives, no other run writes the scene. The system releases it when the process ends.
+/// Lock of a scene folder: as long as it exists, no other run writes the scene. The operating
+/// system releases it when the process ends.
 pub(crate) struct SceneLock {
     folder: PathBuf,
-    /// Whether the folder was made for this run.
+    /// Whether this run created the folder.
     created: bool,
     _file: File,
 }
 
 impl SceneLock {
-    /// Checks that `stage` may write the folder `scene`, creates it where it is missing, and locks it. A scene that a killed run was
-    /// replacing is put back.
+    /// Checks that `stage` may write the folder `scene`, creates it if necessary, and locks it.
+    /// Restores a scene that a killed run was replacing.
     ///
     /// # Errors
-    /// A folder with files that are no scene's, a folder that another run writes, or the system's refusal.
+    /// The folder holds other files than a scene, another run writes it, or it cannot be created.
     pub fn take(scene: &Path, stage: &str) -> Result<Self> {
         let folder = resolved(scene)?;
-        check_writable(&folder).with_context(|| format!("{} cannot be written", scene.display()))?;
+        check_writable(&folder)
+            .with_context(|| format!("{} cannot be written", scene.display()))?;
         let created = !folder.exists();
         std::fs::create_dir_all(&folder).map_err(Error::io(scene))?;
         let path = folder.join(LOCK);
-        let open = File::options().create(true).truncate(false).read(true).write(true).open(&path);
+        let open = File::options()
+            .create(true)
+            .truncate(false)
+            .read(true)
+            .write(true)
+            .open(&path);
         let mut file = open.map_err(Error::io(&path))?;
         match file.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let mut holder = String::new();
                 let _ = file.read_to_string(&mut holder);
-                let holder = holder.trim().strip_prefix(MARK).map_or("another run", |line| line.trim_start_matches([':', ' ']));
-                bail!("{}: {holder} is writing this scene; wait until it ends, or stop it", scene.display());
+                let holder = holder
+                    .trim()
+                    .strip_prefix(MARK)
+                    .map_or("another run", |line| line.trim_start_matches([':', ' ']));
+                bail!(
+                    "{}: {holder} is writing this scene; wait until it ends, or stop it",
+                    scene.display()
+                );
             }
             Err(TryLockError::Error(error)) => return Err(Error::io(&path)(error).into()),
         }
-        let line = format!("{MARK}: 'fastlgs {stage}' (process {})\n", std::process::id());
-        let note = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(line.as_bytes()));
+        let line = format!(
+            "{MARK}: 'fastlgs {stage}' (process {})\n",
+            std::process::id()
+        );
+        let note = file
+            .set_len(0)
+            .and_then(|()| file.rewind())
+            .and_then(|()| file.write_all(line.as_bytes()));
         note.map_err(Error::io(&path))?;
         StagedOutput::recover(&SceneFolder::new(&folder))?;
-        Ok(Self { folder, created, _file: file })
+        Ok(Self {
+            folder,
+            created,
+            _file: file,
+        })
     }
 }
 
 impl SceneLock {
-    /// Locks a scene that must be there.
+    /// Locks an existing scene.
     ///
     /// # Errors
-    /// A folder that is no scene, and those of [`SceneLock::take`].
+    /// A folder that is not a scene, and those of [`SceneLock::take`].
     pub fn of_scene(scene: &Path, stage: &str) -> Result<Self> {
-        // Where a run was killed while it replaced the scene, the lock remains, and the scene is put back below.
+        // If a run was killed while it replaced the scene, the lock file remains, and `take`
+        // restores the scene.
         if !scene.join(LOCK).is_file() {
             SceneFolder::open(scene)?;
         }
@@ -72,7 +96,10 @@ impl SceneLock {
 impl Drop for SceneLock {
     fn drop(&mut self) {
         // A run that failed before it wrote anything leaves nothing behind.
-        let only_lock = self.folder.read_dir().is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == LOCK));
+        let only_lock = self
+            .folder
+            .read_dir()
+            .is_ok_and(|entries| entries.flatten().all(|entry| entry.file_name() == LOCK));
         if only_lock {
             let _ = std::fs::remove_file(self.folder.join(LOCK));
             if self.created {
@@ -82,77 +109,100 @@ impl Drop for SceneLock {
     }
 }
 
-/// A folder may be written when it does not exist, is empty, is a scene of ours, or holds what a killed first run left.
+/// Checks that a folder may be written: it does not exist, is empty, is a scene, or was left by a
+/// killed first run.
 fn check_writable(folder: &Path) -> Result<()> {
     let entries = match folder.read_dir() {
         Ok(entries) => entries,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
         Err(error) => return Err(Error::io(folder)(error).into()),
     };
-    let mut names: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    let mut names: Vec<String> = entries
+        .flatten()
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect();
     names.sort();
     let manifest = folder.join(MANIFEST);
     if manifest.is_file() {
         return match fs::read_json::<Manifest>(&manifest) {
-            Err(error) => bail!("its {MANIFEST} is none that FastLGS wrote ({error}); name a folder that does not exist yet"),
+            Err(error) => bail!(
+                "its {MANIFEST} was not written by FastLGS ({error}); choose a folder that does not exist yet"
+            ),
             Ok(manifest) if manifest.files.is_empty() => {
                 bail!(
-                    "its {MANIFEST} does not list the scene's files, as an earlier version wrote it; name a folder that does not exist yet"
+                    "its {MANIFEST} does not list the files of the scene; choose a folder that does not exist yet"
                 )
             }
             Ok(_) => Ok(()),
         };
     }
-    let ours = std::fs::read_to_string(folder.join(LOCK)).is_ok_and(|text| text.is_empty() || text.starts_with(MARK));
+    let ours = std::fs::read_to_string(folder.join(LOCK))
+        .is_ok_and(|text| text.is_empty() || text.starts_with(MARK));
     match names.first() {
         Some(name) if !ours => {
             bail!(
-                "it is not empty ('{name}') and has no {MANIFEST}, so it is not a scene; name a folder that does not exist yet or is empty"
+                "it is not empty ('{name}') and has no {MANIFEST}, so it is not a scene; choose a folder that does not exist yet or is empty"
             )
         }
         _ => Ok(()),
     }
 }
 
-/// Checks that photos (a folder or a video) and the scene to write lie apart: neither is, holds or lies in the other, links resolved.
+/// Checks that photos (a folder or a video) and the output scene do not contain each other. Links
+/// are resolved.
 ///
 /// # Errors
-/// A sentence that names both places.
+/// A message with both paths.
 pub(crate) fn check_apart(photos: &Path, scene: &Path) -> Result<()> {
     let folder = resolved(scene)?;
     let album = resolved(photos)?;
-    // Photos that are linked from elsewhere must not come from the scene, which is replaced while they are read.
+    // Linked photos must not lie in the scene, which is replaced while they are read.
     let folders = std::iter::once(photos.to_owned()).chain(images_folder(photos));
     let links = folders.flat_map(|folder| folder.read_dir().into_iter().flatten().flatten());
-    let links =
-        links.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink())).filter_map(|entry| entry.path().canonicalize().ok());
-    let within = std::iter::once(album.clone()).chain(links).find(|place| place.starts_with(&folder));
-    let Some(place) = within.or_else(|| folder.starts_with(&album).then(|| album.clone())) else { return Ok(()) };
+    let links = links
+        .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink()))
+        .filter_map(|entry| entry.path().canonicalize().ok());
+    let within = std::iter::once(album.clone())
+        .chain(links)
+        .find(|place| place.starts_with(&folder));
+    let Some(place) = within.or_else(|| folder.starts_with(&album).then(|| album.clone())) else {
+        return Ok(());
+    };
     let how = match (place == folder, place.starts_with(&folder)) {
         (true, _) => "it is the folder of the photos",
-        (_, true) => "the photos lie in it",
+        (_, true) => "it contains the photos",
         _ => "it lies in the folder of the photos",
     };
     let (scene, photos, other) = (scene.display(), photos.display(), beside(&album));
     bail!(
-        "{scene} cannot be the scene of the photos {photos}: {how}; nothing was written, name a folder beside the photos, such as {}",
+        "{scene} cannot be the output folder for the photos {photos}: {how}; nothing was written; choose a folder beside the photos, such as {}",
         other.display()
     )
 }
 
-/// A name for a scene beside a folder of photos.
+/// Returns a path for a scene beside a folder of photos.
 fn beside(photos: &Path) -> PathBuf {
-    let name = photos.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let name = photos
+        .file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned();
     photos.with_file_name(format!("{name}-scene"))
 }
 
-/// An absolute path without links and dots; its last folders need not exist.
+/// Returns an absolute path without links and dots. Its last folders need not exist.
+///
+/// # Errors
+/// An empty path, or one that cannot be made absolute.
 pub(crate) fn resolved(path: &Path) -> Result<PathBuf> {
     if path.as_os_str().is_empty() {
-        bail!("no output folder was named");
+        bail!("the path of the folder is empty; name a folder");
     }
     let mut known = PathBuf::new();
-    for part in std::path::absolute(path).map_err(Error::io(path))?.components() {
+    for part in std::path::absolute(path)
+        .map_err(Error::io(path))?
+        .components()
+    {
         match part {
             Component::ParentDir => drop(known.pop()),
             Component::CurDir => {}
@@ -168,7 +218,7 @@ pub(crate) fn resolved(path: &Path) -> Result<PathBuf> {
 mod tests {
     use super::*;
 
-    /// The sentence with its causes.
+    /// Returns the message of an error with its causes.
     fn refusal<T>(result: Result<T>) -> String {
         crate::one_sentence(&result.err().expect("a refusal"))
     }
@@ -182,20 +232,35 @@ mod tests {
         let album = dir.path().join("album");
         std::fs::create_dir(&album).unwrap();
         drop(SceneLock::take(&album, "preprocess").unwrap());
-        assert_eq!(std::fs::read_dir(&album).unwrap().count(), 0, "a folder that was there stays, as it was");
+        assert_eq!(
+            std::fs::read_dir(&album).unwrap().count(),
+            0,
+            "an existing folder remains unchanged"
+        );
         std::fs::write(album.join("IMG_1.CR3"), "raw").unwrap();
         let refused = refusal(SceneLock::take(&album, "preprocess"));
-        assert!(refused.contains("IMG_1.CR3") && refused.contains("not a scene"), "{refused}");
-        // Another program's scene.json.
+        assert!(
+            refused.contains("IMG_1.CR3") && refused.contains("not a scene"),
+            "{refused}"
+        );
+        // A scene.json of another program.
         std::fs::write(album.join(MANIFEST), r#"{"nodes": []}"#).unwrap();
-        assert!(refusal(SceneLock::take(&album, "preprocess")).contains("none that FastLGS wrote"));
-        assert_eq!(std::fs::read_dir(&album).unwrap().count(), 2, "nothing was written");
-        // What a killed run left.
+        assert!(refusal(SceneLock::take(&album, "preprocess")).contains("not written by FastLGS"));
+        assert_eq!(
+            std::fs::read_dir(&album).unwrap().count(),
+            2,
+            "nothing was written"
+        );
+        // A folder that a killed run left.
         let killed = dir.path().join("killed");
         let lock = SceneLock::take(&killed, "make").unwrap();
         std::fs::create_dir(killed.join("cache")).unwrap();
         let second = refusal(SceneLock::take(&killed, "preprocess"));
-        assert!(second.contains("'fastlgs make'") && second.contains(&format!("process {}", std::process::id())), "{second}");
+        assert!(
+            second.contains("'fastlgs make'")
+                && second.contains(&format!("process {}", std::process::id())),
+            "{second}"
+        );
         drop(lock);
         SceneLock::take(&killed, "preprocess").unwrap();
     }
@@ -208,14 +273,25 @@ mod tests {
         std::fs::create_dir_all(at("album/images")).unwrap();
         std::fs::create_dir_all(at("scene/photos")).unwrap();
         std::os::unix::fs::symlink(at("album"), at("link")).unwrap();
-        for scene in ["album", "album/scene", "link", "link/images/../new", ".", "album/../link", "new/../album/x"] {
+        for scene in [
+            "album",
+            "album/scene",
+            "link",
+            "link/images/../new",
+            ".",
+            "album/../link",
+            "new/../album/x",
+        ] {
             let refused = refusal(check_apart(&at("album"), &at(scene)));
-            assert!(refused.contains("nothing was written"), "{scene}: {refused}");
+            assert!(
+                refused.contains("nothing was written"),
+                "{scene}: {refused}"
+            );
         }
         for scene in ["scene", "album-scene", "album/../scene"] {
             check_apart(&at("album"), &at(scene)).unwrap();
         }
-        // Photos that are linked from within the scene.
+        // Photos that are links into the scene.
         std::fs::create_dir(at("linked")).unwrap();
         std::os::unix::fs::symlink(at("scene/photos"), at("linked/images")).unwrap();
         refusal(check_apart(&at("linked"), &at("scene")));

@@ -1,120 +1,129 @@
-//! What a running stage tells, and how it is stopped.
+//! Progress of a running stage: messages, warnings and cancellation.
 
 use crate::{Error, Result};
 use fastlgs_core::Gaussians;
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What all stages share: device, seed, and who hears of their progress.
+/// Options of all stages: device, seed and progress sink.
 #[derive(Clone, Copy)]
 pub struct Run<'a> {
-    /// `auto`, `cpu`, or an adapter's name or index ([`fastlgs_raster::adapters`] lists them).
+    /// `auto`, `cpu`, or the name or index of an adapter ([`fastlgs_raster::adapters`] lists them).
     pub device: &'a str,
-    /// Seed of all randomness.
+    /// Seed of all random numbers.
     pub seed: u64,
-    /// Who hears of progress and warnings.
+    /// Progress sink, which receives progress and warnings.
     pub progress: &'a dyn Sink,
 }
 
 impl<'a> Run<'a> {
-    /// A run that nobody watches.
+    /// Creates a run without messages.
     pub fn silent(device: &'a str, seed: u64) -> Self {
-        Self { device, seed, progress: &Silent }
+        Self {
+            device,
+            seed,
+            progress: &Silent,
+        }
     }
 
-    /// Begins a stretch of work of `total` steps (0 where that is not known).
+    /// Starts a stage of `total` steps; 0 if their number is unknown.
     pub fn work(&self, stage: &'static str, total: u64) -> Work<'a> {
         self.progress.tell(Message::Started { stage, total });
-        Work { sink: self.progress, stage, total, done: AtomicU64::new(0) }
+        Work {
+            sink: self.progress,
+            stage,
+            total,
+            done: AtomicU64::new(0),
+        }
     }
 
-    /// Tells of something survivable.
+    /// Sends a warning to the progress sink.
     pub fn warn(&self, text: &str) {
         self.progress.tell(Message::Warning(text));
     }
 }
 
-/// Hears what a stage tells. Messages come from several threads.
+/// Progress sink: receives the messages of a stage. They come from several threads.
 pub trait Sink: Sync {
-    /// Takes a message.
+    /// Receives a message.
     fn tell(&self, message: Message<'_>);
 
-    /// Whether the run shall end with [`Error::Cancelled`] at its next step. Earlier results stay whole, and a training that is
-    /// resumed goes on from its last checkpoint.
+    /// Returns whether the run must end with [`Error::Cancelled`] at its next step. Earlier results
+    /// remain, and a training can be resumed from its last checkpoint.
     fn cancelled(&self) -> bool {
         false
     }
 }
 
-/// Hears nothing and never cancels.
+/// A sink that ignores all messages and never cancels.
 pub struct Silent;
 
 impl Sink for Silent {
     fn tell(&self, _: Message<'_>) {}
 }
 
-/// What a stage tells.
+/// A message of a stage.
 #[derive(Clone, Copy)]
 #[non_exhaustive]
 pub enum Message<'a> {
     /// A stage begins.
     Started {
-        /// Its name, such as `masks`.
+        /// Name of the stage, such as `masks`.
         stage: &'static str,
-        /// Its steps; 0 where their number is not known.
+        /// Number of all steps; 0 if it is unknown.
         total: u64,
     },
-    /// Steps were done.
+    /// A stage has made progress.
     Advanced {
-        /// As it was started.
+        /// Name of the stage.
         stage: &'static str,
-        /// All that were done so far.
+        /// Number of completed steps.
         done: u64,
-        /// As it was started.
+        /// Number of all steps; 0 if it is unknown.
         total: u64,
-        /// What is being done now; empty where there is nothing to say.
+        /// Current activity; may be empty.
         note: &'a str,
     },
     /// Training begins with these Gaussians.
     TrainingBegins(&'a Gaussians),
-    /// Training goes on.
+    /// Training has made progress.
     Trained {
-        /// Where it stands.
+        /// State of the training.
         step: TrainStep,
-        /// Iterations that the run will have.
+        /// Number of all iterations.
         total: u32,
-        /// Gives the Gaussians as they are now, which costs a copy from the device.
+        /// Returns the current Gaussians, which are copied from the device.
         scene: &'a dyn Fn() -> Result<Gaussians>,
     },
-    /// Training is over, with these Gaussians; objects follow.
+    /// Training ends with these Gaussians. Finding objects follows.
     TrainingEnds(&'a Gaussians),
-    /// A stage is over, well or not.
+    /// A stage ends, with success or with an error.
     Finished {
-        /// As it was started.
+        /// Name of the stage.
         stage: &'static str,
     },
-    /// Something survivable is wrong.
+    /// A warning: the stage continues.
     Warning(&'a str),
 }
 
-/// Where training stands.
+/// State of a training.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrainStep {
-    /// Steps done.
+    /// Number of completed iterations.
     pub iteration: u32,
     /// Seconds of training.
     pub seconds: f64,
-    /// 0.8 L1 + 0.2 (1 - SSIM) of the last measured training view.
+    /// Loss of the last measured training view: 0.8 L1 + 0.2 (1 - SSIM).
     pub loss: f64,
     /// PSNR of that view in dB.
     pub psnr: f64,
-    /// PSNR of the held-out views in dB, where it was measured.
+    /// PSNR of the held-out views in dB, if it was measured.
     pub psnr_held_out: Option<f64>,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
 }
 
-/// A stretch of work that is being done; dropping it ends the stage.
+/// A running stage. Dropping it ends the stage.
 pub struct Work<'a> {
     sink: &'a dyn Sink,
     stage: &'static str,
@@ -123,34 +132,54 @@ pub struct Work<'a> {
 }
 
 impl Work<'_> {
-    /// One more step is done.
+    /// Reports one more completed step.
     ///
     /// # Errors
-    /// [`Error::Cancelled`] where that is asked for.
+    /// [`Error::Cancelled`] if the sink cancels the run.
     pub fn advance(&self) -> Result<()> {
         let done = self.done.fetch_add(1, Ordering::Relaxed) + 1;
-        self.sink.tell(Message::Advanced { stage: self.stage, done, total: self.total, note: "" });
+        self.sink.tell(Message::Advanced {
+            stage: self.stage,
+            done,
+            total: self.total,
+            note: "",
+        });
         self.check()
     }
 
-    /// Says what is being done now.
+    /// Reports the current activity.
     pub fn note(&self, note: &str) {
         let done = self.done.load(Ordering::Relaxed);
-        self.sink.tell(Message::Advanced { stage: self.stage, done, total: self.total, note });
+        self.sink.tell(Message::Advanced {
+            stage: self.stage,
+            done,
+            total: self.total,
+            note,
+        });
     }
 
-    /// So much of `total` is done, and what is being done now; for work whose extent shows only on the way.
+    /// Reports `done` of `total` steps and the current activity, for stages whose number of steps
+    /// is unknown at the start.
     pub fn set(&self, done: u64, total: u64, note: &str) {
         self.done.store(done, Ordering::Relaxed);
-        self.sink.tell(Message::Advanced { stage: self.stage, done, total, note });
+        self.sink.tell(Message::Advanced {
+            stage: self.stage,
+            done,
+            total,
+            note,
+        });
     }
 
-    /// Ends the run where that is asked for.
+    /// Checks whether the sink cancels the run.
     ///
     /// # Errors
-    /// [`Error::Cancelled`].
+    /// [`Error::Cancelled`] if it does.
     pub fn check(&self) -> Result<()> {
-        if self.sink.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
+        if self.sink.cancelled() {
+            Err(Error::Cancelled)
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -165,7 +194,7 @@ mod tests {
     use super::*;
     use std::sync::Mutex;
 
-    /// Writes down what it hears, and cancels after so many steps.
+    /// Records all messages, and cancels after `after` steps.
     struct Record {
         heard: Mutex<Vec<String>>,
         after: u64,
@@ -183,20 +212,35 @@ mod tests {
         }
 
         fn cancelled(&self) -> bool {
-            self.heard.lock().unwrap().iter().filter(|l| l.parse::<u64>().is_ok()).count() as u64 >= self.after
+            self.heard
+                .lock()
+                .unwrap()
+                .iter()
+                .filter(|l| l.parse::<u64>().is_ok())
+                .count() as u64
+                >= self.after
         }
     }
 
     #[test]
     fn work_is_told_and_cancelled() {
-        let sink = Record { heard: Mutex::default(), after: 2 };
-        let run = Run { progress: &sink, ..Run::silent("cpu", 0) };
+        let sink = Record {
+            heard: Mutex::default(),
+            after: 2,
+        };
+        let run = Run {
+            progress: &sink,
+            ..Run::silent("cpu", 0)
+        };
         let work = || -> Result<()> {
             let work = run.work("masks", 3);
             work.note(" first");
             (0..3).try_for_each(|_| work.advance())
         };
         assert!(matches!(work(), Err(Error::Cancelled)));
-        assert_eq!(*sink.heard.lock().unwrap(), ["masks of 3", "0 first", "1", "2", "masks over"]);
+        assert_eq!(
+            *sink.heard.lock().unwrap(),
+            ["masks of 3", "0 first", "1", "2", "masks over"]
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! Pictures of a trained scene.
+//! Renders images of a trained scene.
 
 use crate::error::bail;
 use crate::session::ViewChoice;
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-/// What a picture shows.
+/// Contents of a rendered image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
@@ -24,49 +24,57 @@ pub enum What {
     Objects,
 }
 
-/// Which pictures are made.
+/// Options of `render`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// From where.
+    /// Cameras to render.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
     pub views: ViewChoice,
-    /// What to write, separated by commas.
-    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value = "color", value_delimiter = ','))]
+    /// Contents of the images, separated by commas.
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_enum, default_value = "color", value_delimiter = ',')
+    )]
     pub what: Vec<What>,
-    /// Folder to write to.
+    /// Output folder.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
 }
 
 impl Default for Config {
     fn default() -> Self {
-        Self { scene: PathBuf::new(), views: ViewChoice::default(), what: vec![What::Color], output: PathBuf::new() }
+        Self {
+            scene: PathBuf::new(),
+            views: ViewChoice::default(),
+            what: vec![What::Color],
+            output: PathBuf::new(),
+        }
     }
 }
 
-/// What was rendered.
+/// Report of `render`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// The scene.
+    /// Scene folder.
     pub scene: PathBuf,
-    /// The pictures.
+    /// Files of the images.
     pub files: Vec<PathBuf>,
-    /// Size of the first one.
+    /// Size of the first image, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
-    /// Milliseconds in which what was asked for was rendered, of each view.
+    /// Milliseconds to render all contents of each view.
     pub render_ms: Vec<f64>,
-    /// The device's name.
+    /// Name of the device.
     pub adapter: String,
 }
 
-/// Adds the time that something takes.
+/// Runs `work`, and adds its duration to `total`.
 fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
     let started = Instant::now();
     let out = work();
@@ -74,14 +82,17 @@ fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
     out
 }
 
-/// Writes pictures of a trained scene.
+/// Renders views of a trained scene, and writes them as images.
 ///
 /// # Errors
-/// A scene that was never trained, an unknown view, a device that fails, or the system's refusal.
+/// A scene that is not trained, an unknown view, a device that fails, or a file that cannot be
+/// written.
 pub fn render(config: &Config, run: &Run) -> Result<Report> {
     let mut scene = Session::open(&config.scene, run.device)?;
     let cameras = config.views.cameras(&scene.folder, &scene.cameras)?;
-    let Some(first) = cameras.first() else { bail!("{}: the scene has no views", config.scene.display()) };
+    let Some(first) = cameras.first() else {
+        bail!("{}: the scene has no views", config.scene.display())
+    };
     let size = format!("{}x{}", first.width, first.height);
     let work = run.work("render", cameras.len() as u64);
     let (mut files, mut milliseconds) = (Vec::new(), Vec::new());
@@ -89,17 +100,26 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut rendered = Duration::ZERO;
         let mut path = |what: &str, ending: &str| {
-            let path = config.output.join(format!("{}.{what}.{ending}", camera.name));
+            let path = config
+                .output
+                .join(format!("{}.{what}.{ending}", camera.name));
             files.push(path.clone());
             path
         };
         if config.what.contains(&What::Color) {
             let frame = timed(&mut rendered, || scene.render(camera))?;
-            image_io::save_png(&path("color", "png"), image_io::from_planar(frame.channels(0, 3), frame.width, frame.height))?;
+            image_io::save_png(
+                &path("color", "png"),
+                image_io::from_planar(frame.channels(0, 3), frame.width, frame.height),
+            )?;
         }
         if config.what.contains(&What::Feature) {
             let frame = timed(&mut rendered, || scene.render_feature(camera))?;
-            let channels = [("feature.0", frame.channels(3, 4)), ("feature.1", frame.channels(4, 5)), ("feature.2", frame.channels(5, 6))];
+            let channels = [
+                ("feature.0", frame.channels(3, 4)),
+                ("feature.1", frame.channels(4, 5)),
+                ("feature.2", frame.channels(5, 6)),
+            ];
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
         if config.what.contains(&What::Depth) {
@@ -110,12 +130,25 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
         }
         if config.what.contains(&What::Objects) {
             let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&scene.grid()?);
-            let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| Rgb(turbo::id_color(ids.at(x, y))));
+            let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| {
+                Rgb(turbo::id_color(ids.at(x, y)))
+            });
             image_io::save_png(&path("objects", "png"), picture)?;
         }
         milliseconds.push(rendered.as_secs_f64() * 1e3);
         work.advance()?;
     }
-    let (scene_root, gaussians, adapter) = (config.scene.clone(), scene.gaussians.len(), scene.engine.name());
-    Ok(Report { scene: scene_root, files, size, gaussians, render_ms: milliseconds, adapter })
+    let (scene_root, gaussians, adapter) = (
+        config.scene.clone(),
+        scene.gaussians.len(),
+        scene.engine.name(),
+    );
+    Ok(Report {
+        scene: scene_root,
+        files,
+        size,
+        gaussians,
+        render_ms: milliseconds,
+        adapter,
+    })
 }

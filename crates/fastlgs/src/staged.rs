@@ -1,4 +1,5 @@
-//! What a stage writes is staged beside its place until all of it is there: a run that fails or is killed leaves the earlier scene.
+//! Staged output: files are written beside the scene and moved into it when they are complete. A
+//! run that fails or is killed leaves the earlier scene.
 
 use crate::Result;
 use crate::error::bail;
@@ -7,32 +8,39 @@ use fastlgs_core::{Error, SceneFolder};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Holds the replaced files until they are removed with the rest.
+/// Subfolder of the replaced files, which is removed together with the staged output.
 const BEFORE: &str = "before";
 
-/// A folder within the scene's; it is removed when this is dropped.
+/// A folder within the scene folder; dropping this value removes it.
 pub(crate) struct StagedOutput {
-    /// The stage writes here.
+    /// Folder that the stage writes.
     pub folder: SceneFolder,
-    /// Whether it must stay, as it holds files that could not be put back.
+    /// Whether the folder must remain, because it holds replaced files that could not be restored.
     stays: bool,
 }
 
 impl StagedOutput {
-    /// An empty folder for a stage.
+    /// Creates an empty folder for the output of a stage.
     pub fn new(scene: &SceneFolder, stage: &str) -> Result<Self> {
         let root = scene.root.join(format!("{stage}.partial"));
         let _ = std::fs::remove_dir_all(&root);
         std::fs::create_dir_all(&root).map_err(Error::io(&root))?;
-        Ok(Self { folder: SceneFolder::new(root), stays: false })
+        Ok(Self {
+            folder: SceneFolder::new(root),
+            stays: false,
+        })
     }
 
-    /// Moves the staged files into the scene and lists them in its manifest, together with `reserved`, which later stages write in place.
-    /// Of the earlier scene only files that its manifest lists and that are, or lie in, one of `replaced` are removed.
-    /// The manifest, without which there is no scene, is moved away first and arrives last.
+    /// Moves the staged files into the scene, and lists them in its manifest. `reserved` are
+    /// further files to list, which later stages write in place.
+    ///
+    /// Only files that the earlier manifest lists are replaced: those that equal or lie in one of
+    /// `replaced`, and those that the stage writes again. A folder without manifest is not a scene,
+    /// so the manifest is moved away first and moved in last.
     ///
     /// # Errors
-    /// A file in the way that the manifest does not list, or the system's refusal. The earlier scene is then put back.
+    /// A file in the way that the manifest does not list, or a move that fails. The earlier scene
+    /// is then restored.
     pub fn publish(
         mut self,
         scene: &SceneFolder,
@@ -40,23 +48,46 @@ impl StagedOutput {
         reserved: impl IntoIterator<Item = String>,
         manifest: &Manifest,
     ) -> Result<()> {
-        let listed = scene.manifest().map(|earlier| earlier.files).unwrap_or_default();
+        let listed = scene
+            .manifest()
+            .map(|earlier| earlier.files)
+            .unwrap_or_default();
         let made = files_in(&self.folder.root)?;
         let new: BTreeSet<String> = made.iter().cloned().chain(reserved).collect();
-        if let Some(foreign) = new.iter().find(|file| !listed.contains(*file) && scene.root.join(file).exists()) {
+        if let Some(foreign) = new
+            .iter()
+            .find(|file| !listed.contains(*file) && scene.root.join(file).exists())
+        {
             let path = scene.root.join(foreign);
-            bail!("{}: this file is no part of the scene and is in the way; move it, or name a new folder", path.display());
+            bail!(
+                "{}: this file does not belong to the scene and is in the way; move it, or choose a new folder",
+                path.display()
+            );
         }
-        let belongs = |file: &String| replaced.iter().any(|name| Path::new(file).starts_with(name));
-        let (old, kept): (BTreeSet<String>, BTreeSet<String>) = listed.into_iter().partition(belongs);
-        // A file that the stage writes anew is replaced as well.
+        let belongs = |file: &String| {
+            replaced
+                .iter()
+                .any(|name| Path::new(file).starts_with(name))
+        };
+        let (old, kept): (BTreeSet<String>, BTreeSet<String>) =
+            listed.into_iter().partition(belongs);
+        // A file that the stage writes again is replaced as well.
         let (old, kept) = (&old | &(&kept & &new), &kept - &new);
         let files = &kept | &new;
-        self.folder.save_manifest(&Manifest { files, ..manifest.clone() })?;
+        self.folder.save_manifest(&Manifest {
+            files,
+            ..manifest.clone()
+        })?;
         let before = self.folder.root.join(BEFORE);
         let manifest = [MANIFEST.to_owned()];
-        let away = manifest.iter().chain(&old).map(|name| (scene.root.join(name), before.join(name)));
-        let into = made.iter().chain(&manifest).map(|name| (self.folder.root.join(name), scene.root.join(name)));
+        let away = manifest
+            .iter()
+            .chain(&old)
+            .map(|name| (scene.root.join(name), before.join(name)));
+        let into = made
+            .iter()
+            .chain(&manifest)
+            .map(|name| (self.folder.root.join(name), scene.root.join(name)));
         let mut moved = Vec::new();
         let done = away.chain(into).try_for_each(|(from, to)| {
             if rename_if_there(&from, &to)? {
@@ -65,24 +96,42 @@ impl StagedOutput {
             Ok(())
         });
         if done.is_err() {
-            self.stays = moved.iter().rev().any(|(from, to)| std::fs::rename(to, from).is_err());
+            self.stays = moved
+                .iter()
+                .rev()
+                .any(|(from, to)| std::fs::rename(to, from).is_err());
         } else {
-            old.iter().for_each(|file| remove_empty_folders(&scene.root, file));
+            old.iter()
+                .for_each(|file| remove_empty_folders(&scene.root, file));
         }
         done
     }
 
-    /// Undoes what a killed run left: moves that were not finished, and the folders of staged output.
+    /// Restores a scene after a killed run: undoes unfinished moves, and removes the folders of
+    /// staged output.
     pub fn recover(scene: &SceneFolder) -> Result<()> {
-        let entries = scene.root.read_dir().map_err(Error::io(&scene.root))?.flatten().map(|entry| entry.path());
+        let entries = scene
+            .root
+            .read_dir()
+            .map_err(Error::io(&scene.root))?
+            .flatten()
+            .map(|entry| entry.path());
         let staged: Vec<SceneFolder> = entries
-            .filter(|path| path.extension().is_some_and(|ending| ending == "partial") && path.is_dir())
+            .filter(|path| {
+                path.extension().is_some_and(|ending| ending == "partial") && path.is_dir()
+            })
             .map(SceneFolder::new)
             .collect();
         if !scene.root.join(MANIFEST).exists() {
-            let with_earlier = staged.iter().find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file());
-            // The first output of a scene has no earlier one.
-            if let Some(staged) = with_earlier.or_else(|| staged.iter().find(|staged| staged.root.join(MANIFEST).is_file())) {
+            let with_earlier = staged
+                .iter()
+                .find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file());
+            // The first run of a scene replaces no earlier manifest.
+            if let Some(staged) = with_earlier.or_else(|| {
+                staged
+                    .iter()
+                    .find(|staged| staged.root.join(MANIFEST).is_file())
+            }) {
                 put_back(scene, staged)?;
             }
         }
@@ -93,13 +142,25 @@ impl StagedOutput {
     }
 }
 
-/// Moves the files of a killed run out of the scene, and the earlier ones back into it.
+/// Moves the files of a killed run out of the scene, and the replaced files back into it.
 fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
     let before = staged.root.join(BEFORE);
-    let old = if before.is_dir() { files_in(&before)? } else { BTreeSet::new() };
-    let kept = SceneFolder::new(&before).manifest().map(|manifest| manifest.files).unwrap_or_default();
-    // What was moved into place is neither staged any more nor one of the earlier scene's other files.
-    let moved_in = staged.manifest()?.files.into_iter().filter(|file| !kept.contains(file) || old.contains(file));
+    let old = if before.is_dir() {
+        files_in(&before)?
+    } else {
+        BTreeSet::new()
+    };
+    let kept = SceneFolder::new(&before)
+        .manifest()
+        .map(|manifest| manifest.files)
+        .unwrap_or_default();
+    // Files that were moved into the scene: in the new manifest, no longer staged, and not kept
+    // from the earlier scene.
+    let moved_in = staged
+        .manifest()?
+        .files
+        .into_iter()
+        .filter(|file| !kept.contains(file) || old.contains(file));
     for name in moved_in.filter(|file| !staged.root.join(file).exists()) {
         rename_if_there(&scene.root.join(&name), &staged.root.join(&name))?;
     }
@@ -117,7 +178,8 @@ impl Drop for StagedOutput {
     }
 }
 
-/// Paths of all files below a folder, relative to it, with '/' between their parts; without its own manifest.
+/// Returns the paths of all files below a folder except its manifest, relative to it and separated
+/// by '/'.
 fn files_in(root: &Path) -> Result<BTreeSet<String>> {
     let mut found = BTreeSet::new();
     let mut folders = vec![root.to_owned()];
@@ -137,14 +199,19 @@ fn files_in(root: &Path) -> Result<BTreeSet<String>> {
     Ok(found)
 }
 
-/// Removes the folders of a file that was moved away, as far as nothing is left in them.
+/// Removes the parent folders of a moved file that are empty now.
 fn remove_empty_folders(root: &Path, file: &str) {
-    let folders = Path::new(file).ancestors().skip(1).filter(|folder| !folder.as_os_str().is_empty());
-    // A folder with anything in it is not removed by this.
-    folders.take_while(|folder| std::fs::remove_dir(root.join(folder)).is_ok()).for_each(drop);
+    let folders = Path::new(file)
+        .ancestors()
+        .skip(1)
+        .filter(|folder| !folder.as_os_str().is_empty());
+    // `remove_dir` fails for a folder that is not empty.
+    folders
+        .take_while(|folder| std::fs::remove_dir(root.join(folder)).is_ok())
+        .for_each(drop);
 }
 
-/// Renames what is there; whether there was anything.
+/// Renames a file if it exists, and returns whether it did.
 fn rename_if_there(from: &Path, to: &Path) -> Result<bool> {
     if !from.exists() {
         return Ok(false);
@@ -162,8 +229,7 @@ mod tests {
     use serde_json::json;
 
     fn manifest(segmenter: &str) -> Manifest {
-        let fields =
-            json!({ "version": "0", "photos": "p", "holdout": 8, "segmenter": segmenter, "encoder": "offline", "seed": 0, "warnings": [] });
+        let fields = json!({ "version": "0", "photos": "p", "holdout": 8, "segmenter": segmenter, "encoder": "offline", "seed": 0, "warnings": [] });
         serde_json::from_value(fields).unwrap()
     }
 
@@ -179,18 +245,31 @@ mod tests {
 
     const REPLACED: [&str; 3] = ["photos", "alpha", "cameras"];
 
-    /// A scene of files that say "old".
+    /// Creates a scene whose files contain "old".
     fn earlier(root: &Path) -> SceneFolder {
         let scene = SceneFolder::new(root);
         let staged = StagedOutput::new(&scene, "first").unwrap();
-        for name in ["photos/a.png", "photos/same.png", "alpha/a.png", "cameras/trained.json", "scene.ply"] {
+        for name in [
+            "photos/a.png",
+            "photos/same.png",
+            "alpha/a.png",
+            "cameras/trained.json",
+            "scene.ply",
+        ] {
             write(&staged.folder, name, "old");
         }
-        staged.publish(&scene, &[], ["masks/objects/a.png".to_owned()], &manifest("offline")).unwrap();
+        staged
+            .publish(
+                &scene,
+                &[],
+                ["masks/objects/a.png".to_owned()],
+                &manifest("offline"),
+            )
+            .unwrap();
         scene
     }
 
-    /// A new output that has not been published.
+    /// Stages new output without publishing it.
     fn begun(scene: &SceneFolder) -> StagedOutput {
         let staged = StagedOutput::new(scene, "preprocess").unwrap();
         for name in ["photos/b.png", "photos/same.png", "cameras/cameras.json"] {
@@ -204,17 +283,40 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let scene = earlier(dir.path());
         drop(begun(&scene));
-        assert_eq!((read(&scene, "photos/same.png").as_deref(), read(&scene, "photos/b.png")), (Some("old"), None));
-        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
-        for gone in ["photos/a.png", "alpha", "cameras/trained.json", "preprocess.partial"] {
+        assert_eq!(
+            (
+                read(&scene, "photos/same.png").as_deref(),
+                read(&scene, "photos/b.png")
+            ),
+            (Some("old"), None)
+        );
+        begun(&scene)
+            .publish(&scene, &REPLACED, [], &manifest("sam"))
+            .unwrap();
+        for gone in [
+            "photos/a.png",
+            "alpha",
+            "cameras/trained.json",
+            "preprocess.partial",
+        ] {
             assert!(!scene.root.join(gone).exists(), "{gone}");
         }
-        let now = ["photos/b.png", "photos/same.png", "scene.ply"].map(|name| read(&scene, name).unwrap());
+        let now = ["photos/b.png", "photos/same.png", "scene.ply"]
+            .map(|name| read(&scene, name).unwrap());
         assert_eq!(now, ["new", "new", "old"]);
         let known = scene.manifest().unwrap();
         assert_eq!(known.segmenter, "sam");
         let files: Vec<&str> = known.files.iter().map(String::as_str).collect();
-        assert_eq!(files, ["cameras/cameras.json", "masks/objects/a.png", "photos/b.png", "photos/same.png", "scene.ply"]);
+        assert_eq!(
+            files,
+            [
+                "cameras/cameras.json",
+                "masks/objects/a.png",
+                "photos/b.png",
+                "photos/same.png",
+                "scene.ply"
+            ]
+        );
     }
 
     #[test]
@@ -222,15 +324,29 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let scene = earlier(dir.path());
         write(&scene, "photos/IMG_1.CR3", "mine");
-        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
+        begun(&scene)
+            .publish(&scene, &REPLACED, [], &manifest("sam"))
+            .unwrap();
         assert_eq!(read(&scene, "photos/IMG_1.CR3").as_deref(), Some("mine"));
-        // One that has the name of a file to be written.
+        // A user's file with the name of a staged file.
         write(&scene, "ignore/b.png", "mine");
         let staged = begun(&scene);
         write(&staged.folder, "ignore/b.png", "new");
-        let refused = staged.publish(&scene, &["photos", "ignore"], [], &manifest("import")).unwrap_err().to_string();
-        assert!(refused.contains("ignore/b.png") && refused.contains("move it"), "{refused}");
-        assert_eq!((read(&scene, "ignore/b.png").as_deref(), read(&scene, "photos/b.png").as_deref()), (Some("mine"), Some("new")));
+        let refused = staged
+            .publish(&scene, &["photos", "ignore"], [], &manifest("import"))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            refused.contains("ignore/b.png") && refused.contains("move it"),
+            "{refused}"
+        );
+        assert_eq!(
+            (
+                read(&scene, "ignore/b.png").as_deref(),
+                read(&scene, "photos/b.png").as_deref()
+            ),
+            (Some("mine"), Some("new"))
+        );
         assert_eq!(scene.manifest().unwrap().segmenter, "sam");
     }
 
@@ -242,8 +358,16 @@ mod tests {
         let staged = begun(&scene);
         write(&staged.folder, "scene.ply", "new");
         std::fs::create_dir_all(staged.folder.root.join(BEFORE).join("scene.ply")).unwrap();
-        staged.publish(&scene, &["photos", "scene.ply"], [], &manifest("import")).unwrap_err();
-        assert_eq!((read(&scene, "photos/same.png").as_deref(), read(&scene, "scene.ply").as_deref()), (Some("old"), Some("old")));
+        staged
+            .publish(&scene, &["photos", "scene.ply"], [], &manifest("import"))
+            .unwrap_err();
+        assert_eq!(
+            (
+                read(&scene, "photos/same.png").as_deref(),
+                read(&scene, "scene.ply").as_deref()
+            ),
+            (Some("old"), Some("old"))
+        );
         assert_eq!(scene.manifest().unwrap().segmenter, "offline");
     }
 
@@ -254,11 +378,22 @@ mod tests {
             let scene = earlier(dir.path());
             let staged = begun(&scene);
             let before = staged.folder.root.join(BEFORE);
-            // Killed after all of the earlier files were moved away, and some of the new ones into place.
+            // The run is killed after it moved all replaced files away and some new ones in.
             let files = files_in(&staged.folder.root).unwrap();
             let listed = &files | &scene.manifest().unwrap().files;
-            staged.folder.save_manifest(&Manifest { files: listed, ..manifest("sam") }).unwrap();
-            for name in ["scene.json", "photos/a.png", "photos/same.png", "cameras/trained.json"] {
+            staged
+                .folder
+                .save_manifest(&Manifest {
+                    files: listed,
+                    ..manifest("sam")
+                })
+                .unwrap();
+            for name in [
+                "scene.json",
+                "photos/a.png",
+                "photos/same.png",
+                "cameras/trained.json",
+            ] {
                 rename_if_there(&scene.root.join(name), &before.join(name)).unwrap();
             }
             for name in files.iter().rev().take(moved_in) {
@@ -266,10 +401,26 @@ mod tests {
             }
             std::mem::forget(staged);
             StagedOutput::recover(&scene).unwrap();
-            for name in ["photos/a.png", "photos/same.png", "alpha/a.png", "cameras/trained.json", "scene.ply"] {
-                assert_eq!(read(&scene, name).as_deref(), Some("old"), "{name} with {moved_in}");
+            for name in [
+                "photos/a.png",
+                "photos/same.png",
+                "alpha/a.png",
+                "cameras/trained.json",
+                "scene.ply",
+            ] {
+                assert_eq!(
+                    read(&scene, name).as_deref(),
+                    Some("old"),
+                    "{name} with {moved_in}"
+                );
             }
-            assert_eq!((read(&scene, "photos/b.png"), scene.manifest().unwrap().segmenter), (None, "offline".to_owned()));
+            assert_eq!(
+                (
+                    read(&scene, "photos/b.png"),
+                    scene.manifest().unwrap().segmenter
+                ),
+                (None, "offline".to_owned())
+            );
             assert!(!scene.root.join("preprocess.partial").exists());
         }
     }
@@ -280,13 +431,21 @@ mod tests {
         let scene = SceneFolder::new(dir.path());
         let staged = begun(&scene);
         let files = files_in(&staged.folder.root).unwrap();
-        staged.folder.save_manifest(&Manifest { files: files.clone(), ..manifest("sam") }).unwrap();
+        staged
+            .folder
+            .save_manifest(&Manifest {
+                files: files.clone(),
+                ..manifest("sam")
+            })
+            .unwrap();
         for name in files.iter().take(2) {
             rename_if_there(&staged.folder.root.join(name), &scene.root.join(name)).unwrap();
         }
         std::mem::forget(staged);
         StagedOutput::recover(&scene).unwrap();
-        begun(&scene).publish(&scene, &REPLACED, [], &manifest("sam")).unwrap();
+        begun(&scene)
+            .publish(&scene, &REPLACED, [], &manifest("sam"))
+            .unwrap();
         assert_eq!(read(&scene, "photos/b.png").as_deref(), Some("new"));
     }
 }

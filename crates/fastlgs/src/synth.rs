@@ -1,4 +1,4 @@
-//! Scenes with exact poses, depths and masks.
+//! Generates scenes with exact poses, depths and masks.
 
 use crate::error::{Context, bail};
 #[cfg(feature = "clap")]
@@ -9,7 +9,7 @@ use fastlgs_vision::models;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// What is generated.
+/// Options of a generated scene.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
@@ -17,25 +17,26 @@ pub struct Config {
     /// Kind of scene.
     #[cfg_attr(feature = "clap", arg(value_parser = kinds()))]
     pub kind: String,
-    /// Folder to write: images/, transforms.json, masks/, depth/, labels/.
+    /// Output folder of images/, transforms.json, masks/, depth/ and labels/.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
     /// Number of photos; by default 40 for most kinds.
     #[cfg_attr(feature = "clap", arg(long))]
     pub views: Option<usize>,
-    /// Size of the photos.
+    /// Size of the photos in pixels.
     #[cfg_attr(feature = "clap", arg(long, default_value = "320x240", value_parser = parse_size))]
     pub size: (u32, u32),
-    /// Folder of the room's pictures, instead of the installed ones.
+    /// Folder of the pictures in the room, instead of the installed ones.
     #[cfg_attr(feature = "clap", arg(long))]
     pub pictures: Option<PathBuf>,
-    /// Write masks as lists in COCO's layout, of whole things and their parts, which overlap, instead of label maps of three levels.
+    /// Write overlapping masks of objects and their parts as COCO lists, instead of label maps of
+    /// three levels.
     #[cfg_attr(feature = "clap", arg(long))]
     pub mask_lists: bool,
-    /// Leave the thing of this name out: what stands behind it, to measure removal against.
+    /// Leave out the object of this name, as ground truth for `remove`.
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME"))]
     pub without: Option<String>,
-    /// Every N-th view is labelled, to be held out.
+    /// Label every N-th view, so that it can be held out.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
     pub holdout: usize,
 }
@@ -57,42 +58,59 @@ impl Default for Config {
 
 #[cfg(feature = "clap")]
 fn kinds() -> Vec<clap::builder::PossibleValue> {
-    KINDS.iter().map(|(name, _, about)| clap::builder::PossibleValue::new(name).help(about)).collect()
+    KINDS
+        .iter()
+        .map(|(name, _, about)| clap::builder::PossibleValue::new(name).help(about))
+        .collect()
 }
 
-/// What was generated.
+/// Report of `synth`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
     /// Kind of scene.
     pub kind: String,
-    /// Where its photos are.
+    /// Folder of the photos.
     pub photos: PathBuf,
     /// Number of photos.
     pub views: usize,
-    /// Their size.
+    /// Size of the photos, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
-    /// Names of the things in it.
+    /// Names of the objects in the scene.
     pub objects: Vec<String>,
 }
 
 /// Writes a generated scene.
 ///
 /// # Errors
-/// An unknown kind, fewer than four views, missing pictures, or the system's refusal.
+/// An unknown kind, fewer than four views, missing pictures, or a file that cannot be written.
 pub fn synth(config: &Config, run: &Run) -> Result<Report> {
-    let kind = Kind::of(&config.kind).with_context(|| format!("'{}' is no kind of generated scene", config.kind))?;
+    let kind = Kind::of(&config.kind).with_context(|| {
+        format!(
+            "'{}' is not a kind of generated scene; 'fastlgs synth --help' lists all kinds",
+            config.kind
+        )
+    })?;
     let views = config.views.unwrap_or(kind.views());
     if views < 4 {
-        bail!("--views {views}: at least 4 are needed");
+        bail!("the number of views is {views}, but at least 4 are needed");
     }
     let pictures = config.pictures.clone().unwrap_or_else(models::pictures_dir);
     let mut world = kind.world(&pictures, views, config.size, run.seed)?;
     if let Some(name) = config.without.as_ref().filter(|name| !world.remove(name)) {
-        bail!("--without: '{name}' is none of {}", world.names().join(", "));
+        bail!(
+            "without: '{name}' is none of the objects of this scene: {}",
+            world.names().join(", ")
+        );
     }
     let work = run.work("synth", views as u64);
-    let masks = if config.mask_lists { Masks::Lists } else { Masks::Levels };
-    synth::write(&config.output, &world, config.holdout, masks, || drop(work.advance()))?;
+    let masks = if config.mask_lists {
+        Masks::Lists
+    } else {
+        Masks::Levels
+    };
+    synth::write(&config.output, &world, config.holdout, masks, || {
+        drop(work.advance())
+    })?;
     work.check()?;
     Ok(Report {
         kind: config.kind.clone(),

@@ -1,4 +1,4 @@
-//! Teaching a name by showing a thing: an object of a scene, or a picture.
+//! Teaches a name by an example: an object of a scene, or a picture.
 
 use crate::error::{Context, bail};
 use crate::names::{Example, Names, plain};
@@ -11,101 +11,164 @@ use fastlgs_grid::query::QueryConfig;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// What is taught; one of `point` (with `view`), `object` and `image`.
+/// A name and one example: `point` (with `view`), `object` or `image`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Lesson {
-    /// The name, in any language.
+    /// Name to teach, in any language.
     pub name: String,
-    /// Trained scene folder, in which the thing is shown or whose encoder embeds the picture.
+    /// Trained scene folder with the object, or with the encoder for the picture.
     pub scene: PathBuf,
-    /// A pixel of the view: the object that it shows; several as X,Y+X,Y: the object that they tell of together.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "X,Y", requires = "view", group = "shown"))]
+    /// Pixel of the view that shows the object; several pixels of it as X,Y+X,Y.
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "X,Y", requires = "view", group = "shown")
+    )]
     pub point: Option<Pixels>,
-    /// The view that the pixel is of.
+    /// View that contains the pixel.
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME", requires = "point"))]
     pub view: Option<String>,
-    /// An object by its number.
+    /// Id of the object.
     #[cfg_attr(feature = "clap", arg(long, value_name = "ID", group = "shown"))]
     pub object: Option<u16>,
-    /// A picture of the thing, cut out of its surroundings.
+    /// Picture that shows only the object.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", group = "shown"))]
     pub image: Option<PathBuf>,
 }
 
-/// What was learned.
+/// Report of `teach`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
     /// The name.
     pub name: String,
-    /// The object that was shown; nothing where a picture was.
+    /// Id of the object; `None` for a picture.
     pub object: Option<u16>,
-    /// Embeddings that it gave.
+    /// Number of embeddings of this example.
     pub views: usize,
-    /// Examples of the name by now.
+    /// Number of all examples of the name.
     pub examples: usize,
-    /// The file that keeps the names.
+    /// File that stores the names.
     pub kept: PathBuf,
 }
 
-/// Teaches a name by showing a thing.
+/// Teaches a name by one example.
 ///
 /// # Errors
-/// An empty name, nothing or no object where it is shown, or the system's refusal; the names then stay as they were.
+/// An empty name, an example without an object, none or several examples, or a file that cannot be
+/// written. The names then remain unchanged.
 pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
     let mut scene = Session::open(&lesson.scene, run.device)?;
     let object = match (lesson.object, &lesson.point, &lesson.image) {
         (Some(id), None, None) => Some(id),
         (None, Some(pixels), None) => Some(shown_at(&mut scene, lesson, pixels)?),
         (None, None, Some(_)) => None,
-        _ => bail!("show the thing in one way: --point X,Y with --view, --object ID, or --image FILE"),
+        _ => {
+            bail!("give exactly one example: --point X,Y with --view, --object ID, or --image FILE")
+        }
     };
     match (object, &lesson.image) {
         (Some(id), _) => learn(&scene, &scene.grid()?, &lesson.name, id),
         (None, Some(path)) => {
-            let embeddings = picture(&scene, &path.display().to_string(), &image_io::load_rgb(path)?)?.meant;
-            keep(&scene, &lesson.name, None, path.display().to_string(), embeddings)
+            let embeddings = picture(
+                &scene,
+                &path.display().to_string(),
+                &image_io::load_rgb(path)?,
+            )?
+            .positive;
+            keep(
+                &scene,
+                &lesson.name,
+                None,
+                path.display().to_string(),
+                embeddings,
+            )
         }
-        (None, None) => bail!("nothing was shown"),
+        (None, None) => bail!("no example is given; name an object or a picture"),
     }
 }
 
-/// Teaches the name of an object of `grid`, the table of a scene.
+/// Teaches `name` by the object `id` of `grid`, the object table of the scene.
 ///
 /// # Errors
 /// As [`teach`].
 pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report> {
     eyes::check_version(&scene.manifest, grid, &scene.folder)?;
     let root = scene.folder.root.display().to_string();
-    let Some(object) = usize::from(id).checked_sub(1).and_then(|k| grid.objects.get(k)) else {
-        bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len())
+    let Some(object) = usize::from(id)
+        .checked_sub(1)
+        .and_then(|k| grid.objects.get(k))
+    else {
+        bail!(
+            "{root}: its object ids are 1 to {}, and none is {id}; choose one of them",
+            grid.objects.len()
+        )
     };
-    keep(scene, name, Some(id), format!("object {id} of {root}"), object.embeddings.clone())
+    keep(
+        scene,
+        name,
+        Some(id),
+        format!("object {id} of {root}"),
+        object.embeddings.clone(),
+    )
 }
 
-fn keep(scene: &Session, name: &str, object: Option<u16>, from: String, embeddings: Vec<Vec<f32>>) -> Result<Report> {
+fn keep(
+    scene: &Session,
+    name: &str,
+    object: Option<u16>,
+    from: String,
+    embeddings: Vec<Vec<f32>>,
+) -> Result<Report> {
     let name = plain(name);
     if name.is_empty() {
-        bail!("the name is empty");
+        bail!("the name is empty; enter a name for the object");
     }
     if embeddings.is_empty() {
-        bail!("{from}: it was never seen well enough to be known again; show something larger");
+        bail!(
+            "{from}: it has no embedding, because no view shows it large enough; choose a larger object"
+        );
     }
     let views = embeddings.len();
     let examples = Names::change(|names| {
-        names.add(&name, Example { encoder: eyes::identity_of(&scene.manifest), from, embeddings });
+        names.add(
+            &name,
+            Example {
+                encoder: eyes::identity_of(&scene.manifest),
+                from,
+                embeddings,
+            },
+        );
         Ok(names.of(&name).map_or(0, <[Example]>::len))
     })?;
-    Ok(Report { name, object, views, examples, kept: Names::path() })
+    Ok(Report {
+        name,
+        object,
+        views,
+        examples,
+        kept: Names::path(),
+    })
 }
 
-/// The object that pixels of a view show.
+/// Returns the id of the object at pixels of a view.
 fn shown_at(scene: &mut Session, lesson: &Lesson, pixels: &Pixels) -> Result<u16> {
-    let view = lesson.view.as_deref().context("--point needs the view that it is of: --view NAME")?;
+    let view = lesson
+        .view
+        .as_deref()
+        .context("a point needs the name of its view; set view as well")?;
     let camera = scene.cameras[scene.folder.view_index(&scene.cameras, view)?].clone();
     let (grid, field) = (scene.grid()?, scene.field(&camera, None)?);
-    let found = Ask::Point(pixels.clone()).meaning(scene, &[])?.find(&grid, &field, &camera, &QueryConfig::default())?;
-    let nothing = || format!("no object is at {pixels} of '{}'", camera.name);
+    let found = Ask::Point(pixels.clone()).meaning(scene, &[])?.find(
+        &grid,
+        &field,
+        &camera,
+        &QueryConfig::default(),
+    )?;
+    let nothing = || {
+        format!(
+            "there is no object at {pixels} of '{}'; choose other pixels",
+            camera.name
+        )
+    };
     Ok(found.targets.first().with_context(nothing)?.id)
 }

@@ -1,4 +1,4 @@
-//! `fastlgs export`: a scene for other programs, for queries elsewhere, or for a web server.
+//! `fastlgs export`: writes a scene for other programs, for queries, or for a web server.
 
 use crate::outcome::Outcome;
 use crate::{report, ui, words};
@@ -12,13 +12,14 @@ use fastlgs_serve::share;
 pub struct Args {
     #[command(flatten)]
     config: Config,
-    /// Write a folder with the page of `serve`, for any web server: it answers common words and all that was taught, and has no photos.
+    /// Write a folder with the viewer page, for any web server. The page answers common words and
+    /// taught names; it has no photos.
     #[arg(long)]
     html: bool,
-    /// With --html, how many common words are answered.
+    /// Number of common words that the page answers, with --html.
     #[arg(long, default_value_t = share::WORDS, requires = "html")]
     words: usize,
-    /// With --html, CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    /// CLIP text tower, with --html; for scenes with imported embeddings, or if the file has moved.
     #[arg(long, value_name = "FILE", requires = "html")]
     clip_text: Option<std::path::PathBuf>,
 }
@@ -28,9 +29,19 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     if !args.html {
         return report::tell(common, &fastlgs::export(config, run)?, words::export);
     }
-    let ending = config.output.extension().and_then(|e| e.to_str()).unwrap_or_default();
-    if ending == "json" || ENDINGS.contains(&ending) || !(names_folder(&config.output) || ending.is_empty()) {
-        bail!("{}: --html writes a folder; name one without the ending .{ending}", config.output.display());
+    let ending = config
+        .output
+        .extension()
+        .and_then(|e| e.to_str())
+        .unwrap_or_default();
+    if ending == "json"
+        || ENDINGS.contains(&ending)
+        || !(names_folder(&config.output) || ending.is_empty())
+    {
+        bail!(
+            "{}: --html writes a folder; give a name without the ending .{ending}",
+            config.output.display()
+        );
     }
     let share = share::Config {
         scene: config.scene.clone(),

@@ -1,4 +1,4 @@
-//! `fastlgs info`: devices, or what is in a scene.
+//! `fastlgs info`: shows the devices of this machine, or the contents of a scene.
 
 use crate::outcome::Outcome;
 use crate::{report, ui, words};
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs info scenes/fox")]
 pub struct Args {
-    /// Scene folder; without it the machine's devices are listed.
+    /// Scene folder; without it, the devices of this machine are shown.
     scene: Option<PathBuf>,
 }
 
@@ -22,9 +22,13 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     }
 }
 
-/// What there is to work with.
+/// Reports versions, devices and models of this machine.
 fn machine(common: &ui::Common) -> Result<Outcome> {
-    let (version, adapters, auto) = (env!("CARGO_PKG_VERSION"), fastlgs_raster::adapters(), fastlgs_raster::choice("auto"));
+    let (version, adapters, auto) = (
+        env!("CARGO_PKG_VERSION"),
+        fastlgs_raster::adapters(),
+        fastlgs_raster::choice("auto"),
+    );
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let (sift, installed) = (keypoints::backend(), models::offline_installed());
     let value = json!({
@@ -39,18 +43,35 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
         words::table(&[
             ("fastlgs", format!("{version}, key points by {sift}")),
             ("cpu", format!("{cores} cores")),
-            ("adapters", if adapters.is_empty() { "none".to_owned() } else { adapters.join(", ") }),
-            ("takes", format!("{} ({})", auto.device, auto.why)),
-            ("encoders", if installed { "installed" } else { "missing: fastlgs models install-offline" }.to_owned()),
+            (
+                "adapters",
+                if adapters.is_empty() {
+                    "none".to_owned()
+                } else {
+                    adapters.join(", ")
+                },
+            ),
+            ("auto device", format!("{} ({})", auto.device, auto.why)),
+            (
+                "encoders",
+                if installed {
+                    "installed"
+                } else {
+                    "missing; run fastlgs models install-offline"
+                }
+                .to_owned(),
+            ),
         ])
     })
 }
 
-/// What is in a scene.
+/// Reports the contents of a scene.
 fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
     let folder = SceneFolder::open(root)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
-    let objects = fastlgs_grid::Grid::load(&folder).map(|g| g.objects.len()).ok();
+    let objects = fastlgs_grid::Grid::load(&folder)
+        .map(|g| g.objects.len())
+        .ok();
     let gaussians = folder.gaussians().map(|g| g.len()).ok();
     let held_out = manifest.held_out(&cameras).len();
     let bytes = |name: &str| std::fs::metadata(root.join(name)).map(|m| m.len()).ok();
@@ -63,15 +84,44 @@ fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
         "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
         "made_by": manifest,
     });
-    let counted = |count: Option<usize>| count.map_or_else(|| "none yet: fastlgs train".to_owned(), words::thousands);
+    let counted = |count: Option<usize>| {
+        count.map_or_else(
+            || "none yet; run fastlgs train".to_owned(),
+            words::thousands,
+        )
+    };
     report::tell(common, &value, |_| {
         words::table(&[
-            ("scene", format!("{}, made by fastlgs {}, seed {}", root.display(), manifest.version, manifest.seed)),
-            ("photos", format!("{} from {}, {held_out} of them kept aside", cameras.len(), manifest.photos.display())),
-            ("eyes", format!("masks: {}, embeddings: {}", manifest.segmenter, manifest.encoder)),
+            (
+                "scene",
+                format!(
+                    "{}, made by fastlgs {}, seed {}",
+                    root.display(),
+                    manifest.version,
+                    manifest.seed
+                ),
+            ),
+            (
+                "photos",
+                format!(
+                    "{} from {}, {held_out} of them held out",
+                    cameras.len(),
+                    manifest.photos.display()
+                ),
+            ),
+            (
+                "models",
+                format!(
+                    "masks: {}, embeddings: {}",
+                    manifest.segmenter, manifest.encoder
+                ),
+            ),
             ("Gaussians", counted(gaussians)),
             ("objects", counted(objects)),
-            ("queries", format!("need {}", words::megabytes(fastlgs::session::bytes(root)))),
+            (
+                "queries",
+                format!("need {}", words::megabytes(fastlgs::session::bytes(root))),
+            ),
             ("warnings", manifest.warnings.join("\n          ")),
         ])
     })

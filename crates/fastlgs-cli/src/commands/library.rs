@@ -1,4 +1,4 @@
-//! `fastlgs query --library`: which scenes of a folder hold what a text names.
+//! `fastlgs query --library`: finds the scenes of a folder that contain an object.
 
 use super::lines::{Line, ends, line_of};
 use crate::outcome::Outcome;
@@ -11,8 +11,15 @@ use serde_json::json;
 use std::io::{BufRead, Write};
 use std::path::Path;
 
-/// Answers all texts; `texts` may be `-` for lines of standard input.
-pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, run: &Run) -> Result<Outcome> {
+/// Answers all texts. If `texts` is `-`, reads one text per line from standard input and answers in
+/// JSON.
+pub fn run(
+    root: &Path,
+    config: Config,
+    texts: &[String],
+    common: &ui::Common,
+    run: &Run,
+) -> Result<Outcome> {
     let search = Search::open(root, config, run)?;
     if texts == ["-"] {
         let mut out = std::io::stdout();
@@ -31,7 +38,10 @@ pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, r
         }
         return Ok(Outcome::Done);
     }
-    let mut answers = texts.iter().map(|text| Ok(search.ask(text)?)).collect::<Result<Vec<_>>>()?;
+    let mut answers = texts
+        .iter()
+        .map(|text| Ok(search.ask(text)?))
+        .collect::<Result<Vec<_>>>()?;
     let found = answers.iter().any(|a| a.found);
     if common.json.is_some() && answers.len() == 1 {
         report::give(common, &answers.remove(0))?;
@@ -40,15 +50,31 @@ pub fn run(root: &Path, config: Config, texts: &[String], common: &ui::Common, r
     } else if !common.quiet {
         answers.iter().for_each(print);
     }
-    Ok(if found { Outcome::Done } else { Outcome::NotFound })
+    Ok(if found {
+        Outcome::Done
+    } else {
+        Outcome::NotFound
+    })
 }
 
 fn print(answer: &Report) {
     let found = answer.scenes.iter().filter(|row| row.found);
-    let (count, asked, all) = (found.clone().count(), answer.scenes.len(), answer.searched.scenes);
-    // The others may hold it, too.
-    let of = if count > 0 && count == asked && asked < all { format!("the {asked} likeliest of {all}") } else { all.to_string() };
-    say!("\"{}\": in {count} of {of} scenes ({:.1} ms)", answer.text, answer.ms.search);
+    let (count, asked, all) = (
+        found.clone().count(),
+        answer.scenes.len(),
+        answer.searched.scenes,
+    );
+    // Scenes that are not listed may contain the object, too.
+    let of = if count > 0 && count == asked && asked < all {
+        format!("the best {asked} of {all}")
+    } else {
+        all.to_string()
+    };
+    say!(
+        "\"{}\": in {count} of {of} scenes ({:.1} ms)",
+        answer.text,
+        answer.ms.search
+    );
     for row in found {
         say!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
     }

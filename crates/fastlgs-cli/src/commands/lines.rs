@@ -1,24 +1,26 @@
-//! Questions as lines of standard input, and answers as lines of standard output.
+//! Queries as lines of standard input, and answers as lines of standard output.
 
 use anyhow::Result;
 use serde_json::json;
 
-/// What a line of standard input asks.
+/// A line of standard input.
 pub(super) enum Line {
-    /// Nothing: the line is empty.
+    /// An empty line.
     None,
-    /// A text.
+    /// A text query.
     Text(String),
-    /// The line is not text; this is the answer to it.
+    /// A line that is not UTF-8, with the error as its answer.
     Unreadable(serde_json::Value),
 }
 
-/// Reads a line.
+/// Parses a line.
 pub(super) fn line_of(line: &[u8]) -> Line {
     match std::str::from_utf8(line) {
         Err(_) => {
             let shown = String::from_utf8_lossy(line).trim().to_owned();
-            Line::Unreadable(json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }))
+            Line::Unreadable(
+                json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }),
+            )
         }
         Ok(line) => match line.trim().trim_start_matches('\u{feff}') {
             "" => Line::None,
@@ -27,10 +29,10 @@ pub(super) fn line_of(line: &[u8]) -> Line {
     }
 }
 
-/// Whether nobody reads the answers any more, which ends the dialogue quietly.
+/// Returns true if the reader has closed the pipe, which ends the dialogue without an error.
 ///
 /// # Errors
-/// Every other refusal.
+/// Any other I/O error.
 pub(super) fn ends(written: std::io::Result<()>) -> Result<bool> {
     match written {
         Ok(()) => Ok(false),

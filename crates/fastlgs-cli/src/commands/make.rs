@@ -1,4 +1,4 @@
-//! `fastlgs make`: from photos to a scene that answers, and what to do with it.
+//! `fastlgs make`: builds a scene from photos and prints the next commands.
 
 use crate::outcome::Outcome;
 use crate::words::thousands;
@@ -9,7 +9,9 @@ use fastlgs::make::{self, Config, State};
 
 pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let made = fastlgs::make(config, run)?;
-    report::tell(common, &made, |made| words(made, &config.preprocess.output.display().to_string()))
+    report::tell(common, &made, |made| {
+        words(made, &config.preprocess.output.display().to_string())
+    })
 }
 
 fn words(made: &make::Report, scene: &str) -> String {
@@ -17,17 +19,30 @@ fn words(made: &make::Report, scene: &str) -> String {
     let seconds = train.seconds + train.mapping_seconds;
     let how = match made.state {
         State::Made => {
-            format!("{} iterations and the objects took {seconds:.0} s ({})", thousands(train.iterations as usize), train.adapter)
+            format!(
+                "{} iterations and the objects took {seconds:.0} s ({})",
+                thousands(train.iterations as usize),
+                train.adapter
+            )
         }
-        State::Kept => "was there already, made from the same photos with the same options".to_owned(),
+        State::Kept => "is up to date; photos and options have not changed".to_owned(),
     };
     let [training, held_out] = made.photos;
-    let colour = train.psnr_held_out.map(|psnr| format!("; colour {psnr:.1} dB on {held_out} that were kept aside")).unwrap_or_default();
-    // A name that a shell would take apart is quoted.
-    let plain = scene.chars().all(|c| c.is_alphanumeric() || "/._-".contains(c));
-    let scene = if plain { scene.to_owned() } else { format!("'{}'", scene.replace('\'', "'\\''")) };
+    let colour = train
+        .psnr_held_out
+        .map(|psnr| format!("; PSNR {psnr:.1} dB on {held_out} held-out photos"))
+        .unwrap_or_default();
+    // Quotes a name with characters that the shell interprets.
+    let plain = scene
+        .chars()
+        .all(|c| c.is_alphanumeric() || "/._-".contains(c));
+    let scene = if plain {
+        scene.to_owned()
+    } else {
+        format!("'{}'", scene.replace('\'', "'\\''"))
+    };
     format!(
-        "{scene}: {how}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nask it:      fastlgs query {scene} \"a thing\"\nlook at it:  fastlgs serve {scene}",
+        "{scene}: {how}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nquery it:  fastlgs query {scene} \"red cup\"\nview it:   fastlgs serve {scene}",
         thousands(train.gaussians),
         thousands(train.objects)
     )
@@ -39,10 +54,24 @@ mod tests {
 
     #[test]
     fn the_next_commands_can_be_copied() {
-        let train = fastlgs::train::Report { gaussians: 12, objects: 3, psnr_held_out: Some(31.26), ..Default::default() };
-        let made = make::Report { state: State::Kept, photos: [7, 1], train };
+        let train = fastlgs::train::Report {
+            gaussians: 12,
+            objects: 3,
+            psnr_held_out: Some(31.26),
+            ..Default::default()
+        };
+        let made = make::Report {
+            state: State::Kept,
+            photos: [7, 1],
+            train,
+        };
         let said = words(&made, "my photos/fox");
-        assert!(said.contains("7 photos, 12 Gaussians, 3 objects and parts; colour 31.3 dB on 1 that"), "{said}");
+        assert!(
+            said.contains(
+                "7 photos, 12 Gaussians, 3 objects and parts; PSNR 31.3 dB on 1 held-out"
+            ),
+            "{said}"
+        );
         assert!(said.ends_with("fastlgs serve 'my photos/fox'"), "{said}");
     }
 }

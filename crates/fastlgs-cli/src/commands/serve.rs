@@ -1,4 +1,4 @@
-//! `fastlgs serve`: a page in the browser where a scene is looked at and asked.
+//! `fastlgs serve`: shows a scene in the browser and answers queries.
 
 use super::bind::{DEFAULT_BIND, parse_bind};
 use crate::outcome::Outcome;
@@ -13,18 +13,19 @@ use std::path::PathBuf;
 
 #[derive(clap::Args)]
 #[command(
-    after_help = "Example: fastlgs serve scenes/fox\n\nStop it with Ctrl-C. Addresses that other machines can reach need the token that is printed."
+    after_help = "Example: fastlgs serve scenes/fox\n\nStop the server with Ctrl-C. If other machines can reach the address, requests need the printed token."
 )]
 pub struct Args {
     /// Trained scene folder.
     scene: PathBuf,
-    /// Address to listen on: IP, PORT or IP:PORT; port 0 takes a free one.
+    /// Address to listen on: IP, PORT or IP:PORT; port 0 selects a free one.
     #[arg(long, default_value = DEFAULT_BIND, value_parser = parse_bind)]
     bind: SocketAddr,
-    /// The name of a proxy on this machine that passes requests on with its own name as host, as nginx can; may be repeated.
+    /// Host name of a proxy on this machine that forwards requests with its own name, such as
+    /// nginx; may be repeated.
     #[arg(long, value_name = "NAME")]
     host_name: Vec<String>,
-    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    /// CLIP text tower, for scenes with imported embeddings, or if the file has moved.
     #[arg(long, value_name = "FILE")]
     clip_text: Option<PathBuf>,
 }
@@ -33,7 +34,10 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     let folder = SceneFolder::open(&args.scene)?;
     let scene = folder.gaussians()?;
     if scene.is_empty() {
-        bail!("{}: the scene has no Gaussians; train it again", args.scene.display());
+        bail!(
+            "{}: the scene has no Gaussians; train it again",
+            args.scene.display()
+        );
     }
     let server = Server::start(&folder, args.bind, None, &args.host_name)?;
     server.set_focus(&scene.means);
@@ -44,7 +48,8 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// Tells where the page is, at once: who starts the server reads this line.
+/// Prints the address of the page and flushes it, so that the program that started the server can
+/// read it.
 fn announce(server: &Server, common: &ui::Common) -> Result<()> {
     if common.json.is_some() {
         report::give(common, &serde_json::json!({ "url": server.url }))?;

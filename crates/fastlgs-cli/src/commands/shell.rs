@@ -1,4 +1,4 @@
-//! `fastlgs completions` and `fastlgs man`: what packages install beside the binary.
+//! `fastlgs completions` and `fastlgs man`: write the files that packages install with the binary.
 
 use crate::outcome::Outcome;
 use anyhow::{Context, Result};
@@ -6,16 +6,18 @@ use clap_complete::Shell;
 use std::path::PathBuf;
 
 #[derive(clap::Args)]
-#[command(after_help = "Example: fastlgs completions bash > ~/.local/share/bash-completion/completions/fastlgs")]
+#[command(
+    after_help = "Example: fastlgs completions bash > ~/.local/share/bash-completion/completions/fastlgs"
+)]
 pub struct Completions {
-    /// Shell to complete in.
+    /// Shell of the script.
     shell: Shell,
 }
 
 #[derive(clap::Args)]
 #[command(after_help = "Example: fastlgs man -o ~/.local/share/man/man1")]
 pub struct Man {
-    /// Folder to write to: fastlgs.1, and a page for each command.
+    /// Output folder, for fastlgs.1 and a page per command.
     #[arg(short, long)]
     output: PathBuf,
 }
@@ -31,6 +33,7 @@ pub fn completions(args: &Completions, mut program: clap::Command) -> Result<Out
 /// Writes the manual pages.
 pub fn man(args: &Man, program: clap::Command) -> Result<Outcome> {
     std::fs::create_dir_all(&args.output).with_context(|| args.output.display().to_string())?;
-    clap_mangen::generate_to(program, &args.output).with_context(|| format!("{}: the pages cannot be written", args.output.display()))?;
+    clap_mangen::generate_to(program, &args.output)
+        .with_context(|| format!("{}: cannot write the manual pages", args.output.display()))?;
     Ok(Outcome::Done)
 }

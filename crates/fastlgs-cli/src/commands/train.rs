@@ -1,4 +1,4 @@
-//! `fastlgs train`: the pipeline's training, and the page that shows it.
+//! `fastlgs train`: trains a scene and can show the training in the browser.
 
 use super::bind::{DEFAULT_BIND, parse_bind};
 use crate::console::Console;
@@ -17,12 +17,12 @@ use std::sync::Arc;
 pub struct Args {
     #[command(flatten)]
     config: train::Config,
-    /// Show the scene in the browser while it grows, with its curves; when it is trained, questions are answered until Ctrl-C.
+    /// Show the training in the browser. After training, the page answers queries until Ctrl-C.
     #[arg(long, value_name = "IP:PORT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_BIND, value_parser = parse_bind)]
     serve: Option<SocketAddr>,
 }
 
-/// The terminal and the page hear the same.
+/// Forwards progress to the terminal and to the page.
 struct Both<'a>(&'a Console, &'a Server);
 
 impl Sink for Both<'_> {
@@ -38,13 +38,26 @@ impl Sink for Both<'_> {
 
 pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcome> {
     let Some(bind) = args.serve else {
-        return report::tell(common, &train::train(&args.config, &common.run(console))?, words::train);
+        return report::tell(
+            common,
+            &train::train(&args.config, &common.run(console))?,
+            words::train,
+        );
     };
     let config = &args.config;
-    let live = Live::new(config.iterations(), config.antialias, config.background.unwrap_or_default().color);
-    let server = Server::start(&SceneFolder::open(&config.scene)?, bind, Some(Arc::new(live)), &[])?;
-    // Standard output is the report's.
-    eprintln!("watch it at {}", server.url);
+    let live = Live::new(
+        config.iterations(),
+        config.antialias,
+        config.background.unwrap_or_default().color,
+    );
+    let server = Server::start(
+        &SceneFolder::open(&config.scene)?,
+        bind,
+        Some(Arc::new(live)),
+        &[],
+    )?;
+    // Standard output is reserved for the report.
+    eprintln!("watch the training at {}", server.url);
     let report = train::train(config, &common.run(&Both(console, &server)))?;
     report::tell(common, &report, words::train)?;
     server.open_scene(&common.device, None)?;

@@ -1,10 +1,10 @@
 //! COLMAP sparse models: `cameras`, `images` and `points3D`, each `.bin` (little-endian) or `.txt`.
 
 use super::album::Album;
-use super::pose::{PoseConvention, StatedPose};
-use super::{PosedPhoto, Stated, text};
-use crate::fs::{self, Bytes};
-use crate::undistort::{Bend, Distortion};
+use super::pose::{PoseConvention, RawPose};
+use super::{ParsedPoses, PosedPhoto, text};
+use crate::fs::{self, ByteReader};
+use crate::undistort::{Distortion, LensProjection};
 use crate::{Camera, Error, Result};
 use glam::{DVec3, Mat4};
 use std::collections::HashMap;
@@ -12,7 +12,9 @@ use std::path::{Path, PathBuf};
 
 /// Returns whether the folder contains a COLMAP model.
 pub fn is_model(folder: &Path) -> bool {
-    ["bin", "txt"].iter().any(|e| folder.join(format!("cameras.{e}")).is_file())
+    ["bin", "txt"]
+        .iter()
+        .any(|e| folder.join(format!("cameras.{e}")).is_file())
 }
 
 /// Intrinsics of one COLMAP camera.
@@ -57,20 +59,27 @@ const MODELS: [(&str, usize); 11] = [
 ];
 
 /// Returns the number of images that the model in a folder registers; 0 if it cannot be read.
-pub fn size(folder: &Path) -> usize {
+pub fn registered_count(folder: &Path) -> usize {
     registered(folder).map_or(0, |(_, images)| images.len())
 }
 
 /// Returns the path of a file of the model, and whether the model is binary.
 fn file(folder: &Path, name: &str) -> (PathBuf, bool) {
     let binary = folder.join("cameras.bin").is_file();
-    (folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" })), binary)
+    (
+        folder.join(format!("{name}.{}", if binary { "bin" } else { "txt" })),
+        binary,
+    )
 }
 
 /// Reads the images of the model. Also returns the path of the file that lists them.
 fn registered(folder: &Path) -> Result<(PathBuf, Vec<Registered>)> {
     let (path, binary) = file(folder, "images");
-    let images = if binary { images_bin(&path)? } else { images_txt(&path)? };
+    let images = if binary {
+        images_bin(&path)?
+    } else {
+        images_txt(&path)?
+    };
     Ok((path, images))
 }
 
@@ -78,11 +87,18 @@ fn registered(folder: &Path) -> Result<(PathBuf, Vec<Registered>)> {
 ///
 /// # Errors
 /// Missing or truncated files, unknown camera models, and fields that are not numbers.
-pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
+pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<ParsedPoses> {
     let ((cameras, binary), (points, _)) = (file(folder, "cameras"), file(folder, "points3D"));
-    let lenses = if binary { cameras_bin(&cameras)? } else { cameras_txt(&cameras)? };
+    let lenses = if binary {
+        cameras_bin(&cameras)?
+    } else {
+        cameras_txt(&cameras)?
+    };
     let (images, registered) = registered(folder)?;
-    let mut stated = Stated { conventions: PoseConvention::OF_QUATERNIONS.to_vec(), ..Stated::default() };
+    let mut stated = ParsedPoses {
+        conventions: PoseConvention::OF_QUATERNIONS.to_vec(),
+        ..ParsedPoses::default()
+    };
     let names: Vec<String> = registered.iter().map(|image| image.name.clone()).collect();
     let mut missing = Vec::new();
     let mut photo_of = HashMap::new();
@@ -99,15 +115,34 @@ pub fn load(album: &Album, base: &Path, folder: &Path) -> Result<Stated> {
         }
     }
     if points.is_file() {
-        let read = if binary { points_bin(&points)? } else { points_txt(&points)? };
+        let read = if binary {
+            points_bin(&points)?
+        } else {
+            points_txt(&points)?
+        };
         // Some programs write no colours, so that all points are black. The photos then give the
         // colours.
         let colorless = read.iter().all(|point| point.color == [0; 3]);
-        let shown_in = |point: &Point| point.images.iter().filter_map(|id| photo_of.get(id).copied()).collect();
-        stated.shown_in = if colorless { read.iter().map(shown_in).collect() } else { Vec::new() };
-        stated.points = read.into_iter().map(|point| (point.position, point.color)).collect();
+        let seen_in = |point: &Point| {
+            point
+                .images
+                .iter()
+                .filter_map(|id| photo_of.get(id).copied())
+                .collect()
+        };
+        stated.shown_in = if colorless {
+            read.iter().map(seen_in).collect()
+        } else {
+            Vec::new()
+        };
+        stated.points = read
+            .into_iter()
+            .map(|point| (point.position, point.color))
+            .collect();
     }
-    stated.warnings.extend(album.missing(&missing, registered.len(), &images));
+    stated
+        .warnings
+        .extend(album.missing(&missing, registered.len(), &images));
     Ok(stated)
 }
 
@@ -123,7 +158,7 @@ fn posed(path: PathBuf, image: &Registered, lens: &Lens) -> PosedPhoto {
             cy: lens.centre[1] as f32,
             world_to_camera: Mat4::IDENTITY,
         },
-        stated: StatedPose::Quaternion(image.rotation, DVec3::from(image.translation)),
+        raw_pose: RawPose::Quaternion(image.rotation, DVec3::from(image.translation)),
         path,
         distortion: lens.distortion,
         ignore: None,
@@ -138,41 +173,134 @@ fn lens(path: &Path, model: &str, width: u64, height: u64, p: &[f64]) -> Result<
         "SIMPLE_PINHOLE" => ([p[0], p[0]], [p[1], p[2]], none),
         "PINHOLE" => ([p[0], p[1]], [p[2], p[3]], none),
         "SIMPLE_RADIAL" => ([p[0], p[0]], [p[1], p[2]], Distortion { k1: d(3), ..none }),
-        "RADIAL" => ([p[0], p[0]], [p[1], p[2]], Distortion { k1: d(3), k2: d(4), ..none }),
-        "OPENCV" => ([p[0], p[1]], [p[2], p[3]], Distortion { k1: d(4), k2: d(5), p1: d(6), p2: d(7), ..none }),
+        "RADIAL" => (
+            [p[0], p[0]],
+            [p[1], p[2]],
+            Distortion {
+                k1: d(3),
+                k2: d(4),
+                ..none
+            },
+        ),
+        "OPENCV" => (
+            [p[0], p[1]],
+            [p[2], p[3]],
+            Distortion {
+                k1: d(4),
+                k2: d(5),
+                p1: d(6),
+                p2: d(7),
+                ..none
+            },
+        ),
         "FULL_OPENCV" => {
             let (tangential, below) = ((d(6), d(7)), [d(9), d(10), d(11)]);
-            ([p[0], p[1]], [p[2], p[3]], Distortion { k1: d(4), k2: d(5), k3: d(8), p1: tangential.0, p2: tangential.1, below, ..none })
+            (
+                [p[0], p[1]],
+                [p[2], p[3]],
+                Distortion {
+                    k1: d(4),
+                    k2: d(5),
+                    k3: d(8),
+                    p1: tangential.0,
+                    p2: tangential.1,
+                    radial_denominator: below,
+                    ..none
+                },
+            )
         }
-        "OPENCV_FISHEYE" => {
-            ([p[0], p[1]], [p[2], p[3]], Distortion { bend: Bend::Fisheye, k1: d(4), k2: d(5), k3: d(6), k4: d(7), ..none })
-        }
-        "SIMPLE_RADIAL_FISHEYE" => ([p[0], p[0]], [p[1], p[2]], Distortion { bend: Bend::Fisheye, k1: d(3), ..none }),
-        "RADIAL_FISHEYE" => ([p[0], p[0]], [p[1], p[2]], Distortion { bend: Bend::Fisheye, k1: d(3), k2: d(4), ..none }),
-        "FOV" => ([p[0], p[1]], [p[2], p[3]], if p[4] == 0.0 { none } else { Distortion { bend: Bend::Fov(d(4)), ..none } }),
+        "OPENCV_FISHEYE" => (
+            [p[0], p[1]],
+            [p[2], p[3]],
+            Distortion {
+                projection: LensProjection::Fisheye,
+                k1: d(4),
+                k2: d(5),
+                k3: d(6),
+                k4: d(7),
+                ..none
+            },
+        ),
+        "SIMPLE_RADIAL_FISHEYE" => (
+            [p[0], p[0]],
+            [p[1], p[2]],
+            Distortion {
+                projection: LensProjection::Fisheye,
+                k1: d(3),
+                ..none
+            },
+        ),
+        "RADIAL_FISHEYE" => (
+            [p[0], p[0]],
+            [p[1], p[2]],
+            Distortion {
+                projection: LensProjection::Fisheye,
+                k1: d(3),
+                k2: d(4),
+                ..none
+            },
+        ),
+        "FOV" => (
+            [p[0], p[1]],
+            [p[2], p[3]],
+            if p[4] == 0.0 {
+                none
+            } else {
+                Distortion {
+                    projection: LensProjection::Fov(d(4)),
+                    ..none
+                }
+            },
+        ),
         "THIN_PRISM_FISHEYE" => {
-            let radial = Distortion { bend: Bend::Fisheye, k1: d(4), k2: d(5), k3: d(8), k4: d(9), ..none };
-            ([p[0], p[1]], [p[2], p[3]], Distortion { p1: d(6), p2: d(7), prism: [d(10), d(11)], ..radial })
+            let radial = Distortion {
+                projection: LensProjection::Fisheye,
+                k1: d(4),
+                k2: d(5),
+                k3: d(8),
+                k4: d(9),
+                ..none
+            };
+            (
+                [p[0], p[1]],
+                [p[2], p[3]],
+                Distortion {
+                    p1: d(6),
+                    p2: d(7),
+                    prism: [d(10), d(11)],
+                    ..radial
+                },
+            )
         }
         other => {
             return Err(Error::format(
                 path,
-                format!("camera model {other} is not supported; undistort with 'colmap image_undistorter' first"),
+                format!(
+                    "camera model {other} is not supported; undistort with 'colmap image_undistorter' first"
+                ),
             ));
         }
     };
-    Ok(Lens { width: width as u32, height: height as u32, focal, centre, distortion })
+    Ok(Lens {
+        width: width as u32,
+        height: height as u32,
+        focal,
+        centre,
+        distortion,
+    })
 }
 
 fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
     let data = fs::read(path)?;
-    let mut bytes = Bytes::new(path, &data);
+    let mut bytes = ByteReader::new(path, &data);
     let count = bytes.count(24)?;
     let mut lenses = HashMap::new();
     for _ in 0..count {
         let (id, model) = (bytes.u32()?, bytes.u32()?);
         let (width, height) = (bytes.u64()?, bytes.u64()?);
-        let &(name, n) = MODELS.get(model as usize).ok_or_else(|| Error::format(path, unknown(&format!("number {model}"))))?;
+        let &(name, n) = MODELS
+            .get(model as usize)
+            .ok_or_else(|| Error::format(path, unknown(&format!("number {model}"))))?;
         let parameters = (0..n).map(|_| bytes.f64()).collect::<Result<Vec<_>>>()?;
         lenses.insert(id, lens(path, name, width, height, &parameters)?);
     }
@@ -181,7 +309,7 @@ fn cameras_bin(path: &Path) -> Result<HashMap<u32, Lens>> {
 
 fn images_bin(path: &Path) -> Result<Vec<Registered>> {
     let data = fs::read(path)?;
-    let mut bytes = Bytes::new(path, &data);
+    let mut bytes = ByteReader::new(path, &data);
     let count = bytes.count(73)?;
     (0..count)
         .map(|_| {
@@ -195,14 +323,20 @@ fn images_bin(path: &Path) -> Result<Vec<Registered>> {
             let observations = bytes.count(24)?;
             bytes.take(observations * 24)?;
             let [w, x, y, z, tx, ty, tz] = pose;
-            Ok(Registered { id, rotation: [w, x, y, z], translation: [tx, ty, tz], lens, name })
+            Ok(Registered {
+                id,
+                rotation: [w, x, y, z],
+                translation: [tx, ty, tz],
+                lens,
+                name,
+            })
         })
         .collect()
 }
 
 fn points_bin(path: &Path) -> Result<Vec<Point>> {
     let data = fs::read(path)?;
-    let mut bytes = Bytes::new(path, &data);
+    let mut bytes = ByteReader::new(path, &data);
     let count = bytes.count(51)?;
     (0..count)
         .map(|_| {
@@ -213,15 +347,25 @@ fn points_bin(path: &Path) -> Result<Vec<Point>> {
             bytes.f64()?;
             let length = bytes.count(8)?;
             let track = bytes.take(length * 8)?;
-            let images = track.chunks_exact(8).map(|seen| u32::from_le_bytes([seen[0], seen[1], seen[2], seen[3]])).collect();
-            Ok(Point { position, color, images })
+            let images = track
+                .chunks_exact(8)
+                .map(|seen| u32::from_le_bytes([seen[0], seen[1], seen[2], seen[3]]))
+                .collect();
+            Ok(Point {
+                position,
+                color,
+                images,
+            })
         })
         .collect()
 }
 
 /// Yields the line number and the fields of each line that is not a comment.
 fn rows(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
-    let lines = text.lines().enumerate().filter(|(_, l)| !l.starts_with('#'));
+    let lines = text
+        .lines()
+        .enumerate()
+        .filter(|(_, l)| !l.starts_with('#'));
     lines.map(|(i, l)| (i + 1, l.split_whitespace().collect()))
 }
 
@@ -235,10 +379,15 @@ fn unknown(model: &str) -> String {
 }
 
 fn parse<T: std::str::FromStr>(path: &Path, line: usize, fields: &[&str], i: usize) -> Result<T> {
-    fields
-        .get(i)
-        .and_then(|f| f.parse().ok())
-        .ok_or_else(|| Error::format(path, format!("line {line}, field {} is not a valid number; export the model again", i + 1)))
+    fields.get(i).and_then(|f| f.parse().ok()).ok_or_else(|| {
+        Error::format(
+            path,
+            format!(
+                "line {line}, field {} is not a valid number; export the model again",
+                i + 1
+            ),
+        )
+    })
 }
 
 fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
@@ -246,15 +395,27 @@ fn cameras_txt(path: &Path) -> Result<HashMap<u32, Lens>> {
     for (line, f) in rows(&text(path)?).filter(|(_, f)| !f.is_empty()) {
         let model = f.get(1).copied().unwrap_or_default();
         let n = MODELS.iter().find(|m| m.0 == model).map(|m| m.1);
-        let n = n.ok_or_else(|| Error::format(path, format!("line {line}: {}", unknown(&format!("'{model}'")))))?;
+        let n = n.ok_or_else(|| {
+            Error::format(
+                path,
+                format!("line {line}: {}", unknown(&format!("'{model}'"))),
+            )
+        })?;
         if f.len() != 4 + n {
             let given = f.len().saturating_sub(4);
-            let why = format!("line {line}: the camera model {model} has {n} parameters, but this line has {given}; export the model again");
+            let why = format!(
+                "line {line}: the camera model {model} has {n} parameters, but this line has {given}; export the model again"
+            );
             return Err(Error::format(path, why));
         }
-        let parameters = (0..n).map(|i| parse(path, line, &f, 4 + i)).collect::<Result<Vec<f64>>>()?;
+        let parameters = (0..n)
+            .map(|i| parse(path, line, &f, 4 + i))
+            .collect::<Result<Vec<f64>>>()?;
         let (width, height) = (parse(path, line, &f, 2)?, parse(path, line, &f, 3)?);
-        lenses.insert(parse(path, line, &f, 0)?, lens(path, model, width, height, &parameters)?);
+        lenses.insert(
+            parse(path, line, &f, 0)?,
+            lens(path, model, width, height, &parameters)?,
+        );
     }
     Ok(lenses)
 }
@@ -266,7 +427,11 @@ const BEFORE_NAME: usize = 9;
 /// these lines, or omit them only if they are empty.
 fn images_txt(path: &Path) -> Result<Vec<Registered>> {
     let content = text(path)?;
-    let mut lines = content.lines().enumerate().filter(|(_, line)| !line.starts_with('#')).peekable();
+    let mut lines = content
+        .lines()
+        .enumerate()
+        .filter(|(_, line)| !line.starts_with('#'))
+        .peekable();
     let mut images = Vec::new();
     while let Some((line, row)) = lines.next() {
         let f: Vec<&str> = row.split_whitespace().collect();
@@ -280,7 +445,14 @@ fn images_txt(path: &Path) -> Result<Vec<Registered>> {
             rotation: [number(1)?, number(2)?, number(3)?, number(4)?],
             translation: [number(5)?, number(6)?, number(7)?],
             lens: parse(path, line, &f, 8)?,
-            name: name_of(row).ok_or_else(|| Error::format(path, format!("line {line}: the name of the image is missing; export the model again")))?,
+            name: name_of(row).ok_or_else(|| {
+                Error::format(
+                    path,
+                    format!(
+                        "line {line}: the name of the image is missing; export the model again"
+                    ),
+                )
+            })?,
         });
         lines.next_if(|(_, next)| is_observations(next));
     }
@@ -311,8 +483,18 @@ fn points_txt(path: &Path) -> Result<Vec<Point>> {
             let byte = |i| parse::<u8>(path, line, &f, i);
             // The reprojection error (field 7) is followed by pairs of image id and key point
             // index.
-            let images = f.get(8..).unwrap_or_default().iter().step_by(2).filter_map(|id| id.parse().ok()).collect();
-            Ok(Point { position: DVec3::new(number(1)?, number(2)?, number(3)?), color: [byte(4)?, byte(5)?, byte(6)?], images })
+            let images = f
+                .get(8..)
+                .unwrap_or_default()
+                .iter()
+                .step_by(2)
+                .filter_map(|id| id.parse().ok())
+                .collect();
+            Ok(Point {
+                position: DVec3::new(number(1)?, number(2)?, number(3)?),
+                color: [byte(4)?, byte(5)?, byte(6)?],
+                images,
+            })
         })
         .collect()
 }

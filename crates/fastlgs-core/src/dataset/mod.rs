@@ -12,7 +12,7 @@ use crate::{Camera, Error, Result, fs};
 use album::Album;
 pub use album::images_folder;
 use glam::{DVec3, Vec3};
-pub use pose::{PoseConvention, StatedPose};
+pub use pose::{PoseConvention, RawPose};
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ pub struct PosedPhoto {
     /// states, which may differ from the photo's.
     pub camera: Camera,
     /// Pose as written in the file.
-    pub stated: StatedPose,
+    pub raw_pose: RawPose,
     /// Lens distortion that preparation removes.
     pub distortion: Distortion,
     /// Path of the mask of ignored pixels, which are black in it.
@@ -48,7 +48,7 @@ pub struct SfmPoint {
 
 /// Content of the pose files, before sorting and checks.
 #[derive(Clone, Debug, Default)]
-pub struct Stated {
+pub struct ParsedPoses {
     /// Photos with poses. Name and pose of their cameras are not set yet.
     photos: Vec<PosedPhoto>,
     /// Points in world coordinates with their colours, 0 to 255.
@@ -90,10 +90,17 @@ pub struct Dataset {
 impl Dataset {
     /// Sets the poses of all cameras by a convention. Chooses the frame again and transforms the
     /// points into it.
-    pub fn read_poses_by(&mut self, convention: PoseConvention) {
-        let poses: Vec<_> = self.photos.iter().map(|photo| photo.stated.by(convention)).collect();
+    pub fn apply_convention(&mut self, convention: PoseConvention) {
+        let poses: Vec<_> = self
+            .photos
+            .iter()
+            .map(|photo| photo.raw_pose.to_pose(convention))
+            .collect();
         let centres: Vec<DVec3> = poses.iter().map(|pose| pose.centre()).collect();
-        self.frame = self.earlier_frame.filter(|frame| frame.holds(&centres)).unwrap_or_else(|| WorldFrame::around(&centres));
+        self.frame = self
+            .earlier_frame
+            .filter(|frame| frame.keeps_precision(&centres))
+            .unwrap_or_else(|| WorldFrame::for_cameras(&centres));
         for (photo, pose) in self.photos.iter_mut().zip(&poses) {
             photo.camera.world_to_camera = self.frame.local_pose(pose);
         }
@@ -108,28 +115,49 @@ impl Dataset {
 fn colmap_model(photos: &Path) -> Option<(PathBuf, Option<String>)> {
     let roots = ["sparse", "colmap/sparse"].map(|root| photos.join(root));
     let numbered = roots.iter().flat_map(|root| {
-        let mut folders: Vec<PathBuf> = root.read_dir().into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+        let mut folders: Vec<PathBuf> = root
+            .read_dir()
+            .into_iter()
+            .flatten()
+            .flatten()
+            .map(|entry| entry.path())
+            .collect();
         folders.sort();
         folders
     });
-    let models: Vec<PathBuf> = numbered.chain(roots.iter().cloned()).filter(|folder| colmap::is_model(folder)).collect();
+    let models: Vec<PathBuf> = numbered
+        .chain(roots.iter().cloned())
+        .filter(|folder| colmap::is_model(folder))
+        .collect();
     if models.len() < 2 {
         return models.into_iter().next().map(|model| (model, None));
     }
-    let mut sizes: Vec<(usize, PathBuf)> = models.into_iter().map(|model| (colmap::size(&model), model)).collect();
+    let mut sizes: Vec<(usize, PathBuf)> = models
+        .into_iter()
+        .map(|model| (colmap::registered_count(&model), model))
+        .collect();
     // The sort is stable: among models of equal size, the first wins.
     sizes.sort_by_key(|(size, _)| std::cmp::Reverse(*size));
     let list = |models: &[(usize, PathBuf)]| {
-        let each = models.iter().map(|(size, model)| format!("{} ({size} photos)", model.display()));
+        let each = models
+            .iter()
+            .map(|(size, model)| format!("{} ({size} photos)", model.display()));
         each.collect::<Vec<_>>().join(", ")
     };
-    let warning = format!("found {} COLMAP models; using {}; ignoring {}", sizes.len(), list(&sizes[..1]), list(&sizes[1..]));
+    let warning = format!(
+        "found {} COLMAP models; using {}; ignoring {}",
+        sizes.len(),
+        list(&sizes[..1]),
+        list(&sizes[1..])
+    );
     Some((sizes.swap_remove(0).1, Some(warning)))
 }
 
 /// Returns whether PHOTOS has poses that [`load`] can read.
 pub fn has_poses(photos: &Path) -> bool {
-    colmap_model(photos).is_some() || !transforms::files(photos).is_empty() || photos.join(llff::FILE).is_file()
+    colmap_model(photos).is_some()
+        || !transforms::files(photos).is_empty()
+        || photos.join(llff::FILE).is_file()
 }
 
 /// Loads the posed photos of PHOTOS, with the masks in `ignore/`.
@@ -142,7 +170,10 @@ pub fn has_poses(photos: &Path) -> bool {
 /// No poses, a damaged file, a pose that is not finite, or poses without any photo.
 pub fn load(photos: &Path) -> Result<Dataset> {
     if !photos.is_dir() {
-        return Err(Error::Invalid(format!("{}: no such folder of photos", photos.display())));
+        return Err(Error::Invalid(format!(
+            "{}: no such folder of photos",
+            photos.display()
+        )));
     }
     if let Some((folder, warning)) = colmap_model(photos) {
         let mut dataset = load_model(photos, &folder)?;
@@ -175,60 +206,127 @@ pub fn load_model(photos: &Path, model: &Path) -> Result<Dataset> {
 }
 
 /// Names, sorts and checks the content of the pose files.
-fn assembled(photos: &Path, album: &Album, mut stated: Stated) -> Result<Dataset> {
+fn assembled(photos: &Path, album: &Album, mut stated: ParsedPoses) -> Result<Dataset> {
     if stated.photos.is_empty() {
-        let why = stated.warnings.iter().map(|warning| format!("; {warning}")).collect::<String>();
-        return Err(Error::Invalid(format!("{}: no photo has a pose{why}", photos.display())));
+        let why = stated
+            .warnings
+            .iter()
+            .map(|warning| format!("; {warning}"))
+            .collect::<String>();
+        return Err(Error::Invalid(format!(
+            "{}: no photo has a pose{why}",
+            photos.display()
+        )));
     }
-    let files: Vec<&Path> = stated.photos.iter().map(|photo| photo.path.as_path()).collect();
+    let files: Vec<&Path> = stated
+        .photos
+        .iter()
+        .map(|photo| photo.path.as_path())
+        .collect();
     let names = album.view_names(&files);
-    let held_out = files.iter().zip(&names).filter(|(file, _)| stated.held_out.iter().any(|held| held == *file)).map(|f| f.1.clone());
+    let held_out = files
+        .iter()
+        .zip(&names)
+        .filter(|(file, _)| stated.held_out.iter().any(|held| held == *file))
+        .map(|f| f.1.clone());
     let held_out = held_out.collect();
-    stated.photos.iter_mut().zip(names).for_each(|(photo, name)| photo.camera.name = name);
+    stated
+        .photos
+        .iter_mut()
+        .zip(names)
+        .for_each(|(photo, name)| photo.camera.name = name);
     let mut order: Vec<usize> = (0..stated.photos.len()).collect();
-    order.sort_by(|a, b| stated.photos[*a].camera.name.cmp(&stated.photos[*b].camera.name));
+    order.sort_by(|a, b| {
+        stated.photos[*a]
+            .camera
+            .name
+            .cmp(&stated.photos[*b].camera.name)
+    });
     let mut place = vec![0; order.len()];
-    order.iter().enumerate().for_each(|(new, old)| place[*old] = new as u32);
-    let renumbered = |photos: &Vec<u32>| photos.iter().map(|photo| place[*photo as usize]).collect();
+    order
+        .iter()
+        .enumerate()
+        .for_each(|(new, old)| place[*old] = new as u32);
+    let renumbered =
+        |photos: &Vec<u32>| photos.iter().map(|photo| place[*photo as usize]).collect();
     let mut dataset = Dataset {
         shown_in: stated.shown_in.iter().map(renumbered).collect(),
-        photos: order.into_iter().map(|old| stated.photos[old].clone()).collect(),
+        photos: order
+            .into_iter()
+            .map(|old| stated.photos[old].clone())
+            .collect(),
         conventions: stated.conventions,
         held_out,
         warnings: stated.warnings,
         ..Dataset::default()
     };
-    if let Some(pair) = dataset.photos.windows(2).find(|p| p[0].camera.name == p[1].camera.name) {
-        return Err(Error::format(photos, format!("the photo '{}' has two poses; remove one of them", pair[0].camera.name)));
+    if let Some(pair) = dataset
+        .photos
+        .windows(2)
+        .find(|p| p[0].camera.name == p[1].camera.name)
+    {
+        return Err(Error::format(
+            photos,
+            format!(
+                "the photo '{}' has two poses; remove one of them",
+                pair[0].camera.name
+            ),
+        ));
     }
-    let finite: Vec<bool> = stated.points.iter().map(|(position, _)| position.is_finite()).collect();
+    let finite: Vec<bool> = stated
+        .points
+        .iter()
+        .map(|(position, _)| position.is_finite())
+        .collect();
     let lost = finite.iter().filter(|finite| !**finite).count();
     if lost > 0 {
-        dataset.warnings.push(format!("{lost} of {} points have NaN or infinite positions and are ignored", finite.len()));
+        dataset.warnings.push(format!(
+            "{lost} of {} points have NaN or infinite positions and are ignored",
+            finite.len()
+        ));
     }
     let mut keep = finite.iter();
     dataset.shown_in.retain(|_| *keep.next().unwrap_or(&true));
-    for (position, color) in stated.points.into_iter().filter(|(position, _)| position.is_finite()) {
+    for (position, color) in stated
+        .points
+        .into_iter()
+        .filter(|(position, _)| position.is_finite())
+    {
         dataset.stated_points.push(position);
-        dataset.points.push(SfmPoint { position: Vec3::ZERO, color, seen_by: Vec::new() });
+        dataset.points.push(SfmPoint {
+            position: Vec3::ZERO,
+            color,
+            seen_by: Vec::new(),
+        });
     }
-    dataset.read_poses_by(dataset.conventions[0]);
+    dataset.apply_convention(dataset.conventions[0]);
     for photo in &mut dataset.photos {
-        photo.camera.check().map_err(|reason| Error::format(photos, reason))?;
+        photo
+            .camera
+            .check()
+            .map_err(|reason| Error::format(photos, reason))?;
         check_principal_point(photo)?;
         if photo.ignore.is_none() {
             photo.ignore = ignore_mask(photos, &photo.camera.name, &photo.path);
         }
     }
     warn_of_photos_without_pose(album, &mut dataset);
-    dataset.warnings.extend(images_folder(photos).and_then(|images| passed_over(&images)));
+    dataset
+        .warnings
+        .extend(images_folder(photos).and_then(|images| unreadable_images_warning(&images)));
     Ok(dataset)
 }
 
 /// Returns an error if the principal point lies outside the photo. The intrinsics then belong to
 /// another image size.
 fn check_principal_point(photo: &PosedPhoto) -> Result<()> {
-    let Camera { width, height, cx, cy, .. } = photo.camera;
+    let Camera {
+        width,
+        height,
+        cx,
+        cy,
+        ..
+    } = photo.camera;
     let within = |c: f32, side: u32| c > 0.0 && c < side as f32;
     if within(cx, width) && within(cy, height) {
         return Ok(());
@@ -241,17 +339,25 @@ fn check_principal_point(photo: &PosedPhoto) -> Result<()> {
 
 /// Reads a UTF-8 file and removes the byte order mark.
 fn text(path: &Path) -> Result<String> {
-    let text = String::from_utf8(fs::read(path)?).map_err(|_| Error::format(path, "not UTF-8 text"))?;
-    Ok(text.strip_prefix('\u{feff}').map(str::to_owned).unwrap_or(text))
+    let text =
+        String::from_utf8(fs::read(path)?).map_err(|_| Error::format(path, "not UTF-8 text"))?;
+    Ok(text
+        .strip_prefix('\u{feff}')
+        .map(str::to_owned)
+        .unwrap_or(text))
 }
 
 /// Returns the ignore mask of a photo: `PHOTOS/ignore/NAME.png`. NAME is the view's name or the
 /// photo's path in its folder, with or without the photo's extension.
 fn ignore_mask(photos: &Path, view: &str, file: &Path) -> Option<PathBuf> {
-    let below = images_folder(photos).and_then(|images| Some(file.strip_prefix(images).ok()?.to_owned()));
+    let below =
+        images_folder(photos).and_then(|images| Some(file.strip_prefix(images).ok()?.to_owned()));
     let names = [PathBuf::from(view), below.unwrap_or_default()];
-    let each = names.iter().flat_map(|name| [name.with_added_extension("png"), name.with_extension("png")]);
-    each.map(|name| photos.join("ignore").join(name)).find(|path| path.is_file())
+    let each = names
+        .iter()
+        .flat_map(|name| [name.with_added_extension("png"), name.with_extension("png")]);
+    each.map(|name| photos.join("ignore").join(name))
+        .find(|path| path.is_file())
 }
 
 /// Adds one warning that lists all photos without a pose.
@@ -259,51 +365,105 @@ fn warn_of_photos_without_pose(album: &Album, dataset: &mut Dataset) {
     let posed: HashSet<&Path> = dataset.photos.iter().map(|p| p.path.as_path()).collect();
     let extra: Vec<String> = album.others(&posed).collect();
     if !extra.is_empty() {
-        let warning = format!("{} photos have no pose and are ignored: {}", extra.len(), first_few(&extra));
+        let warning = format!(
+            "{} photos have no pose and are ignored: {}",
+            extra.len(),
+            join_first(&extra)
+        );
         dataset.warnings.push(warning);
     }
 }
 
 /// Extensions of image formats that cannot be read.
-const UNREAD: [&str; 11] = ["arw", "avif", "cr2", "cr3", "dng", "heic", "heif", "jp2", "jxl", "nef", "orf"];
+const UNSUPPORTED_EXTENSIONS: [&str; 11] = [
+    "arw", "avif", "cr2", "cr3", "dng", "heic", "heif", "jp2", "jxl", "nef", "orf",
+];
 
 /// Returns a warning if a folder contains images that cannot be read, with their names; else
 /// `None`.
-pub fn passed_over(images: &Path) -> Option<String> {
-    let ending = |path: &Path| path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-    let is_hidden = |path: &Path| path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-    let entries = std::fs::read_dir(images).ok()?.flatten().map(|entry| entry.path()).filter(|path| !is_hidden(path));
-    let mut unread: Vec<PathBuf> = entries.filter(|path| ending(path).is_some_and(|e| UNREAD.contains(&e.as_str()))).collect();
+pub fn unreadable_images_warning(images: &Path) -> Option<String> {
+    let ending = |path: &Path| {
+        path.extension()
+            .map(|e| e.to_string_lossy().to_ascii_lowercase())
+    };
+    let is_hidden = |path: &Path| {
+        path.file_name()
+            .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."))
+    };
+    let entries = std::fs::read_dir(images)
+        .ok()?
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| !is_hidden(path));
+    let mut unread: Vec<PathBuf> = entries
+        .filter(|path| ending(path).is_some_and(|e| UNSUPPORTED_EXTENSIONS.contains(&e.as_str())))
+        .collect();
     unread.sort();
-    let names: Vec<String> = unread.iter().filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    let names: Vec<String> = unread
+        .iter()
+        .filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned()))
+        .collect();
     let count = names.len();
-    (count > 0).then(|| format!("{count} images have formats that cannot be read; convert them to JPEG or PNG: {}", first_few(&names)))
+    (count > 0).then(|| {
+        format!(
+            "{count} images have formats that cannot be read; convert them to JPEG or PNG: {}",
+            join_first(&names)
+        )
+    })
 }
 
 /// Returns the names of the subfolders that contain photos, sorted.
 pub fn folders_within(images: &Path) -> Vec<String> {
-    let holds_photos =
-        |path: &PathBuf| std::fs::read_dir(path).is_ok_and(|mut entries| entries.any(|e| e.is_ok_and(|e| is_photo(&e.path()))));
-    let entries = std::fs::read_dir(images).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut found: Vec<String> = entries.filter(holds_photos).filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned())).collect();
+    let holds_photos = |path: &PathBuf| {
+        std::fs::read_dir(path)
+            .is_ok_and(|mut entries| entries.any(|e| e.is_ok_and(|e| is_photo(&e.path()))))
+    };
+    let entries = std::fs::read_dir(images)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path());
+    let mut found: Vec<String> = entries
+        .filter(holds_photos)
+        .filter_map(|p| Some(p.file_name()?.to_string_lossy().into_owned()))
+        .collect();
     found.sort();
     found
 }
 
 /// Extensions of the image formats that can be read.
-const READ: [&str; 8] = ["bmp", "jfif", "jpeg", "jpg", "png", "tif", "tiff", "webp"];
+const PHOTO_EXTENSIONS: [&str; 8] = ["bmp", "jfif", "jpeg", "jpg", "png", "tif", "tiff", "webp"];
 
 /// Returns whether the file extension is that of a readable photo. Hidden files, such as the
 /// `._NAME` files of macOS, are not photos.
 pub fn is_photo(path: &Path) -> bool {
-    let hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
-    !hidden && READ.contains(&ending.as_str())
+    let hidden = path
+        .file_name()
+        .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+    let ending = path
+        .extension()
+        .and_then(|e| e.to_str())
+        .unwrap_or_default()
+        .to_ascii_lowercase();
+    !hidden && PHOTO_EXTENSIONS.contains(&ending.as_str())
 }
 
 /// Joins the first five names of a list for a message.
-fn first_few(names: &[String]) -> String {
-    let printable = |name: &String| name.chars().map(|c| if c.is_control() { '?' } else { c }).collect::<String>();
-    let shown = names.iter().take(5).map(printable).collect::<Vec<_>>().join(", ");
-    if names.len() > 5 { format!("{shown}, ...") } else { shown }
+fn join_first(names: &[String]) -> String {
+    let printable = |name: &String| {
+        name.chars()
+            .map(|c| if c.is_control() { '?' } else { c })
+            .collect::<String>()
+    };
+    let shown = names
+        .iter()
+        .take(5)
+        .map(printable)
+        .collect::<Vec<_>>()
+        .join(", ");
+    if names.len() > 5 {
+        format!("{shown}, ...")
+    } else {
+        shown
+    }
 }

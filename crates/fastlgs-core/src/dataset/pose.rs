@@ -26,13 +26,29 @@ pub enum PoseConvention {
 
 impl PoseConvention {
     /// Conventions that matrices may have. The first is the default.
-    pub const OF_MATRICES: [Self; 4] = [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpencv, Self::W2cOpengl];
+    pub const OF_MATRICES: [Self; 4] = [
+        Self::C2wOpengl,
+        Self::C2wOpencv,
+        Self::W2cOpencv,
+        Self::W2cOpengl,
+    ];
     /// Conventions that quaternions may have. The first is the default.
-    pub const OF_QUATERNIONS: [Self; 4] = [Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencv, Self::C2wOpencvXyzw];
+    pub const OF_QUATERNIONS: [Self; 4] = [
+        Self::W2cOpencv,
+        Self::W2cOpencvXyzw,
+        Self::C2wOpencv,
+        Self::C2wOpencvXyzw,
+    ];
 
     /// All conventions.
-    pub const ALL: [Self; 6] =
-        [Self::C2wOpengl, Self::C2wOpencv, Self::W2cOpengl, Self::W2cOpencv, Self::W2cOpencvXyzw, Self::C2wOpencvXyzw];
+    pub const ALL: [Self; 6] = [
+        Self::C2wOpengl,
+        Self::C2wOpencv,
+        Self::W2cOpengl,
+        Self::W2cOpencv,
+        Self::W2cOpencvXyzw,
+        Self::C2wOpencvXyzw,
+    ];
 
     /// Returns the name on the command line.
     pub fn name(self) -> &'static str {
@@ -49,24 +65,33 @@ impl PoseConvention {
 
 /// A pose as written in a file, before a convention is applied.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum StatedPose {
+pub enum RawPose {
     /// A 4x4 matrix.
     Matrix(DMat4),
     /// The four numbers of a rotation quaternion in file order, and a translation.
     Quaternion([f64; 4], DVec3),
 }
 
-impl StatedPose {
+impl RawPose {
     /// Converts the pose to OpenCV axes, assuming that it is written in `convention`.
-    pub fn by(&self, convention: PoseConvention) -> Pose {
-        use PoseConvention::{C2wOpencv, C2wOpencvXyzw, C2wOpengl, W2cOpencv, W2cOpencvXyzw, W2cOpengl};
+    pub fn to_pose(&self, convention: PoseConvention) -> Pose {
+        use PoseConvention::{
+            C2wOpencv, C2wOpencvXyzw, C2wOpengl, W2cOpencv, W2cOpencvXyzw, W2cOpengl,
+        };
         let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
         let matrix = match *self {
             Self::Matrix(matrix) => matrix,
             Self::Quaternion([a, b, c, d], translation) => {
                 let xyzw = matches!(convention, W2cOpencvXyzw | C2wOpencvXyzw);
-                let rotation = if xyzw { DQuat::from_xyzw(a, b, c, d) } else { DQuat::from_xyzw(b, c, d, a) };
-                DMat4::from_mat3_translation(glam::DMat3::from_quat(rotation.normalize()), translation)
+                let rotation = if xyzw {
+                    DQuat::from_xyzw(a, b, c, d)
+                } else {
+                    DQuat::from_xyzw(b, c, d, a)
+                };
+                DMat4::from_mat3_translation(
+                    glam::DMat3::from_quat(rotation.normalize()),
+                    translation,
+                )
             }
         };
         match convention {
@@ -92,12 +117,21 @@ mod tests {
         let quaternion = |pose: DMat4, xyzw: bool| {
             let (_, rotation, translation) = pose.to_scale_rotation_translation();
             let [x, y, z, w] = rotation.to_array();
-            StatedPose::Quaternion(if xyzw { [x, y, z, w] } else { [w, x, y, z] }, translation)
+            RawPose::Quaternion(if xyzw { [x, y, z, w] } else { [w, x, y, z] }, translation)
         };
-        let quaternions = [quaternion(w2c, false), quaternion(w2c, true), quaternion(c2w, false), quaternion(c2w, true)];
-        let stated = PoseConvention::OF_MATRICES.into_iter().zip(matrices.map(StatedPose::Matrix));
-        for (convention, stated) in stated.chain(PoseConvention::OF_QUATERNIONS.into_iter().zip(quaternions)) {
-            let found = match stated.by(convention) {
+        let quaternions = [
+            quaternion(w2c, false),
+            quaternion(w2c, true),
+            quaternion(c2w, false),
+            quaternion(c2w, true),
+        ];
+        let stated = PoseConvention::OF_MATRICES
+            .into_iter()
+            .zip(matrices.map(RawPose::Matrix));
+        for (convention, stated) in
+            stated.chain(PoseConvention::OF_QUATERNIONS.into_iter().zip(quaternions))
+        {
+            let found = match stated.to_pose(convention) {
                 Pose::CameraToWorld(pose) => pose,
                 Pose::WorldToCamera(pose) => pose.inverse(),
             };

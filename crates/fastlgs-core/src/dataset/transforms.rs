@@ -1,10 +1,10 @@
 //! Reads `transforms.json` of instant-ngp and nerfstudio: camera-to-world matrices with OpenGL axes
 //! (y up, looking along -z).
 
-use super::album::{Album, by_last_parts};
-use super::pose::{PoseConvention, StatedPose};
-use super::{PosedPhoto, Stated, text};
-use crate::undistort::{Bend, Distortion};
+use super::album::{Album, find_by_suffix};
+use super::pose::{PoseConvention, RawPose};
+use super::{ParsedPoses, PosedPhoto, text};
+use crate::undistort::{Distortion, LensProjection};
 use crate::{Camera, Error, Result};
 use glam::{DMat4, DVec3, DVec4, Mat4};
 use serde::Deserialize;
@@ -61,18 +61,34 @@ pub fn files(photos: &Path) -> Vec<(PathBuf, bool)> {
         return vec![(one, false)];
     }
     let sets = [(photos.join(TRAIN), false), (photos.join(TEST), true)];
-    if sets[0].0.is_file() { sets.into_iter().filter(|(file, _)| file.is_file()).collect() } else { Vec::new() }
+    if sets[0].0.is_file() {
+        sets.into_iter()
+            .filter(|(file, _)| file.is_file())
+            .collect()
+    } else {
+        Vec::new()
+    }
 }
 
 /// Reads the poses of PHOTOS. Frames without photo are skipped, and a warning lists them.
 ///
 /// # Errors
 /// Damaged JSON, a matrix entry that is NaN or infinite, a missing focal length, or a missing mask.
-pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<Stated> {
-    let mut stated = Stated { conventions: PoseConvention::OF_MATRICES.to_vec(), ..Stated::default() };
-    let read = files.iter().map(|(path, _)| read(path)).collect::<Result<Vec<_>>>()?;
+pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<ParsedPoses> {
+    let mut stated = ParsedPoses {
+        conventions: PoseConvention::OF_MATRICES.to_vec(),
+        ..ParsedPoses::default()
+    };
+    let read = files
+        .iter()
+        .map(|(path, _)| read(path))
+        .collect::<Result<Vec<_>>>()?;
     // Names of all files are resolved together, so that no two names get the same photo.
-    let names: Vec<String> = read.iter().flat_map(|file| &file.frames).map(|frame| frame.file_path.clone()).collect();
+    let names: Vec<String> = read
+        .iter()
+        .flat_map(|file| &file.frames)
+        .map(|frame| frame.file_path.clone())
+        .collect();
     let mut found = album.find(&names, photos).into_iter();
     for ((path, held_out), file) in files.iter().zip(&read) {
         let photos: Vec<Option<PathBuf>> = found.by_ref().take(file.frames.len()).collect();
@@ -83,20 +99,35 @@ pub fn load(photos: &Path, album: &Album, files: &[(PathBuf, bool)]) -> Result<S
 
 fn read(path: &Path) -> Result<Transforms> {
     // JSON has no NaN, but Python writes it. Such entries become null, and `matrix` reports them.
-    let text = without_what_is_no_number(&text(path)?);
-    let file: Transforms = serde_json::from_str(&text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))?;
+    let text = replace_non_finite(&text(path)?);
+    let file: Transforms = serde_json::from_str(&text)
+        .map_err(|e| Error::format(path, format!("not the expected JSON: {e}")))?;
     if file.frames.is_empty() {
-        return Err(Error::format(path, "the file lists no frames; export it again"));
+        return Err(Error::format(
+            path,
+            "the file lists no frames; export it again",
+        ));
     }
     Ok(file)
 }
 
 /// Adds the frames of a file that have a photo.
-fn add(album: &Album, path: &Path, held_out: bool, file: &Transforms, photos: Vec<Option<PathBuf>>, stated: &mut Stated) -> Result<()> {
-    let matrices = file.frames.iter().map(|frame| matrix(path, frame)).collect::<Result<Vec<_>>>()?;
+fn add(
+    album: &Album,
+    path: &Path,
+    held_out: bool,
+    file: &Transforms,
+    photos: Vec<Option<PathBuf>>,
+    stated: &mut ParsedPoses,
+) -> Result<()> {
+    let matrices = file
+        .frames
+        .iter()
+        .map(|frame| matrix(path, frame))
+        .collect::<Result<Vec<_>>>()?;
     // The storage order of a pose at the origin is ambiguous. It follows the other poses of the
     // file.
-    let by_columns = matrices.iter().any(|(_, by_columns)| *by_columns);
+    let stored_transposed = matrices.iter().any(|(_, by_columns)| *by_columns);
     let mut missing = Vec::new();
     for ((frame, photo), (matrix, transposed)) in file.frames.iter().zip(photos).zip(matrices) {
         let Some(photo) = photo else {
@@ -104,17 +135,26 @@ fn add(album: &Album, path: &Path, held_out: bool, file: &Transforms, photos: Ve
             continue;
         };
         let at_origin = matrix.w_axis.truncate() == DVec3::ZERO;
-        let matrix = if by_columns && !transposed && at_origin { matrix.transpose() } else { matrix };
+        let matrix = if stored_transposed && !transposed && at_origin {
+            matrix.transpose()
+        } else {
+            matrix
+        };
         if held_out {
             stated.held_out.push(photo.clone());
         }
-        stated.photos.push(posed(path, photo, frame, &file.lens, matrix)?);
+        stated
+            .photos
+            .push(posed(path, photo, frame, &file.lens, matrix)?);
     }
-    if by_columns {
-        let why = "the translations are in the last row of the matrices, so they were read as transposed";
+    if stored_transposed {
+        let why =
+            "the translations are in the last row of the matrices, so they were read as transposed";
         stated.warnings.push(format!("{}: {why}", path.display()));
     }
-    stated.warnings.extend(album.missing(&missing, file.frames.len(), path));
+    stated
+        .warnings
+        .extend(album.missing(&missing, file.frames.len(), path));
     Ok(())
 }
 
@@ -127,7 +167,10 @@ fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
     let mut rows = [DVec4::W; 4];
     if !(3..=4).contains(&frame.transform_matrix.len()) {
         let count = frame.transform_matrix.len();
-        return Err(Error::format(file, format!("the pose of '{name}' has {count} rows, not 4; export it again")));
+        return Err(Error::format(
+            file,
+            format!("the pose of '{name}' has {count} rows, not 4; export it again"),
+        ));
     }
     for (row, values) in rows.iter_mut().zip(&frame.transform_matrix) {
         for (k, value) in values.iter().enumerate() {
@@ -153,7 +196,7 @@ fn matrix(file: &Path, frame: &Frame) -> Result<(DMat4, bool)> {
 }
 
 /// Replaces Python's NaN and Infinity by null, except inside strings.
-fn without_what_is_no_number(text: &str) -> String {
+fn replace_non_finite(text: &str) -> String {
     let mut within = false;
     let mut escaped = false;
     let parts = text.split_inclusive(|c| {
@@ -164,12 +207,24 @@ fn without_what_is_no_number(text: &str) -> String {
     let mended = parts.map(|part| {
         let number = !within;
         within ^= part.ends_with('"');
-        if number { part.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null") } else { part.to_owned() }
+        if number {
+            part.replace("-Infinity", "null")
+                .replace("Infinity", "null")
+                .replace("NaN", "null")
+        } else {
+            part.to_owned()
+        }
     });
     mended.collect()
 }
 
-fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat4) -> Result<PosedPhoto> {
+fn posed(
+    file: &Path,
+    photo: PathBuf,
+    frame: &Frame,
+    shared: &Lens,
+    matrix: DMat4,
+) -> Result<PosedPhoto> {
     let either = |f: fn(&Lens) -> Option<f64>| f(&frame.lens).or(f(shared));
     let (w, h) = match (either(|l| l.w), either(|l| l.h)) {
         (Some(w), Some(h)) => (w, h),
@@ -179,17 +234,39 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
         }
     };
     let from_angle = either(|l| l.camera_angle_x).map(|a| w / (2.0 * (a / 2.0).tan()));
-    let fx = either(|l| l.fl_x).or(from_angle).ok_or_else(|| Error::format(file, "the focal length is missing; add fl_x or camera_angle_x"))?;
+    let fx = either(|l| l.fl_x).or(from_angle).ok_or_else(|| {
+        Error::format(
+            file,
+            "the focal length is missing; add fl_x or camera_angle_x",
+        )
+    })?;
     let coefficient = |f: fn(&Lens) -> Option<f64>| either(f).unwrap_or(0.0) as f32;
-    let bend = match frame.lens.camera_model.as_deref().or(shared.camera_model.as_deref()) {
-        None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => Bend::Fisheye,
-        None | Some("PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE") => Bend::None,
-        Some("OPENCV_FISHEYE") => Bend::Fisheye,
+    let bend = match frame
+        .lens
+        .camera_model
+        .as_deref()
+        .or(shared.camera_model.as_deref())
+    {
+        None if frame.lens.is_fisheye.or(shared.is_fisheye) == Some(true) => {
+            LensProjection::Fisheye
+        }
+        None
+        | Some(
+            "PINHOLE" | "SIMPLE_PINHOLE" | "OPENCV" | "SIMPLE_RADIAL" | "RADIAL" | "PERSPECTIVE",
+        ) => LensProjection::None,
+        Some("OPENCV_FISHEYE") => LensProjection::Fisheye,
         Some(other) => {
-            return Err(Error::format(file, format!("the camera_model '{other}' is not supported; undistort the photos first")));
+            return Err(Error::format(
+                file,
+                format!("the camera_model '{other}' is not supported; undistort the photos first"),
+            ));
         }
     };
-    let ignore = frame.mask_path.as_ref().map(|mask| find_mask(file, &photo, mask)).transpose()?;
+    let ignore = frame
+        .mask_path
+        .as_ref()
+        .map(|mask| find_mask(file, &photo, mask))
+        .transpose()?;
     Ok(PosedPhoto {
         path: photo,
         camera: Camera {
@@ -202,9 +279,9 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
             cy: either(|l| l.cy).unwrap_or(h / 2.0) as f32,
             world_to_camera: Mat4::IDENTITY,
         },
-        stated: StatedPose::Matrix(matrix),
+        raw_pose: RawPose::Matrix(matrix),
         distortion: Distortion {
-            bend,
+            projection: bend,
             k1: coefficient(|l| l.k1),
             k2: coefficient(|l| l.k2),
             k3: coefficient(|l| l.k3),
@@ -223,10 +300,16 @@ fn posed(file: &Path, photo: PathBuf, frame: &Frame, shared: &Lens, matrix: DMat
 fn find_mask(file: &Path, photo: &Path, mask: &str) -> Result<PathBuf> {
     let folder = file.parent().unwrap_or(Path::new("."));
     let same = |path: &PathBuf| path.canonicalize().ok() == photo.canonicalize().ok();
-    let found = by_last_parts(mask, &[folder.to_owned()]).filter(|path| !same(path));
+    let found = find_by_suffix(mask, &[folder.to_owned()]).filter(|path| !same(path));
     found.ok_or_else(|| {
         let (mask, photo) = (folder.join(mask), photo.display());
-        Error::format(file, format!("the mask '{}' of '{photo}' is missing; add it or remove its mask_path", mask.display()))
+        Error::format(
+            file,
+            format!(
+                "the mask '{}' of '{photo}' is missing; add it or remove its mask_path",
+                mask.display()
+            ),
+        )
     })
 }
 
@@ -239,7 +322,8 @@ mod tests {
     fn instant_ngps_fisheyes_and_names_like_numbers_are_read() {
         let dir = tempfile::tempdir().expect("a folder");
         let name = "Infinity \"NaN\".png";
-        crate::image_io::save_png(&dir.path().join("images").join(name), RgbImage::new(8, 6)).expect("a photo");
+        crate::image_io::save_png(&dir.path().join("images").join(name), RgbImage::new(8, 6))
+            .expect("a photo");
         let frame = |pose: &str| {
             let text = format!(
                 r#"{{"fl_x": 9, "w": 8, "h": 6, "k1": 0.1, "is_fisheye": true,
@@ -249,9 +333,16 @@ mod tests {
             std::fs::write(dir.path().join("transforms.json"), text).expect("a file");
             super::super::load(dir.path())
         };
-        let photos = frame("[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]").expect("a pose").photos;
-        assert_eq!((photos.len(), photos[0].distortion.bend), (1, Bend::Fisheye));
-        let refused = frame("[[NaN,0,0,0],[0,1,0,-Infinity],[0,0,1,0],[0,0,0,1]]").expect_err("no pose").to_string();
+        let photos = frame("[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]")
+            .expect("a pose")
+            .photos;
+        assert_eq!(
+            (photos.len(), photos[0].distortion.projection),
+            (1, LensProjection::Fisheye)
+        );
+        let refused = frame("[[NaN,0,0,0],[0,1,0,-Infinity],[0,0,1,0],[0,0,0,1]]")
+            .expect_err("no pose")
+            .to_string();
         assert!(refused.contains("NaN or infinite"), "{refused}");
     }
 }

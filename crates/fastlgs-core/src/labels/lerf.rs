@@ -35,13 +35,30 @@ pub fn view(path: &Path) -> Result<LabelledView> {
     for object in file.objects {
         let finite = object.segmentation.iter().flatten().all(|v| v.is_finite());
         if object.segmentation.len() < 3 || !finite {
-            return Err(Error::format(path, format!("the polygon of '{}' has fewer than three points or one that is not finite", object.category)));
+            return Err(Error::format(
+                path,
+                format!(
+                    "the polygon of '{}' has fewer than three points or one that is not finite",
+                    object.category
+                ),
+            ));
         }
         match labels.iter_mut().find(|l| l.0 == object.category) {
             Some(label) => label.1.push(object.segmentation),
             None => labels.push((object.category, vec![object.segmentation])),
         }
     }
-    let labels = labels.into_iter().map(|(category, polygons)| Label { category, region: Region::Polygons(polygons) }).collect();
-    Ok(LabelledView { name: file.info.name, width: file.info.width, height: file.info.height, labels })
+    let labels = labels
+        .into_iter()
+        .map(|(category, polygons)| Label {
+            category,
+            region: Region::Polygons(polygons),
+        })
+        .collect();
+    Ok(LabelledView {
+        name: file.info.name,
+        width: file.info.width,
+        height: file.info.height,
+        labels,
+    })
 }

@@ -7,13 +7,19 @@ use std::path::{Path, PathBuf};
 
 /// Returns the file name without its extension.
 fn stem(path: &Path) -> String {
-    path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+    path.file_stem()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned()
 }
 
 /// Reads a mask and its size; `None` for a mask that is black everywhere.
 fn mask(path: &Path) -> Result<((u32, u32), Option<Region>)> {
     let mask = MaskImage::load(path)?;
-    Ok(((mask.width, mask.height), (mask.area() > 0).then_some(Region::Mask(mask.inside))))
+    Ok((
+        (mask.width, mask.height),
+        (mask.area() > 0).then_some(Region::Mask(mask.inside)),
+    ))
 }
 
 /// Reads labels of 3D-OVS: `VIEW/CLASS.png` for the classes in `classes.txt`, one per line. A class
@@ -21,29 +27,62 @@ fn mask(path: &Path) -> Result<((u32, u32), Option<Region>)> {
 /// error, and so is a class that no view shows.
 pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
     let list = folder.join("classes.txt");
-    let text = String::from_utf8(fs::read(&list)?).map_err(|_| Error::format(&list, "not UTF-8 text"))?;
-    let classes: Vec<&str> = text.lines().map(str::trim).filter(|c| !c.is_empty()).collect();
+    let text =
+        String::from_utf8(fs::read(&list)?).map_err(|_| Error::format(&list, "not UTF-8 text"))?;
+    let classes: Vec<&str> = text
+        .lines()
+        .map(str::trim)
+        .filter(|c| !c.is_empty())
+        .collect();
     if classes.is_empty() {
-        return Err(Error::format(&list, "it lists no classes; write one class name per line"));
+        return Err(Error::format(
+            &list,
+            "it lists no classes; write one class name per line",
+        ));
     }
-    let mut views: Vec<PathBuf> = std::fs::read_dir(folder).map_err(Error::io(folder))?.flatten().map(|e| e.path()).collect();
+    let mut views: Vec<PathBuf> = std::fs::read_dir(folder)
+        .map_err(Error::io(folder))?
+        .flatten()
+        .map(|e| e.path())
+        .collect();
     views.retain(|p| p.is_dir());
     views.sort();
     let mut seen = vec![false; classes.len()];
     let mut out = Vec::new();
     for path in views {
-        let mut pictures: Vec<PathBuf> = std::fs::read_dir(&path).map_err(Error::io(&path))?.flatten().map(|e| e.path()).collect();
+        let mut pictures: Vec<PathBuf> = std::fs::read_dir(&path)
+            .map_err(Error::io(&path))?
+            .flatten()
+            .map(|e| e.path())
+            .collect();
         pictures.retain(|p| p.extension().is_some_and(|e| e == "png"));
         pictures.sort();
-        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let mut view = LabelledView { name, width: 0, height: 0, labels: Vec::new() };
+        let name = path
+            .file_name()
+            .unwrap_or_default()
+            .to_string_lossy()
+            .into_owned();
+        let mut view = LabelledView {
+            name,
+            width: 0,
+            height: 0,
+            labels: Vec::new(),
+        };
         for picture in pictures {
             let category = stem(&picture);
             let class = classes.iter().position(|c| *c == category);
-            let class = class.ok_or_else(|| Error::format(&picture, format!("'{category}' is not a class in {}", list.display())))?;
+            let class = class.ok_or_else(|| {
+                Error::format(
+                    &picture,
+                    format!("'{category}' is not a class in {}", list.display()),
+                )
+            })?;
             let (size, region) = mask(&picture)?;
             if !view.labels.is_empty() && size != (view.width, view.height) {
-                return Err(Error::format(&picture, "its size differs from that of the view's other masks"));
+                return Err(Error::format(
+                    &picture,
+                    "its size differs from that of the view's other masks",
+                ));
             }
             (view.width, view.height) = size;
             if let Some(region) = region {
@@ -54,20 +93,35 @@ pub fn three_d_ovs(folder: &Path) -> Result<Vec<LabelledView>> {
         out.push(view);
     }
     match seen.iter().position(|s| !s) {
-        Some(never) if !out.is_empty() => Err(Error::format(&list, format!("no view shows the class '{}'", classes[never]))),
+        Some(never) if !out.is_empty() => Err(Error::format(
+            &list,
+            format!("no view shows the class '{}'", classes[never]),
+        )),
         _ => Ok(out),
     }
 }
 
 /// Reads labels of SPIn-NeRF: each image is the mask of the one labelled object in the view of the
 /// same name. Views with a black mask are left out.
-pub fn spin_nerf(folder: &Path, pictures: &[PathBuf], text: Option<&str>) -> Result<Vec<LabelledView>> {
+pub fn spin_nerf(
+    folder: &Path,
+    pictures: &[PathBuf],
+    text: Option<&str>,
+) -> Result<Vec<LabelledView>> {
     let category = text.map_or_else(|| stem(folder), str::to_owned);
     let mut out = Vec::new();
     for picture in pictures {
         let ((width, height), region) = mask(picture)?;
-        let label = |region| Label { category: category.clone(), region };
-        out.extend(region.map(|region| LabelledView { name: stem(picture), width, height, labels: vec![label(region)] }));
+        let label = |region| Label {
+            category: category.clone(),
+            region,
+        };
+        out.extend(region.map(|region| LabelledView {
+            name: stem(picture),
+            width,
+            height,
+            labels: vec![label(region)],
+        }));
     }
     Ok(out)
 }
@@ -94,14 +148,42 @@ mod tests {
         picture(&root.join("10/camera.png"), 1);
         std::fs::write(root.join("classes.txt"), "camera\nred bag\n").unwrap();
         let views = load(dir.path(), None).unwrap();
-        let found: Vec<(&str, Vec<&str>)> =
-            views.iter().map(|v| (v.name.as_str(), v.labels.iter().map(|l| l.category.as_str()).collect())).collect();
-        assert_eq!(found, [("04", vec!["camera", "red bag"]), ("10", vec!["camera"])], "a black mask is not a label");
-        assert_eq!(views[0].mask(&views[0].labels[1], 6, 4).iter().filter(|m| **m).count(), 8);
+        let found: Vec<(&str, Vec<&str>)> = views
+            .iter()
+            .map(|v| {
+                (
+                    v.name.as_str(),
+                    v.labels.iter().map(|l| l.category.as_str()).collect(),
+                )
+            })
+            .collect();
+        assert_eq!(
+            found,
+            [("04", vec!["camera", "red bag"]), ("10", vec!["camera"])],
+            "a black mask is not a label"
+        );
+        assert_eq!(
+            views[0]
+                .mask(&views[0].labels[1], 6, 4)
+                .iter()
+                .filter(|m| **m)
+                .count(),
+            8
+        );
         std::fs::write(root.join("classes.txt"), "camera\nred bag\nbanana\n").unwrap();
-        assert!(load(dir.path(), None).unwrap_err().to_string().contains("banana"));
+        assert!(
+            load(dir.path(), None)
+                .unwrap_err()
+                .to_string()
+                .contains("banana")
+        );
         std::fs::write(root.join("classes.txt"), "camera\n").unwrap();
-        assert!(load(dir.path(), None).unwrap_err().to_string().contains("red bag"));
+        assert!(
+            load(dir.path(), None)
+                .unwrap_err()
+                .to_string()
+                .contains("red bag")
+        );
     }
 
     #[test]
@@ -111,10 +193,25 @@ mod tests {
         picture(&folder.join("IMG_1.png"), 3);
         picture(&folder.join("IMG_2.png"), 0);
         let views = load(&folder, None).unwrap();
-        assert_eq!((views.len(), views[0].name.as_str(), views[0].labels[0].category.as_str()), (1, "IMG_1", "fortress"));
-        assert_eq!(load(&folder, Some("a stone fortress")).unwrap()[0].labels[0].category, "a stone fortress");
+        assert_eq!(
+            (
+                views.len(),
+                views[0].name.as_str(),
+                views[0].labels[0].category.as_str()
+            ),
+            (1, "IMG_1", "fortress")
+        );
+        assert_eq!(
+            load(&folder, Some("a stone fortress")).unwrap()[0].labels[0].category,
+            "a stone fortress"
+        );
         let empty = dir.path().join("empty");
         std::fs::create_dir(&empty).unwrap();
-        assert!(load(&empty, None).unwrap_err().to_string().contains("3D-OVS"));
+        assert!(
+            load(&empty, None)
+                .unwrap_err()
+                .to_string()
+                .contains("3D-OVS")
+        );
     }
 }

@@ -40,13 +40,20 @@ pub struct LabelledView {
 impl LabelledView {
     /// Returns the mask of a label at the given size.
     pub fn mask(&self, label: &Label, width: u32, height: u32) -> Vec<bool> {
-        let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let (sx, sy) = (
+            f64::from(width) / f64::from(self.width),
+            f64::from(height) / f64::from(self.height),
+        );
         let polygons = match &label.region {
             Region::Mask(mask) => {
                 // Index of the source pixel that contains the centre of a target pixel.
-                let from = |k: u32, n: u32, of: u32| ((2 * u64::from(k) + 1) * u64::from(of) / (2 * u64::from(n))) as usize;
+                let from = |k: u32, n: u32, of: u32| {
+                    ((2 * u64::from(k) + 1) * u64::from(of) / (2 * u64::from(n))) as usize
+                };
                 let row = |y: u32| from(y, height, self.height) * self.width as usize;
-                return (0..width * height).map(|p| mask[row(p / width) + from(p % width, width, self.width)]).collect();
+                return (0..width * height)
+                    .map(|p| mask[row(p / width) + from(p % width, width, self.width)])
+                    .collect();
             }
             Region::Polygons(polygons) => polygons,
         };
@@ -61,21 +68,42 @@ impl LabelledView {
     /// Returns bounding boxes `[left, top, right, bottom]` of a label at the given size: one for
     /// each polygon, or one for a mask.
     pub fn boxes(&self, label: &Label, width: u32, height: u32) -> Vec<[f64; 4]> {
-        let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        let (sx, sy) = (
+            f64::from(width) / f64::from(self.width),
+            f64::from(height) / f64::from(self.height),
+        );
         let around = |points: &mut dyn Iterator<Item = [f64; 2]>| {
-            points.fold([f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY], |b, [x, y]| {
-                [b[0].min(x * sx), b[1].min(y * sy), b[2].max(x * sx), b[3].max(y * sy)]
-            })
+            points.fold(
+                [
+                    f64::INFINITY,
+                    f64::INFINITY,
+                    f64::NEG_INFINITY,
+                    f64::NEG_INFINITY,
+                ],
+                |b, [x, y]| {
+                    [
+                        b[0].min(x * sx),
+                        b[1].min(y * sy),
+                        b[2].max(x * sx),
+                        b[3].max(y * sy),
+                    ]
+                },
+            )
         };
         match &label.region {
-            Region::Polygons(polygons) => polygons.iter().map(|p| around(&mut p.iter().copied())).collect(),
+            Region::Polygons(polygons) => polygons
+                .iter()
+                .map(|p| around(&mut p.iter().copied()))
+                .collect(),
             Region::Mask(mask) => {
                 let w = self.width as usize;
                 let corners = |p: usize| {
                     let (x, y) = ((p % w) as f64, (p / w) as f64);
                     [[x, y], [x + 1.0, y + 1.0]]
                 };
-                vec![around(&mut (0..mask.len()).filter(|p| mask[*p]).flat_map(corners))]
+                vec![around(
+                    &mut (0..mask.len()).filter(|p| mask[*p]).flat_map(corners),
+                )]
             }
         }
     }
@@ -116,17 +144,26 @@ pub(crate) fn fill(polygon: &[[f64; 2]], width: u32, height: u32, mask: &mut [bo
 /// An empty folder, damaged files, a class that no view shows, or a view without a label.
 pub fn load(folder: &Path, text: Option<&str>) -> Result<Vec<LabelledView>> {
     let segmentations = folder.join("segmentations");
-    let three_d_ovs = [folder, &segmentations].into_iter().find(|f| f.join("classes.txt").is_file());
-    let with_ending = |ending: &str| -> Result<Vec<PathBuf>> {
+    let three_d_ovs = [folder, &segmentations]
+        .into_iter()
+        .find(|f| f.join("classes.txt").is_file());
+    let with_extension = |ending: &str| -> Result<Vec<PathBuf>> {
         let entries = std::fs::read_dir(folder).map_err(Error::io(folder))?;
-        let mut files: Vec<_> = entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == ending)).collect();
+        let mut files: Vec<_> = entries
+            .flatten()
+            .map(|e| e.path())
+            .filter(|p| p.extension().is_some_and(|e| e == ending))
+            .collect();
         files.sort();
         Ok(files)
     };
-    let (polygons, pictures) = (with_ending("json")?, with_ending("png")?);
+    let (polygons, pictures) = (with_extension("json")?, with_extension("png")?);
     let views = match three_d_ovs {
         Some(folder) => masks::three_d_ovs(folder)?,
-        None if !polygons.is_empty() => polygons.iter().map(|path| lerf::view(path)).collect::<Result<_>>()?,
+        None if !polygons.is_empty() => polygons
+            .iter()
+            .map(|path| lerf::view(path))
+            .collect::<Result<_>>()?,
         None => masks::spin_nerf(folder, &pictures, text)?,
     };
     if views.is_empty() {
@@ -136,7 +173,11 @@ pub fn load(folder: &Path, text: Option<&str>) -> Result<Vec<LabelledView>> {
         )));
     }
     if let Some(bare) = views.iter().find(|v| v.labels.is_empty()) {
-        return Err(Error::Invalid(format!("{}: the view '{}' has no label; label it or remove it", folder.display(), bare.name)));
+        return Err(Error::Invalid(format!(
+            "{}: the view '{}' has no label; label it or remove it",
+            folder.display(),
+            bare.name
+        )));
     }
     Ok(views)
 }
@@ -148,21 +189,39 @@ mod tests {
     #[test]
     fn a_square_fills_its_pixels() {
         let mut mask = vec![false; 100];
-        fill(&[[2.0, 3.0], [6.0, 3.0], [6.0, 5.0], [2.0, 5.0]], 10, 10, &mut mask);
+        fill(
+            &[[2.0, 3.0], [6.0, 3.0], [6.0, 5.0], [2.0, 5.0]],
+            10,
+            10,
+            &mut mask,
+        );
         assert_eq!(mask.iter().filter(|m| **m).count(), 8);
         assert!(mask[32] && mask[45] && !mask[46] && !mask[52]);
     }
 
     #[test]
     fn masks_scale_by_pixel_centres_and_have_boxes() {
-        let mask: Vec<bool> = (0..16).map(|p| (1..3).contains(&(p % 4)) && p / 4 == 2).collect();
-        let label = Label { category: "a".to_owned(), region: Region::Mask(mask) };
-        let view = LabelledView { name: String::new(), width: 4, height: 4, labels: Vec::new() };
+        let mask: Vec<bool> = (0..16)
+            .map(|p| (1..3).contains(&(p % 4)) && p / 4 == 2)
+            .collect();
+        let label = Label {
+            category: "a".to_owned(),
+            region: Region::Mask(mask),
+        };
+        let view = LabelledView {
+            name: String::new(),
+            width: 4,
+            height: 4,
+            labels: Vec::new(),
+        };
         let double = view.mask(&label, 8, 8);
         let count = double.iter().filter(|m| **m).count();
         assert!(count == 8 && double[4 * 8 + 2] && double[5 * 8 + 5] && !double[6 * 8 + 2]);
         assert_eq!(view.boxes(&label, 8, 8), [[2.0, 4.0, 6.0, 6.0]]);
-        let polygon = Label { category: "b".to_owned(), region: Region::Polygons(vec![vec![[1.0, 1.0], [3.0, 1.0], [3.0, 2.0]]]) };
+        let polygon = Label {
+            category: "b".to_owned(),
+            region: Region::Polygons(vec![vec![[1.0, 1.0], [3.0, 1.0], [3.0, 2.0]]]),
+        };
         assert_eq!(view.boxes(&polygon, 4, 8), [[1.0, 2.0, 3.0, 4.0]]);
     }
 }

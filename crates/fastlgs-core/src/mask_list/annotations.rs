@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
-const MOST_PIXELS: u64 = 1 << 31;
+const MAX_PIXELS: u64 = 1 << 31;
 
 /// A file of annotations in any supported format.
 #[derive(Deserialize)]
@@ -167,18 +167,31 @@ const CORNERS: usize = 64;
 
 /// Returns whether a file name in an annotation refers to the photo of a view. Ignores folders,
 /// extension and case. Also accepts the prefix of Label Studio: eight characters and a hyphen.
-fn names_photo(name: &str, view: &str) -> bool {
+fn is_name_of_view(name: &str, view: &str) -> bool {
     let bare = |name: &str| {
-        let own = name.rsplit(['/', '\\']).next().unwrap_or(name).to_lowercase();
-        Path::new(&own).file_stem().map_or(own.clone(), |stem| stem.to_string_lossy().into_owned())
+        let own = name
+            .rsplit(['/', '\\'])
+            .next()
+            .unwrap_or(name)
+            .to_lowercase();
+        Path::new(&own)
+            .file_stem()
+            .map_or(own.clone(), |stem| stem.to_string_lossy().into_owned())
     };
     // If file names are not unique, names of views contain the folder: `left_1.jpg`.
     let joined = name.replace(['/', '\\'], "_");
-    if bare(&joined) == bare(view) || joined.to_lowercase().ends_with(&format!("_{}", view.to_lowercase())) {
+    if bare(&joined) == bare(view)
+        || joined
+            .to_lowercase()
+            .ends_with(&format!("_{}", view.to_lowercase()))
+    {
         return true;
     }
     let (name, view) = (bare(name), bare(view));
-    name == view || name.strip_suffix(view.as_str()).is_some_and(|code| code.len() == 9 && code.ends_with('-'))
+    name == view
+        || name
+            .strip_suffix(view.as_str())
+            .is_some_and(|code| code.len() == 9 && code.ends_with('-'))
 }
 
 /// Reads the masks of a photo from a file of annotations; `None` if the file is for other photos.
@@ -188,36 +201,64 @@ fn names_photo(name: &str, view: &str) -> bool {
 ///
 /// # Errors
 /// A missing or damaged file, an unsupported shape, or masks of different or invalid sizes.
-pub fn load(path: &Path, view: Option<&str>, sides: Option<(u32, u32)>) -> Result<Option<MaskList>> {
+pub fn load(
+    path: &Path,
+    view: Option<&str>,
+    sides: Option<(u32, u32)>,
+) -> Result<Option<MaskList>> {
     let text = fs::read(path)?;
     let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(&text);
     let known = "supported formats: COCO with run lengths or polygons, labelme, Label Studio";
-    let file = serde_json::from_slice(text).map_err(|e| Error::format(path, format!("not the expected JSON: {e}; {known}")))?;
+    let file = serde_json::from_slice(text)
+        .map_err(|e| Error::format(path, format!("not the expected JSON: {e}; {known}")))?;
     match file {
         File::List(list) => coco(path, list.iter(), None, sides).map(Some),
-        File::Coco { annotations, images: None } => coco(path, annotations.iter(), None, sides).map(Some),
-        File::Coco { annotations, images: Some(images) } => {
-            let own = images.iter().find(|image| view.is_none_or(|view| names_photo(&image.file_name, view)));
+        File::Coco {
+            annotations,
+            images: None,
+        } => coco(path, annotations.iter(), None, sides).map(Some),
+        File::Coco {
+            annotations,
+            images: Some(images),
+        } => {
+            let own = images
+                .iter()
+                .find(|image| view.is_none_or(|view| is_name_of_view(&image.file_name, view)));
             let Some(image) = own else { return Ok(None) };
-            let of_image = annotations.iter().filter(|a| a.image_id.is_none_or(|id| id == image.id));
+            let of_image = annotations
+                .iter()
+                .filter(|a| a.image_id.is_none_or(|id| id == image.id));
             coco(path, of_image, Some((image.width, image.height)), sides).map(Some)
         }
         File::Labelme(file) => labelme(path, &file, sides).map(Some),
         File::LabelStudio(tasks) if tasks.is_empty() => Ok(Some(MaskList::default())),
         File::LabelStudio(tasks) => {
             let names = |task: &&Task| {
-                task.data.values().any(|value| value.as_str().is_some_and(|name| view.is_none_or(|view| names_photo(name, view))))
+                task.data.values().any(|value| {
+                    value
+                        .as_str()
+                        .is_some_and(|name| view.is_none_or(|view| is_name_of_view(name, view)))
+                })
             };
-            tasks.iter().find(names).map(|task| label_studio(path, task)).transpose()
+            tasks
+                .iter()
+                .find(names)
+                .map(|task| label_studio(path, task))
+                .transpose()
         }
     }
 }
 
 fn check_size(path: &Path, width: u32, height: u32) -> Result<()> {
-    if (1..=MOST_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
+    if (1..=MAX_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
         return Ok(());
     }
-    Err(Error::format(path, format!("{width}x{height} pixels is not a valid mask size; set the size of the photo in the file")))
+    Err(Error::format(
+        path,
+        format!(
+            "{width}x{height} pixels is not a valid mask size; set the size of the photo in the file"
+        ),
+    ))
 }
 
 fn coco<'a>(
@@ -227,18 +268,34 @@ fn coco<'a>(
     sides: Option<(u32, u32)>,
 ) -> Result<MaskList> {
     let of_runs = |annotation: &Annotation| match annotation.segmentation {
-        Segmentation::Runs { size: [height, width], .. } => Some((width, height)),
+        Segmentation::Runs {
+            size: [height, width],
+            ..
+        } => Some((width, height)),
         Segmentation::Polygons(_) => None,
     };
-    let Some(first) = annotations.clone().next() else { return Ok(MaskList::default()) };
+    let Some(first) = annotations.clone().next() else {
+        return Ok(MaskList::default());
+    };
     let size = of_runs(first).or(stated).or(sides);
-    let (width, height) = size.ok_or_else(|| Error::format(path, "polygons need the size of the photo; export the file with its list of images"))?;
+    let (width, height) = size.ok_or_else(|| {
+        Error::format(
+            path,
+            "polygons need the size of the photo; export the file with its list of images",
+        )
+    })?;
     check_size(path, width, height)?;
     let mut list = MaskList::new(width, height);
     for (k, annotation) in annotations.enumerate() {
         let runs = match &annotation.segmentation {
             Segmentation::Runs { size, .. } if *size != [height, width] => {
-                return Err(Error::format(path, format!("mask {k} has {}x{} pixels, but the first mask has {width}x{height}; export all masks in one size", size[1], size[0])));
+                return Err(Error::format(
+                    path,
+                    format!(
+                        "mask {k} has {}x{} pixels, but the first mask has {width}x{height}; export all masks in one size",
+                        size[1], size[0]
+                    ),
+                ));
             }
             Segmentation::Runs { counts, .. } => {
                 let pixels = u64::from(width) * u64::from(height);
@@ -250,10 +307,17 @@ fn coco<'a>(
             }
             Segmentation::Polygons(polygons) => {
                 let corners = |flat: &Vec<f64>| flat.as_chunks::<2>().0.to_vec();
-                drawn(&polygons.iter().map(corners).collect::<Vec<_>>(), width, height)
+                rasterize_union(
+                    &polygons.iter().map(corners).collect::<Vec<_>>(),
+                    width,
+                    height,
+                )
             }
         };
-        let track = annotation.track_id.as_ref().or(annotation.attributes.as_ref().and_then(|a| a.track_id.as_ref()));
+        let track = annotation.track_id.as_ref().or(annotation
+            .attributes
+            .as_ref()
+            .and_then(|a| a.track_id.as_ref()));
         list.masks.push(Mask {
             level: annotation.level.unwrap_or_default(),
             predicted_iou: annotation.predicted_iou.unwrap_or(1.0),
@@ -269,24 +333,31 @@ fn coco<'a>(
 /// mean no track.
 fn track_number(track: &Track) -> Option<u32> {
     match track {
-        Track::Number(number) => (*number >= 0.0 && *number <= f64::from(u32::MAX)).then_some(*number as u32),
+        Track::Number(number) => {
+            (*number >= 0.0 && *number <= f64::from(u32::MAX)).then_some(*number as u32)
+        }
         Track::Name(name) => match name.trim().parse::<i64>() {
             Ok(number) => u32::try_from(number).ok(),
             // FNV-1a with 32 bits.
-            Err(_) => Some(name.bytes().fold(0x811c_9dc5, |hash: u32, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))),
+            Err(_) => Some(name.bytes().fold(0x811c_9dc5, |hash: u32, byte| {
+                (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193)
+            })),
         },
     }
 }
 
 /// Rasterizes the union of polygons, given in pixels.
-fn drawn(polygons: &[Vec<[f64; 2]>], width: u32, height: u32) -> RunLengths {
+fn rasterize_union(polygons: &[Vec<[f64; 2]>], width: u32, height: u32) -> RunLengths {
     let mut inside = vec![false; (width * height) as usize];
     for polygon in polygons {
         let mut own = vec![false; inside.len()];
         fill(polygon, width, height, &mut own);
-        inside.iter_mut().zip(own).for_each(|(inside, own)| *inside |= own);
+        inside
+            .iter_mut()
+            .zip(own)
+            .for_each(|(inside, own)| *inside |= own);
     }
-    RunLengths::of(width, height, |x, y| inside[(y * width + x) as usize])
+    RunLengths::from_fn(width, height, |x, y| inside[(y * width + x) as usize])
 }
 
 /// Returns a polygon that approximates an ellipse around `middle`. `rotation` is in degrees.
@@ -302,22 +373,42 @@ fn ellipse(middle: [f64; 2], radii: [f64; 2], rotation: f64) -> Vec<[f64; 2]> {
 
 fn labelme(path: &Path, file: &Labelme, sides: Option<(u32, u32)>) -> Result<MaskList> {
     let size = file.image_width.zip(file.image_height).or(sides);
-    let (width, height) = size.ok_or_else(|| Error::format(path, "the size of the photo is missing; add imageWidth and imageHeight"))?;
+    let (width, height) = size.ok_or_else(|| {
+        Error::format(
+            path,
+            "the size of the photo is missing; add imageWidth and imageHeight",
+        )
+    })?;
     check_size(path, width, height)?;
     // Shapes with the same label and group belong to one object.
     type Group<'a> = Option<(&'a str, i64)>;
     let mut objects: Vec<(Group<'_>, Vec<bool>)> = Vec::new();
     for shape in &file.shapes {
-        let Some(inside) = shape_pixels(path, shape, width, height)? else { continue };
+        let Some(inside) = shape_pixels(path, shape, width, height)? else {
+            continue;
+        };
         let group = shape.group_id.map(|group| (shape.label.as_str(), group));
-        match objects.iter_mut().find(|object| group.is_some() && object.0 == group) {
-            Some((_, all)) => all.iter_mut().zip(inside).for_each(|(all, own)| *all |= own),
+        match objects
+            .iter_mut()
+            .find(|object| group.is_some() && object.0 == group)
+        {
+            Some((_, all)) => all
+                .iter_mut()
+                .zip(inside)
+                .for_each(|(all, own)| *all |= own),
             None => objects.push((group, inside)),
         }
     }
-    let mask =
-        |(_, inside): (_, Vec<bool>)| Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| inside[(y * width + x) as usize]));
-    Ok(MaskList { masks: objects.into_iter().map(mask).collect(), ..MaskList::new(width, height) })
+    let mask = |(_, inside): (_, Vec<bool>)| {
+        Mask::new(
+            Level::Whole,
+            RunLengths::from_fn(width, height, |x, y| inside[(y * width + x) as usize]),
+        )
+    };
+    Ok(MaskList {
+        masks: objects.into_iter().map(mask).collect(),
+        ..MaskList::new(width, height)
+    })
 }
 
 /// Returns the pixels of a labelme shape; `None` for points and lines, which have no area.
@@ -331,13 +422,27 @@ fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<O
             ellipse(*middle, [radius; 2], 0.0)
         }
         (Some("mask"), [corner, ..]) => {
-            let picture = shape.mask.as_deref().and_then(|text| base64::engine::general_purpose::STANDARD.decode(text).ok());
-            let picture: Option<GrayImage> =
-                picture.and_then(|data| image::load_from_memory(&data).ok()).map(|picture| picture.into_luma8());
-            let picture =
-                picture.ok_or_else(|| Error::format(path, format!("the mask of '{}' cannot be read; save it again", shape.label)))?;
+            let picture = shape
+                .mask
+                .as_deref()
+                .and_then(|text| base64::engine::general_purpose::STANDARD.decode(text).ok());
+            let picture: Option<GrayImage> = picture
+                .and_then(|data| image::load_from_memory(&data).ok())
+                .map(|picture| picture.into_luma8());
+            let picture = picture.ok_or_else(|| {
+                Error::format(
+                    path,
+                    format!(
+                        "the mask of '{}' cannot be read; save it again",
+                        shape.label
+                    ),
+                )
+            })?;
             for (x, y, _) in picture.enumerate_pixels().filter(|(_, _, p)| p[0] > 0) {
-                let (x, y) = (corner[0] as i64 + i64::from(x), corner[1] as i64 + i64::from(y));
+                let (x, y) = (
+                    corner[0] as i64 + i64::from(x),
+                    corner[1] as i64 + i64::from(y),
+                );
                 if (0..i64::from(width)).contains(&x) && (0..i64::from(height)).contains(&y) {
                     inside[(y * i64::from(width) + x) as usize] = true;
                 }
@@ -346,7 +451,13 @@ fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<O
         }
         (Some("point" | "points" | "line" | "linestrip"), _) => return Ok(None),
         (Some(other), _) => {
-            return Err(Error::format(path, format!("the shape_type '{other}' of '{}' is not supported; draw a polygon instead", shape.label)));
+            return Err(Error::format(
+                path,
+                format!(
+                    "the shape_type '{other}' of '{}' is not supported; draw a polygon instead",
+                    shape.label
+                ),
+            ));
         }
     };
     fill(&polygon, width, height, &mut inside);
@@ -355,8 +466,15 @@ fn shape_pixels(path: &Path, shape: &Shape, width: u32, height: u32) -> Result<O
 
 fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
     // A task may have several annotations; the last one is used.
-    let regions = task.annotations.last().map(|annotation| annotation.result.as_slice()).unwrap_or_default();
-    let Some(first) = regions.iter().find(|region| region.value.is_some() && region.original_width > 0) else {
+    let regions = task
+        .annotations
+        .last()
+        .map(|annotation| annotation.result.as_slice())
+        .unwrap_or_default();
+    let Some(first) = regions
+        .iter()
+        .find(|region| region.value.is_some() && region.original_width > 0)
+    else {
         return Ok(MaskList::default());
     };
     let (width, height) = (first.original_width, first.original_height);
@@ -366,23 +484,53 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
     for value in regions.iter().filter_map(|region| region.value.as_ref()) {
         let polygon = match value {
             Value::Polygon { points } => points.iter().copied().map(pixels).collect(),
-            Value::Ellipse { x, y, rx, ry, rotation } => ellipse(pixels([*x, *y]), pixels([*rx, *ry]), *rotation),
-            Value::Rectangle { x, y, width: w, height: h, rotation } => {
+            Value::Ellipse {
+                x,
+                y,
+                rx,
+                ry,
+                rotation,
+            } => ellipse(pixels([*x, *y]), pixels([*rx, *ry]), *rotation),
+            Value::Rectangle {
+                x,
+                y,
+                width: w,
+                height: h,
+                rotation,
+            } => {
                 let (corner, [w, h]) = (pixels([*x, *y]), pixels([*w, *h]));
                 let (sin, cos) = rotation.to_radians().sin_cos();
-                let turned = |[x, y]: [f64; 2]| [corner[0] + cos * x - sin * y, corner[1] + sin * x + cos * y];
-                [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]].map(turned).to_vec()
+                let turned = |[x, y]: [f64; 2]| {
+                    [corner[0] + cos * x - sin * y, corner[1] + sin * x + cos * y]
+                };
+                [[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]
+                    .map(turned)
+                    .to_vec()
             }
             Value::Brush { rle } => {
-                let alpha = brush(rle).filter(|alpha| alpha.len() == (width * height) as usize);
-                let alpha = alpha.ok_or_else(|| Error::format(path, "a brush mask cannot be decoded; export as COCO with run lengths"))?;
-                list.masks.push(Mask::new(Level::Whole, RunLengths::of(width, height, |x, y| alpha[(y * width + x) as usize] > 127)));
+                let alpha =
+                    decode_brush(rle).filter(|alpha| alpha.len() == (width * height) as usize);
+                let alpha = alpha.ok_or_else(|| {
+                    Error::format(
+                        path,
+                        "a brush mask cannot be decoded; export as COCO with run lengths",
+                    )
+                })?;
+                list.masks.push(Mask::new(
+                    Level::Whole,
+                    RunLengths::from_fn(width, height, |x, y| {
+                        alpha[(y * width + x) as usize] > 127
+                    }),
+                ));
                 continue;
             }
             // Choices, relations and texts have no pixels.
             Value::Other(_) => continue,
         };
-        list.masks.push(Mask::new(Level::Whole, drawn(&[polygon], width, height)));
+        list.masks.push(Mask::new(
+            Level::Whole,
+            rasterize_union(&[polygon], width, height),
+        ));
     }
     Ok(list)
 }
@@ -394,7 +542,7 @@ fn label_studio(path: &Path, task: &Task) -> Result<MaskList> {
 /// (RGBA), then 5 bits with the width of a value less 1. Four times 4 bits give the widths, less 1,
 /// of four kinds of lengths. In each block, one bit selects a repeated value or a list of values.
 /// Two bits select the kind of length. The length less 1 and the values follow.
-fn brush(rle: &[u8]) -> Option<Vec<u8>> {
+fn decode_brush(rle: &[u8]) -> Option<Vec<u8>> {
     let mut at = 0;
     let mut take = |bits: usize| -> Option<u32> {
         let value = (0..bits).try_fold(0u32, |value, k| {
@@ -442,7 +590,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.json");
         std::fs::write(&path, text).unwrap();
-        load(&path, Some(view), Some((10, 8))).unwrap().map(|list| list.masks.iter().map(|mask| mask.runs.area()).collect())
+        load(&path, Some(view), Some((10, 8)))
+            .unwrap()
+            .map(|list| list.masks.iter().map(|mask| mask.runs.area()).collect())
     }
 
     const IMAGES: &str = r#""images": [{"id": 3, "file_name": "album/a.jpg", "width": 10, "height": 8}, {"id": 4, "file_name": "B.JPG", "width": 10, "height": 8}]"#;
@@ -458,22 +608,51 @@ mod tests {
         assert_eq!(areas(&text, "a.jpg"), Some(vec![14]));
         assert_eq!(areas(&format!("\u{feff}{text}"), "b.png"), Some(vec![3]));
         assert_eq!(areas(&text, "c.jpg"), None);
-        assert_eq!(areas("[]", "a.jpg"), Some(Vec::new()), "a photo without masks");
-        let folders = text.replace("album/a.jpg", "images/left/1.jpg").replace("B.JPG", "images/right/1.jpg");
-        assert_eq!((areas(&folders, "left_1.jpg"), areas(&folders, "right_1.jpg")), (Some(vec![14]), Some(vec![3])));
+        assert_eq!(
+            areas("[]", "a.jpg"),
+            Some(Vec::new()),
+            "a photo without masks"
+        );
+        let folders = text
+            .replace("album/a.jpg", "images/left/1.jpg")
+            .replace("B.JPG", "images/right/1.jpg");
+        assert_eq!(
+            (
+                areas(&folders, "left_1.jpg"),
+                areas(&folders, "right_1.jpg")
+            ),
+            (Some(vec![14]), Some(vec![3]))
+        );
     }
 
     #[test]
     fn tracks_are_numbers_names_or_none() {
-        let text = |track: &str| format!(r#"[{{"segmentation": {{"size": [8, 10], "counts": [80]}}, "track_id": {track}}}]"#);
+        let text = |track: &str| {
+            format!(
+                r#"[{{"segmentation": {{"size": [8, 10], "counts": [80]}}, "track_id": {track}}}]"#
+            )
+        };
         let track = |json: &str| {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("a.json");
             std::fs::write(&path, text(json)).unwrap();
             load(&path, None, None).unwrap().unwrap().masks[0].track
         };
-        assert_eq!([track("-1"), track("null"), track("5"), track("\"5\""), track("\"-1\"")], [None, None, Some(5), Some(5), None]);
-        assert!(track("\"cup\"").is_some() && track("\"cup\"") == track("\"cup\"") && track("\"cup\"") != track("\"cups\""));
+        assert_eq!(
+            [
+                track("-1"),
+                track("null"),
+                track("5"),
+                track("\"5\""),
+                track("\"-1\"")
+            ],
+            [None, None, Some(5), Some(5), None]
+        );
+        assert!(
+            track("\"cup\"").is_some()
+                && track("\"cup\"") == track("\"cup\"")
+                && track("\"cup\"") != track("\"cups\"")
+        );
     }
 
     #[test]
@@ -507,15 +686,29 @@ mod tests {
         put(8, 32);
         put(7, 5);
         (0..4).for_each(|_| put(3, 4));
-        for (value, count) in [(1, 1), (0, 2), (3, 4), (0, 8), (0, 1), (0, 2), (3, 4), (1, 8), (2, 8), (3, 8), (255, 8)] {
+        for (value, count) in [
+            (1, 1),
+            (0, 2),
+            (3, 4),
+            (0, 8),
+            (0, 1),
+            (0, 2),
+            (3, 4),
+            (1, 8),
+            (2, 8),
+            (3, 8),
+            (255, 8),
+        ] {
             put(value, count);
         }
         let bytes: Vec<u8> = bits
             .as_bytes()
             .chunks(8)
-            .map(|b| u8::from_str_radix(&format!("{:0<8}", std::str::from_utf8(b).unwrap()), 2).unwrap())
+            .map(|b| {
+                u8::from_str_radix(&format!("{:0<8}", std::str::from_utf8(b).unwrap()), 2).unwrap()
+            })
             .collect();
-        assert_eq!(brush(&bytes), Some(vec![0, 255]));
-        assert_eq!(brush(&bytes[..8]), None);
+        assert_eq!(decode_brush(&bytes), Some(vec![0, 255]));
+        assert_eq!(decode_brush(&bytes[..8]), None);
     }
 }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// Largest number of pixels of an image. Pixel indices are 32-bit numbers.
-const MOST_PIXELS: u64 = 1 << 31;
+const MAX_PIXELS: u64 = 1 << 31;
 
 /// A mask as a COCO annotation.
 #[derive(Serialize, Deserialize)]
@@ -62,13 +62,20 @@ impl MaskList {
     pub fn save(&self, path: &Path) -> Result<()> {
         let annotation = |mask: &Mask| {
             let mut b = [u32::MAX, u32::MAX, 0, 0];
-            for p in self.places(mask) {
+            for p in self.pixel_indices(mask) {
                 let (x, y) = (p as u32 % self.width, p as u32 / self.width);
                 b = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
             }
-            let bbox = if b[2] > 0 { [b[0], b[1], b[2] - b[0], b[3] - b[1]] } else { [0; 4] };
+            let bbox = if b[2] > 0 {
+                [b[0], b[1], b[2] - b[0], b[3] - b[1]]
+            } else {
+                [0; 4]
+            };
             Annotation {
-                segmentation: Segmentation { size: [self.height, self.width], counts: Counts::Text(mask.runs.to_text()) },
+                segmentation: Segmentation {
+                    size: [self.height, self.width],
+                    counts: Counts::Text(mask.runs.to_text()),
+                },
                 area: mask.runs.area() as f64,
                 bbox: bbox.map(f64::from),
                 predicted_iou: mask.predicted_iou,
@@ -90,14 +97,25 @@ impl MaskList {
             File::List(list) | File::Named { annotations: list } => list,
         };
         let [height, width] = annotations.first().map_or([0, 0], |a| a.segmentation.size);
-        if !annotations.is_empty() && !(1..=MOST_PIXELS).contains(&(u64::from(width) * u64::from(height))) {
-            return Err(Error::format(path, format!("{width}x{height} pixels is not a valid mask size; create the masks again")));
+        if !annotations.is_empty()
+            && !(1..=MAX_PIXELS).contains(&(u64::from(width) * u64::from(height)))
+        {
+            return Err(Error::format(
+                path,
+                format!("{width}x{height} pixels is not a valid mask size; create the masks again"),
+            ));
         }
         let mut list = Self::new(width, height);
         for (k, annotation) in annotations.into_iter().enumerate() {
             let Segmentation { size, counts } = annotation.segmentation;
             if size != [height, width] {
-                return Err(Error::format(path, format!("mask {k} has {}x{} pixels, but the first mask has {width}x{height}; create all masks in one size", size[1], size[0])));
+                return Err(Error::format(
+                    path,
+                    format!(
+                        "mask {k} has {}x{} pixels, but the first mask has {width}x{height}; create all masks in one size",
+                        size[1], size[0]
+                    ),
+                ));
             }
             let pixels = u64::from(width) * u64::from(height);
             let runs = match counts {
@@ -107,7 +125,13 @@ impl MaskList {
             let runs =
                 runs.ok_or_else(|| Error::format(path, format!("the run lengths of mask {k} do not add up to {width}x{height} pixels; create it again")))?;
             let (level, predicted_iou) = (annotation.level, annotation.predicted_iou);
-            list.masks.push(Mask { level, predicted_iou, stability: annotation.stability_score, track: annotation.track_id, runs });
+            list.masks.push(Mask {
+                level,
+                predicted_iou,
+                stability: annotation.stability_score,
+                track: annotation.track_id,
+                runs,
+            });
         }
         Ok(list)
     }
@@ -122,15 +146,26 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.json");
         let mut list = MaskList::new(5, 4);
-        let runs = RunLengths::of(5, 4, |x, y| x > 1 && y == 2);
+        let runs = RunLengths::from_fn(5, 4, |x, y| x > 1 && y == 2);
         list.masks = vec![
-            Mask { level: Level::Part, predicted_iou: 0.5, stability: 0.25, track: Some(7), runs },
-            Mask::new(Level::Whole, RunLengths::of(5, 4, |_, _| true)),
+            Mask {
+                level: Level::Part,
+                predicted_iou: 0.5,
+                stability: 0.25,
+                track: Some(7),
+                runs,
+            },
+            Mask::new(Level::Whole, RunLengths::from_fn(5, 4, |_, _| true)),
         ];
         list.save(&path).unwrap();
         assert_eq!(MaskList::load(&path).unwrap(), list);
-        let text = std::fs::read_to_string(&path).unwrap().replace([' ', '\n'], "");
-        assert!(text.contains("\"bbox\":[2.0,2.0,3.0,1.0]") && text.contains("\"area\":3.0"), "{text}");
+        let text = std::fs::read_to_string(&path)
+            .unwrap()
+            .replace([' ', '\n'], "");
+        assert!(
+            text.contains("\"bbox\":[2.0,2.0,3.0,1.0]") && text.contains("\"area\":3.0"),
+            "{text}"
+        );
     }
 
     #[test]
@@ -143,9 +178,17 @@ mod tests {
         };
         let list = load(r#"{"image": {}, "annotations": [{"segmentation": {"size": [2, 3], "counts": [1, 2, 3]}, "id": 4, "area": 2.5}]}"#)
             .unwrap();
-        assert_eq!((list.width, list.height, list.masks[0].runs.area()), (3, 2, 2));
+        assert_eq!(
+            (list.width, list.height, list.masks[0].runs.area()),
+            (3, 2, 2)
+        );
         assert_eq!(load("[]").unwrap(), MaskList::default());
-        for damaged in [r#"[{"segmentation": {"size": [2, 3], "counts": [1, 2, 9]}}]"#, r#"[{"segmentation": 1}]"#, "[", r#"{"a": 1}"#] {
+        for damaged in [
+            r#"[{"segmentation": {"size": [2, 3], "counts": [1, 2, 9]}}]"#,
+            r#"[{"segmentation": 1}]"#,
+            "[",
+            r#"{"a": 1}"#,
+        ] {
             let error = load(damaged).unwrap_err().to_string();
             assert!(error.contains("a.json"), "{error}");
         }

@@ -6,7 +6,7 @@ use crate::metrics::dilate;
 
 /// Half side of the square that defines a gap, in pixels. Uncovered pixels are a gap where no
 /// uncovered 5x5 square fits: gaps are at most 4 pixels wide.
-const HALF: u32 = 2;
+const GAP_RADIUS: u32 = 2;
 
 /// Gives each pixel of a gap (label 0) the nearest label. Wider uncovered areas keep label 0,
 /// because no mask covers them.
@@ -14,18 +14,35 @@ pub(super) fn close(map: &mut LabelMap) {
     let (width, height) = (map.width as usize, map.height as usize);
     let covered: Vec<bool> = map.labels.iter().map(|label| *label > 0).collect();
     // Morphological opening of the uncovered pixels: erosion, then dilation.
-    let widened = |mask: &[bool]| dilate(mask, map.width, map.height, [HALF; 2]);
-    let wide = widened(&widened(&covered).iter().map(|near| !near).collect::<Vec<_>>());
-    let mut gaps: Vec<usize> = (0..covered.len()).filter(|&p| !covered[p] && !wide[p]).collect();
+    let dilate_gap = |mask: &[bool]| dilate(mask, map.width, map.height, [GAP_RADIUS; 2]);
+    let wide = dilate_gap(
+        &dilate_gap(&covered)
+            .iter()
+            .map(|near| !near)
+            .collect::<Vec<_>>(),
+    );
+    let mut gaps: Vec<usize> = (0..covered.len())
+        .filter(|&p| !covered[p] && !wide[p])
+        .collect();
     // Each round extends all labels by one pixel into the gaps.
-    for _ in 0..2 * HALF {
+    for _ in 0..2 * GAP_RADIUS {
         let beside = |p: &usize| {
             let (x, y) = (p % width, p / width);
-            let near = [(x > 0, p.wrapping_sub(1)), (x + 1 < width, p + 1), (y > 0, p.wrapping_sub(width)), (y + 1 < height, p + width)];
-            near.into_iter().filter(|n| n.0).map(|(_, q)| map.labels[q]).find(|label| *label > 0)
+            let near = [
+                (x > 0, p.wrapping_sub(1)),
+                (x + 1 < width, p + 1),
+                (y > 0, p.wrapping_sub(width)),
+                (y + 1 < height, p + width),
+            ];
+            near.into_iter()
+                .filter(|n| n.0)
+                .map(|(_, q)| map.labels[q])
+                .find(|label| *label > 0)
         };
         let found: Vec<(usize, u16)> = gaps.iter().filter_map(|p| Some((*p, beside(p)?))).collect();
-        found.into_iter().for_each(|(p, label)| map.labels[p] = label);
+        found
+            .into_iter()
+            .for_each(|(p, label)| map.labels[p] = label);
         gaps.retain(|p| map.labels[*p] == 0);
     }
 }
@@ -42,7 +59,11 @@ mod tests {
             10..16 => 2,
             _ => 0,
         };
-        let mut map = LabelMap { width: 24, height: 12, labels: (0..24 * 12).map(|p| column(p % 24)).collect() };
+        let mut map = LabelMap {
+            width: 24,
+            height: 12,
+            labels: (0..24 * 12).map(|p| column(p % 24)).collect(),
+        };
         close(&mut map);
         let row: Vec<u16> = map.labels[6 * 24..][..24].to_vec();
         assert_eq!(row, [[1; 8].as_slice(), &[2; 8], &[0; 8]].concat());

@@ -9,12 +9,14 @@ mod run_lengths;
 
 use crate::undistort::Distortion;
 use crate::{Camera, LabelMap};
-pub use atoms::{Atoms, Table};
+pub use atoms::{AtomTable, Atoms};
 pub use run_lengths::RunLengths;
 use serde::{Deserialize, Serialize};
 
 /// Size class of a mask.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
     /// A whole object (the paper's *whole* level).
@@ -54,7 +56,13 @@ pub struct Mask {
 impl Mask {
     /// Creates a mask with scores of 1 and no track id.
     pub fn new(level: Level, runs: RunLengths) -> Self {
-        Self { level, predicted_iou: 1.0, stability: 1.0, track: None, runs }
+        Self {
+            level,
+            predicted_iou: 1.0,
+            stability: 1.0,
+            track: None,
+            runs,
+        }
     }
 }
 
@@ -72,12 +80,16 @@ pub struct MaskList {
 impl MaskList {
     /// Creates an empty list for photos of this size.
     pub fn new(width: u32, height: u32) -> Self {
-        Self { width, height, masks: Vec::new() }
+        Self {
+            width,
+            height,
+            masks: Vec::new(),
+        }
     }
 
     /// Creates the list of the masks in three label maps of one size, one for each level, coarse to
     /// fine.
-    pub fn of_levels(levels: &[LabelMap; 3]) -> Self {
+    pub fn from_levels(levels: &[LabelMap; 3]) -> Self {
         let mut list = Self::new(levels[0].width, levels[0].height);
         for (level, map) in Level::ALL.into_iter().zip(levels) {
             list.add(level, map);
@@ -89,16 +101,26 @@ impl MaskList {
     pub fn add(&mut self, level: Level, map: &LabelMap) -> Vec<u16> {
         let boxes = map.boxes();
         let mut labels = Vec::new();
-        for (label, [x0, y0, x1, y1]) in boxes.iter().enumerate().skip(1).filter_map(|(l, b)| Some((l as u16, (*b)?))) {
-            let inside = |x: u32, y: u32| (x0..x1).contains(&x) && (y0..y1).contains(&y) && map.at(x, y) == label;
-            self.masks.push(Mask::new(level, RunLengths::of(map.width, map.height, inside)));
+        for (label, [x0, y0, x1, y1]) in boxes
+            .iter()
+            .enumerate()
+            .skip(1)
+            .filter_map(|(l, b)| Some((l as u16, (*b)?)))
+        {
+            let inside = |x: u32, y: u32| {
+                (x0..x1).contains(&x) && (y0..y1).contains(&y) && map.at(x, y) == label
+            };
+            self.masks.push(Mask::new(
+                level,
+                RunLengths::from_fn(map.width, map.height, inside),
+            ));
             labels.push(label);
         }
         labels
     }
 
     /// Yields the row-major indices of a mask's pixels.
-    pub fn places(&self, mask: &Mask) -> impl Iterator<Item = usize> {
+    pub fn pixel_indices(&self, mask: &Mask) -> impl Iterator<Item = usize> {
         mask.runs.places(self.width, self.height)
     }
 
@@ -111,30 +133,47 @@ impl MaskList {
     /// Masks that become empty are removed.
     #[must_use]
     pub fn undistorted(&self, camera: &Camera, distortion: &Distortion) -> Self {
-        let masks = self.redrawn(|map| map.undistorted(camera, distortion)).flatten().collect();
-        Self { masks, ..Self::new(self.width, self.height) }
+        let masks = self
+            .redrawn(|map| map.undistorted(camera, distortion))
+            .flatten()
+            .collect();
+        Self {
+            masks,
+            ..Self::new(self.width, self.height)
+        }
     }
 
     /// Transforms each mask with `redraw`, which receives a map that is 1 inside the mask and 0
     /// elsewhere. Yields `None` for masks that become empty.
-    pub fn redrawn(&self, redraw: impl Fn(LabelMap) -> LabelMap) -> impl Iterator<Item = Option<Mask>> {
+    pub fn redrawn(
+        &self,
+        redraw: impl Fn(LabelMap) -> LabelMap,
+    ) -> impl Iterator<Item = Option<Mask>> {
         self.masks.iter().map(move |mask| {
             let mut map = LabelMap::new(self.width, self.height);
-            self.places(mask).for_each(|p| map.labels[p] = 1);
+            self.pixel_indices(mask).for_each(|p| map.labels[p] = 1);
             let map = redraw(map);
-            let runs = RunLengths::of(map.width, map.height, |x, y| map.at(x, y) > 0);
-            (runs.area() > 0).then(|| Mask { runs, ..mask.clone() })
+            let runs = RunLengths::from_fn(map.width, map.height, |x, y| map.at(x, y) > 0);
+            (runs.area() > 0).then(|| Mask {
+                runs,
+                ..mask.clone()
+            })
         })
     }
 
     /// Returns the masks of a level as a label map. Labels 1, 2, ... are in descending order of
     /// area. Smaller masks cover larger ones. Masks after the 65,535th are dropped.
     pub fn painted(&self, level: Level) -> LabelMap {
-        let mut order: Vec<(usize, &Mask)> = self.masks.iter().filter(|m| m.level == level).map(|m| (m.runs.area(), m)).collect();
+        let mut order: Vec<(usize, &Mask)> = self
+            .masks
+            .iter()
+            .filter(|m| m.level == level)
+            .map(|m| (m.runs.area(), m))
+            .collect();
         order.sort_by_key(|(area, _)| std::cmp::Reverse(*area));
         let mut map = LabelMap::new(self.width, self.height);
         for (label, (_, mask)) in (1..=u16::MAX).zip(order) {
-            self.places(mask).for_each(|p| map.labels[p] = label);
+            self.pixel_indices(mask).for_each(|p| map.labels[p] = label);
         }
         map
     }
@@ -145,7 +184,11 @@ mod tests {
     use super::*;
 
     fn map(labels: &[u16]) -> LabelMap {
-        LabelMap { width: 4, height: 1, labels: labels.to_vec() }
+        LabelMap {
+            width: 4,
+            height: 1,
+            labels: labels.to_vec(),
+        }
     }
 
     #[test]
@@ -155,15 +198,28 @@ mod tests {
         list.add(Level::Whole, &map(&[1, 1, 1, 0]));
         list.add(Level::Part, &map(&[0, 0, 0, 2]));
         assert_eq!(list.painted(Level::Whole), map(&[1, 2, 2, 0]));
-        assert_eq!((list.count(Level::Whole), list.count(Level::Part), list.painted(Level::Part).max()), (2, 1, 1));
+        assert_eq!(
+            (
+                list.count(Level::Whole),
+                list.count(Level::Part),
+                list.painted(Level::Part).max()
+            ),
+            (2, 1, 1)
+        );
     }
 
     #[test]
     fn label_maps_become_lists() {
-        let list = MaskList::of_levels(&[map(&[9, 9, 3, 3]), map(&[0; 4]), map(&[5, 0, 0, 0])]);
+        let list = MaskList::from_levels(&[map(&[9, 9, 3, 3]), map(&[0; 4]), map(&[5, 0, 0, 0])]);
         let levels: Vec<Level> = list.masks.iter().map(|m| m.level).collect();
         assert_eq!(levels, [Level::Whole, Level::Whole, Level::Subpart]);
-        assert_eq!(list.places(&list.masks[0]).collect::<Vec<_>>(), [2, 3]);
-        assert_eq!(MaskList::new(4, 1).add(Level::Whole, &map(&[9, 9, 3, 3])), [3, 9]);
+        assert_eq!(
+            list.pixel_indices(&list.masks[0]).collect::<Vec<_>>(),
+            [2, 3]
+        );
+        assert_eq!(
+            MaskList::new(4, 1).add(Level::Whole, &map(&[9, 9, 3, 3])),
+            [3, 9]
+        );
     }
 }

@@ -9,12 +9,12 @@ pub struct RunLengths(Vec<u32>);
 /// that another group follows. The last group is sign-extended. An offset of 48 makes each group a
 /// printable character.
 const BITS: u32 = 5;
-const MORE: i64 = 1 << BITS;
-const FIRST: u8 = 48;
+const CONTINUE_BIT: i64 = 1 << BITS;
+const ASCII_OFFSET: u8 = 48;
 
 impl RunLengths {
     /// Creates the run lengths of the pixels (x, y) for which `member` returns true.
-    pub fn of(width: u32, height: u32, member: impl Fn(u32, u32) -> bool) -> Self {
+    pub fn from_fn(width: u32, height: u32, member: impl Fn(u32, u32) -> bool) -> Self {
         let (mut runs, mut inside, mut length) = (Vec::new(), false, 0);
         for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
             if member(x, y) != inside {
@@ -39,11 +39,11 @@ impl RunLengths {
         while let Some(mut byte) = bytes.next() {
             let (mut value, mut shift) = (0i64, 0);
             loop {
-                let bits = i64::from(byte.checked_sub(FIRST).filter(|b| *b < 64)?);
-                value |= (bits & (MORE - 1)) << shift;
+                let bits = i64::from(byte.checked_sub(ASCII_OFFSET).filter(|b| *b < 64)?);
+                value |= (bits & (CONTINUE_BIT - 1)) << shift;
                 shift += BITS;
-                if bits & MORE == 0 {
-                    if bits & (MORE >> 1) != 0 {
+                if bits & CONTINUE_BIT == 0 {
+                    if bits & (CONTINUE_BIT >> 1) != 0 {
                         value -= 1 << shift;
                     }
                     break;
@@ -52,7 +52,11 @@ impl RunLengths {
                 byte = bytes.next().filter(|_| shift <= 30)?;
             }
             // From index 3 on, the text stores the difference from the count two places earlier.
-            let before = if counts.len() > 2 { counts[counts.len() - 2] } else { 0 };
+            let before = if counts.len() > 2 {
+                counts[counts.len() - 2]
+            } else {
+                0
+            };
             counts.push(u32::try_from(value + i64::from(before)).ok()?);
         }
         Self::from_counts(counts, pixels)
@@ -64,10 +68,16 @@ impl RunLengths {
         for (k, &count) in self.0.iter().enumerate() {
             let mut value = i64::from(count) - if k > 2 { i64::from(self.0[k - 2]) } else { 0 };
             loop {
-                let bits = value & (MORE - 1);
+                let bits = value & (CONTINUE_BIT - 1);
                 value >>= BITS;
-                let last = if bits & (MORE >> 1) == 0 { value == 0 } else { value == -1 };
-                text.push(char::from(FIRST + (bits | if last { 0 } else { MORE }) as u8));
+                let last = if bits & (CONTINUE_BIT >> 1) == 0 {
+                    value == 0
+                } else {
+                    value == -1
+                };
+                text.push(char::from(
+                    ASCII_OFFSET + (bits | if last { 0 } else { CONTINUE_BIT }) as u8,
+                ));
                 if last {
                     break;
                 }
@@ -101,10 +111,13 @@ mod tests {
     fn runs_go_down_the_columns() {
         // . # #
         // . . #
-        let mask = RunLengths::of(3, 2, |x, y| x == 2 || (x, y) == (1, 0));
+        let mask = RunLengths::from_fn(3, 2, |x, y| x == 2 || (x, y) == (1, 0));
         assert_eq!(mask.0, [2, 1, 1, 2]);
-        assert_eq!((mask.area(), mask.places(3, 2).collect::<Vec<_>>()), (3, vec![1, 2, 5]));
-        assert_eq!(RunLengths::of(2, 1, |_, _| true).0, [0, 2]);
+        assert_eq!(
+            (mask.area(), mask.places(3, 2).collect::<Vec<_>>()),
+            (3, vec![1, 2, 5])
+        );
+        assert_eq!(RunLengths::from_fn(2, 1, |_, _| true).0, [0, 2]);
         assert_eq!(RunLengths::from_counts(vec![2, 1], 4), None);
     }
 
@@ -114,8 +127,15 @@ mod tests {
         // "3"; 0 - 40 -> "hN"; 9 - 4 -> "5".
         let mask = RunLengths(vec![6, 1, 40, 4, 0, 9]);
         assert_eq!(mask.to_text(), "61X13hN5");
-        for runs in [vec![0, 100_000], vec![3, 2, 1, 70_000, 12, 1, 500, 0, 31, 32], vec![4_000_000_000]] {
-            let (mask, pixels) = (RunLengths(runs.clone()), runs.iter().map(|r| u64::from(*r)).sum());
+        for runs in [
+            vec![0, 100_000],
+            vec![3, 2, 1, 70_000, 12, 1, 500, 0, 31, 32],
+            vec![4_000_000_000],
+        ] {
+            let (mask, pixels) = (
+                RunLengths(runs.clone()),
+                runs.iter().map(|r| u64::from(*r)).sum(),
+            );
             assert_eq!(RunLengths::from_text(&mask.to_text(), pixels), Some(mask));
         }
         for damaged in ["61X", "6 1", "é", "oooooooooo"] {

@@ -11,7 +11,7 @@
 mod codebook;
 mod palette;
 
-use crate::curve::along_curve;
+use crate::curve::morton_order;
 use crate::gaussians::{MAX_SH_DEGREE, logit, rest_len, sigmoid};
 use crate::{Error, Gaussians, Result, fs};
 use codebook::{CODES, codebook, nearest};
@@ -29,7 +29,7 @@ const VERSION: u32 = 2;
 /// Palette rows per row of the palette image.
 const PALETTE_COLUMNS: usize = 64;
 /// Fourth channel of a rotation whose omitted component is w; 253 to 255 stand for x, y and z.
-const FIRST_TAG: u8 = 252;
+const ROTATION_TAG_W: u8 = 252;
 
 #[derive(Serialize, Deserialize)]
 struct Meta {
@@ -89,11 +89,11 @@ fn byte(value: f32) -> u8 {
 }
 
 /// Compresses positions far from the origin: sign(v) ln(|v| + 1).
-fn log(v: Vec3) -> Vec3 {
+fn signed_log(v: Vec3) -> Vec3 {
     (v.abs() + 1.0).map(f32::ln) * v.signum()
 }
 
-fn exp(v: Vec3) -> Vec3 {
+fn signed_exp(v: Vec3) -> Vec3 {
     (v.abs().map(f32::exp) - 1.0) * v.signum()
 }
 
@@ -104,9 +104,12 @@ fn exp(v: Vec3) -> Vec3 {
 /// [`Error::Invalid`] for an empty scene, [`Error::Io`] with the path.
 pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     if scene.is_empty() {
-        return Err(Error::Invalid(format!("{}: there are no Gaussians to write", path.display())));
+        return Err(Error::Invalid(format!(
+            "{}: there are no Gaussians to write",
+            path.display()
+        )));
     }
-    let scene = &scene.select(&along_curve(&scene.means));
+    let scene = &scene.select(&morton_order(&scene.means));
     let n = scene.len();
     // Width and height are multiples of four, as in the encoder of the specification.
     let width = ((n as f64).sqrt() / 4.0).ceil() as usize * 4;
@@ -115,23 +118,45 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
     let mut picture = |name: &'static str, of: &dyn Fn(usize) -> [u8; 4]| {
         let mut own: Vec<[u8; 4]> = (0..n).map(of).collect();
         own.resize(pixels, [0, 0, 0, 255]);
-        pictures.push(Picture { name, width, pixels: own });
+        pictures.push(Picture {
+            name,
+            width,
+            pixels: own,
+        });
         name.to_owned()
     };
 
-    let logs: Vec<Vec3> = scene.means.iter().map(|m| log(*m)).collect();
+    let logs: Vec<Vec3> = scene.means.iter().map(|m| signed_log(*m)).collect();
     let low = logs.iter().copied().reduce(Vec3::min).unwrap_or_default();
     let high = logs.iter().copied().reduce(Vec3::max).unwrap_or_default();
     let range = (high - low).max(Vec3::splat(1e-6));
-    let steps = |i: usize| ((logs[i] - low) / range * 65535.0).round().to_array().map(|v| v as u16);
-    let means_l = picture("means_l.webp", &|i| with_alpha(steps(i).map(|v| v as u8), 255));
-    let means_u = picture("means_u.webp", &|i| with_alpha(steps(i).map(|v| (v >> 8) as u8), 255));
+    let steps = |i: usize| {
+        ((logs[i] - low) / range * 65535.0)
+            .round()
+            .to_array()
+            .map(|v| v as u16)
+    };
+    let means_l = picture("means_l.webp", &|i| {
+        with_alpha(steps(i).map(|v| v as u8), 255)
+    });
+    let means_u = picture("means_u.webp", &|i| {
+        with_alpha(steps(i).map(|v| (v >> 8) as u8), 255)
+    });
     let quats = picture("quats.webp", &|i| packed_rotation(scene.rotations[i]));
     let scale_codes = codebook(scene.log_scales.iter().flat_map(|s| s.to_array()));
-    let scales = picture("scales.webp", &|i| with_alpha(scene.log_scales[i].to_array().map(|s| nearest(&scale_codes, s)), 255));
+    let scales = picture("scales.webp", &|i| {
+        with_alpha(
+            scene.log_scales[i]
+                .to_array()
+                .map(|s| nearest(&scale_codes, s)),
+            255,
+        )
+    });
     let color_codes = codebook(scene.sh_dc.iter().flat_map(|c| c.to_array()));
     let color = |i: usize| scene.sh_dc[i].to_array().map(|c| nearest(&color_codes, c));
-    let sh0 = picture("sh0.webp", &|i| with_alpha(color(i), byte(sigmoid(scene.opacity_logits[i]))));
+    let sh0 = picture("sh0.webp", &|i| {
+        with_alpha(color(i), byte(sigmoid(scene.opacity_logits[i])))
+    });
     let bands = scene.sh_degree;
     let mut centroids = None;
     let rest = (bands > 0).then(|| {
@@ -142,24 +167,48 @@ pub fn write(path: &Path, scene: &Gaussians) -> Result<()> {
             [low, high, 0, 255]
         });
         let codes = codebook(palette.rows.iter().copied());
-        let coded = palette.rows.chunks_exact(3).map(|v| with_alpha([0, 1, 2].map(|k| nearest(&codes, v[k])), 255));
+        let coded = palette
+            .rows
+            .chunks_exact(3)
+            .map(|v| with_alpha([0, 1, 2].map(|k| nearest(&codes, v[k])), 255));
         let width = PALETTE_COLUMNS * rest_len(bands);
         let mut coded: Vec<[u8; 4]> = coded.collect();
         let count = coded.len() / rest_len(bands);
         coded.resize(coded.len().next_multiple_of(width), [0, 0, 0, 255]);
         let name = "shN_centroids.webp";
-        centroids = Some(Picture { name, width, pixels: coded });
-        Rest { count, bands, codebook: codes.to_vec(), files: [name.to_owned(), labels] }
+        centroids = Some(Picture {
+            name,
+            width,
+            pixels: coded,
+        });
+        Rest {
+            count,
+            bands,
+            codebook: codes.to_vec(),
+            files: [name.to_owned(), labels],
+        }
     });
     pictures.extend(centroids);
     let meta = Meta {
         version: VERSION,
-        asset: Asset { generator: concat!("FastLGS ", env!("CARGO_PKG_VERSION")).to_owned() },
+        asset: Asset {
+            generator: concat!("FastLGS ", env!("CARGO_PKG_VERSION")).to_owned(),
+        },
         count: n,
-        means: Means { mins: low.to_array(), maxs: (low + range).to_array(), files: [means_l, means_u] },
-        scales: Coded { codebook: scale_codes.to_vec(), files: [scales] },
+        means: Means {
+            mins: low.to_array(),
+            maxs: (low + range).to_array(),
+            files: [means_l, means_u],
+        },
+        scales: Coded {
+            codebook: scale_codes.to_vec(),
+            files: [scales],
+        },
         quats: Files { files: [quats] },
-        sh0: Coded { codebook: color_codes.to_vec(), files: [sh0] },
+        sh0: Coded {
+            codebook: color_codes.to_vec(),
+            files: [sh0],
+        },
         rest,
     };
     archive(path, &meta, &pictures)
@@ -171,7 +220,9 @@ fn with_alpha([r, g, b]: [u8; 3], a: u8) -> [u8; 4] {
 
 /// Builds the archive in memory and writes it atomically.
 fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
-    let damaged = |error: &dyn std::fmt::Display| Error::format(path, format!("the SOG archive cannot be written: {error}"));
+    let damaged = |error: &dyn std::fmt::Display| {
+        Error::format(path, format!("the SOG archive cannot be written: {error}"))
+    };
     let mut archive = ZipWriter::new(Cursor::new(Vec::new()));
     // WebP images are compressed already.
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored);
@@ -179,12 +230,27 @@ fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
         archive.start_file(name, options).map_err(|e| damaged(&e))?;
         archive.write_all(data).map_err(|e| damaged(&e))
     };
-    add("meta.json", &serde_json::to_vec(meta).map_err(|e| damaged(&e))?)?;
-    for Picture { name, width, pixels } in pictures {
+    add(
+        "meta.json",
+        &serde_json::to_vec(meta).map_err(|e| damaged(&e))?,
+    )?;
+    for Picture {
+        name,
+        width,
+        pixels,
+    } in pictures
+    {
         let mut data = Vec::new();
         let height = (pixels.len() / width) as u32;
         let encoder = WebPEncoder::new_lossless(&mut data);
-        encoder.encode(pixels.as_flattened(), *width as u32, height, ExtendedColorType::Rgba8).map_err(|e| damaged(&e))?;
+        encoder
+            .encode(
+                pixels.as_flattened(),
+                *width as u32,
+                height,
+                ExtendedColorType::Rgba8,
+            )
+            .map_err(|e| damaged(&e))?;
         add(name, &data)?;
     }
     let data = archive.finish().map_err(|e| damaged(&e))?.into_inner();
@@ -195,17 +261,24 @@ fn archive(path: &Path, meta: &Meta, pictures: &[Picture]) -> Result<()> {
 /// one. Components are scaled by sqrt(2) to [-1, 1] and stored as bytes.
 fn packed_rotation(q: [f32; 4]) -> [u8; 4] {
     let length = q.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
-    let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
+    let largest = (0..4)
+        .max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs()))
+        .unwrap_or(0);
     let scale = std::f32::consts::FRAC_1_SQRT_2 / if q[largest] < 0.0 { -length } else { length };
-    let mut rest = (0..4).filter(|k| *k != largest).map(|k| byte(q[k] * scale + 0.5));
+    let mut rest = (0..4)
+        .filter(|k| *k != largest)
+        .map(|k| byte(q[k] * scale + 0.5));
     let mut next = || rest.next().unwrap_or(0);
-    [next(), next(), next(), FIRST_TAG + largest as u8]
+    [next(), next(), next(), ROTATION_TAG_W + largest as u8]
 }
 
 fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
-    let largest = usize::from(tag.checked_sub(FIRST_TAG)?);
-    let rest = [a, b, c].map(|v| (f32::from(v) / 255.0 * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
-    let own = (1.0 - rest.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
+    let largest = usize::from(tag.checked_sub(ROTATION_TAG_W)?);
+    let rest =
+        [a, b, c].map(|v| (f32::from(v) / 255.0 * 2.0 - 1.0) * std::f32::consts::FRAC_1_SQRT_2);
+    let own = (1.0 - rest.iter().map(|v| v * v).sum::<f32>())
+        .max(0.0)
+        .sqrt();
     let mut out = rest.to_vec();
     out.insert(largest, own);
     out.try_into().ok()
@@ -218,16 +291,24 @@ fn rotation([a, b, c, tag]: [u8; 4]) -> Option<[f32; 4]> {
 pub fn read(path: &Path) -> Result<Gaussians> {
     let bad = |reason: String| Error::format(path, reason);
     let data = fs::read(path)?;
-    let mut archive = ZipArchive::new(Cursor::new(data)).map_err(|e| bad(format!("not a complete SOG file ({e}); copy it again")))?;
+    let mut archive = ZipArchive::new(Cursor::new(data))
+        .map_err(|e| bad(format!("not a complete SOG file ({e}); copy it again")))?;
     let mut member = |name: &str| -> Result<Vec<u8>> {
         let mut data = Vec::new();
-        let mut file = archive.by_name(name).map_err(|e| bad(format!("it does not contain {name} ({e}); export it again")))?;
-        file.read_to_end(&mut data).map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
+        let mut file = archive
+            .by_name(name)
+            .map_err(|e| bad(format!("it does not contain {name} ({e}); export it again")))?;
+        file.read_to_end(&mut data)
+            .map_err(|e| bad(format!("{name} is damaged ({e}); copy it again")))?;
         Ok(data)
     };
-    let meta: Meta = serde_json::from_slice(&member("meta.json")?).map_err(|e| bad(format!("meta.json: {e}")))?;
+    let meta: Meta = serde_json::from_slice(&member("meta.json")?)
+        .map_err(|e| bad(format!("meta.json: {e}")))?;
     if meta.version != VERSION {
-        return Err(bad(format!("SOG version {} is not supported; export it as version {VERSION}", meta.version)));
+        return Err(bad(format!(
+            "SOG version {} is not supported; export it as version {VERSION}",
+            meta.version
+        )));
     }
     let n = meta.count;
     let mut picture = |name: &str, least: usize| -> Result<Vec<[u8; 4]>> {
@@ -238,7 +319,9 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         let (width, height) = decoder.dimensions();
         // Check the size before allocating memory for it.
         if (width as usize) * (height as usize) < least {
-            return Err(bad(format!("{name} has {width}x{height} pixels, too few for {n} Gaussians")));
+            return Err(bad(format!(
+                "{name} has {width}x{height} pixels, too few for {n} Gaussians"
+            )));
         }
         let mut values = vec![0; decoder.total_bytes() as usize];
         decoder.read_image(&mut values).map_err(damaged)?;
@@ -246,45 +329,90 @@ pub fn read(path: &Path) -> Result<Gaussians> {
         Ok(values.chunks_exact(channels).map(pixel).collect())
     };
     let of = |codes: &[f32], name: &str| {
-        <[f32; CODES]>::try_from(codes).map_err(|_| bad(format!("the codebook of {name} does not have {CODES} numbers; export it again")))
+        <[f32; CODES]>::try_from(codes).map_err(|_| {
+            bad(format!(
+                "the codebook of {name} does not have {CODES} numbers; export it again"
+            ))
+        })
     };
-    let look = |codes: [f32; CODES]| move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)]));
+    let lookup = |codes: [f32; CODES]| {
+        move |p: [u8; 4]| Vec3::from_array([p[0], p[1], p[2]].map(|v| codes[usize::from(v)]))
+    };
 
     let low = picture(&meta.means.files[0], n)?;
     let high = picture(&meta.means.files[1], n)?;
     let (from, to) = (Vec3::from(meta.means.mins), Vec3::from(meta.means.maxs));
     let mean = |(l, u): (&[u8; 4], &[u8; 4])| {
-        let steps = Vec3::from_array([0, 1, 2].map(|k| f32::from(u16::from_le_bytes([l[k], u[k]]))));
-        exp(from + (to - from) * steps / 65535.0)
+        let steps =
+            Vec3::from_array([0, 1, 2].map(|k| f32::from(u16::from_le_bytes([l[k], u[k]]))));
+        signed_exp(from + (to - from) * steps / 65535.0)
     };
     let means = low.iter().zip(&high).take(n).map(mean).collect();
-    let rotations = picture(&meta.quats.files[0], n)?.into_iter().take(n).map(rotation).collect::<Option<Vec<_>>>();
-    let rotations = rotations.ok_or_else(|| bad(format!("{} has pixels that are not rotations; export it again", meta.quats.files[0])))?;
-    let scale = look(of(&meta.scales.codebook, "scales")?);
-    let log_scales = picture(&meta.scales.files[0], n)?.into_iter().take(n).map(scale).collect();
+    let rotations = picture(&meta.quats.files[0], n)?
+        .into_iter()
+        .take(n)
+        .map(rotation)
+        .collect::<Option<Vec<_>>>();
+    let rotations = rotations.ok_or_else(|| {
+        bad(format!(
+            "{} has pixels that are not rotations; export it again",
+            meta.quats.files[0]
+        ))
+    })?;
+    let scale = lookup(of(&meta.scales.codebook, "scales")?);
+    let log_scales = picture(&meta.scales.files[0], n)?
+        .into_iter()
+        .take(n)
+        .map(scale)
+        .collect();
     let colors = picture(&meta.sh0.files[0], n)?;
     // Opacities of exactly 0 and 1 have no finite logit.
-    let opacity_logits = colors.iter().take(n).map(|p| logit((f32::from(p[3]) / 255.0).clamp(0.001, 0.999))).collect();
-    let sh_dc = colors.into_iter().take(n).map(look(of(&meta.sh0.codebook, "sh0")?)).collect();
+    let opacity_logits = colors
+        .iter()
+        .take(n)
+        .map(|p| logit((f32::from(p[3]) / 255.0).clamp(0.001, 0.999)))
+        .collect();
+    let sh_dc = colors
+        .into_iter()
+        .take(n)
+        .map(lookup(of(&meta.sh0.codebook, "sh0")?))
+        .collect();
     let mut sh_rest = Vec::new();
     let mut sh_degree = 0;
     if let Some(rest) = &meta.rest {
         sh_degree = rest.bands;
         if sh_degree > MAX_SH_DEGREE {
-            return Err(bad(format!("SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less")));
+            return Err(bad(format!(
+                "SH degree {sh_degree} is not supported; export it with degree {MAX_SH_DEGREE} or less"
+            )));
         }
         let width = rest_len(sh_degree);
         let centroids = picture(&rest.files[0], rest.count * width)?;
         let labels = picture(&rest.files[1], n)?;
-        let value = look(of(&rest.codebook, "shN")?);
+        let value = lookup(of(&rest.codebook, "shN")?);
         for label in labels.iter().take(n) {
             let at = usize::from(u16::from_le_bytes([label[0], label[1]])) * width;
-            let row = centroids.get(at..at + width).ok_or_else(|| bad(format!("{} refers to rows that the palette does not have; export it again", rest.files[1])))?;
+            let row = centroids.get(at..at + width).ok_or_else(|| {
+                bad(format!(
+                    "{} refers to rows that the palette does not have; export it again",
+                    rest.files[1]
+                ))
+            })?;
             sh_rest.extend(row.iter().map(|p| value(*p)));
         }
     }
     let (features, object_ids) = (vec![Vec3::ZERO; n], vec![0; n]);
-    Ok(Gaussians { means, log_scales, rotations, opacity_logits, sh_dc, sh_degree, sh_rest, features, object_ids })
+    Ok(Gaussians {
+        means,
+        log_scales,
+        rotations,
+        opacity_logits,
+        sh_dc,
+        sh_degree,
+        sh_rest,
+        features,
+        object_ids,
+    })
 }
 
 #[cfg(test)]
@@ -294,17 +422,29 @@ mod tests {
 
     fn sample(n: usize) -> Gaussians {
         let mut rng = Rng::new(1, "sog");
-        let mut g = Gaussians { sh_degree: 2, ..Gaussians::default() };
+        let mut g = Gaussians {
+            sh_degree: 2,
+            ..Gaussians::default()
+        };
         for i in 0..n {
             let mean = 3.0 * Vec3::new(rng.normal(), rng.normal(), rng.normal());
-            g.push_sphere(mean, rng.range(0.001, 0.5), rng.range(0.1, 0.9), [rng.uniform(), rng.uniform(), rng.uniform()]);
+            g.push_sphere(
+                mean,
+                rng.range(0.001, 0.5),
+                rng.range(0.1, 0.9),
+                [rng.uniform(), rng.uniform(), rng.uniform()],
+            );
             g.rotations[i] = [rng.normal(), rng.normal(), rng.normal(), rng.normal()];
         }
         // Each Gaussian has one of 20 sets of SH coefficients, with a little noise.
-        let kinds: Vec<Vec3> = (0..20 * rest_len(2)).map(|_| 0.1 * Vec3::new(rng.normal(), rng.normal(), rng.normal())).collect();
+        let kinds: Vec<Vec3> = (0..20 * rest_len(2))
+            .map(|_| 0.1 * Vec3::new(rng.normal(), rng.normal(), rng.normal()))
+            .collect();
         for row in g.sh_rest.chunks_exact_mut(rest_len(2)) {
             let kind = (20.0 * rng.uniform()) as usize * rest_len(2);
-            row.iter_mut().zip(&kinds[kind..]).for_each(|(v, own)| *v = *own + 0.003 * Vec3::splat(rng.normal()));
+            row.iter_mut()
+                .zip(&kinds[kind..])
+                .for_each(|(v, own)| *v = *own + 0.003 * Vec3::splat(rng.normal()));
         }
         g
     }
@@ -316,20 +456,37 @@ mod tests {
         let before = sample(3000);
         write(&path, &before).unwrap();
         let after = read(&path).unwrap();
-        let before = before.select(&along_curve(&before.means));
+        let before = before.select(&morton_order(&before.means));
         assert_eq!((after.len(), after.sh_degree), (3000, 2));
         for i in 0..before.len() {
             assert!((after.means[i] - before.means[i]).length() < 2e-3);
-            assert!((after.log_scales[i] - before.log_scales[i]).abs().max_element() <= 0.1);
-            assert!((sigmoid(after.opacity_logits[i]) - sigmoid(before.opacity_logits[i])).abs() < 0.003);
+            assert!(
+                (after.log_scales[i] - before.log_scales[i])
+                    .abs()
+                    .max_element()
+                    <= 0.1
+            );
+            assert!(
+                (sigmoid(after.opacity_logits[i]) - sigmoid(before.opacity_logits[i])).abs()
+                    < 0.003
+            );
             assert!((after.sh_dc[i] - before.sh_dc[i]).abs().max_element() < 0.03);
             assert!(after.rotation(i).dot(before.rotation(i)).abs() > 0.9999);
         }
-        let error = |a: &[Vec3]| a.iter().zip(&before.sh_rest).map(|(a, b)| (*a - *b).length_squared()).sum::<f32>();
+        let error = |a: &[Vec3]| {
+            a.iter()
+                .zip(&before.sh_rest)
+                .map(|(a, b)| (*a - *b).length_squared())
+                .sum::<f32>()
+        };
         assert!(error(&after.sh_rest) < 0.01 * error(&vec![Vec3::ZERO; before.sh_rest.len()]));
         let again = dir.path().join("again.sog");
         write(&again, &sample(3000)).unwrap();
-        assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(&again).unwrap(), "the same scene gives the same bytes");
+        assert_eq!(
+            std::fs::read(&path).unwrap(),
+            std::fs::read(&again).unwrap(),
+            "the same scene gives the same bytes"
+        );
         // A single Gaussian without view-dependent colour.
         write(&path, &sample(1).with_sh_degree(0)).unwrap();
         assert_eq!(read(&path).unwrap().len(), 1);
@@ -352,6 +509,9 @@ mod tests {
         more[count..count + 10].copy_from_slice(b"\"count\":99");
         std::fs::write(&path, &more).unwrap();
         let said = read(&path).unwrap_err().to_string();
-        assert!(said.contains("damaged") || said.contains("too few"), "{said}");
+        assert!(
+            said.contains("damaged") || said.contains("too few"),
+            "{said}"
+        );
     }
 }

@@ -4,12 +4,12 @@ use rayon::prelude::*;
 
 /// Largest palette, in rows. The format allows 65,536, but time grows with palette rows times scene
 /// rows.
-const MOST: usize = 4096;
+const MAX_ROWS: usize = 4096;
 /// Scene rows per palette row. In small scenes a longer palette would be most of the file; four
 /// times the rows gain only 2.7 dB over 47 dB.
-const SHARE: usize = 16;
+const INPUT_ROWS_PER_ROW: usize = 16;
 /// Number of rows that train the palette; the others are only assigned to it.
-const LEARNED_FROM: usize = 65_536;
+const TRAINING_ROWS: usize = 65_536;
 /// Iterations of Lloyd's algorithm.
 const ROUNDS: usize = 8;
 /// Number of independent partial sums, for vector instructions.
@@ -26,11 +26,17 @@ pub struct Palette {
 /// Computes a palette for `rows` of `width` numbers each. Deterministic.
 pub fn palette(rows: &[f32], width: usize) -> Palette {
     let n = rows.len() / width;
-    let count = (n / SHARE).clamp(1, MOST);
+    let count = (n / INPUT_ROWS_PER_ROW).clamp(1, MAX_ROWS);
     let padded = Rows::new(rows.chunks_exact(width), width);
-    let sample = Rows::new(rows.chunks_exact(width).step_by(n.div_ceil(LEARNED_FROM)), width);
+    let sample = Rows::new(
+        rows.chunks_exact(width).step_by(n.div_ceil(TRAINING_ROWS)),
+        width,
+    );
     let learned = sample.len();
-    let mut centres = Rows::new((0..count).map(|k| &rows[(k * n / count) * width..][..width]), width);
+    let mut centres = Rows::new(
+        (0..count).map(|k| &rows[(k * n / count) * width..][..width]),
+        width,
+    );
     for _ in 0..ROUNDS {
         let labels = centres.nearest(&sample);
         let mut sums = vec![0.0f64; count * width];
@@ -38,15 +44,29 @@ pub fn palette(rows: &[f32], width: usize) -> Palette {
         for (row, label) in (0..learned).map(|k| sample.row(k)).zip(&labels) {
             let label = usize::from(*label);
             counts[label] += 1;
-            sums[label * width..][..width].iter_mut().zip(row).for_each(|(s, v)| *s += f64::from(*v));
+            sums[label * width..][..width]
+                .iter_mut()
+                .zip(row)
+                .for_each(|(s, v)| *s += f64::from(*v));
         }
         for (k, count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
-            let mean = sums[k * width..][..width].iter().map(|s| (s / f64::from(*count)) as f32);
-            centres.row_mut(k).iter_mut().zip(mean).for_each(|(v, mean)| *v = mean);
+            let mean = sums[k * width..][..width]
+                .iter()
+                .map(|s| (s / f64::from(*count)) as f32);
+            centres
+                .row_mut(k)
+                .iter_mut()
+                .zip(mean)
+                .for_each(|(v, mean)| *v = mean);
         }
     }
     let labels = centres.nearest(&padded);
-    Palette { rows: (0..count).flat_map(|k| centres.row(k)[..width].to_vec()).collect(), labels }
+    Palette {
+        rows: (0..count)
+            .flat_map(|k| centres.row(k)[..width].to_vec())
+            .collect(),
+        labels,
+    }
 }
 
 /// Rows, padded with zeros to a multiple of `LANES` numbers.
@@ -59,7 +79,12 @@ impl Rows {
     fn new<'a>(rows: impl Iterator<Item = &'a [f32]>, width: usize) -> Self {
         let stride = width.next_multiple_of(LANES);
         let fill = stride - width;
-        Self { values: rows.flat_map(|row| row.iter().copied().chain(std::iter::repeat_n(0.0, fill))).collect(), stride }
+        Self {
+            values: rows
+                .flat_map(|row| row.iter().copied().chain(std::iter::repeat_n(0.0, fill)))
+                .collect(),
+            stride,
+        }
     }
 
     fn len(&self) -> usize {
@@ -78,10 +103,17 @@ impl Rows {
     /// ties.
     fn nearest(&self, others: &Self) -> Vec<u16> {
         // |x - c|^2 = |x|^2 - 2 (x c - |c|^2 / 2), and |x|^2 is the same for all c.
-        let halves: Vec<f32> = (0..self.len()).map(|k| 0.5 * dot(self.row(k), self.row(k))).collect();
+        let halves: Vec<f32> = (0..self.len())
+            .map(|k| 0.5 * dot(self.row(k), self.row(k)))
+            .collect();
         let of = |row: &[f32]| {
             let (mut best, mut place) = (f32::NEG_INFINITY, 0);
-            for (k, (centre, half)) in self.values.chunks_exact(self.stride).zip(&halves).enumerate() {
+            for (k, (centre, half)) in self
+                .values
+                .chunks_exact(self.stride)
+                .zip(&halves)
+                .enumerate()
+            {
                 let near = dot(row, centre) - half;
                 if near > best {
                     (best, place) = (near, k);
@@ -89,7 +121,11 @@ impl Rows {
             }
             place as u16
         };
-        others.values.par_chunks_exact(self.stride).map(of).collect()
+        others
+            .values
+            .par_chunks_exact(self.stride)
+            .map(of)
+            .collect()
     }
 }
 
@@ -111,10 +147,17 @@ mod tests {
     #[test]
     fn rows_of_a_few_kinds_are_told_apart() {
         let mut rng = Rng::new(5, "palette");
-        let kinds: Vec<[f32; 9]> = (0..20).map(|_| std::array::from_fn(|_| rng.normal())).collect();
-        let rows: Vec<f32> = (0..800).flat_map(|_| kinds[(20.0 * rng.uniform()) as usize]).collect();
+        let kinds: Vec<[f32; 9]> = (0..20)
+            .map(|_| std::array::from_fn(|_| rng.normal()))
+            .collect();
+        let rows: Vec<f32> = (0..800)
+            .flat_map(|_| kinds[(20.0 * rng.uniform()) as usize])
+            .collect();
         let rows: Vec<f32> = rows.into_iter().map(|v| v + 0.001 * rng.normal()).collect();
-        let Palette { rows: palette, labels } = palette(&rows, 9);
+        let Palette {
+            rows: palette,
+            labels,
+        } = palette(&rows, 9);
         assert_eq!((palette.len(), labels.len()), (50 * 9, 800));
         for (row, label) in rows.chunks_exact(9).zip(labels) {
             let own = &palette[usize::from(label) * 9..][..9];

@@ -1,7 +1,7 @@
 //! Furniture and household objects, in metres, that image classifiers recognise. Each object stands
 //! on y = 0 with its front towards +z.
 
-use super::props::{BRASS, DARKER, Look, Make, OWN, Piece, WOOD, piece};
+use super::props::{BRASS, BuildFn, DARKER, Look, OWN, Piece, WOOD, piece};
 use super::solid::Shape::{Ball, Block, Cone, Cylinder};
 use glam::Vec3;
 use std::f32::consts::{FRAC_PI_2, TAU};
@@ -23,7 +23,7 @@ const SPINES: [Vec3; 7] = [
 /// An object with its position in the room.
 pub struct Placed {
     pub name: &'static str,
-    pub make: Make,
+    pub make: BuildFn,
     /// Colour of the pieces that have no colour of their own.
     pub color: Vec3,
     pub at: [f32; 3],
@@ -33,9 +33,19 @@ pub struct Placed {
 
 /// Returns a round table with small objects on it and furniture around it.
 pub fn study() -> [Placed; 12] {
-    let [red, orange_peel, oak] = [Vec3::new(0.75, 0.1, 0.1), Vec3::new(0.95, 0.5, 0.08), Vec3::new(0.42, 0.27, 0.15)];
+    let [red, orange_peel, oak] = [
+        Vec3::new(0.75, 0.1, 0.1),
+        Vec3::new(0.95, 0.5, 0.08),
+        Vec3::new(0.42, 0.27, 0.15),
+    ];
     let top = 0.738;
-    let placed = |name, make: Make, color, at, yaw| Placed { name, make, color, at, yaw };
+    let placed = |name, make: BuildFn, color, at, yaw| Placed {
+        name,
+        make,
+        color,
+        at,
+        yaw,
+    };
     [
         placed("dining table", dining_table, oak, [0.0, 0.0, 0.0], 0.0),
         placed("table lamp", table_lamp, Vec3::ONE, [0.0, top, 0.0], 0.0),
@@ -43,32 +53,81 @@ pub fn study() -> [Placed; 12] {
         placed("coffee mug", coffee_mug, red, [-0.1, top, 0.38], 0.6),
         placed("candle", candle, Vec3::ONE, [-0.32, top, -0.2], 0.0),
         placed("bookcase", bookcase, Vec3::ONE, [0.0, 0.0, -1.5], 0.0),
-        placed("television", television, Vec3::ONE, [1.45, 0.0, -0.45], -FRAC_PI_2 + 0.3),
-        placed("washing machine", washing_machine, Vec3::ONE, [-1.4, 0.0, -0.45], FRAC_PI_2 - 0.3),
+        placed(
+            "television",
+            television,
+            Vec3::ONE,
+            [1.45, 0.0, -0.45],
+            -FRAC_PI_2 + 0.3,
+        ),
+        placed(
+            "washing machine",
+            washing_machine,
+            Vec3::ONE,
+            [-1.4, 0.0, -0.45],
+            FRAC_PI_2 - 0.3,
+        ),
         placed("umbrella", umbrella, red, [-1.05, 0.0, 1.05], 0.0),
         placed("dumbbell", dumbbell, Vec3::ONE, [-0.4, 0.0, 1.45], 0.5),
-        placed("soccer ball", soccer_ball, Vec3::ONE, [0.25, 0.0, 1.35], 0.3),
-        placed("traffic light", traffic_light, Vec3::ONE, [1.15, 0.0, 1.1], 0.8),
+        placed(
+            "soccer ball",
+            soccer_ball,
+            Vec3::ONE,
+            [0.25, 0.0, 1.35],
+            0.3,
+        ),
+        placed(
+            "traffic light",
+            traffic_light,
+            Vec3::ONE,
+            [1.15, 0.0, 1.1],
+            0.8,
+        ),
     ]
 }
 
 /// A bookcase full of books.
 fn bookcase() -> Vec<Piece> {
     let (width, height, depth, shelves) = (0.5, 1.7, 0.16, 5);
-    let mut pieces = vec![piece(Block, [0.0, 0.5 * height, -0.9 * depth], [width, 0.5 * height, 0.012], WOOD)];
-    pieces.extend([-1.0, 1.0].map(|side| piece(Block, [side * width, 0.5 * height, 0.0], [0.02, 0.5 * height, depth], WOOD)));
-    let clear = height / shelves as f32;
+    let mut pieces = vec![piece(
+        Block,
+        [0.0, 0.5 * height, -0.9 * depth],
+        [width, 0.5 * height, 0.012],
+        WOOD,
+    )];
+    pieces.extend([-1.0, 1.0].map(|side| {
+        piece(
+            Block,
+            [side * width, 0.5 * height, 0.0],
+            [0.02, 0.5 * height, depth],
+            WOOD,
+        )
+    }));
+    let shelf_spacing = height / shelves as f32;
     let mut book = 0;
     for shelf in 0..=shelves {
-        let floor = shelf as f32 * clear;
-        pieces.push(piece(Block, [0.0, floor.max(0.015), 0.0], [width, 0.015, depth], WOOD));
+        let floor = shelf as f32 * shelf_spacing;
+        pieces.push(piece(
+            Block,
+            [0.0, floor.max(0.015), 0.0],
+            [width, 0.015, depth],
+            WOOD,
+        ));
         let mut x = -width + 0.03;
         while shelf < shelves && x < width - 0.06 {
             // Heights and widths of the books have different periods, so that the pattern does not
             // repeat soon.
-            let (thick, tall) = (0.014 + 0.006 * (book * 5 % 4) as f32, 0.1 + 0.012 * (book * 7 % 5) as f32);
+            let (thick, tall) = (
+                0.014 + 0.006 * (book * 5 % 4) as f32,
+                0.1 + 0.012 * (book * 7 % 5) as f32,
+            );
             let look = Look::Painted(SPINES[book * 3 % SPINES.len()]);
-            pieces.push(piece(Block, [x + thick, floor + 0.015 + tall, -0.01], [thick, tall, 0.8 * depth], look));
+            pieces.push(piece(
+                Block,
+                [x + thick, floor + 0.015 + tall, -0.01],
+                [thick, tall, 0.8 * depth],
+                look,
+            ));
             x += 2.0 * thick + 0.004;
             book += 1;
         }
@@ -91,8 +150,9 @@ fn television() -> Vec<Piece> {
 /// A white box with a round window.
 fn washing_machine() -> Vec<Piece> {
     let glass = Look::Painted(Vec3::new(0.12, 0.15, 0.19));
-    let disc =
-        |radius: f32, z: f32, thick: f32, look: Look| piece(Cylinder, [0.0, 0.4, z], [radius, thick, radius], look).tilted(0.0, FRAC_PI_2);
+    let disc = |radius: f32, z: f32, thick: f32, look: Look| {
+        piece(Cylinder, [0.0, 0.4, z], [radius, thick, radius], look).tilted(0.0, FRAC_PI_2)
+    };
     vec![
         piece(Block, [0.0, 0.43, 0.0], [0.3, 0.43, 0.29], WHITE),
         disc(0.2, 0.295, 0.015, STEEL),
@@ -111,12 +171,29 @@ fn traffic_light() -> Vec<Piece> {
         piece(Cylinder, [0.0, 0.45, 0.0], [0.035, 0.42, 0.035], STEEL),
         piece(Block, [0.0, 1.2, 0.0], [0.15, 0.38, 0.1], BLACK),
     ];
-    let lights = [(1.45, Vec3::new(1.0, 0.12, 0.08)), (1.2, Vec3::new(0.45, 0.33, 0.05)), (0.95, Vec3::new(0.04, 0.25, 0.1))];
+    let lights = [
+        (1.45, Vec3::new(1.0, 0.12, 0.08)),
+        (1.2, Vec3::new(0.45, 0.33, 0.05)),
+        (0.95, Vec3::new(0.04, 0.25, 0.1)),
+    ];
     for (y, color) in lights {
         // The lights are visible from both sides.
         for side in [-1.0, 1.0] {
-            pieces.push(piece(Cylinder, [0.0, y, side * 0.1], [0.1, 0.012, 0.1], Look::Painted(color)).tilted(0.0, FRAC_PI_2));
-            pieces.push(piece(Block, [0.0, y + 0.1, side * 0.15], [0.11, 0.012, 0.05], BLACK));
+            pieces.push(
+                piece(
+                    Cylinder,
+                    [0.0, y, side * 0.1],
+                    [0.1, 0.012, 0.1],
+                    Look::Painted(color),
+                )
+                .tilted(0.0, FRAC_PI_2),
+            );
+            pieces.push(piece(
+                Block,
+                [0.0, y + 0.1, side * 0.15],
+                [0.11, 0.012, 0.05],
+                BLACK,
+            ));
         }
     }
     pieces
@@ -129,9 +206,17 @@ fn soccer_ball() -> Vec<Piece> {
 
 /// A bar between two weights.
 fn dumbbell() -> Vec<Piece> {
-    let disc = |x: f32, radius: f32| piece(Cylinder, [x, 0.13, 0.0], [radius, 0.035, radius], BLACK).tilted(FRAC_PI_2, 0.0);
+    let disc = |x: f32, radius: f32| {
+        piece(Cylinder, [x, 0.13, 0.0], [radius, 0.035, radius], BLACK).tilted(FRAC_PI_2, 0.0)
+    };
     let bar = piece(Cylinder, [0.0, 0.13, 0.0], [0.022, 0.3, 0.022], STEEL).tilted(FRAC_PI_2, 0.0);
-    vec![bar, disc(-0.17, 0.13), disc(-0.245, 0.105), disc(0.17, 0.13), disc(0.245, 0.105)]
+    vec![
+        bar,
+        disc(-0.17, 0.13),
+        disc(-0.245, 0.105),
+        disc(0.17, 0.13),
+        disc(0.245, 0.105),
+    ]
 }
 
 /// A lamp with a foot, a pole and a shade.
@@ -158,7 +243,12 @@ fn table_lamp() -> Vec<Piece> {
 fn orange() -> Vec<Piece> {
     vec![
         piece(Ball, [0.0, 0.075, 0.0], [0.078, 0.075, 0.078], OWN),
-        piece(Cylinder, [0.0, 0.15, 0.0], [0.008, 0.006, 0.008], Look::Fixed(Vec3::new(0.25, 0.4, 0.15))),
+        piece(
+            Cylinder,
+            [0.0, 0.15, 0.0],
+            [0.008, 0.006, 0.008],
+            Look::Fixed(Vec3::new(0.25, 0.4, 0.15)),
+        ),
     ]
 }
 
@@ -166,11 +256,20 @@ fn orange() -> Vec<Piece> {
 fn coffee_mug() -> Vec<Piece> {
     let mut pieces = vec![
         piece(Cylinder, [0.0, 0.075, 0.0], [0.062, 0.075, 0.062], OWN),
-        piece(Cylinder, [0.0, 0.147, 0.0], [0.056, 0.004, 0.056], Look::Fixed(Vec3::new(0.2, 0.1, 0.05))),
+        piece(
+            Cylinder,
+            [0.0, 0.147, 0.0],
+            [0.056, 0.004, 0.056],
+            Look::Fixed(Vec3::new(0.2, 0.1, 0.05)),
+        ),
     ];
     for k in 0..9 {
         let angle = FRAC_PI_2 - std::f32::consts::PI * k as f32 / 8.0;
-        let at = [0.062 + 0.045 * angle.cos(), 0.078 + 0.048 * angle.sin(), 0.0];
+        let at = [
+            0.062 + 0.045 * angle.cos(),
+            0.078 + 0.048 * angle.sin(),
+            0.0,
+        ];
         pieces.push(piece(Block, at, [0.006, 0.012, 0.012], OWN).tilted(angle, 0.0));
     }
     pieces
@@ -182,7 +281,12 @@ fn candle() -> Vec<Piece> {
         piece(Cylinder, [0.0, 0.01, 0.0], [0.085, 0.01, 0.085], BRASS),
         piece(Cylinder, [0.0, 0.14, 0.0], [0.035, 0.12, 0.035], WHITE),
         piece(Cylinder, [0.0, 0.27, 0.0], [0.004, 0.012, 0.004], BLACK),
-        piece(Ball, [0.0, 0.305, 0.0], [0.014, 0.03, 0.014], Look::Fixed(Vec3::new(1.0, 0.8, 0.25))),
+        piece(
+            Ball,
+            [0.0, 0.305, 0.0],
+            [0.014, 0.03, 0.014],
+            Look::Fixed(Vec3::new(1.0, 0.8, 0.25)),
+        ),
     ]
 }
 
@@ -205,7 +309,12 @@ fn umbrella() -> Vec<Piece> {
     ];
     for k in 0..8 {
         let angle = TAU * k as f32 / 8.0;
-        pieces.push(piece(Ball, [0.54 * angle.cos(), 1.11, 0.54 * angle.sin()], [0.02; 3], BLACK));
+        pieces.push(piece(
+            Ball,
+            [0.54 * angle.cos(), 1.11, 0.54 * angle.sin()],
+            [0.02; 3],
+            BLACK,
+        ));
     }
     pieces
 }

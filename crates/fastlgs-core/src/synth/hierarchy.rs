@@ -19,12 +19,15 @@ struct Node {
 }
 
 /// Largest number of solids in a leaf.
-const FEW: usize = 4;
+const LEAF_SIZE: usize = 4;
 
 impl Hierarchy {
     /// Builds the tree by median splits along the longest axis of each box.
     pub fn new(solids: &[Solid]) -> Self {
-        let mut tree = Self { nodes: Vec::new(), order: (0..solids.len() as u32).collect() };
+        let mut tree = Self {
+            nodes: Vec::new(),
+            order: (0..solids.len() as u32).collect(),
+        };
         let bounds: Vec<[Vec3; 2]> = solids.iter().map(Solid::bounds).collect();
         tree.split(&bounds, 0, solids.len());
         tree
@@ -32,12 +35,19 @@ impl Hierarchy {
 
     fn split(&mut self, bounds: &[[Vec3; 2]], from: usize, to: usize) {
         let place = self.nodes.len();
-        let around = self.order[from..to].iter().fold([Vec3::INFINITY, Vec3::NEG_INFINITY], |[low, high], i| {
-            let [l, h] = bounds[*i as usize];
-            [low.min(l), high.max(h)]
+        let around = self.order[from..to].iter().fold(
+            [Vec3::INFINITY, Vec3::NEG_INFINITY],
+            |[low, high], i| {
+                let [l, h] = bounds[*i as usize];
+                [low.min(l), high.max(h)]
+            },
+        );
+        self.nodes.push(Node {
+            bounds: around,
+            first: from as u32,
+            count: (to - from) as u32,
         });
-        self.nodes.push(Node { bounds: around, first: from as u32, count: (to - from) as u32 });
-        if to - from <= FEW {
+        if to - from <= LEAF_SIZE {
             return;
         }
         let axis = (around[1] - around[0]).max_position();
@@ -51,13 +61,21 @@ impl Hierarchy {
     }
 
     /// Returns the index of the first solid that a ray meets, and the crossing.
-    pub fn nearest(&self, solids: &[Solid], origin: Vec3, direction: Vec3) -> Option<(usize, Crossing)> {
+    pub fn nearest(
+        &self,
+        solids: &[Solid],
+        origin: Vec3,
+        direction: Vec3,
+    ) -> Option<(usize, Crossing)> {
         let inverse = direction.recip();
         let mut best: Option<(usize, Crossing)> = None;
         let mut stack = vec![0usize];
         while let Some(place) = stack.pop() {
             let node = &self.nodes[place];
-            let (a, b) = ((node.bounds[0] - origin) * inverse, (node.bounds[1] - origin) * inverse);
+            let (a, b) = (
+                (node.bounds[0] - origin) * inverse,
+                (node.bounds[1] - origin) * inverse,
+            );
             let (enter, exit) = (a.min(b).max_element(), a.max(b).min_element());
             if exit < enter.max(0.0) || best.is_some_and(|(_, hit)| enter > hit.t) {
                 continue;
@@ -88,13 +106,14 @@ mod tests {
     #[test]
     fn the_tree_finds_what_asking_everyone_finds() {
         let mut rng = Rng::new(1, "hierarchy");
-        let mut point = |reach: f32| Vec3::from_array(std::array::from_fn(|_| rng.range(-reach, reach)));
+        let mut point =
+            |reach: f32| Vec3::from_array(std::array::from_fn(|_| rng.range(-reach, reach)));
         let solids: Vec<Solid> = (0..200)
             .map(|k| Solid {
                 shape: [Shape::Ball, Shape::Block, Shape::Cylinder, Shape::Cone][k % 4],
                 centre: point(5.0),
                 half: point(0.3).abs() + 0.05,
-                turn: Mat3::from_rotation_y(k as f32),
+                rotation: Mat3::from_rotation_y(k as f32),
                 surface: Surface::plain(Vec3::ONE),
                 thing: k as u16 + 1,
             })
@@ -103,9 +122,14 @@ mod tests {
         let mut hits = 0;
         for _ in 0..2000 {
             let (origin, direction) = (point(6.0), point(1.0));
-            let all = solids.iter().enumerate().filter_map(|(i, s)| Some((i, s.hit(origin, direction)?.t)));
+            let all = solids
+                .iter()
+                .enumerate()
+                .filter_map(|(i, s)| Some((i, s.hit(origin, direction)?.t)));
             let nearest = all.min_by(|a, b| a.1.total_cmp(&b.1));
-            let found = tree.nearest(&solids, origin, direction).map(|(i, hit)| (i, hit.t));
+            let found = tree
+                .nearest(&solids, origin, direction)
+                .map(|(i, hit)| (i, hit.t));
             assert_eq!(found, nearest);
             hits += usize::from(found.is_some());
         }

@@ -3,11 +3,11 @@
 
 use super::furniture;
 use super::hierarchy::Hierarchy;
-use super::props::{self, Look, Make, Piece};
+use super::props::{self, BuildFn, Look, Piece};
 use super::solid::{Shape, Solid};
 use super::surface::Surface;
-use super::walks::{CORE, CORRIDOR, Ring, path, walk};
-use super::{Backdrop, Thing, World};
+use super::walks::{CORE, CORRIDOR, Ring, corridor_path, walk};
+use super::{Backdrop, SceneObject, World};
 use crate::rng::Rng;
 use crate::{Camera, Error, Result, image_io};
 use glam::{Mat3, Vec3};
@@ -17,8 +17,12 @@ use std::sync::Arc;
 
 /// Names of the room's objects and the files of their pictures. All pictures ship with
 /// scikit-image.
-pub const PICTURES: [(&str, &str); 4] =
-    [("cat", "chelsea.png"), ("coffee", "coffee.png"), ("rocket", "rocket.jpg"), ("astronaut", "astronaut.png")];
+pub const PICTURES: [(&str, &str); 4] = [
+    ("cat", "chelsea.png"),
+    ("coffee", "coffee.png"),
+    ("rocket", "rocket.jpg"),
+    ("astronaut", "astronaut.png"),
+];
 /// Textures of the room's floor and walls.
 pub const TEXTURES: [&str; 2] = ["gravel.png", "brick.png"];
 
@@ -43,18 +47,54 @@ pub enum Kind {
 
 /// All kinds, each with its name and a description for users.
 pub const KINDS: [(&str, Kind, &str); 13] = [
-    ("room", Kind::Room, "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room"),
-    ("study", Kind::Study, "a furnished room: a table with small objects, a bookcase, a television and other furniture"),
+    (
+        "room",
+        Kind::Room,
+        "four blocks with pictures of a cat, coffee, a rocket and an astronaut in a brick room",
+    ),
+    (
+        "study",
+        Kind::Study,
+        "a furnished room: a table with small objects, a bookcase, a television and other furniture",
+    ),
     ("table", Kind::Table, "twelve different objects on a table"),
-    ("twins", Kind::Twins, "three pairs of identical objects, side by side"),
+    (
+        "twins",
+        Kind::Twins,
+        "three pairs of identical objects, side by side",
+    ),
     ("nested", Kind::Nested, "objects with parts that have parts"),
-    ("containers", Kind::Containers, "cups on saucers, chests with drawers and bottles with labels"),
+    (
+        "containers",
+        Kind::Containers,
+        "cups on saucers, chests with drawers and bottles with labels",
+    ),
     ("thin", Kind::Thin, "wires, spokes and leaves"),
-    ("mirror", Kind::Mirror, "objects in front of a mirror, and a mirrored ball"),
-    ("glass", Kind::Glass, "objects behind a glass pane and a glass ball"),
-    ("dark", Kind::Dark, "the table with exposure and white balance that vary between views"),
-    ("sparse", Kind::Sparse, "the table, seen in only a few views (8 by default)"),
-    ("long", Kind::Long, "a walk along a corridor that forms a closed loop"),
+    (
+        "mirror",
+        Kind::Mirror,
+        "objects in front of a mirror, and a mirrored ball",
+    ),
+    (
+        "glass",
+        Kind::Glass,
+        "objects behind a glass pane and a glass ball",
+    ),
+    (
+        "dark",
+        Kind::Dark,
+        "the table with exposure and white balance that vary between views",
+    ),
+    (
+        "sparse",
+        Kind::Sparse,
+        "the table, seen in only a few views (8 by default)",
+    ),
+    (
+        "long",
+        Kind::Long,
+        "a walk along a corridor that forms a closed loop",
+    ),
     ("big", Kind::Big, "a thousand objects"),
 ];
 
@@ -75,7 +115,7 @@ const COLORS: [(&str, Vec3); 12] = [
 ];
 
 /// Height of the table top in metres.
-const TABLE: f32 = 0.75;
+const TABLE_HEIGHT: f32 = 0.75;
 
 impl Kind {
     /// Returns the kind with a name.
@@ -98,16 +138,34 @@ impl Kind {
     ///
     /// # Errors
     /// A picture is missing or damaged.
-    pub fn world(self, pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<World> {
+    pub fn world(
+        self,
+        pictures: &Path,
+        views: usize,
+        size: (u32, u32),
+        seed: u64,
+    ) -> Result<World> {
         let mut build = Builder::new(seed);
-        let ring = Ring { radius: 2.9, height: 1.75, wave: 0.35, target: Vec3::Y * (TABLE + 0.12), fov: 0.85 };
+        let ring = Ring {
+            radius: 2.9,
+            height: 1.75,
+            wave: 0.35,
+            target: Vec3::Y * (TABLE_HEIGHT + 0.12),
+            fov: 0.85,
+        };
         let mut cameras = ring.cameras(views, size);
         let mut exposures = vec![Vec3::ONE; views];
         match self {
             Self::Room => return room(pictures, views, size, seed),
             Self::Study => {
                 build.study();
-                let ring = Ring { radius: 3.3, height: 1.6, wave: 0.3, target: Vec3::Y * 0.65, fov: 0.8 };
+                let ring = Ring {
+                    radius: 3.3,
+                    height: 1.6,
+                    wave: 0.3,
+                    target: Vec3::Y * 0.65,
+                    fov: 0.8,
+                };
                 cameras = ring.cameras(views, size);
             }
             Self::Table | Self::Sparse => build.dozen(),
@@ -127,14 +185,27 @@ impl Kind {
             }
             Self::Big => {
                 build.thousand();
-                let ring = Ring { radius: 6.0, height: 4.2, wave: 0.5, target: Vec3::ZERO, fov: 0.9 };
+                let ring = Ring {
+                    radius: 6.0,
+                    height: 4.2,
+                    wave: 0.5,
+                    target: Vec3::ZERO,
+                    fov: 0.9,
+                };
                 cameras = ring.cameras(views, size);
             }
         }
-        let half = if self == Self::Long { CORRIDOR } else { Vec3::new(7.5, 3.0, 7.5) };
-        let wall = |a: [f32; 3], b: [f32; 3], grain: f32| Surface::Grain { colors: [a.into(), b.into()], grain };
+        let half = if self == Self::Long {
+            CORRIDOR
+        } else {
+            Vec3::new(7.5, 3.0, 7.5)
+        };
+        let wall = |a: [f32; 3], b: [f32; 3], grain: f32| Surface::Grain {
+            colors: [a.into(), b.into()],
+            grain,
+        };
         let backdrop = Backdrop {
-            half,
+            half_extents: half,
             floor: wall([0.35, 0.3, 0.25], [0.6, 0.53, 0.45], 3.0),
             walls: wall([0.5, 0.55, 0.6], [0.75, 0.78, 0.78], 1.6),
             ceiling: wall([0.8, 0.8, 0.78], [0.88, 0.88, 0.86], 1.0),
@@ -161,7 +232,7 @@ enum Material {
 
 /// Builds a world object by object.
 struct Builder {
-    things: Vec<Thing>,
+    things: Vec<SceneObject>,
     solids: Vec<Solid>,
     rng: Rng,
 }
@@ -175,13 +246,20 @@ struct Place {
 
 impl Builder {
     fn new(seed: u64) -> Self {
-        Self { things: Vec::new(), solids: Vec::new(), rng: Rng::new(seed, "synth things") }
+        Self {
+            things: Vec::new(),
+            solids: Vec::new(),
+            rng: Rng::new(seed, "synth things"),
+        }
     }
 
     /// Returns the id of the object with a name and parent. Creates the object if it does not
     /// exist.
     fn thing(&mut self, name: &str, parent: u16) -> u16 {
-        let thing = Thing { name: name.to_owned(), parent };
+        let thing = SceneObject {
+            name: name.to_owned(),
+            parent,
+        };
         let known = self.things.iter().position(|t| *t == thing);
         let place = known.unwrap_or_else(|| {
             self.things.push(thing);
@@ -191,18 +269,32 @@ impl Builder {
     }
 
     /// Adds an object. With `parts`, its parts become objects named "NAME's PART".
-    fn add(&mut self, name: &str, pieces: Vec<Piece>, material: Material, place: &Place, parts: bool) {
+    fn add(
+        &mut self,
+        name: &str,
+        pieces: Vec<Piece>,
+        material: Material,
+        place: &Place,
+        parts: bool,
+    ) {
         let whole = self.thing(name, 0);
         let to_world = Mat3::from_rotation_y(place.yaw);
         for piece in pieces {
             let path = if parts { piece.part.as_slice() } else { &[] };
-            let thing = path.iter().fold(whole, |parent, part| self.thing(&format!("{name}'s {part}"), parent));
+            let thing = path.iter().fold(whole, |parent, part| {
+                self.thing(&format!("{name}'s {part}"), parent)
+            });
             let own = Mat3::from_rotation_z(piece.tilt[0]) * Mat3::from_rotation_x(piece.tilt[1]);
             let surface = match (piece.look, material) {
                 (Look::Fixed(color), _) => Surface::plain(color),
-                (Look::Painted(color), _) => Surface::Grain { colors: [color * 0.93, (color * 1.03).min(Vec3::ONE)], grain: 2.0 },
+                (Look::Painted(color), _) => Surface::Grain {
+                    colors: [color * 0.93, (color * 1.03).min(Vec3::ONE)],
+                    grain: 2.0,
+                },
                 (Look::Football, _) => Surface::Football,
-                (Look::Own(factor), Material::Grain(color)) => Surface::grained(color * factor, 2.2),
+                (Look::Own(factor), Material::Grain(color)) => {
+                    Surface::grained(color * factor, 2.2)
+                }
                 (Look::Own(_), Material::Mirror) => Surface::Mirror(Vec3::splat(0.92)),
                 (Look::Own(_), Material::Glass) => Surface::Glass(Vec3::new(0.9, 0.97, 0.95)),
             };
@@ -210,7 +302,7 @@ impl Builder {
                 shape: piece.shape,
                 centre: place.at + place.scale * (to_world * piece.centre),
                 half: place.scale * piece.half,
-                turn: (to_world * own).transpose(),
+                rotation: (to_world * own).transpose(),
                 surface,
                 thing,
             });
@@ -222,14 +314,25 @@ impl Builder {
             shape: Shape::Block,
             centre,
             half,
-            turn: Mat3::IDENTITY,
-            surface: Surface::Grain { colors: [Vec3::new(0.4, 0.25, 0.13), Vec3::new(0.66, 0.45, 0.26)], grain: 6.0 },
+            rotation: Mat3::IDENTITY,
+            surface: Surface::Grain {
+                colors: [Vec3::new(0.4, 0.25, 0.13), Vec3::new(0.66, 0.45, 0.26)],
+                grain: 6.0,
+            },
             thing,
         };
         let table = self.thing("wooden table", 0);
-        self.solids.push(slab(Vec3::Y * (TABLE - 0.04), Vec3::new(1.35, 0.04, 1.35), table));
+        self.solids.push(slab(
+            Vec3::Y * (TABLE_HEIGHT - 0.04),
+            Vec3::new(1.35, 0.04, 1.35),
+            table,
+        ));
         for (x, z) in [(-1.2, -1.2), (-1.2, 1.2), (1.2, -1.2), (1.2, 1.2)] {
-            self.solids.push(slab(Vec3::new(x, 0.5 * (TABLE - 0.08), z), Vec3::new(0.06, 0.5 * (TABLE - 0.08), 0.06), table));
+            self.solids.push(slab(
+                Vec3::new(x, 0.5 * (TABLE_HEIGHT - 0.08), z),
+                Vec3::new(0.06, 0.5 * (TABLE_HEIGHT - 0.08), 0.06),
+                table,
+            ));
         }
     }
 
@@ -237,7 +340,11 @@ impl Builder {
     /// the circle as a fraction of a full turn.
     fn on_table(&mut self, radius: f32, turn: f32, scale: f32) -> Place {
         let (s, c) = (TAU * turn).sin_cos();
-        Place { at: Vec3::new(radius * c, TABLE, radius * s), scale, yaw: self.rng.range(0.0, TAU) }
+        Place {
+            at: Vec3::new(radius * c, TABLE_HEIGHT, radius * s),
+            scale,
+            yaw: self.rng.range(0.0, TAU),
+        }
     }
 
     /// Adds each catalogue entry once, with random colours and positions.
@@ -250,34 +357,78 @@ impl Builder {
         for (k, entry) in order.into_iter().enumerate() {
             let (name, make) = props::CATALOGUE[entry];
             let (color_name, color) = colors[entry];
-            let place = if k < 4 { self.on_table(0.42, k as f32 / 4.0, 0.42) } else { self.on_table(1.02, k as f32 / 8.0, 0.42) };
-            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+            let place = if k < 4 {
+                self.on_table(0.42, k as f32 / 4.0, 0.42)
+            } else {
+                self.on_table(1.02, k as f32 / 8.0, 0.42)
+            };
+            self.add(
+                &format!("{color_name} {name}"),
+                make(),
+                Material::Grain(color),
+                &place,
+                false,
+            );
         }
     }
 
     fn study(&mut self) {
-        for furniture::Placed { name, make, color, at, yaw } in furniture::study() {
-            self.add(name, make(), Material::Grain(color), &Place { at: at.into(), scale: 1.0, yaw }, false);
+        for furniture::Placed {
+            name,
+            make,
+            color,
+            at,
+            yaw,
+        } in furniture::study()
+        {
+            self.add(
+                name,
+                make(),
+                Material::Grain(color),
+                &Place {
+                    at: at.into(),
+                    scale: 1.0,
+                    yaw,
+                },
+                false,
+            );
         }
     }
 
     fn twins(&mut self) {
         self.table();
-        let pairs: [(&str, Make, usize, f32); 3] =
-            [("mug", props::mug, 0, 0.0), ("lamp", props::lamp, 1, 1.0), ("ball", || props::CATALOGUE[1].1(), 3, 2.0)];
+        let pairs: [(&str, BuildFn, usize, f32); 3] = [
+            ("mug", props::mug, 0, 0.0),
+            ("lamp", props::lamp, 1, 1.0),
+            ("ball", || props::CATALOGUE[1].1(), 3, 2.0),
+        ];
         for (name, make, color, third) in pairs {
             let (s, c) = (TAU * third / 3.0).sin_cos();
             for (twin, side) in [(1, -1.0), (2, 1.0)] {
                 // The pair is side by side as seen from the centre of the table.
-                let at = Vec3::new(0.75 * c - side * 0.27 * s, TABLE, 0.75 * s + side * 0.27 * c);
-                let place = Place { at, scale: 0.5, yaw: 0.0 };
-                self.add(&format!("{} {name} {twin}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, false);
+                let at = Vec3::new(
+                    0.75 * c - side * 0.27 * s,
+                    TABLE_HEIGHT,
+                    0.75 * s + side * 0.27 * c,
+                );
+                let place = Place {
+                    at,
+                    scale: 0.5,
+                    yaw: 0.0,
+                };
+                self.add(
+                    &format!("{} {name} {twin}", COLORS[color].0),
+                    make(),
+                    Material::Grain(COLORS[color].1),
+                    &place,
+                    false,
+                );
             }
         }
     }
 
     fn nested(&mut self) {
-        let things: [(&str, Make, usize); 6] = [
+        let things: [(&str, BuildFn, usize); 6] = [
             ("cart", props::cart, 0),
             ("cabinet", props::cabinet, 8),
             ("lamp", props::lamp, 9),
@@ -289,18 +440,27 @@ impl Builder {
     }
 
     /// Adds six objects with named parts on a circle on the table.
-    fn with_parts(&mut self, things: &[(&str, Make, usize); 6]) {
+    fn with_parts(&mut self, things: &[(&str, BuildFn, usize); 6]) {
         self.table();
         for (k, &(name, make, color)) in things.iter().enumerate() {
             let turn = k as f32 / 6.0;
             // Drawers face outwards.
-            let place = Place { yaw: FRAC_PI_2 - TAU * turn, ..self.on_table(0.88, turn, 0.55) };
-            self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, true);
+            let place = Place {
+                yaw: FRAC_PI_2 - TAU * turn,
+                ..self.on_table(0.88, turn, 0.55)
+            };
+            self.add(
+                &format!("{} {name}", COLORS[color].0),
+                make(),
+                Material::Grain(COLORS[color].1),
+                &place,
+                true,
+            );
         }
     }
 
     fn containers(&mut self) {
-        let things: [(&str, Make, usize); 6] = [
+        let things: [(&str, BuildFn, usize); 6] = [
             ("coffee set", props::cup_and_saucer, 0),
             ("chest", props::chest, 8),
             ("bottle", props::labelled_bottle, 2),
@@ -313,7 +473,7 @@ impl Builder {
 
     fn thin(&mut self) {
         self.table();
-        let things: [(&str, Make, usize); 6] = [
+        let things: [(&str, BuildFn, usize); 6] = [
             ("wire cube", props::wire_frame, 0),
             ("spoked wheel", props::spoked_wheel, 11),
             ("plant", props::plant, 8),
@@ -323,7 +483,13 @@ impl Builder {
         ];
         for (k, (name, make, color)) in things.into_iter().enumerate() {
             let place = self.on_table(0.8, k as f32 / 6.0, 0.65);
-            self.add(&format!("{} {name}", COLORS[color].0), make(), Material::Grain(COLORS[color].1), &place, false);
+            self.add(
+                &format!("{} {name}", COLORS[color].0),
+                make(),
+                Material::Grain(COLORS[color].1),
+                &place,
+                false,
+            );
         }
     }
 
@@ -334,33 +500,92 @@ impl Builder {
         for &k in places {
             let ((name, make), (color_name, color)) = (props::CATALOGUE[k], COLORS[k]);
             let place = self.on_table(0.95, k as f32 / 8.0, 0.45);
-            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+            self.add(
+                &format!("{color_name} {name}"),
+                make(),
+                Material::Grain(color),
+                &place,
+                false,
+            );
         }
     }
 
     fn mirrors(&mut self) {
         self.around(&[0, 1, 3, 4, 5, 7]);
-        self.add("mirror", props::slab(), Material::Mirror, &Place { at: Vec3::Y * TABLE, scale: 0.75, yaw: 0.3 }, false);
+        self.add(
+            "mirror",
+            props::slab(),
+            Material::Mirror,
+            &Place {
+                at: Vec3::Y * TABLE_HEIGHT,
+                scale: 0.75,
+                yaw: 0.3,
+            },
+            false,
+        );
         let place = self.on_table(0.95, 0.25, 0.5);
-        self.add("mirrored ball", props::CATALOGUE[1].1(), Material::Mirror, &place, false);
+        self.add(
+            "mirrored ball",
+            props::CATALOGUE[1].1(),
+            Material::Mirror,
+            &place,
+            false,
+        );
     }
 
     fn glass(&mut self) {
         self.around(&[0, 1, 3, 4, 5, 7]);
-        self.add("glass pane", props::slab(), Material::Glass, &Place { at: Vec3::Y * TABLE, scale: 0.75, yaw: 0.3 }, false);
+        self.add(
+            "glass pane",
+            props::slab(),
+            Material::Glass,
+            &Place {
+                at: Vec3::Y * TABLE_HEIGHT,
+                scale: 0.75,
+                yaw: 0.3,
+            },
+            false,
+        );
         let place = self.on_table(0.95, 0.25, 0.5);
-        self.add("glass ball", props::CATALOGUE[1].1(), Material::Glass, &place, false);
+        self.add(
+            "glass ball",
+            props::CATALOGUE[1].1(),
+            Material::Glass,
+            &place,
+            false,
+        );
     }
 
     fn corridor(&mut self) {
-        let walls = Surface::Grain { colors: [Vec3::new(0.6, 0.5, 0.4), Vec3::new(0.85, 0.76, 0.66)], grain: 9.0 };
+        let walls = Surface::Grain {
+            colors: [Vec3::new(0.6, 0.5, 0.4), Vec3::new(0.85, 0.76, 0.66)],
+            grain: 9.0,
+        };
         let centre = Vec3::Y * CORE.y;
-        self.solids.push(Solid { shape: Shape::Block, centre, half: CORE, turn: Mat3::IDENTITY, surface: walls, thing: 0 });
+        self.solids.push(Solid {
+            shape: Shape::Block,
+            centre,
+            half: CORE,
+            rotation: Mat3::IDENTITY,
+            surface: walls,
+            thing: 0,
+        });
         for k in 0..24 {
-            let ((name, make), (color_name, color)) = (props::CATALOGUE[k % 12], COLORS[(k + k / 12 * 5) % 12]);
+            let ((name, make), (color_name, color)) =
+                (props::CATALOGUE[k % 12], COLORS[(k + k / 12 * 5) % 12]);
             let out = if k % 2 == 0 { 1.18 } else { 0.8 };
-            let place = Place { at: path((k as f32 + 0.5) / 24.0) * out, scale: 0.75, yaw: self.rng.range(0.0, TAU) };
-            self.add(&format!("{color_name} {name}"), make(), Material::Grain(color), &place, false);
+            let place = Place {
+                at: corridor_path((k as f32 + 0.5) / 24.0) * out,
+                scale: 0.75,
+                yaw: self.rng.range(0.0, TAU),
+            };
+            self.add(
+                &format!("{color_name} {name}"),
+                make(),
+                Material::Grain(color),
+                &place,
+                false,
+            );
         }
     }
 
@@ -368,15 +593,37 @@ impl Builder {
         for k in 0..1000 {
             let (name, make) = props::CATALOGUE[self.rng.below(12)];
             let (color_name, color) = COLORS[self.rng.below(12)];
-            let at = Vec3::new((k % 40) as f32 - 19.5, 0.0, (k / 40) as f32 - 12.0) * Vec3::new(0.25, 0.0, 0.3);
-            let jitter = Vec3::new(self.rng.range(-0.02, 0.02), 0.0, self.rng.range(-0.04, 0.04));
-            let place = Place { at: at + jitter, scale: self.rng.range(0.17, 0.21), yaw: self.rng.range(0.0, TAU) };
-            self.add(&format!("{color_name} {name} {}", k + 1), make(), Material::Grain(color), &place, false);
+            let at = Vec3::new((k % 40) as f32 - 19.5, 0.0, (k / 40) as f32 - 12.0)
+                * Vec3::new(0.25, 0.0, 0.3);
+            let jitter = Vec3::new(
+                self.rng.range(-0.02, 0.02),
+                0.0,
+                self.rng.range(-0.04, 0.04),
+            );
+            let place = Place {
+                at: at + jitter,
+                scale: self.rng.range(0.17, 0.21),
+                yaw: self.rng.range(0.0, TAU),
+            };
+            self.add(
+                &format!("{color_name} {name} {}", k + 1),
+                make(),
+                Material::Grain(color),
+                &place,
+                false,
+            );
         }
     }
 
     fn finish(self, cameras: Vec<Camera>, exposures: Vec<Vec3>, backdrop: Backdrop) -> World {
-        World { tree: Hierarchy::new(&self.solids), things: self.things, cameras, exposures, solids: self.solids, backdrop }
+        World {
+            tree: Hierarchy::new(&self.solids),
+            objects: self.things,
+            cameras,
+            exposures,
+            solids: self.solids,
+            backdrop,
+        }
     }
 }
 
@@ -385,7 +632,10 @@ fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<Wo
     let load = |file: &str| {
         let path = pictures.join(file);
         if !path.is_file() {
-            return Err(Error::Invalid(format!("{}: the picture is missing; run 'fastlgs models install-offline'", path.display())));
+            return Err(Error::Invalid(format!(
+                "{}: the picture is missing; run 'fastlgs models install-offline'",
+                path.display()
+            )));
         }
         Ok(Arc::new(image_io::load_rgb(&path)?))
     };
@@ -400,16 +650,40 @@ fn room(pictures: &Path, views: usize, size: (u32, u32), seed: u64) -> Result<Wo
         let centre = Vec3::new(1.15 * angle.cos(), half.y, 1.15 * angle.sin());
         let turn = Mat3::from_rotation_y(rng.range(-0.6, 0.6) - angle);
         let thing = build.thing(name, 0);
-        build.solids.push(Solid { shape: Shape::Block, centre, half, turn, surface: Surface::Picture(picture), thing });
+        build.solids.push(Solid {
+            shape: Shape::Block,
+            centre,
+            half,
+            rotation: turn,
+            surface: Surface::Picture(picture),
+            thing,
+        });
     }
     let [floor, walls] = TEXTURES;
     let backdrop = Backdrop {
-        half: Vec3::new(5.0, 2.0, 5.0),
-        floor: Surface::Tiles { picture: load(floor)?, tint: Vec3::ONE, times: 0.5 },
-        walls: Surface::Tiles { picture: load(walls)?, tint: Vec3::new(1.0, 0.9, 0.82), times: 0.4 },
-        ceiling: Surface::Grain { colors: [Vec3::new(0.882, 0.871, 0.839); 2], grain: 1.0 },
+        half_extents: Vec3::new(5.0, 2.0, 5.0),
+        floor: Surface::Tiles {
+            picture: load(floor)?,
+            tint: Vec3::ONE,
+            repeats_per_unit: 0.5,
+        },
+        walls: Surface::Tiles {
+            picture: load(walls)?,
+            tint: Vec3::new(1.0, 0.9, 0.82),
+            repeats_per_unit: 0.4,
+        },
+        ceiling: Surface::Grain {
+            colors: [Vec3::new(0.882, 0.871, 0.839); 2],
+            grain: 1.0,
+        },
     };
-    let ring = Ring { radius: 3.4, height: 1.5, wave: 0.35, target: Vec3::new(0.0, 0.35, 0.0), fov: 0.85 };
+    let ring = Ring {
+        radius: 3.4,
+        height: 1.5,
+        wave: 0.35,
+        target: Vec3::new(0.0, 0.35, 0.0),
+        fov: 0.85,
+    };
     Ok(build.finish(ring.cameras(views, size), vec![Vec3::ONE; views], backdrop))
 }
 
@@ -422,26 +696,49 @@ mod tests {
     fn kinds_show_what_they_name() {
         for (name, kind, _) in KINDS.into_iter().filter(|k| k.1 != Kind::Room) {
             let views = if kind == Kind::Long { 40 } else { 6 };
-            let size = if kind == Kind::Big { (320, 240) } else { (120, 90) };
+            let size = if kind == Kind::Big {
+                (320, 240)
+            } else {
+                (120, 90)
+            };
             let world = kind.world(Path::new(""), views, size, 0).expect("a world");
-            let names: std::collections::BTreeSet<&str> = world.things.iter().map(|t| t.name.as_str()).collect();
-            assert_eq!(names.len(), world.things.len(), "{name}");
-            let mut seen = vec![false; world.things.len() + 1];
+            let names: std::collections::BTreeSet<&str> =
+                world.objects.iter().map(|t| t.name.as_str()).collect();
+            assert_eq!(names.len(), world.objects.len(), "{name}");
+            let mut seen = vec![false; world.objects.len() + 1];
             for view in 0..views {
                 let view = world.render(view, 1);
-                view.instances.labels.iter().for_each(|l| seen[usize::from(*l)] = true);
-                assert!(view.depth.iter().all(|d| *d > 0.0 && d.is_finite()), "{name}");
+                view.instances
+                    .labels
+                    .iter()
+                    .for_each(|l| seen[usize::from(*l)] = true);
+                assert!(
+                    view.depth.iter().all(|d| *d > 0.0 && d.is_finite()),
+                    "{name}"
+                );
             }
             // An object with parts is visible through its parts. With few views, other objects hide
             // some of the smallest ones.
-            let hidden = (1..seen.len()).filter(|&k| !seen[k] && !world.things.iter().any(|t| usize::from(t.parent) == k)).count();
-            assert!(hidden * 10 <= world.things.len(), "{name}: {hidden} of {} objects are not visible in any view", world.things.len());
+            let hidden = (1..seen.len())
+                .filter(|&k| !seen[k] && !world.objects.iter().any(|t| usize::from(t.parent) == k))
+                .count();
+            assert!(
+                hidden * 10 <= world.objects.len(),
+                "{name}: {hidden} of {} objects are not visible in any view",
+                world.objects.len()
+            );
         }
     }
 
     #[test]
     fn the_same_seed_makes_the_same_photo() {
-        let photo = |seed| Kind::Table.world(Path::new(""), 3, (60, 45), seed).expect("a world").render(1, 2).photo;
+        let photo = |seed| {
+            Kind::Table
+                .world(Path::new(""), 3, (60, 45), seed)
+                .expect("a world")
+                .render(1, 2)
+                .photo
+        };
         assert_eq!(photo(4), photo(4));
         assert_ne!(photo(4), photo(5));
     }

@@ -25,7 +25,7 @@ use surface::Surface;
 
 /// An object or a part of one.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Thing {
+pub struct SceneObject {
     /// Name, unique in its world.
     pub name: String,
     /// Id of the object that contains it; 0 for none.
@@ -34,7 +34,7 @@ pub struct Thing {
 
 /// The inside of a box that encloses the scene.
 struct Backdrop {
-    half: Vec3,
+    half_extents: Vec3,
     floor: Surface,
     walls: Surface,
     ceiling: Surface,
@@ -43,7 +43,7 @@ struct Backdrop {
 /// A generated scene with its cameras.
 pub struct World {
     /// Objects and parts. The id of an object is its index plus 1.
-    pub things: Vec<Thing>,
+    pub objects: Vec<SceneObject>,
     /// The views, sorted by name.
     pub cameras: Vec<Camera>,
     /// Exposure factor of each view, for each channel.
@@ -92,16 +92,25 @@ impl World {
                 let centre = trace(corner + 0.5);
                 let mut sum = Vec3::ZERO;
                 for s in 0..samples * samples {
-                    let offset = (Vec2::new((s % samples) as f32, (s / samples) as f32) + 0.5) / samples as f32;
+                    let offset = (Vec2::new((s % samples) as f32, (s / samples) as f32) + 0.5)
+                        / samples as f32;
                     sum += trace(corner + offset).color;
                 }
                 let color = 255.0 * exposure * sum / (samples * samples) as f32;
-                (centre.thing, centre.t, Rgb(color.to_array().map(|v| (v.clamp(0.0, 255.0) + 0.5) as u8)))
+                (
+                    centre.thing,
+                    centre.t,
+                    Rgb(color.to_array().map(|v| (v.clamp(0.0, 255.0) + 0.5) as u8)),
+                )
             })
             .collect();
         View {
             photo: RgbImage::from_fn(w, camera.height, |x, y| pixels[(y * w + x) as usize].2),
-            instances: LabelMap { width: w, height: camera.height, labels: pixels.iter().map(|p| p.0).collect() },
+            instances: LabelMap {
+                width: w,
+                height: camera.height,
+                labels: pixels.iter().map(|p| p.0).collect(),
+            },
             depth: pixels.iter().map(|p| p.1).collect(),
         }
     }
@@ -109,41 +118,85 @@ impl World {
     /// Removes an object and its parts, to render what they hide. Ids of other objects do not
     /// change. Returns whether the object exists.
     pub fn remove(&mut self, name: &str) -> bool {
-        let Some(number) = (1..).zip(&self.things).find(|(_, thing)| thing.name == name).map(|(number, _)| number) else { return false };
-        self.solids.retain(|solid| !chain(&self.things, solid.thing).any(|id| id == number));
+        let Some(number) = (1..)
+            .zip(&self.objects)
+            .find(|(_, thing)| thing.name == name)
+            .map(|(number, _)| number)
+        else {
+            return false;
+        };
+        self.solids
+            .retain(|solid| !containing_ids(&self.objects, solid.thing).any(|id| id == number));
         self.tree = Hierarchy::new(&self.solids);
         true
     }
 
     /// Returns the names of all objects that have not been removed.
     pub fn names(&self) -> Vec<&str> {
-        let there = |number: u16| self.solids.iter().any(|solid| chain(&self.things, solid.thing).any(|id| id == number));
-        (1..).zip(&self.things).filter(|(number, _)| there(*number)).map(|(_, thing)| thing.name.as_str()).collect()
+        let there = |number: u16| {
+            self.solids
+                .iter()
+                .any(|solid| containing_ids(&self.objects, solid.thing).any(|id| id == number))
+        };
+        (1..)
+            .zip(&self.objects)
+            .filter(|(number, _)| there(*number))
+            .map(|(_, thing)| thing.name.as_str())
+            .collect()
     }
 
     /// Returns the nearest hit of a ray, with its shaded colour.
     fn trace(&self, origin: Vec3, direction: Vec3, bounces: u32) -> Hit {
-        let Some((index, hit)) = self.tree.nearest(&self.solids, origin, direction) else { return self.backdrop.hit(origin, direction) };
+        let Some((index, hit)) = self.tree.nearest(&self.solids, origin, direction) else {
+            return self.backdrop.hit(origin, direction);
+        };
         let solid = &self.solids[index];
         let point = origin + hit.t * direction;
         let color = match &solid.surface {
             _ if bounces == 0 => Vec3::splat(0.5),
-            Surface::Mirror(tint) => *tint * self.trace(point, reflect(direction, hit.normal), bounces - 1).color,
-            Surface::Glass(tint) => self.through_glass(solid, point, direction.normalize(), hit.normal, *tint, bounces - 1),
+            Surface::Mirror(tint) => {
+                *tint
+                    * self
+                        .trace(point, reflect(direction, hit.normal), bounces - 1)
+                        .color
+            }
+            Surface::Glass(tint) => self.through_glass(
+                solid,
+                point,
+                direction.normalize(),
+                hit.normal,
+                *tint,
+                bounces - 1,
+            ),
             surface => surface.color(hit.local, point, hit.normal) * light(hit.normal),
         };
-        Hit { thing: solid.thing, t: hit.t, color }
+        Hit {
+            thing: solid.thing,
+            t: hit.t,
+            color,
+        }
     }
 
     /// Returns the colour of glass: reflected and refracted light, mixed by Schlick's approximation
     /// of the Fresnel equations. Ignores solids inside the glass.
-    fn through_glass(&self, solid: &Solid, point: Vec3, direction: Vec3, normal: Vec3, tint: Vec3, bounces: u32) -> Vec3 {
+    fn through_glass(
+        &self,
+        solid: &Solid,
+        point: Vec3,
+        direction: Vec3,
+        normal: Vec3,
+        tint: Vec3,
+        bounces: u32,
+    ) -> Vec3 {
         let facing = -direction.dot(normal);
         let straight = ((GLASS - 1.0) / (GLASS + 1.0)).powi(2);
         let mirrored = straight + (1.0 - straight) * (1.0 - facing.clamp(0.0, 1.0)).powi(5);
         let inside = refract(direction, normal, 1.0 / GLASS).unwrap_or(direction);
         let (exit, out) = match solid.hit(point, inside) {
-            Some(exit) => (point + exit.t * inside, refract(inside, -exit.normal, GLASS).unwrap_or(inside)),
+            Some(exit) => (
+                point + exit.t * inside,
+                refract(inside, -exit.normal, GLASS).unwrap_or(inside),
+            ),
             None => (point, direction),
         };
         let behind = self.trace(exit, out, bounces).color;
@@ -154,10 +207,21 @@ impl World {
 
 impl Backdrop {
     fn hit(&self, origin: Vec3, direction: Vec3) -> Hit {
-        let centre = Vec3::Y * self.half.y;
-        let inside = Solid { shape: Shape::Block, centre, half: self.half, turn: Mat3::IDENTITY, surface: self.walls.clone(), thing: 0 };
+        let centre = Vec3::Y * self.half_extents.y;
+        let inside = Solid {
+            shape: Shape::Block,
+            centre,
+            half: self.half_extents,
+            rotation: Mat3::IDENTITY,
+            surface: self.walls.clone(),
+            thing: 0,
+        };
         let Some([_, exit]) = inside.crossings(origin, direction) else {
-            return Hit { thing: 0, t: f32::INFINITY, color: Vec3::ZERO };
+            return Hit {
+                thing: 0,
+                t: f32::INFINITY,
+                color: Vec3::ZERO,
+            };
         };
         let point = origin + exit.t * direction;
         let surface = match exit.normal.y {
@@ -166,12 +230,16 @@ impl Backdrop {
             _ => &self.walls,
         };
         let shade = 0.75 + 0.25 * exit.normal.y.abs();
-        Hit { thing: 0, t: exit.t, color: surface.color(point, point, exit.normal) * shade }
+        Hit {
+            thing: 0,
+            t: exit.t,
+            color: surface.color(point, point, exit.normal) * shade,
+        }
     }
 }
 
 /// Yields an object's id and the ids of all objects that contain it, from small to large.
-fn chain(things: &[Thing], id: u16) -> impl Iterator<Item = u16> {
+fn containing_ids(things: &[SceneObject], id: u16) -> impl Iterator<Item = u16> {
     let above = |id: &u16| Some(things[usize::from(*id) - 1].parent).filter(|p| *p > 0);
     std::iter::successors(Some(id).filter(|id| *id > 0), above)
 }
@@ -201,7 +269,10 @@ mod tests {
     fn light_bends_by_snells_law() {
         let down = Vec3::new(0.6, -0.8, 0.0);
         let bent = refract(down, Vec3::Y, 1.0 / 1.5).expect("passes");
-        assert!((bent.length() - 1.0).abs() < 1e-5 && (bent.x - 0.4).abs() < 1e-5, "sin 0.6 becomes 0.4: {bent}");
+        assert!(
+            (bent.length() - 1.0).abs() < 1e-5 && (bent.x - 0.4).abs() < 1e-5,
+            "sin 0.6 becomes 0.4: {bent}"
+        );
         assert!(refract(down, Vec3::Y, 2.0).is_none(), "total reflection");
         assert_eq!(reflect(down, Vec3::Y), Vec3::new(0.6, 0.8, 0.0));
     }
@@ -214,36 +285,58 @@ mod tests {
             shape: Shape::Block,
             centre: Vec3::new(0.0, 1.0, 3.0),
             half: Vec3::new(2.0, 1.0, 0.1),
-            turn: Mat3::IDENTITY,
+            rotation: Mat3::IDENTITY,
             surface,
             thing: 1,
         };
-        let red = Surface::Grain { colors: [Vec3::X; 2], grain: 1.0 };
+        let red = Surface::Grain {
+            colors: [Vec3::X; 2],
+            grain: 1.0,
+        };
         let ball = Solid {
             shape: Shape::Ball,
             centre: Vec3::new(0.0, 1.0, -3.0),
             half: Vec3::splat(0.5),
-            turn: Mat3::IDENTITY,
+            rotation: Mat3::IDENTITY,
             surface: red,
             thing: 2,
         };
-        let grey = || Surface::Grain { colors: [Vec3::splat(0.5); 2], grain: 1.0 };
+        let grey = || Surface::Grain {
+            colors: [Vec3::splat(0.5); 2],
+            grain: 1.0,
+        };
         let solids = vec![wall, ball];
-        let camera = Camera::look_at("0.png", Vec3::new(0.0, 1.0, 0.0), Vec3::new(0.0, 1.0, 3.0), Vec3::Y, 21, 21, 0.8);
+        let camera = Camera::look_at(
+            "0.png",
+            Vec3::new(0.0, 1.0, 0.0),
+            Vec3::new(0.0, 1.0, 3.0),
+            Vec3::Y,
+            21,
+            21,
+            0.8,
+        );
         let world = World {
-            things: Vec::new(),
+            objects: Vec::new(),
             cameras: vec![camera],
             exposures: vec![Vec3::ONE],
             tree: Hierarchy::new(&solids),
             solids,
-            backdrop: Backdrop { half: Vec3::splat(8.0), floor: grey(), walls: grey(), ceiling: grey() },
+            backdrop: Backdrop {
+                half_extents: Vec3::splat(8.0),
+                floor: grey(),
+                walls: grey(),
+                ceiling: grey(),
+            },
         };
         let view = world.render(0, 1);
         let middle = 10 * 21 + 10;
         assert_eq!(view.instances.labels[middle], 1);
         assert!((view.depth[middle] - 2.9).abs() < 1e-3);
         let color = view.photo.get_pixel(10, 10).0;
-        assert!(color[0] > 150 && color[1] == 0, "the mirror shows the red ball behind the camera: {color:?}");
+        assert!(
+            color[0] > 150 && color[1] == 0,
+            "the mirror shows the red ball behind the camera: {color:?}"
+        );
         assert!(!view.instances.labels.contains(&2));
     }
 }

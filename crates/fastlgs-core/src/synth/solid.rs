@@ -26,7 +26,7 @@ pub struct Solid {
     /// Half extents along the solid's own axes.
     pub half: Vec3,
     /// Rotation from the world to the solid's own axes.
-    pub turn: Mat3,
+    pub rotation: Mat3,
     /// Appearance.
     pub surface: Surface,
     /// Id of the object that it belongs to; 0 for the background.
@@ -45,29 +45,44 @@ pub struct Crossing {
 }
 
 /// Smallest ray parameter of a hit, so that a ray does not hit the surface that it starts from.
-const NEAR: f32 = 1e-3;
+const MIN_HIT_T: f32 = 1e-3;
 
 impl Solid {
     /// Returns where a ray enters and leaves the solid, in this order; `None` if it misses. Both
     /// ray parameters may be negative.
     pub fn crossings(&self, origin: Vec3, direction: Vec3) -> Option<[Crossing; 2]> {
-        let o = self.turn * (origin - self.centre) / self.half;
-        let d = self.turn * direction / self.half;
+        let o = self.rotation * (origin - self.centre) / self.half;
+        let d = self.rotation * direction / self.half;
         let pair = match self.shape {
             Shape::Block => block(o, d),
-            Shape::Ball => quadric(o, d, Vec3::ONE, Vec3::ZERO, -1.0).map(|ts| ts.map(|t| (t, o + t * d))),
-            Shape::Cylinder => {
-                between_planes(o, d, quadric(o, d, Vec3::new(1.0, 0.0, 1.0), Vec3::ZERO, -1.0), |p| Vec3::new(p.x, 0.0, p.z))
+            Shape::Ball => {
+                quadric(o, d, Vec3::ONE, Vec3::ZERO, -1.0).map(|ts| ts.map(|t| (t, o + t * d)))
             }
+            Shape::Cylinder => between_planes(
+                o,
+                d,
+                quadric(o, d, Vec3::new(1.0, 0.0, 1.0), Vec3::ZERO, -1.0),
+                |p| Vec3::new(p.x, 0.0, p.z),
+            ),
             // x^2 + z^2 = ((1 - y) / 2)^2
             Shape::Cone => {
-                let sides = quadric(o, d, Vec3::new(1.0, -0.25, 1.0), Vec3::new(0.0, 0.5, 0.0), -0.25);
+                let sides = quadric(
+                    o,
+                    d,
+                    Vec3::new(1.0, -0.25, 1.0),
+                    Vec3::new(0.0, 0.5, 0.0),
+                    -0.25,
+                );
                 cone(o, d, sides)
             }
         }?;
         let crossing = |(t, normal): (f32, Vec3)| {
-            let world = (self.turn.transpose() * (normal / self.half)).normalize_or_zero();
-            Crossing { t, normal: world, local: o + t * d }
+            let world = (self.rotation.transpose() * (normal / self.half)).normalize_or_zero();
+            Crossing {
+                t,
+                normal: world,
+                local: o + t * d,
+            }
         };
         Some(pair.map(crossing))
     }
@@ -75,13 +90,17 @@ impl Solid {
     /// Returns the first crossing in front of the origin. It is the exit if the ray starts inside
     /// the solid.
     pub fn hit(&self, origin: Vec3, direction: Vec3) -> Option<Crossing> {
-        self.crossings(origin, direction)?.into_iter().find(|c| c.t > NEAR)
+        self.crossings(origin, direction)?
+            .into_iter()
+            .find(|c| c.t > MIN_HIT_T)
     }
 
     /// Returns the minimum and maximum corner of the bounding box in the world.
     pub fn bounds(&self) -> [Vec3; 2] {
-        let axes = self.turn.transpose();
-        let reach = axes.x_axis.abs() * self.half.x + axes.y_axis.abs() * self.half.y + axes.z_axis.abs() * self.half.z;
+        let axes = self.rotation.transpose();
+        let reach = axes.x_axis.abs() * self.half.x
+            + axes.y_axis.abs() * self.half.y
+            + axes.z_axis.abs() * self.half.z;
         [self.centre - reach, self.centre + reach]
     }
 }
@@ -121,7 +140,12 @@ fn quadric(o: Vec3, d: Vec3, weight: Vec3, slope: Vec3, constant: f32) -> Option
 
 /// Returns the two crossings of a cylinder between the planes y = -1 and y = 1. `sides` are the
 /// crossings of the infinite cylinder.
-fn between_planes(o: Vec3, d: Vec3, sides: Option<[f32; 2]>, normal: impl Fn(Vec3) -> Vec3) -> Option<[(f32, Vec3); 2]> {
+fn between_planes(
+    o: Vec3,
+    d: Vec3,
+    sides: Option<[f32; 2]>,
+    normal: impl Fn(Vec3) -> Vec3,
+) -> Option<[(f32, Vec3); 2]> {
     let [low, high] = match sides {
         Some(ts) => ts,
         None if o.x * o.x + o.z * o.z < 1.0 => [f32::NEG_INFINITY, f32::INFINITY],
@@ -129,8 +153,16 @@ fn between_planes(o: Vec3, d: Vec3, sides: Option<[f32; 2]>, normal: impl Fn(Vec
     };
     let (a, b) = ((-1.0 - o.y) / d.y, (1.0 - o.y) / d.y);
     let side = |t: f32| (t, normal(o + t * d));
-    let enter = if a.min(b) > low { (a.min(b), Vec3::Y * -d.y.signum()) } else { side(low) };
-    let exit = if a.max(b) < high { (a.max(b), Vec3::Y * d.y.signum()) } else { side(high) };
+    let enter = if a.min(b) > low {
+        (a.min(b), Vec3::Y * -d.y.signum())
+    } else {
+        side(low)
+    };
+    let exit = if a.max(b) < high {
+        (a.max(b), Vec3::Y * d.y.signum())
+    } else {
+        side(high)
+    };
     (enter.0 < exit.0).then_some([enter, exit])
 }
 
@@ -159,30 +191,67 @@ mod tests {
 
     fn solid(shape: Shape) -> Solid {
         let surface = Surface::plain(Vec3::ONE);
-        Solid { shape, centre: Vec3::new(1.0, 2.0, 3.0), half: Vec3::new(0.5, 1.0, 2.0), turn: Mat3::IDENTITY, surface, thing: 1 }
+        Solid {
+            shape,
+            centre: Vec3::new(1.0, 2.0, 3.0),
+            half: Vec3::new(0.5, 1.0, 2.0),
+            rotation: Mat3::IDENTITY,
+            surface,
+            thing: 1,
+        }
     }
 
     #[test]
     fn rays_cross_where_geometry_says() {
         // A ray along x through the centre: the half extent is 0.5. A cone has half its radius
         // there.
-        for (shape, reach) in [(Shape::Ball, 0.5), (Shape::Block, 0.5), (Shape::Cylinder, 0.5), (Shape::Cone, 0.25)] {
-            let [enter, exit] = solid(shape).crossings(Vec3::new(-3.0, 2.0, 3.0), Vec3::X).expect("a hit");
-            assert!((enter.t - (4.0 - reach)).abs() < 1e-5 && (exit.t - (4.0 + reach)).abs() < 1e-5, "{shape:?} {enter:?} {exit:?}");
-            assert!(enter.normal.x < -0.5 && exit.normal.x > 0.5, "{shape:?} {enter:?}");
-            assert!(solid(shape).crossings(Vec3::new(-3.0, 5.0, 3.0), Vec3::X).is_none(), "{shape:?}");
+        for (shape, reach) in [
+            (Shape::Ball, 0.5),
+            (Shape::Block, 0.5),
+            (Shape::Cylinder, 0.5),
+            (Shape::Cone, 0.25),
+        ] {
+            let [enter, exit] = solid(shape)
+                .crossings(Vec3::new(-3.0, 2.0, 3.0), Vec3::X)
+                .expect("a hit");
+            assert!(
+                (enter.t - (4.0 - reach)).abs() < 1e-5 && (exit.t - (4.0 + reach)).abs() < 1e-5,
+                "{shape:?} {enter:?} {exit:?}"
+            );
+            assert!(
+                enter.normal.x < -0.5 && exit.normal.x > 0.5,
+                "{shape:?} {enter:?}"
+            );
+            assert!(
+                solid(shape)
+                    .crossings(Vec3::new(-3.0, 5.0, 3.0), Vec3::X)
+                    .is_none(),
+                "{shape:?}"
+            );
         }
         // A ray from above hits the tip of the cone and the top of the other shapes.
-        for (shape, t) in [(Shape::Ball, 3.0), (Shape::Block, 3.0), (Shape::Cylinder, 3.0), (Shape::Cone, 3.0)] {
-            let hit = solid(shape).hit(Vec3::new(1.001, 6.0, 3.0), Vec3::NEG_Y).expect("a hit");
+        for (shape, t) in [
+            (Shape::Ball, 3.0),
+            (Shape::Block, 3.0),
+            (Shape::Cylinder, 3.0),
+            (Shape::Cone, 3.0),
+        ] {
+            let hit = solid(shape)
+                .hit(Vec3::new(1.001, 6.0, 3.0), Vec3::NEG_Y)
+                .expect("a hit");
             assert!((hit.t - t).abs() < 0.02, "{shape:?} {hit:?}");
         }
-        assert_eq!(solid(Shape::Block).bounds(), [Vec3::new(0.5, 1.0, 1.0), Vec3::new(1.5, 3.0, 5.0)]);
+        assert_eq!(
+            solid(Shape::Block).bounds(),
+            [Vec3::new(0.5, 1.0, 1.0), Vec3::new(1.5, 3.0, 5.0)]
+        );
     }
 
     #[test]
     fn a_ray_that_starts_inside_hits_from_inside() {
-        let hit = solid(Shape::Ball).hit(Vec3::new(1.0, 2.0, 3.0), Vec3::Y).expect("a hit");
+        let hit = solid(Shape::Ball)
+            .hit(Vec3::new(1.0, 2.0, 3.0), Vec3::Y)
+            .expect("a hit");
         assert!((hit.t - 1.0).abs() < 1e-5 && hit.normal.y > 0.9);
     }
 }

@@ -16,8 +16,12 @@ pub enum Surface {
     /// A picture on each face of a block.
     Picture(Arc<RgbImage>),
     /// A repeating picture on axis-aligned planes of the world. `tint` is a factor on its colours;
-    /// `times` is the number of repetitions in one world unit.
-    Tiles { picture: Arc<RgbImage>, tint: Vec3, times: f32 },
+    /// `repeats_per_unit` is the number of repetitions in one world unit.
+    Tiles {
+        picture: Arc<RgbImage>,
+        tint: Vec3,
+        repeats_per_unit: f32,
+    },
     /// A mirror with a tint.
     Mirror(Vec3),
     /// Tinted glass: it refracts light and reflects more at grazing angles.
@@ -33,7 +37,10 @@ impl Surface {
     /// Creates a surface with shades of one colour (0.55 to 1.15 times) and `grain` noise cells
     /// along the half extent.
     pub fn grained(color: Vec3, grain: f32) -> Self {
-        Self::Grain { colors: [color * 0.55, (color * 1.15).min(Vec3::ONE)], grain }
+        Self::Grain {
+            colors: [color * 0.55, (color * 1.15).min(Vec3::ONE)],
+            grain,
+        }
     }
 
     /// Returns the unlit colour (0 to 1) at a point. `local` is the point in the coordinates of the
@@ -55,7 +62,11 @@ impl Surface {
                 };
                 sample(picture, 0.5 + 0.5 * u, 0.5 - 0.5 * v)
             }
-            Self::Tiles { picture, tint, times } => {
+            Self::Tiles {
+                picture,
+                tint,
+                repeats_per_unit: times,
+            } => {
                 let (u, v) = if normal.y.abs() > 0.5 {
                     (world.x, world.z)
                 } else if normal.x.abs() > 0.5 {
@@ -74,15 +85,31 @@ impl Surface {
 fn football(direction: Vec3) -> Vec3 {
     let golden = 0.5 * (1.0 + 5f32.sqrt());
     let signs = [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)];
-    let around =
-        |a: f32, b: f32| signs.map(|(s, t)| [Vec3::new(0.0, s * a, t * b), Vec3::new(s * a, t * b, 0.0), Vec3::new(t * b, 0.0, s * a)]);
+    let around = |a: f32, b: f32| {
+        signs.map(|(s, t)| {
+            [
+                Vec3::new(0.0, s * a, t * b),
+                Vec3::new(s * a, t * b, 0.0),
+                Vec3::new(t * b, 0.0, s * a),
+            ]
+        })
+    };
     // Centres of the 12 pentagons and of the 20 hexagons.
     let pentagons = around(1.0, golden);
     let hexagons = around(1.0 / golden, golden);
     let cubes = signs.map(|(s, t)| [Vec3::new(s, t, -1.0), Vec3::new(s, t, 1.0), Vec3::ZERO]);
-    let mut near: Vec<f32> = [hexagons, cubes].concat().as_flattened().iter().map(|h| h.normalize_or_zero().dot(direction)).collect();
+    let mut near: Vec<f32> = [hexagons, cubes]
+        .concat()
+        .as_flattened()
+        .iter()
+        .map(|h| h.normalize_or_zero().dot(direction))
+        .collect();
     near.sort_by(|a, b| b.total_cmp(a));
-    let pentagon = pentagons.as_flattened().iter().map(|p| p.normalize().dot(direction)).fold(-1.0, f32::max);
+    let pentagon = pentagons
+        .as_flattened()
+        .iter()
+        .map(|p| p.normalize().dot(direction))
+        .fold(-1.0, f32::max);
     match (pentagon, near[0] - near[1]) {
         (pentagon, _) if pentagon > 0.94 => Vec3::splat(0.06),
         (_, seam) if seam < 0.012 => Vec3::splat(0.35),
@@ -94,14 +121,23 @@ fn football(direction: Vec3) -> Vec3 {
 /// corner, (1, 1) the lower right. Returns a colour in 0 to 1.
 fn sample(picture: &RgbImage, u: f32, v: f32) -> Vec3 {
     let (w, h) = (picture.width(), picture.height());
-    let (x, y) = (u.rem_euclid(1.0) * w as f32 - 0.5, v.rem_euclid(1.0) * h as f32 - 0.5);
+    let (x, y) = (
+        u.rem_euclid(1.0) * w as f32 - 0.5,
+        v.rem_euclid(1.0) * h as f32 - 0.5,
+    );
     let at = |i: f32, j: f32| {
-        let p = picture.get_pixel((i.max(0.0) as u32).min(w - 1), (j.max(0.0) as u32).min(h - 1));
+        let p = picture.get_pixel(
+            (i.max(0.0) as u32).min(w - 1),
+            (j.max(0.0) as u32).min(h - 1),
+        );
         Vec3::from(p.0.map(f32::from))
     };
     let (i, j) = (x.floor(), y.floor());
     let (fx, fy) = (x - i, y - j);
-    at(i, j).lerp(at(i + 1.0, j), fx).lerp(at(i, j + 1.0).lerp(at(i + 1.0, j + 1.0), fx), fy) / 255.0
+    at(i, j)
+        .lerp(at(i + 1.0, j), fx)
+        .lerp(at(i, j + 1.0).lerp(at(i + 1.0, j + 1.0), fx), fy)
+        / 255.0
 }
 
 /// Returns smooth value noise in 0 to 1 with one lattice cell per unit.
@@ -110,9 +146,12 @@ fn noise(p: Vec3) -> f32 {
     let f = p - cell;
     let f = f * f * (3.0 - 2.0 * f);
     let corner = |x: f32, y: f32, z: f32| {
-        let [x, y, z] = (cell + Vec3::new(x, y, z)).to_array().map(|v| v as i32 as u32);
+        let [x, y, z] = (cell + Vec3::new(x, y, z))
+            .to_array()
+            .map(|v| v as i32 as u32);
         // A simple integer hash. Its statistical quality does not matter.
-        let mut h = x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
+        let mut h =
+            x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
         h = (h ^ (h >> 13)).wrapping_mul(0x5bd1_e995);
         (h ^ (h >> 15)) as f32 / u32::MAX as f32
     };
@@ -130,7 +169,9 @@ mod tests {
 
     #[test]
     fn noise_is_smooth_and_fills_its_range() {
-        let values: Vec<f32> = (0..4000).map(|k| noise(Vec3::new(k as f32 * 0.01, 0.3, 0.7))).collect();
+        let values: Vec<f32> = (0..4000)
+            .map(|k| noise(Vec3::new(k as f32 * 0.01, 0.3, 0.7)))
+            .collect();
         assert!(values.windows(2).all(|w| (w[0] - w[1]).abs() < 0.03));
         assert!(values.iter().all(|v| (0.0..=1.0).contains(v)));
         assert!(values.iter().any(|v| *v < 0.25) && values.iter().any(|v| *v > 0.75));

@@ -17,8 +17,20 @@ impl Ring {
     pub fn cameras(&self, count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
         let at = |k: usize| {
             let angle = TAU * k as f32 / count as f32;
-            let eye = Vec3::new(self.radius * angle.cos(), self.height + self.wave * (3.0 * angle).sin(), self.radius * angle.sin());
-            Camera::look_at(&format!("{k:03}.png"), eye, self.target, Vec3::Y, width, height, self.fov)
+            let eye = Vec3::new(
+                self.radius * angle.cos(),
+                self.height + self.wave * (3.0 * angle).sin(),
+                self.radius * angle.sin(),
+            );
+            Camera::look_at(
+                &format!("{k:03}.png"),
+                eye,
+                self.target,
+                Vec3::Y,
+                width,
+                height,
+                self.fov,
+            )
         };
         (0..count).map(at).collect()
     }
@@ -30,7 +42,7 @@ pub const CORE: Vec3 = Vec3::new(3.5, 1.5, 3.5);
 
 /// Returns a point at floor level on the square path in the middle of the corridor. `along` is the
 /// fraction of one round, 0 to 1; other values wrap around.
-pub fn path(along: f32) -> Vec3 {
+pub fn corridor_path(along: f32) -> Vec3 {
     let side = 4.0 * along.rem_euclid(1.0);
     let r = 0.5 * (CORRIDOR.x + CORE.x);
     let t = 2.0 * side.fract() - 1.0;
@@ -51,10 +63,26 @@ pub fn walk(count: usize, (width, height): (u32, u32)) -> Vec<Camera> {
     let at = |k: usize| {
         let along = k as f32 / count as f32;
         // A moving average of the path, which rounds the corners.
-        let smooth = |from: f32| (0..9).map(|s| path(from + (s as f32 - 4.0) * 0.008)).sum::<Vec3>() / 9.0;
-        let (eye, ahead) = (smooth(along) + Vec3::Y * 1.25, smooth(along + 0.05) + Vec3::Y * 0.75);
+        let smooth = |from: f32| {
+            (0..9)
+                .map(|s| corridor_path(from + (s as f32 - 4.0) * 0.008))
+                .sum::<Vec3>()
+                / 9.0
+        };
+        let (eye, ahead) = (
+            smooth(along) + Vec3::Y * 1.25,
+            smooth(along + 0.05) + Vec3::Y * 0.75,
+        );
         let sway = Mat3::from_rotation_y(0.55 * (TAU * k as f32 / 17.0).sin());
-        Camera::look_at(&format!("{k:03}.png"), eye, eye + sway * (ahead - eye), Vec3::Y, width, height, 0.95)
+        Camera::look_at(
+            &format!("{k:03}.png"),
+            eye,
+            eye + sway * (ahead - eye),
+            Vec3::Y,
+            width,
+            height,
+            0.95,
+        )
     };
     (0..count).map(at).collect()
 }

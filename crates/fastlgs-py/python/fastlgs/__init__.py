@@ -1,4 +1,4 @@
-"""Open-vocabulary 3-D scenes: build them from photos and ask them for things by name. See README.md beside this package."""
+"""Open-vocabulary 3-D scenes: build them from photos, and find objects in them by text."""
 
 from . import _fastlgs, own
 from ._fastlgs import Answer, Camera, Error, Scene, __version__, make, synth, train
@@ -8,10 +8,11 @@ __all__ = ["Answer", "Camera", "Error", "Scene", "__version__", "make", "preproc
 
 
 def preprocess(photos, output, *, masks=None, **options):
-    """Photos to masks, key points, poses and points, in the scene folder `output`.
+    """Computes masks, key points, poses and points from photos, in the scene folder `output`.
 
-    `masks` may be an iterable, such as a generator, of (name of a photo, masks) or (name, masks, embeddings): bool (n, height, width), and float
-    (n, numbers). They are written beside the photos, and taken instead of the offline ones.
+    `masks` is an iterable, such as a generator, of (name of a photo, masks) or (name, masks,
+    embeddings). Masks are bool (n, height, width), embeddings float (n, numbers). They are written
+    beside the photos and used instead of those of the offline models.
     """
     if masks is not None:
         options = {**own.imported(photos, masks), **options}

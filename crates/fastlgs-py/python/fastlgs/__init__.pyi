@@ -10,10 +10,13 @@ __version__: str
 Path = Union[str, "PathLike[str]"]
 View = Union[str, "Camera"]
 Progress = Callable[[Dict[str, Any]], object]
-"""Hears {"stage", "done", "total", "note"}, while training also "loss", "psnr" and "gaussians", or {"warning"}."""
+"""Receives {"stage", "done", "total", "note"} or {"warning"}.
+
+Events of training have "loss", "psnr" and "gaussians" instead of "note".
+"""
 
 class Error(Exception):
-    """What went wrong, in one sentence that names the file and the mend."""
+    """An error of the pipeline: one sentence that names the file and the solution."""
 
 class Camera:
     """An undistorted pinhole camera: x right, y down, looking along +z (OpenCV)."""
@@ -40,7 +43,10 @@ class Camera:
         cy: Optional[float] = None,
         name: str = "camera",
     ) -> "Camera":
-        """From a pose as nerfstudio and OpenGL have it: camera to world, x right, y up, looking along -z; (3, 4) or (4, 4)."""
+        """Creates a camera from a pose of nerfstudio or OpenGL, (3, 4) or (4, 4).
+
+        The pose is camera to world, with x right, y up, looking along -z.
+        """
     @property
     def name(self) -> str: ...
     @property
@@ -51,11 +57,11 @@ class Camera:
         """fx, fy, cx, cy in pixels."""
     @property
     def world_to_camera(self) -> NDArray[np.float64]:
-        """(4, 4)."""
+        """World-to-camera matrix, (4, 4)."""
     def resized(self, width: int, height: int) -> "Camera": ...
 
 class Answer:
-    """What a question was answered with, in one view. True where something was found."""
+    """The answer to a query in one view. It is true if something was found."""
 
     @property
     def text(self) -> str: ...
@@ -63,28 +69,31 @@ class Answer:
     def found(self) -> bool: ...
     @property
     def confidence(self) -> float:
-        """The share of absent names whose best score is lower."""
+        """Score of the best object, 0 to 1: share of absent names whose best score is lower."""
     @property
     def view(self) -> str: ...
     @property
     def seen_best(self) -> Optional[str]:
-        """The view that shows the answer best, where this one hardly does."""
+        """Name of the view that shows most of the answer, if this view hardly shows it."""
     @property
     def mask(self) -> NDArray[np.bool_]:
-        """(height, width)."""
+        """Mask of the answer, (height, width)."""
     @property
     def relevancy(self) -> NDArray[np.float32]:
-        """Confidence of the object that each pixel shows, 0 to 1; (height, width)."""
+        """Confidence of the object at each pixel, 0 to 1; (height, width)."""
     @property
     def objects(self) -> List[Dict[str, Any]]:
-        """id, parent, support, score, bbox2d, bbox3d, pixels, gaussians."""
+        """Objects of the answer: id, parent, support, score, bbox2d, bbox3d, pixels, gaussians."""
     @property
     def report(self) -> Dict[str, Any]:
-        """The same as `fastlgs query --json` prints."""
+        """The report of the answer, as `fastlgs query --json` prints it."""
     def __bool__(self) -> bool: ...
 
 class Scene:
-    """A trained scene folder, opened on a device. Python goes on while it works; one thing is done at a time."""
+    """A trained scene folder, opened on a device.
+
+    Calls release the GIL, so that other threads continue. Calls on one scene run one after another.
+    """
 
     def __init__(
         self,
@@ -94,7 +103,11 @@ class Scene:
         clip_text: Optional[Path] = None,
         embed_text: Optional[Callable[[List[str]], NDArray[np.float32]]] = None,
     ) -> None:
-        """`embed_text` embeds texts where the masks were embedded by a model of the caller's: a list of str to (texts, numbers)."""
+        """Opens a trained scene folder.
+
+        `embed_text` replaces the text encoder, for scenes with imported embeddings. It takes a list
+        of str and returns float32 (texts, numbers).
+        """
     @property
     def path(self) -> pathlib.Path: ...
     @property
@@ -115,24 +128,50 @@ class Scene:
         false_alarms: Optional[float] = None,
         top_k: Optional[int] = None,
     ) -> Answer:
-        """Asks for a text, for what a pixel of the view (or several of one thing) shows, or for what a picture (uint8, (height, width, 3)) shows."""
+        """Finds objects by a text, by pixels of the view, or by a picture.
+
+        `point` is one pixel (x, y), or several pixels of one object. `image` is uint8
+        (height, width, 3).
+        """
     @property
     def objects(self) -> List[Dict[str, Any]]:
-        """id, parent (0 for none), support, views, area (largest share of a photo), code."""
+        """All objects and parts: id, parent (0 for none), support, views, area, code.
+
+        `area` is the largest share of a photo.
+        """
     def embeddings(self, id: int) -> NDArray[np.float32]:
-        """(views, numbers): with the offline encoder 384 that texts are compared by, 12 colours and materials, 64 more that count between objects, examples and pictures."""
+        """Returns the embeddings of an object's masks, (masks, numbers).
+
+        Embeddings of the offline encoder have 384 numbers for texts, and 12 for colours and
+        materials. Further 64 numbers are compared only between objects, examples and pictures.
+        """
     def render(self, view: Optional[View] = None, what: Literal["color", "depth", "feature", "objects"] = "color") -> NDArray[Any]:
-        """color uint8 (h, w, 3), depth float32 (h, w) in units of the scene, feature float32 (h, w, 3), objects uint16 (h, w)."""
+        """Renders a view.
+
+        `color` is uint8 (h, w, 3), `depth` float32 (h, w) in world units, `feature` float32
+        (h, w, 3), and `objects` uint16 (h, w).
+        """
     @property
     def object_lists(self) -> List[List[int]]:
-        """For each of the Gaussians' object_ids, 0 included, the objects that it stands for, from small to large: objects may overlap."""
+        """Objects of each value of the Gaussians' object_ids, 0 included, from small to large.
+
+        A Gaussian may belong to several objects, since objects may overlap.
+        """
     @property
     def gaussians(self) -> Dict[str, NDArray[Any]]:
-        """means, scales (n, 3), rotations (n, 4) as (w, x, y, z), opacities (n), sh (n, k, 3), features (n, 3), object_ids (n)."""
+        """All Gaussians as arrays.
+
+        means (n, 3), scales (n, 3), rotations (n, 4), opacities (n), sh (n, k, 3),
+        features (n, 3), object_ids (n). Means and scales are in world units; rotations are
+        (w, x, y, z).
+        """
     def select(self, ids: Sequence[int]) -> NDArray[np.uint32]:
-        """Places of the Gaussians of some objects and their parts, rising."""
+        """Returns the indices of the Gaussians of objects and their parts, ascending."""
     def export(self, path: Path, ids: Optional[Sequence[int]] = None, *, rest: bool = False) -> None:
-        """Writes the Gaussians of some objects, or with `rest` all others, as .ply, .spz, .sog or .glb."""
+        """Writes the Gaussians of objects, or with `rest` all others, as .ply, .spz, .sog or .glb.
+
+        Without `ids`, writes all Gaussians.
+        """
 
 def make(
     photos: Path,
@@ -144,13 +183,16 @@ def make(
     effort: Optional[Literal["quick", "standard", "paper", "like-paper"]] = None,
     **options: Any,
 ) -> Dict[str, Any]:
-    """From photos to a scene that answers, with an effort. Options are those of `fastlgs make`, with underscores."""
+    """Makes a queryable scene from photos.
+
+    Options are those of `fastlgs make`, with underscores.
+    """
 
 OwnMasks = Union[
     Tuple[str, NDArray[np.bool_]],
     Tuple[str, NDArray[np.bool_], Optional[NDArray[np.float32]]],
 ]
-"""The name of a photo, its masks (n, height, width), which may overlap, and their embeddings (n, numbers)."""
+"""Name of a photo, its masks (n, height, width), which may overlap, and embeddings (n, numbers)."""
 
 def preprocess(
     photos: Path,
@@ -162,21 +204,30 @@ def preprocess(
     seed: int = 0,
     **options: Any,
 ) -> Dict[str, Any]:
-    """Photos to masks, key points, poses and points. Options are those of `fastlgs preprocess`, with underscores.
+    """Computes masks, key points, poses and points from photos.
 
-    `masks`, of all photos, are written beside the photos and taken instead of the offline ones. A dict has the names of the photos as keys, and
-    masks or (masks, embeddings) as values.
+    Options are those of `fastlgs preprocess`, with underscores.
+
+    `masks` has masks of all photos. They are written beside the photos and used instead of those of
+    the offline models. A dict has names of photos as keys, and masks or (masks, embeddings) as
+    values.
     """
 
 def write_masks(
     photos: Path, name: str, masks: NDArray[np.bool_], embeddings: Optional[NDArray[np.float32]] = None
 ) -> None:
-    """Keeps the masks of one photo, and an embedding for each, where `preprocess` imports them from."""
+    """Writes the masks of a photo, and an embedding for each, for import by `preprocess`."""
 
 def train(scene: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any) -> Dict[str, Any]:
-    """Gaussians with colour and objects. Options are those of `fastlgs train`, with underscores."""
+    """Trains Gaussians and finds objects.
+
+    Options are those of `fastlgs train`, with underscores.
+    """
 
 def synth(
     kind: str, output: Path, *, progress: Optional[Progress] = None, device: str = "auto", seed: int = 0, **options: Any
 ) -> Dict[str, Any]:
-    """A generated scene with exact poses, depths and masks. Options are those of `fastlgs synth`, with underscores."""
+    """Generates photos with exact poses, depths and masks.
+
+    Options are those of `fastlgs synth`, with underscores.
+    """

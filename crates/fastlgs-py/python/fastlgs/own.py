@@ -1,4 +1,7 @@
-"""Masks and embeddings of the caller's own models: arrays, written beside the photos in the layouts that `preprocess` imports (docs/formats.md)."""
+"""Masks and embeddings of the caller's own models.
+
+Arrays are written beside the photos, in the layouts that `preprocess` imports (docs/formats.md).
+"""
 
 import io
 import json
@@ -10,7 +13,7 @@ import numpy as np
 from ._fastlgs import Error
 
 
-# Marks the files that are written here, which may be replaced.
+# Marks files of this module, which may be replaced.
 OWN = {"made_by": "fastlgs.write_masks"}
 
 
@@ -22,26 +25,29 @@ def _is_own(path):
 
 
 def _images(photos):
-    """The folder that photos lie in, as `preprocess` finds it."""
+    """Returns the folder of the photo files, as `preprocess` finds it."""
     named = [pathlib.Path(photos) / name for name in ("images", "input")]
     return next((folder for folder in named if folder.is_dir()), pathlib.Path(photos))
 
 
-# Endings of photos.
+# File name extensions of photos.
 PHOTOS = {".bmp", ".jfif", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 
 
 def write_masks(photos, name, masks, embeddings=None):
-    """Keeps the masks of a photo, bool (n, height, width), which may overlap, and an embedding for each, float (n, numbers)."""
+    """Writes the masks of a photo, and an embedding for each, for import by `preprocess`.
+
+    Masks are bool (n, height, width) and may overlap. Embeddings are float (n, numbers).
+    """
     masks = np.asarray(masks)
     if masks.ndim != 3 or masks.dtype not in (np.bool_, np.uint8):
-        raise Error(f"{name}: masks are bool of (n, height, width), not {masks.dtype} of {masks.shape}")
+        raise Error(f"{name}: masks must be bool of shape (n, height, width), not {masks.dtype} of {masks.shape}")
     photos = pathlib.Path(photos)
     if not (_images(photos) / name).is_file():
         raise Error(f"{_images(photos) / name}: there is no such photo")
     place = photos / "masks" / f"{name}.json"
     if place.exists() and not _is_own(place):
-        raise Error(f"{place}: this file was not written by write_masks; move it elsewhere")
+        raise Error(f"{place}: this file was not written by write_masks; move it to another folder")
     if embeddings is not None:
         embeddings = np.asarray(embeddings, dtype=np.float32)
         if embeddings.ndim != 2 or len(embeddings) != len(masks) or not np.isfinite(embeddings).all():
@@ -56,7 +62,7 @@ def write_masks(photos, name, masks, embeddings=None):
 
 
 def run_lengths(mask):
-    """COCO's run lengths of a mask: down each column, outside first."""
+    """Returns the run lengths of a mask as in COCO: by columns, starting with background."""
     flat = np.asarray(mask, dtype=bool).T.ravel()
     borders = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     counts = np.diff(np.concatenate([[0], borders, [flat.size]])).tolist()
@@ -71,27 +77,28 @@ def _write(path, data):
 
 
 def _entry(entry):
-    """Name, masks and embeddings (or None) of what an iterable of masks gave."""
+    """Returns name, masks and embeddings (or None) of an item of the iterable."""
     parts = tuple(entry) if isinstance(entry, (tuple, list)) else ()
     if len(parts) not in (2, 3) or not isinstance(parts[0], str):
-        raise Error("masks are (name of a photo, masks) or (name, masks, embeddings), or a dict of name to masks or (masks, embeddings)")
+        raise Error("masks are given as (name of a photo, masks) or (name, masks, embeddings), or as a dict of name to masks or (masks, embeddings)")
     return parts[0], parts[1], parts[2] if len(parts) == 3 else None
 
 
 def _entries(masks):
-    """All entries of an iterable, or of a dict."""
+    """Returns all entries of an iterable or a dict."""
     if not isinstance(masks, dict):
         try:
             return iter(masks)
         except TypeError:
-            raise Error(f"masks are an iterable or a dict, not {type(masks).__name__}") from None
+            raise Error(f"masks are given as an iterable or a dict, not {type(masks).__name__}") from None
     return ((name, *own) if isinstance(own, tuple) else (name, own) for name, own in masks.items())
 
 
 def imported(photos, masks):
-    """Writes what an iterable of (name, masks) or (name, masks, embeddings), or a dict, gives; returns the options that make `preprocess` read it.
+    """Writes masks from an iterable of (name, masks) or (name, masks, embeddings), or from a dict.
 
-    All photos need masks: files of an earlier call would be read for the others.
+    Returns the options with which `preprocess` imports them. All photos need masks: for others,
+    files of an earlier call would be imported.
     """
     embedded, given = set(), set()
     for entry in _entries(masks):
@@ -104,7 +111,7 @@ def imported(photos, masks):
     missing = sorted(path.name for path in _images(photos).iterdir() if path.suffix.lower() in PHOTOS and path.name not in given)
     missing = [name for name in missing if not name.startswith(".")]
     if missing:
-        raise Error(f"{photos}: {len(missing)} photos have no masks: {', '.join(missing[:5])}; give masks of all, an empty array for none")
+        raise Error(f"{photos}: {len(missing)} photos have no masks: {', '.join(missing[:5])}; give masks of all photos, and an empty array for photos without masks")
     if len(embedded) > 1:
         raise Error(f"{photos}: some photos have embeddings and some have none; give them for all or for none")
     return {"segmenter": "import", "encoder": "import"} if embedded.pop() else {"segmenter": "import"}

@@ -17,7 +17,11 @@ pub(crate) fn pixels_of(tile: u32, view: &View) -> impl Iterator<Item = (u32, u3
 
 /// Returns 1 for pixels of the image and 0 for pixels of the padding.
 pub(crate) fn shown(x: u32, y: u32, view: &View) -> f32 {
-    if x < view.size[0] && y < view.size[1] { 1.0 } else { 0.0 }
+    if x < view.size[0] && y < view.size[1] {
+        1.0
+    } else {
+        0.0
+    }
 }
 
 /// Blends all tiles into `frame` `[8][padded pixels]`. Channels that are not requested keep their
@@ -37,15 +41,29 @@ pub fn blend(
     let tiles: Vec<Vec<(usize, [f32; 8])>> = tile_order
         .par_iter()
         .map(|&tile| {
-            let pairs = &sorted_pairs[ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
-            let mut pixels: Vec<_> = pixels_of(tile, view).map(|(x, y)| ((x, y), shown(x, y, view), [0.0f32; 6])).collect();
+            let pairs = &sorted_pairs
+                [ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize];
+            let mut pixels: Vec<_> = pixels_of(tile, view)
+                .map(|(x, y)| ((x, y), shown(x, y, view), [0.0f32; 6]))
+                .collect();
             let mut walked = 0;
             for batch in pairs.chunks(BATCH) {
                 for &e in batch {
                     let splat = &splats[pair_gaussians[e as usize] as usize];
-                    let values = [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]];
+                    let values = [
+                        splat[1][2],
+                        splat[1][3],
+                        splat[2][0],
+                        splat[2][1],
+                        splat[2][2],
+                        splat[2][3],
+                    ];
                     for ((x, y), transmittance, sums) in &mut pixels {
-                        let w = alpha(splat, *x as f32 + 0.5 - splat[0][0], *y as f32 + 0.5 - splat[0][1]) * *transmittance;
+                        let w = alpha(
+                            splat,
+                            *x as f32 + 0.5 - splat[0][0],
+                            *y as f32 + 0.5 - splat[0][1],
+                        ) * *transmittance;
                         for (sum, value) in sums.iter_mut().zip(values) {
                             *sum += w * value;
                         }
@@ -53,21 +71,39 @@ pub fn blend(
                     }
                 }
                 walked += batch.len();
-                if pixels.iter().all(|p| p.1 < view.finished) {
+                if pixels.iter().all(|p| p.1 < view.min_transmittance) {
                     break;
                 }
             }
             let finished = |((x, y), t, sums): ((u32, u32), f32, [f32; 6])| {
                 let value = |c: usize| shown(x, y, view) * (sums[c] + t * background[c / 3][c % 3]);
-                (view.at(x, y), [value(0), value(1), value(2), value(3), value(4), value(5), t, walked as f32])
+                (
+                    view.index_of(x, y),
+                    [
+                        value(0),
+                        value(1),
+                        value(2),
+                        value(3),
+                        value(4),
+                        value(5),
+                        t,
+                        walked as f32,
+                    ],
+                )
             };
             pixels.into_iter().map(finished).collect()
         })
         .collect();
-    for (at, values) in tiles.into_iter().flatten() {
+    for (pixel_index, values) in tiles.into_iter().flatten() {
         for (c, value) in values.into_iter().enumerate() {
-            if c >= 6 || if c < 3 { channels.color() } else { channels.feature() } {
-                frame[c * n + at] = value;
+            if c >= 6
+                || if c < 3 {
+                    channels.color()
+                } else {
+                    channels.feature()
+                }
+            {
+                frame[c * n + pixel_index] = value;
             }
         }
     }

@@ -23,48 +23,88 @@ pub fn blend_backward(
 ) {
     let n = view.padded_pixels();
     // Number of channels whose gradient moves geometry.
-    let moving = match channels {
+    let geometry_channels = match channels {
         Channels::Feature => 0,
         Channels::Color | Channels::Both => 3,
         Channels::Coupled => 6,
     };
-    let trained = |c: usize| if c < 3 { channels.color() } else { channels.feature() };
+    let trained = |c: usize| {
+        if c < 3 {
+            channels.color()
+        } else {
+            channels.feature()
+        }
+    };
     let tiles: Vec<Vec<(u32, [f32; 12])>> = tile_order
         .par_iter()
         .map(|&tile| {
             let range = ranges[2 * tile as usize] as usize..ranges[2 * tile as usize + 1] as usize;
-            let walked = frame[7 * n + view.at(tile % view.tiles[0] * TILE, tile / view.tiles[0] * TILE)] as usize;
+            let walked = frame
+                [7 * n + view.index_of(tile % view.tiles[0] * TILE, tile / view.tiles[0] * TILE)]
+                as usize;
             let mut pixels: Vec<_> = pixels_of(tile, view)
                 .map(|(x, y)| {
-                    let at = view.at(x, y);
-                    let g: [f32; 6] = std::array::from_fn(|c| if trained(c) { gradient[c * n + at] } else { 0.0 });
-                    let r_dot_g: f32 = (0..moving).map(|c| frame[c * n + at] * g[c]).sum();
-                    (x as f32 + 0.5, y as f32 + 0.5, shown(x, y, view), r_dot_g, g)
+                    let at = view.index_of(x, y);
+                    let g: [f32; 6] = std::array::from_fn(|c| {
+                        if trained(c) {
+                            gradient[c * n + at]
+                        } else {
+                            0.0
+                        }
+                    });
+                    let r_dot_g: f32 = (0..geometry_channels)
+                        .map(|c| frame[c * n + at] * g[c])
+                        .sum();
+                    (
+                        x as f32 + 0.5,
+                        y as f32 + 0.5,
+                        shown(x, y, view),
+                        r_dot_g,
+                        g,
+                    )
                 })
                 .collect();
-            let backward = |(k, e): (usize, u32)| {
+            let backward = |(k, pair): (usize, u32)| {
                 let mut slot = [0.0f32; 12];
                 if k >= walked {
-                    return (e, slot);
+                    return (pair, slot);
                 }
-                let splat = &splats[pair_gaussians[e as usize] as usize];
-                let values = [splat[1][2], splat[1][3], splat[2][0], splat[2][1], splat[2][2], splat[2][3]];
+                let splat = &splats[pair_gaussians[pair as usize] as usize];
+                let values = [
+                    splat[1][2],
+                    splat[1][3],
+                    splat[2][0],
+                    splat[2][1],
+                    splat[2][2],
+                    splat[2][3],
+                ];
                 for (x, y, transmittance, r_dot_g, g) in &mut pixels {
                     let (dx, dy) = (*x - splat[0][0], *y - splat[0][1]);
                     let a = alpha(splat, dx, dy);
                     let w = a * *transmittance;
                     *transmittance -= w;
-                    let w_c_dot_g: f32 = w * (0..moving).map(|c| values[c] * g[c]).sum::<f32>();
+                    let w_c_dot_g: f32 = w
+                        * (0..geometry_channels)
+                            .map(|c| values[c] * g[c])
+                            .sum::<f32>();
                     *r_dot_g -= w_c_dot_g;
                     let p = w_c_dot_g - *r_dot_g * (a / (1.0 - a));
                     let add = [p * dx, p * dy, p * dx * dx, p * dx * dy, p * dy * dy, p];
-                    for (sum, value) in slot.iter_mut().zip(add.into_iter().chain(g.iter().map(|g| w * g))) {
+                    for (sum, value) in slot
+                        .iter_mut()
+                        .zip(add.into_iter().chain(g.iter().map(|g| w * g)))
+                    {
                         *sum += value;
                     }
                 }
-                (e, slot)
+                (pair, slot)
             };
-            sorted_pairs[range].iter().copied().enumerate().map(backward).collect()
+            sorted_pairs[range]
+                .iter()
+                .copied()
+                .enumerate()
+                .map(backward)
+                .collect()
         })
         .collect();
     let floats = 4 * channels.slot();

@@ -41,7 +41,12 @@ pub fn basis_slopes(d: Vec3) -> [Vec3; 15] {
         -0.590_043_6 * v(6.0 * d.x * d.y, 3.0 * (xx - yy), 0.0),
         2.890_611_4 * v(d.y * d.z, d.x * d.z, d.x * d.y),
         -0.457_045_8 * v(-2.0 * d.x * d.y, 4.0 * zz - xx - 3.0 * yy, 8.0 * d.y * d.z),
-        0.373_176_33 * v(-6.0 * d.x * d.z, -6.0 * d.y * d.z, 6.0 * zz - 3.0 * (xx + yy)),
+        0.373_176_33
+            * v(
+                -6.0 * d.x * d.z,
+                -6.0 * d.y * d.z,
+                6.0 * zz - 3.0 * (xx + yy),
+            ),
         -0.457_045_8 * v(4.0 * zz - 3.0 * xx - yy, -2.0 * d.x * d.y, 8.0 * d.x * d.z),
         1.445_305_7 * v(2.0 * d.x * d.z, -2.0 * d.y * d.z, xx - yy),
         -0.590_043_6 * v(3.0 * (xx - yy), -6.0 * d.x * d.y, 0.0),
@@ -60,7 +65,11 @@ mod tests {
             let (after, before) = (basis(d + axis * step), basis(d - axis * step));
             for k in 0..15 {
                 let measured = (after[k] - before[k]) / (2.0 * step);
-                assert!((measured - slopes[k].dot(axis)).abs() < 2e-3, "coefficient {k}: {measured} against {}", slopes[k].dot(axis));
+                assert!(
+                    (measured - slopes[k].dot(axis)).abs() < 2e-3,
+                    "coefficient {k}: {measured} against {}",
+                    slopes[k].dot(axis)
+                );
             }
         }
     }

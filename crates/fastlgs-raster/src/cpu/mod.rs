@@ -31,7 +31,7 @@ mod tile_load;
 mod tile_ranges;
 
 pub use adam::adam;
-pub(crate) use adam::{FEATURES, OPACITY, moved, opacity_penalty};
+pub(crate) use adam::{FEATURES, OPACITY, adam_step, opacity_penalty};
 pub use blend::blend;
 pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;
@@ -58,38 +58,43 @@ pub use ssim_rows::ssim_rows;
 pub use tile_load::tile_load;
 pub use tile_ranges::tile_ranges;
 
-use crate::view::{Job, Plane};
+use crate::view::{ChunkJob, Plane};
 
 /// Number of rows that one invocation of the loss passes computes; `shaders/shared/columns.wgsl`.
-pub const RUN: usize = 8;
+pub const ROWS_PER_INVOCATION: usize = 8;
 
 /// A projected Gaussian as blending reads it; layout in `shaders/project.wgsl`.
 pub type Splat = [[f32; 4]; 3];
 
 pub(crate) const ALPHA_MIN: f32 = 1.0 / 255.0;
 pub(crate) const ALPHA_MAX: f32 = 0.99;
-pub(crate) const SOLID: f32 = 0.9;
+pub(crate) const SOLID_OPACITY: f32 = 0.9;
 /// log2 of `ALPHA_MAX`: the upper bound of the exponent.
 pub(crate) const LOG2_ALPHA_MAX: f32 = -0.014_499_57;
 pub(crate) const DILATION: f32 = 0.3;
 pub(crate) const NEAR: f32 = 0.5;
 
 /// Returns the index ranges of a job's chunks, in order; `shaders/shared/chunks.wgsl`.
-pub(crate) fn chunks(job: &Job) -> impl Iterator<Item = std::ops::Range<usize>> {
+pub(crate) fn chunks(job: &ChunkJob) -> impl Iterator<Item = std::ops::Range<usize>> {
     let (n, length) = (job.n as usize, job.n.div_ceil(job.chunks) as usize);
     (0..job.chunks as usize).map(move |t| (t * length).min(n)..((t + 1) * length).min(n))
 }
 
 /// Returns alpha of a splat at the offset (dx, dy) in pixels from its mean; 0 below `ALPHA_MIN`.
 pub(crate) fn alpha(splat: &Splat, dx: f32, dy: f32) -> f32 {
-    let exponent = dx * (splat[0][2] * dx + splat[0][3] * dy) + (splat[1][0] * dy * dy + splat[1][1]);
+    let exponent =
+        dx * (splat[0][2] * dx + splat[0][3] * dy) + (splat[1][0] * dy * dy + splat[1][1]);
     let alpha = exponent.exp2().min(ALPHA_MAX);
     if alpha >= ALPHA_MIN { alpha } else { 0.0 }
 }
 
 /// Returns 1 if a pixel of a padded plane lies in the image, else 0.
-fn shown_plane(plane: &Plane, i: usize, j: usize) -> f32 {
-    if i < plane.size[0] as usize && j < plane.size[1] as usize { 1.0 } else { 0.0 }
+fn inside_plane(plane: &Plane, i: usize, j: usize) -> f32 {
+    if i < plane.size[0] as usize && j < plane.size[1] as usize {
+        1.0
+    } else {
+        0.0
+    }
 }
 
 /// Rendered value x and target value y of one pixel; `shaders/shared/window.wgsl`.
@@ -100,13 +105,17 @@ struct Compared {
     weight: f32,
 }
 
-fn shown_target(plane: &Plane, frame: &[f32], targets: &[u32], i: usize, j: usize) -> Compared {
+fn sample(plane: &Plane, frame: &[f32], targets: &[u32], i: usize, j: usize) -> Compared {
     let at = (j * 4 * plane.quads as usize) + i;
     let size = (4 * plane.quads * plane.rows) as usize;
-    let inside = shown_plane(plane, i, j);
+    let inside = inside_plane(plane, i, j);
     let x = inside * (plane.gain * frame[plane.channel as usize * size + at] + plane.offset);
     let packed = targets[plane.channel as usize / 3 * size + at];
     let counts = packed >= 0x8000_0000;
     let y = (packed >> (8 * (plane.channel % 3)) & 255) as f32 / 255.0;
-    Compared { x, y: if counts { y } else { x }, weight: if counts { inside } else { 0.0 } }
+    Compared {
+        x,
+        y: if counts { y } else { x },
+        weight: if counts { inside } else { 0.0 },
+    }
 }

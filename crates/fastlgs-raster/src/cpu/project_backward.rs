@@ -31,12 +31,21 @@ pub fn project_backward(
             continue;
         }
         let i = (g - view.first) as usize;
-        let put = |c: usize, value: f32| gradients[c * page + i] = value;
+        let store_gradient = |c: usize, value: f32| gradients[c * page + i] = value;
         let first = start - view.slot_first;
-        let runs = (first / view.fold + 1) * view.fold;
-        let pairs = std::iter::once(first).chain((runs..first + touched[g as usize]).step_by(view.fold as usize));
+        let runs = (first / view.fold_length + 1) * view.fold_length;
+        let pairs = std::iter::once(first)
+            .chain((runs..first + touched[g as usize]).step_by(view.fold_length as usize));
         let slot = sum_of(slots, floats, pairs.take(touched[g as usize] as usize));
-        match backward_one(view, channels, |c| params[c * page + i], touched[g as usize] > 0, &splats[g as usize], &slot, put) {
+        match backward_one(
+            view,
+            channels,
+            |c| params[c * page + i],
+            touched[g as usize] > 0,
+            &splats[g as usize],
+            &slot,
+            store_gradient,
+        ) {
             Some(length) if channels.color() => {
                 stats[g as usize] += length;
                 stats[(view.gaussians + g) as usize] += 1.0;
@@ -50,7 +59,10 @@ pub fn project_backward(
 fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f32; 12] {
     let mut slot = [0.0; 12];
     for pair in pairs {
-        for (sum, value) in slot[12 - floats..].iter_mut().zip(&slots[pair as usize * floats..]) {
+        for (sum, value) in slot[12 - floats..]
+            .iter_mut()
+            .zip(&slots[pair as usize * floats..])
+        {
             *sum += value;
         }
     }
@@ -58,7 +70,7 @@ fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f3
 }
 
 /// Propagates the summed slot of one Gaussian to its trained values and passes the gradients to
-/// `put(channel, gradient)`. Formulas and symbols are those of docs/gradients.md, sections 2 to 6.
+/// `store_gradient(channel, gradient)`. Formulas and symbols are those of docs/gradients.md, sections 2 to 6.
 /// Returns the length of the gradient of the projected mean in half-image units, 0 with frozen
 /// geometry, or none if the Gaussian is not drawn.
 pub(crate) fn backward_one(
@@ -79,13 +91,14 @@ pub(crate) fn backward_one(
     if !drawn {
         (0..12).step_by(3).for_each(|c| put3(c, Vec3::ZERO));
         (12..14).for_each(|c| put(c, 0.0));
-        (0..rest_len(view.sh_degree)).for_each(|k| (0..3).for_each(|c| put(BASE_CHANNELS + 3 * k + c, 0.0)));
+        (0..rest_len(view.sh_degree))
+            .for_each(|k| (0..3).for_each(|c| put(BASE_CHANNELS + 3 * k + c, 0.0)));
         return None;
     }
     let mean = param3(0);
     // Section 6. Colour is clamped at 0 from below.
-    let shown = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
-    let d_color = Vec3::select(shown, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
+    let positive = Vec3::new(splat[1][2], splat[1][3], splat[2][0]).cmpgt(Vec3::ZERO);
+    let d_color = Vec3::select(positive, Vec3::new(slot[6], slot[7], slot[8]), Vec3::ZERO);
     put3(11, SH_C0 * d_color);
     let mut d_mean_by_color = Vec3::ZERO;
     if view.sh_degree > 0 {
@@ -102,16 +115,26 @@ pub(crate) fn backward_one(
 
     // Section 3: the conic Q of the natural exponent, from the splat's base-2 exponent.
     let ln2 = std::f32::consts::LN_2;
-    let (q_xx, q_xy, q_yy) = (-2.0 * ln2 * splat[0][2], -ln2 * splat[0][3], -2.0 * ln2 * splat[1][0]);
-    let d_center = Vec2::new(q_xx * slot[0] + q_xy * slot[1], q_xy * slot[0] + q_yy * slot[1]);
+    let (q_xx, q_xy, q_yy) = (
+        -2.0 * ln2 * splat[0][2],
+        -ln2 * splat[0][3],
+        -2.0 * ln2 * splat[1][0],
+    );
+    let d_center = Vec2::new(
+        q_xx * slot[0] + q_xy * slot[1],
+        q_xy * slot[0] + q_yy * slot[1],
+    );
     let size = Vec2::new(view.size[0] as f32, view.size[1] as f32);
 
     // dL/dQ = -1/2 sum p d d^T; dL/dcov = -(Q dL/dQ) Q.
     let (d_q_xx, d_q_xy, d_q_yy) = (-0.5 * slot[2], -0.5 * slot[3], -0.5 * slot[4]);
     let (qdq_xx, qdq_xy) = (q_xx * d_q_xx + q_xy * d_q_xy, q_xx * d_q_xy + q_xy * d_q_yy);
     let (qdq_yx, qdq_yy) = (q_xy * d_q_xx + q_yy * d_q_xy, q_xy * d_q_xy + q_yy * d_q_yy);
-    let (mut d_cov_xx, mut d_cov_xy, mut d_cov_yy) =
-        (-(qdq_xx * q_xx + qdq_xy * q_xy), -(qdq_xx * q_xy + qdq_xy * q_yy), -(qdq_yx * q_xy + qdq_yy * q_yy));
+    let (mut d_cov_xx, mut d_cov_xy, mut d_cov_yy) = (
+        -(qdq_xx * q_xx + qdq_xy * q_xy),
+        -(qdq_xx * q_xy + qdq_xy * q_yy),
+        -(qdq_yx * q_xy + qdq_yy * q_yy),
+    );
 
     let t = Mat4::from_cols_array(&view.world_to_camera).transform_point3(mean);
     let (q, r) = covariance::rotation(&param);
@@ -136,9 +159,19 @@ pub(crate) fn backward_one(
         d_cov_yy += half * (xx / det - q_yy);
     }
     // Section 4: cov = A A^T + dilation, A = (J W) M, M = R S.
-    let (d_a_x, d_a_y) = (2.0 * (d_cov_xx * a_x + d_cov_xy * a_y), 2.0 * (d_cov_xy * a_x + d_cov_yy * a_y));
+    let (d_a_x, d_a_y) = (
+        2.0 * (d_cov_xx * a_x + d_cov_xy * a_y),
+        2.0 * (d_cov_xy * a_x + d_cov_yy * a_y),
+    );
     let d_m = [0, 1, 2].map(|k| jw_x * d_a_x[k] + jw_y * d_a_y[k]);
-    put3(3, s * Vec3::new(r.col(0).dot(d_m[0]), r.col(1).dot(d_m[1]), r.col(2).dot(d_m[2])));
+    put3(
+        3,
+        s * Vec3::new(
+            r.col(0).dot(d_m[0]),
+            r.col(1).dot(d_m[1]),
+            r.col(2).dot(d_m[2]),
+        ),
+    );
 
     let [d_r0, d_r1, d_r2] = [d_m[0] * s.x, d_m[1] * s.y, d_m[2] * s.z];
     let length = Vec4::from(q).length().max(1e-12);
@@ -147,9 +180,12 @@ pub(crate) fn backward_one(
     let d_unit = 2.0
         * Vec4::new(
             z * (d_r0.y - d_r1.x) + y * (d_r2.x - d_r0.z) + x * (d_r1.z - d_r2.y),
-            y * (d_r0.y + d_r1.x) + z * (d_r0.z + d_r2.x) + w * (d_r1.z - d_r2.y) - 2.0 * x * (d_r1.y + d_r2.z),
-            x * (d_r0.y + d_r1.x) + z * (d_r1.z + d_r2.y) + w * (d_r2.x - d_r0.z) - 2.0 * y * (d_r0.x + d_r2.z),
-            x * (d_r0.z + d_r2.x) + y * (d_r1.z + d_r2.y) + w * (d_r0.y - d_r1.x) - 2.0 * z * (d_r0.x + d_r1.y),
+            y * (d_r0.y + d_r1.x) + z * (d_r0.z + d_r2.x) + w * (d_r1.z - d_r2.y)
+                - 2.0 * x * (d_r1.y + d_r2.z),
+            x * (d_r0.y + d_r1.x) + z * (d_r1.z + d_r2.y) + w * (d_r2.x - d_r0.z)
+                - 2.0 * y * (d_r0.x + d_r2.z),
+            x * (d_r0.z + d_r2.x) + y * (d_r1.z + d_r2.y) + w * (d_r0.y - d_r1.x)
+                - 2.0 * z * (d_r0.x + d_r1.y),
         );
     let d_rotation = (d_unit - unit * unit.dot(d_unit)) / length;
 
@@ -157,17 +193,19 @@ pub(crate) fn backward_one(
     // Section 5: the mean, through the projected centre and through J.
     let d_jw_x = m[0] * d_a_x.x + m[1] * d_a_x.y + m[2] * d_a_x.z;
     let d_jw_y = m[0] * d_a_y.x + m[1] * d_a_y.y + m[2] * d_a_y.z;
-    let world = covariance::world(view);
+    let world = covariance::world_to_camera_rotation(view);
     let (d_j_x, d_j_y) = (world * d_jw_x, world * d_jw_y);
     let (inverse_z, focal) = (1.0 / t.z, Vec2::from(view.focal));
     let slope = covariance::clamped_slope(t, view);
     let unclamped = Vec2::select(slope.cmpeq(t.truncate() / t.z), Vec2::ONE, Vec2::ZERO);
-    let mut d_t = (focal * inverse_z * d_center).extend(-(focal * t.truncate() * inverse_z * inverse_z).dot(d_center));
+    let mut d_t = (focal * inverse_z * d_center)
+        .extend(-(focal * t.truncate() * inverse_z * inverse_z).dot(d_center));
     let d_slope = -focal * inverse_z * Vec2::new(d_j_x.z, d_j_y.z) * unclamped;
     d_t.x += d_slope.x * inverse_z;
     d_t.y += d_slope.y * inverse_z;
     let d_rows = Vec2::new(d_j_x.x - slope.x * d_j_x.z, d_j_y.y - slope.y * d_j_y.z);
-    d_t.z -= inverse_z * inverse_z * focal.dot(d_rows) + inverse_z * inverse_z * d_slope.dot(t.truncate());
+    d_t.z -= inverse_z * inverse_z * focal.dot(d_rows)
+        + inverse_z * inverse_z * d_slope.dot(t.truncate());
     put3(0, world.transpose() * d_t + d_mean_by_color);
     (0..4).for_each(|k| put(6 + k, d_rotation[k]));
     Some((d_center * 0.5 * size).length())

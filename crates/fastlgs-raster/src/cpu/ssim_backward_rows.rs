@@ -10,7 +10,9 @@ pub fn ssim_backward_rows(plane: &Plane, partials: &[f32], rows: &mut [f32]) {
     for j in 0..3 * h {
         for i in 0..w {
             let taps = i.saturating_sub(SSIM_RADIUS)..=(i + SSIM_RADIUS).min(w - 1);
-            rows[j * w + i] = taps.map(|k| window[k + SSIM_RADIUS - i] * partials[j * w + k]).sum();
+            rows[j * w + i] = taps
+                .map(|k| window[k + SSIM_RADIUS - i] * partials[j * w + k])
+                .sum();
         }
     }
 }

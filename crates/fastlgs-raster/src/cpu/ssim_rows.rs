@@ -1,6 +1,6 @@
 //! CPU twin of `shaders/ssim_rows.wgsl`: blur of the moments of SSIM.
 
-use super::shown_target;
+use super::sample;
 use crate::view::Plane;
 use fastlgs_core::metrics::{SSIM_RADIUS, ssim_window};
 
@@ -12,9 +12,12 @@ pub fn ssim_rows(plane: &Plane, frame: &[f32], targets: &[u32], rows: &mut [f32]
         for i in 0..w {
             let mut sums = [0.0f32; 4];
             for k in i.saturating_sub(SSIM_RADIUS)..=(i + SSIM_RADIUS).min(w - 1) {
-                let p = shown_target(plane, frame, targets, k, j);
+                let p = sample(plane, frame, targets, k, j);
                 let weight = window[k + SSIM_RADIUS - i];
-                for (sum, value) in sums.iter_mut().zip([p.x, p.y, p.x * p.x + p.y * p.y, p.x * p.y]) {
+                for (sum, value) in
+                    sums.iter_mut()
+                        .zip([p.x, p.y, p.x * p.x + p.y * p.y, p.x * p.y])
+                {
                     *sum += weight * value;
                 }
             }

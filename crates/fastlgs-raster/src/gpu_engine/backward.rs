@@ -7,7 +7,9 @@ use super::lists::Lists;
 use super::pages::Gaussians;
 use crate::channels::Channels;
 use crate::pass::Recorder;
-use crate::shader::shaders::{AdamBuffers, BlendBackwardBuffers, FoldSlotsBuffers, ProjectBackwardBuffers};
+use crate::shader::shaders::{
+    AdamBuffers, BlendBackwardBuffers, FoldSlotsBuffers, ProjectBackwardBuffers,
+};
 use crate::view::{Step, View, stride};
 use crate::{Error, Gpu, Result};
 use wgpu::Buffer;
@@ -28,26 +30,56 @@ impl Slots {
     /// Returns a buffer for all pairs, or for as many as one binding holds, and its windows. A
     /// Gaussian that starts in a window may have up to `tile_count` pairs beyond its end, so each
     /// window leaves room for them.
-    fn windows(&mut self, gpu: &Gpu, view: &View, channels: Channels) -> Result<(&Buffer, Vec<Window>)> {
+    fn windows(
+        &mut self,
+        gpu: &Gpu,
+        view: &View,
+        channels: Channels,
+    ) -> Result<(&Buffer, Vec<Window>)> {
         let bytes = 16 * channels.slot();
-        let most = (gpu.max_binding as usize / bytes).min(u32::MAX as usize / 2);
+        let max_slots = (gpu.max_binding as usize / bytes).min(u32::MAX as usize / 2);
         let (pairs, spare) = (view.pairs as usize, view.tile_count() as usize);
-        let window = if pairs <= most { pairs } else { most.saturating_sub(spare) };
+        let window = if pairs <= max_slots {
+            pairs
+        } else {
+            max_slots.saturating_sub(spare)
+        };
         if window == 0 && pairs > 0 {
-            return Err(Error::TooLarge(format!("{spare} tiles are too many for '{}'; lower the option size", gpu.name)));
+            return Err(Error::TooLarge(format!(
+                "{spare} tiles are too many for '{}'; lower the option size",
+                gpu.name
+            )));
         }
-        let needed = (bytes * pairs.min(most)) as u64;
+        let needed = (bytes * pairs.min(max_slots)) as u64;
         let slots = match self.0.take().filter(|slots| slots.size() >= needed) {
             Some(slots) => slots,
-            None => gpu.storage("gradient slots of the tile list", (needed + needed / 4).min((bytes * most) as u64))?,
+            None => gpu.storage(
+                "gradient slots of the tile list",
+                (needed + needed / 4).min((bytes * max_slots) as u64),
+            )?,
         };
         let slots = self.0.insert(slots);
-        if pairs <= most {
+        if pairs <= max_slots {
             return Ok((slots, vec![(0, u32::MAX / 2)]));
         }
-        let firsts: Vec<u32> = (0..pairs).step_by(window).map(|first| first as u32).collect();
+        let firsts: Vec<u32> = (0..pairs)
+            .step_by(window)
+            .map(|first| first as u32)
+            .collect();
         let last = *firsts.last().expect("pairs > most");
-        let windows = firsts.iter().map(|&f| (f, if f == last { (pairs - f as usize) as u32 + 1 } else { window as u32 })).collect();
+        let windows = firsts
+            .iter()
+            .map(|&f| {
+                (
+                    f,
+                    if f == last {
+                        (pairs - f as usize) as u32 + 1
+                    } else {
+                        window as u32
+                    },
+                )
+            })
+            .collect();
         Ok((slots, windows))
     }
 
@@ -63,23 +95,80 @@ impl Slots {
         frame: &Buffer,
         gradient: &Buffer,
     ) -> Result<()> {
-        let Lists { view, order, touched, first_pair, ranges, tile_order, sorted_pairs, pair_gaussians } = lists;
+        let Lists {
+            view,
+            order,
+            touched,
+            first_pair,
+            ranges,
+            tile_order,
+            sorted_pairs,
+            pair_gaussians,
+        } = lists;
         let Gaussians { splats, stats, .. } = g;
         let (slots, windows) = self.windows(gpu, view, channels)?;
         for (slot_first, slot_count) in windows {
-            let view = View { slot_first, slot_count, fold: gpu.shape.fold(), ..*view };
-            let of_frame = BlendBackwardBuffers { ranges, tile_order, sorted_pairs, pair_gaussians, splats, frame, gradient, slots };
-            r.run(&passes.blend_backward, &view, of_frame, gpu.shape.groups(view.tile_count()))?;
-            if view.fold > 1 {
-                let folded = FoldSlotsBuffers { touched, first_pair, pair_gaussians, slots };
-                let pairs = (view.pairs - slot_first).min(slot_count.saturating_add(view.tile_count()));
-                r.run(&passes.fold_slots, &view, folded, pairs.div_ceil(view.fold).div_ceil(GROUP))?;
+            let view = View {
+                slot_first,
+                slot_count,
+                fold_length: gpu.shape.fold(),
+                ..*view
+            };
+            let of_frame = BlendBackwardBuffers {
+                ranges,
+                tile_order,
+                sorted_pairs,
+                pair_gaussians,
+                splats,
+                frame,
+                gradient,
+                slots,
+            };
+            r.run(
+                &passes.blend_backward,
+                &view,
+                of_frame,
+                gpu.shape.groups(view.tile_count()),
+            )?;
+            if view.fold_length > 1 {
+                let folded = FoldSlotsBuffers {
+                    touched,
+                    first_pair,
+                    pair_gaussians,
+                    slots,
+                };
+                let pairs =
+                    (view.pairs - slot_first).min(slot_count.saturating_add(view.tile_count()));
+                r.run(
+                    &passes.fold_slots,
+                    &view,
+                    folded,
+                    pairs.div_ceil(view.fold_length).div_ceil(GROUP),
+                )?;
             }
             for page in &g.pages {
-                let view = View { first: page.first as u32, page: page.n as u32, ..view };
+                let view = View {
+                    first: page.first as u32,
+                    page: page.n as u32,
+                    ..view
+                };
                 let (params, gradients) = (&page.params, &page.gradients);
-                let of_slots = ProjectBackwardBuffers { params, splats, order, touched, first_pair, slots, gradients, stats };
-                r.run(&passes.project_backward, &view, of_slots, view.gaussians.div_ceil(GROUP))?;
+                let of_slots = ProjectBackwardBuffers {
+                    params,
+                    splats,
+                    order,
+                    touched,
+                    first_pair,
+                    slots,
+                    gradients,
+                    stats,
+                };
+                r.run(
+                    &passes.project_backward,
+                    &view,
+                    of_slots,
+                    view.gaussians.div_ceil(GROUP),
+                )?;
             }
         }
         Ok(())
@@ -89,9 +178,23 @@ impl Slots {
 /// Records Adam on all pages.
 pub fn adam(passes: &Training, r: &mut Recorder, g: &Gaussians, step: &Step) -> Result<()> {
     for page in &g.pages {
-        let step = Step { quads: stride(page.n) as u32 / 4, ..*step };
-        let (gradients, params, moment1, moment2) = (&page.gradients, &page.params, &page.moment1, &page.moment2);
-        r.run(&passes.adam, &step, AdamBuffers { gradients, params, moment1, moment2 }, step.quads.div_ceil(GROUP))?;
+        let step = Step {
+            quads: stride(page.n) as u32 / 4,
+            ..*step
+        };
+        let (gradients, params, moment1, moment2) =
+            (&page.gradients, &page.params, &page.moment1, &page.moment2);
+        r.run(
+            &passes.adam,
+            &step,
+            AdamBuffers {
+                gradients,
+                params,
+                moment1,
+                moment2,
+            },
+            step.quads.div_ceil(GROUP),
+        )?;
     }
     Ok(())
 }

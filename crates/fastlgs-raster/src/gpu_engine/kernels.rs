@@ -2,7 +2,7 @@
 
 use crate::channels::Channels;
 use crate::gpu::Gpu;
-use crate::pass::Typed;
+use crate::pass::TypedPass;
 use crate::shader::shaders;
 use crate::view::View;
 use std::collections::HashMap;
@@ -12,36 +12,36 @@ pub const GROUP: u32 = 64;
 
 /// Passes of sorting and prefix sums.
 pub struct Sorting {
-    pub radix_count: Typed<shaders::RadixCount>,
-    pub radix_scatter: Typed<shaders::RadixScatter>,
-    pub scan_chunks: Typed<shaders::ScanChunks>,
-    pub scan_apply: Typed<shaders::ScanApply>,
+    pub radix_count: TypedPass<shaders::RadixCount>,
+    pub radix_scatter: TypedPass<shaders::RadixScatter>,
+    pub scan_chunks: TypedPass<shaders::ScanChunks>,
+    pub scan_apply: TypedPass<shaders::ScanApply>,
 }
 
 /// Passes between projection and blending.
 pub struct Listing {
-    pub gather_counts: Typed<shaders::GatherCounts>,
-    pub emit: Typed<shaders::Emit>,
-    pub tile_ranges: Typed<shaders::TileRanges>,
-    pub tile_load: Typed<shaders::TileLoad>,
+    pub gather_counts: TypedPass<shaders::GatherCounts>,
+    pub emit: TypedPass<shaders::Emit>,
+    pub tile_ranges: TypedPass<shaders::TileRanges>,
+    pub tile_load: TypedPass<shaders::TileLoad>,
 }
 
 /// Passes of the loss and the optimiser.
 pub struct Training {
-    pub ssim_rows: Typed<shaders::SsimRows>,
-    pub ssim_columns: Typed<shaders::SsimColumns>,
-    pub ssim_backward_rows: Typed<shaders::SsimBackwardRows>,
-    pub loss_gradient: Typed<shaders::LossGradient>,
-    pub adam: Typed<shaders::Adam>,
+    pub ssim_rows: TypedPass<shaders::SsimRows>,
+    pub ssim_columns: TypedPass<shaders::SsimColumns>,
+    pub ssim_backward_rows: TypedPass<shaders::SsimBackwardRows>,
+    pub loss_gradient: TypedPass<shaders::LossGradient>,
+    pub adam: TypedPass<shaders::Adam>,
 }
 
 /// Passes that are compiled for each kind of frame.
 pub struct Blending {
-    pub project: Typed<shaders::Project>,
-    pub blend: Typed<shaders::Blend>,
-    pub blend_backward: Typed<shaders::BlendBackward>,
-    pub fold_slots: Typed<shaders::FoldSlots>,
-    pub project_backward: Typed<shaders::ProjectBackward>,
+    pub project: TypedPass<shaders::Project>,
+    pub blend: TypedPass<shaders::Blend>,
+    pub blend_backward: TypedPass<shaders::BlendBackward>,
+    pub fold_slots: TypedPass<shaders::FoldSlots>,
+    pub project_backward: TypedPass<shaders::ProjectBackward>,
 }
 
 /// Kind of a frame: its channels, and whether colour depends on the view.
@@ -57,7 +57,7 @@ pub struct Kernels {
     pub sorting: Sorting,
     pub listing: Listing,
     pub training: Training,
-    pub blend_ids: Typed<shaders::BlendIds>,
+    pub blend_ids: TypedPass<shaders::BlendIds>,
     blending: HashMap<Kind, Blending>,
 }
 
@@ -66,12 +66,22 @@ impl Kernels {
     pub fn new(gpu: &Gpu) -> Self {
         macro_rules! pass {
             () => {
-                Typed::new(gpu, Channels::Both, false)
+                TypedPass::new(gpu, Channels::Both, false)
             };
         }
         Self {
-            sorting: Sorting { radix_count: pass!(), radix_scatter: pass!(), scan_chunks: pass!(), scan_apply: pass!() },
-            listing: Listing { gather_counts: pass!(), emit: pass!(), tile_ranges: pass!(), tile_load: pass!() },
+            sorting: Sorting {
+                radix_count: pass!(),
+                radix_scatter: pass!(),
+                scan_chunks: pass!(),
+                scan_apply: pass!(),
+            },
+            listing: Listing {
+                gather_counts: pass!(),
+                emit: pass!(),
+                tile_ranges: pass!(),
+                tile_load: pass!(),
+            },
             training: Training {
                 ssim_rows: pass!(),
                 ssim_columns: pass!(),
@@ -88,11 +98,11 @@ impl Kernels {
     pub fn prepare(&mut self, gpu: &Gpu, kind: Kind) {
         let (channels, harmonics) = kind;
         self.blending.entry(kind).or_insert_with(|| Blending {
-            project: Typed::new(gpu, channels, harmonics),
-            blend: Typed::new(gpu, channels, harmonics),
-            blend_backward: Typed::new(gpu, channels, harmonics),
-            fold_slots: Typed::new(gpu, channels, harmonics),
-            project_backward: Typed::new(gpu, channels, harmonics),
+            project: TypedPass::new(gpu, channels, harmonics),
+            blend: TypedPass::new(gpu, channels, harmonics),
+            blend_backward: TypedPass::new(gpu, channels, harmonics),
+            fold_slots: TypedPass::new(gpu, channels, harmonics),
+            project_backward: TypedPass::new(gpu, channels, harmonics),
         });
     }
 

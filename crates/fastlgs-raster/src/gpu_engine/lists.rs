@@ -6,7 +6,9 @@ use super::pages::Gaussians;
 use super::sorting::Sort;
 use crate::engine::{Memory, tile_bits};
 use crate::pass::Recorder;
-use crate::shader::shaders::{EmitBuffers, GatherCountsBuffers, ProjectBuffers, TileLoadBuffers, TileRangesBuffers};
+use crate::shader::shaders::{
+    EmitBuffers, GatherCountsBuffers, ProjectBuffers, TileLoadBuffers, TileRangesBuffers,
+};
 use crate::view::View;
 use crate::{Error, Gpu, Result};
 use std::collections::HashMap;
@@ -30,7 +32,15 @@ pub struct Lists {
 
 impl Lists {
     fn bytes(&self) -> u64 {
-        let own = [&self.order, &self.touched, &self.first_pair, &self.ranges, &self.tile_order, &self.sorted_pairs, &self.pair_gaussians];
+        let own = [
+            &self.order,
+            &self.touched,
+            &self.first_pair,
+            &self.ranges,
+            &self.tile_order,
+            &self.sorted_pairs,
+            &self.pair_gaussians,
+        ];
         own.iter().map(|b| b.size()).sum()
     }
 }
@@ -51,15 +61,15 @@ struct Pairs {
 
 /// Builds tile lists, and caches those of views with frozen geometry.
 #[derive(Default)]
-pub struct ListMaker {
+pub struct ListBuilder {
     tiles: Option<Tiles>,
     pairs: Option<Pairs>,
     frozen: HashMap<usize, Lists>,
 }
 
-impl ListMaker {
+impl ListBuilder {
     /// Drops all cached lists, because the Gaussians have changed.
-    pub fn forget(&mut self) {
+    pub fn clear_cache(&mut self) {
         self.frozen.clear();
     }
 
@@ -69,17 +79,40 @@ impl ListMaker {
     }
 
     /// Runs projection and sorting. Returns the tile lists.
-    pub fn lists(&mut self, gpu: &Gpu, kernels: &Kernels, g: &Gaussians, mut view: View, kind: Kind, on_cpu: &mut usize) -> Result<Lists> {
+    pub fn lists(
+        &mut self,
+        gpu: &Gpu,
+        kernels: &Kernels,
+        g: &Gaussians,
+        mut view: View,
+        kind: Kind,
+        on_cpu: &mut usize,
+    ) -> Result<Lists> {
         self.prepare_tiles(gpu, &view)?;
         let n = g.n as u32;
         let groups = n.div_ceil(GROUP);
         let (sorting, listing) = (&kernels.sorting, &kernels.listing);
-        let Gaussians { touched, offsets, footprints, first_pair, .. } = g;
+        let Gaussians {
+            touched,
+            offsets,
+            footprints,
+            first_pair,
+            ..
+        } = g;
         let mut r = Recorder::new(gpu, *on_cpu);
         project(kernels, &mut r, g, &view, kind)?;
         let side = g.sort.record(gpu, sorting, &mut r, n, 24)?;
         let order = &g.sort.values[side];
-        r.run(&listing.gather_counts, &view, GatherCountsBuffers { order, touched, offsets }, groups)?;
+        r.run(
+            &listing.gather_counts,
+            &view,
+            GatherCountsBuffers {
+                order,
+                touched,
+                offsets,
+            },
+            groups,
+        )?;
         g.scan.record(gpu, sorting, &mut r, offsets, n)?;
         *on_cpu = r.submit();
         // The pairs are counted before any is written, so no list can overflow.
@@ -89,18 +122,52 @@ impl ListMaker {
             return Err(Error::TooLarge(reason.to_owned()));
         }
         self.prepare_pairs(gpu, view.pairs as usize)?;
-        let (pairs, tiles) = (self.pairs.as_ref().expect("prepared"), self.tiles.as_ref().expect("prepared"));
+        let (pairs, tiles) = (
+            self.pairs.as_ref().expect("prepared"),
+            self.tiles.as_ref().expect("prepared"),
+        );
         let mut r = Recorder::new(gpu, *on_cpu);
-        let (pair_tiles, pair_gaussians, ranges) = (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
-        let emitted = EmitBuffers { order, offsets, footprints, touched, pair_tiles, pair_gaussians, first_pair };
-        r.run(&listing.emit, &view, emitted, (n * gpu.shape.writers()).div_ceil(GROUP))?;
-        let sorted = pairs.sort.record(gpu, sorting, &mut r, view.pairs, tile_bits(&view))?;
+        let (pair_tiles, pair_gaussians, ranges) =
+            (&pairs.sort.keys[0], &pairs.gaussians, &tiles.ranges);
+        let emitted = EmitBuffers {
+            order,
+            offsets,
+            footprints,
+            touched,
+            pair_tiles,
+            pair_gaussians,
+            first_pair,
+        };
+        r.run(
+            &listing.emit,
+            &view,
+            emitted,
+            (n * gpu.shape.writers()).div_ceil(GROUP),
+        )?;
+        let sorted = pairs
+            .sort
+            .record(gpu, sorting, &mut r, view.pairs, tile_bits(&view))?;
         r.clear(ranges);
         let sorted_tiles = &pairs.sort.keys[sorted];
-        r.run(&listing.tile_ranges, &view, TileRangesBuffers { sorted_tiles, ranges }, view.pairs.div_ceil(GROUP))?;
+        r.run(
+            &listing.tile_ranges,
+            &view,
+            TileRangesBuffers {
+                sorted_tiles,
+                ranges,
+            },
+            view.pairs.div_ceil(GROUP),
+        )?;
         let keys = &tiles.sort.keys[0];
-        r.run(&listing.tile_load, &view, TileLoadBuffers { ranges, keys }, view.tile_count().div_ceil(GROUP))?;
-        let ordered = tiles.sort.record(gpu, sorting, &mut r, view.tile_count(), 8)?;
+        r.run(
+            &listing.tile_load,
+            &view,
+            TileLoadBuffers { ranges, keys },
+            view.tile_count().div_ceil(GROUP),
+        )?;
+        let ordered = tiles
+            .sort
+            .record(gpu, sorting, &mut r, view.tile_count(), 8)?;
         *on_cpu = r.submit();
         Ok(Lists {
             view,
@@ -126,7 +193,11 @@ impl ListMaker {
         id: usize,
         on_cpu: &mut usize,
     ) -> Result<Lists> {
-        let known = self.frozen.get(&id).filter(|l| same_camera(&l.view, &view)).cloned();
+        let known = self
+            .frozen
+            .get(&id)
+            .filter(|l| same_camera(&l.view, &view))
+            .cloned();
         if let Some(lists) = known {
             let mut r = Recorder::new(gpu, *on_cpu);
             project(kernels, &mut r, g, &view, kind)?;
@@ -135,7 +206,11 @@ impl ListMaker {
         }
         let lists = self.lists(gpu, kernels, g, view, kind, on_cpu)?;
         if self.frozen.values().map(Lists::bytes).sum::<u64>() < CACHE_LIMIT {
-            let (pairs, n, tiles) = (lists.view.pairs, lists.view.gaussians, lists.view.tile_count());
+            let (pairs, n, tiles) = (
+                lists.view.pairs,
+                lists.view.gaussians,
+                lists.view.tile_count(),
+            );
             let mut r = Recorder::new(gpu, 0);
             let mut keep = |from: &Buffer, words: u32| -> Result<Buffer> {
                 let to = gpu.storage("a view's lists", 4 * u64::from(words))?;
@@ -162,7 +237,11 @@ impl ListMaker {
         if self.tiles.as_ref().is_none_or(|t| t.size != view.size) {
             let tiles = view.tile_count();
             let ranges = gpu.storage("tile ranges", 8 * u64::from(tiles))?;
-            self.tiles = Some(Tiles { size: view.size, ranges, sort: Sort::new(gpu, "tile order", tiles as usize)? });
+            self.tiles = Some(Tiles {
+                size: view.size,
+                ranges,
+                sort: Sort::new(gpu, "tile order", tiles as usize)?,
+            });
         }
         Ok(())
     }
@@ -175,26 +254,57 @@ impl ListMaker {
             self.pairs = None;
             let gaussians = gpu.storage("the tile list", 4 * capacity as u64)?;
             let sort = Sort::new(gpu, "the tile list", capacity)?;
-            self.pairs = Some(Pairs { capacity, gaussians, sort });
+            self.pairs = Some(Pairs {
+                capacity,
+                gaussians,
+                sort,
+            });
         }
         Ok(())
     }
 
     /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
-        memory.lists += self.pairs.as_ref().map_or(0, |p| p.gaussians.size() + p.sort.bytes());
-        memory.frame += self.tiles.as_ref().map_or(0, |t| t.ranges.size() + t.sort.bytes());
+        memory.lists += self
+            .pairs
+            .as_ref()
+            .map_or(0, |p| p.gaussians.size() + p.sort.bytes());
+        memory.frame += self
+            .tiles
+            .as_ref()
+            .map_or(0, |t| t.ranges.size() + t.sort.bytes());
         memory.views += self.frozen.values().map(Lists::bytes).sum::<u64>();
     }
 }
 
 /// Records the projection of all pages.
-fn project(kernels: &Kernels, r: &mut Recorder, g: &Gaussians, view: &View, kind: Kind) -> Result<()> {
+fn project(
+    kernels: &Kernels,
+    r: &mut Recorder,
+    g: &Gaussians,
+    view: &View,
+    kind: Kind,
+) -> Result<()> {
     let pass = &kernels.blending(kind).project;
     for page in &g.pages {
-        let view = View { first: page.first as u32, page: page.n as u32, ..*view };
-        let Gaussians { splats, footprints, touched, .. } = g;
-        let buffers = ProjectBuffers { params: &page.params, splats, depths: &g.sort.keys[0], footprints, touched };
+        let view = View {
+            first: page.first as u32,
+            page: page.n as u32,
+            ..*view
+        };
+        let Gaussians {
+            splats,
+            footprints,
+            touched,
+            ..
+        } = g;
+        let buffers = ProjectBuffers {
+            params: &page.params,
+            splats,
+            depths: &g.sort.keys[0],
+            footprints,
+            touched,
+        };
         r.run(pass, &view, buffers, view.page.div_ceil(GROUP))?;
     }
     Ok(())
@@ -202,6 +312,15 @@ fn project(kernels: &Kernels, r: &mut Recorder, g: &Gaussians, view: &View, kind
 
 /// Returns whether lists built for `a` are valid for `b`.
 fn same_camera(a: &View, b: &View) -> bool {
-    let key = |v: &View| (v.world_to_camera, v.focal, v.centre, v.size, v.gaussians, v.antialias);
+    let key = |v: &View| {
+        (
+            v.world_to_camera,
+            v.focal,
+            v.centre,
+            v.size,
+            v.gaussians,
+            v.antialias,
+        )
+    };
     key(a) == key(b)
 }

@@ -17,9 +17,9 @@ use crate::view::{Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
 use fastlgs_core::Shares;
-use fastlgs_core::shares::KEPT;
+use fastlgs_core::shares::IDS_PER_PIXEL;
 use kernels::{Kernels, kind};
-use lists::{ListMaker, Lists};
+use lists::{ListBuilder, Lists};
 use pages::Gaussians;
 use picture::{Loss, Picture};
 use std::collections::{BTreeMap, HashMap};
@@ -29,7 +29,7 @@ use wgpu::Buffer;
 pub struct GpuEngine {
     pub(crate) gpu: Gpu,
     kernels: Kernels,
-    lists: ListMaker,
+    lists: ListBuilder,
     gaussians: Option<Gaussians>,
     picture: Option<Picture>,
     /// Created on the first step.
@@ -48,7 +48,7 @@ impl GpuEngine {
     pub fn new(gpu: Gpu) -> Self {
         Self {
             kernels: Kernels::new(&gpu),
-            lists: ListMaker::default(),
+            lists: ListBuilder::default(),
             gpu,
             gaussians: None,
             picture: None,
@@ -56,51 +56,108 @@ impl GpuEngine {
             slots: Slots::default(),
             targets: HashMap::new(),
             last: None,
-            passes_on_cpu: std::env::var("FASTLGS_PASSES_ON_CPU").ok().and_then(|k| k.parse().ok()).unwrap_or(0),
+            passes_on_cpu: std::env::var("FASTLGS_PASSES_ON_CPU")
+                .ok()
+                .and_then(|k| k.parse().ok())
+                .unwrap_or(0),
         }
     }
 
     /// Compiles what a frame needs and builds its tile lists. With `frozen`, the lists of that view
     /// are cached.
-    fn prepare(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
+    fn prepare(
+        &mut self,
+        view: View,
+        channels: Channels,
+        frozen: Option<usize>,
+        on_cpu: &mut usize,
+    ) -> Result<Lists> {
         let held = self.len();
         let kind = kind(&view, channels);
-        let Some(g) = self.gaussians.as_ref().filter(|g| g.n == view.gaussians as usize && g.n > 0) else {
-            return Err(Error::Invalid(format!("the view has {} Gaussians, but the engine holds {held}; both must be equal and more than 0", view.gaussians)));
+        let Some(g) = self
+            .gaussians
+            .as_ref()
+            .filter(|g| g.n == view.gaussians as usize && g.n > 0)
+        else {
+            return Err(Error::Invalid(format!(
+                "the view has {} Gaussians, but the engine holds {held}; both must be equal and more than 0",
+                view.gaussians
+            )));
         };
         self.kernels.prepare(&self.gpu, kind);
-        self.picture = Some(Picture::fitting(self.picture.take(), &self.gpu, &view)?);
+        self.picture = Some(Picture::reuse_or_create(
+            self.picture.take(),
+            &self.gpu,
+            &view,
+        )?);
         match frozen {
-            Some(id) => self.lists.frozen(&self.gpu, &self.kernels, g, view, kind, id, on_cpu),
-            None => self.lists.lists(&self.gpu, &self.kernels, g, view, kind, on_cpu),
+            Some(id) => self
+                .lists
+                .frozen(&self.gpu, &self.kernels, g, view, kind, id, on_cpu),
+            None => self
+                .lists
+                .lists(&self.gpu, &self.kernels, g, view, kind, on_cpu),
         }
     }
 
     /// Runs all passes up to blending into the frame buffer.
-    fn forward(&mut self, view: View, channels: Channels, frozen: Option<usize>, on_cpu: &mut usize) -> Result<Lists> {
+    fn forward(
+        &mut self,
+        view: View,
+        channels: Channels,
+        frozen: Option<usize>,
+        on_cpu: &mut usize,
+    ) -> Result<Lists> {
         let lists = self.prepare(view, channels, frozen, on_cpu)?;
         let (splats, frame) = (&self.gaussians().splats, &self.picture().frame);
         let mut r = Recorder::new(&self.gpu, *on_cpu);
-        let Lists { ranges, tile_order, sorted_pairs, pair_gaussians, .. } = &lists;
-        let buffers = BlendBuffers { ranges, tile_order, sorted_pairs, pair_gaussians, splats, frame };
-        let view = View { pairs: lists.view.pairs, ..view };
-        r.run(&self.kernels.blending(kind(&view, channels)).blend, &view, buffers, self.gpu.shape.groups(view.tile_count()))?;
+        let Lists {
+            ranges,
+            tile_order,
+            sorted_pairs,
+            pair_gaussians,
+            ..
+        } = &lists;
+        let buffers = BlendBuffers {
+            ranges,
+            tile_order,
+            sorted_pairs,
+            pair_gaussians,
+            splats,
+            frame,
+        };
+        let view = View {
+            pairs: lists.view.pairs,
+            ..view
+        };
+        r.run(
+            &self.kernels.blending(kind(&view, channels)).blend,
+            &view,
+            buffers,
+            self.gpu.shape.groups(view.tile_count()),
+        )?;
         *on_cpu = r.submit();
         Ok(Lists { view, ..lists })
     }
 
     /// Returns the Gaussians; needs [`Self::prepare`] first.
     fn gaussians(&self) -> &Gaussians {
-        self.gaussians.as_ref().expect("checked when the frame was prepared")
+        self.gaussians
+            .as_ref()
+            .expect("checked when the frame was prepared")
     }
 
     /// Returns the frame buffer; needs [`Self::prepare`] first.
     fn picture(&self) -> &Picture {
-        self.picture.as_ref().expect("made when the frame was prepared")
+        self.picture
+            .as_ref()
+            .expect("made when the frame was prepared")
     }
 
     fn read_pages(&self, what: impl Fn(&pages::Page) -> &Buffer) -> Result<Vec<f32>> {
-        self.gaussians.as_ref().map_or_else(|| Ok(Vec::new()), |g| g.read(&self.gpu, what))
+        self.gaussians
+            .as_ref()
+            .map_or_else(|| Ok(Vec::new()), |g| g.read(&self.gpu, what))
     }
 }
 
@@ -115,9 +172,12 @@ impl Engine for GpuEngine {
 
     fn set_state(&mut self, state: &State) -> Result<()> {
         let (n, sh_degree) = (state.len(), state.sh_degree);
-        self.lists.forget();
+        self.lists.clear_cache();
         // Free the old buffers before new ones are created.
-        let known = self.gaussians.take().filter(|g| (g.n, g.sh_degree) == (n, sh_degree));
+        let known = self
+            .gaussians
+            .take()
+            .filter(|g| (g.n, g.sh_degree) == (n, sh_degree));
         let g = match known {
             Some(g) => g,
             None => Gaussians::new(&self.gpu, n, sh_degree)?,
@@ -135,16 +195,25 @@ impl Engine for GpuEngine {
     fn state(&self) -> Result<State> {
         let sh_degree = self.gaussians.as_ref().map_or(0, |g| g.sh_degree);
         let params = self.read_pages(|p| &p.params)?;
-        Ok(State { sh_degree, params, moment1: self.read_pages(|p| &p.moment1)?, moment2: self.read_pages(|p| &p.moment2)? })
+        Ok(State {
+            sh_degree,
+            params,
+            moment1: self.read_pages(|p| &p.moment1)?,
+            moment2: self.read_pages(|p| &p.moment2)?,
+        })
     }
 
     fn stats(&self) -> Result<Vec<f32>> {
-        self.gaussians.as_ref().map_or(Ok(Vec::new()), |g| self.gpu.read(&g.stats, 2 * g.n))
+        self.gaussians
+            .as_ref()
+            .map_or(Ok(Vec::new()), |g| self.gpu.read(&g.stats, 2 * g.n))
     }
 
     fn set_stats(&mut self, stats: &[f32]) -> Result<()> {
         if let Some(g) = &self.gaussians {
-            self.gpu.queue.write_buffer(&g.stats, 0, bytemuck::cast_slice(stats));
+            self.gpu
+                .queue
+                .write_buffer(&g.stats, 0, bytemuck::cast_slice(stats));
         }
         Ok(())
     }
@@ -154,15 +223,20 @@ impl Engine for GpuEngine {
     }
 
     fn set_target(&mut self, id: usize, target: TargetImage) -> Result<()> {
-        let camera_less =
-            View { size: target.size, tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)), ..bytemuck::Zeroable::zeroed() };
-        let buffer = self.gpu.storage_with("a target image", &target.padded(&camera_less))?;
+        let camera_less = View {
+            size: target.size,
+            tiles: target.size.map(|s| s.div_ceil(crate::view::TILE)),
+            ..bytemuck::Zeroable::zeroed()
+        };
+        let buffer = self
+            .gpu
+            .storage_with("a target image", &target.padded(&camera_less))?;
         self.targets.insert(id, (target.size, buffer));
         self.lists.forget_view(id);
         Ok(())
     }
 
-    fn forget_target(&mut self, id: usize) {
+    fn remove_target(&mut self, id: usize) {
         self.targets.remove(&id);
         self.lists.forget_view(id);
     }
@@ -171,9 +245,12 @@ impl Engine for GpuEngine {
         let mut on_cpu = self.passes_on_cpu;
         let view = self.forward(view, channels, None, &mut on_cpu)?.view;
         let plane = view.padded_pixels();
-        self.gpu.read_with(&self.picture().frame, 8 * plane, |planes: &[f32]| {
-            Frame::gathered(&view, channels, |channel, y| &planes[channel * plane + view.at(0, y)..])
-        })
+        self.gpu
+            .read_with(&self.picture().frame, 8 * plane, |planes: &[f32]| {
+                Frame::gathered(&view, channels, |channel, y| {
+                    &planes[channel * plane + view.index_of(0, y)..]
+                })
+            })
     }
 
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
@@ -185,17 +262,41 @@ impl Engine for GpuEngine {
         // The frame has eight words a pixel; the id weights need four.
         let (splats, shares) = (&self.gaussians().splats, &self.picture().frame);
         let mut r = Recorder::new(&self.gpu, on_cpu);
-        let Lists { ranges, sorted_pairs, pair_gaussians, .. } = &lists;
-        let buffers = BlendIdsBuffers { ranges, sorted_pairs, pair_gaussians, splats, ids, shares };
-        r.run(&self.kernels.blend_ids, &lists.view, buffers, view.tile_count().div_ceil(8))?;
+        let Lists {
+            ranges,
+            sorted_pairs,
+            pair_gaussians,
+            ..
+        } = &lists;
+        let buffers = BlendIdsBuffers {
+            ranges,
+            sorted_pairs,
+            pair_gaussians,
+            splats,
+            ids,
+            shares,
+        };
+        r.run(
+            &self.kernels.blend_ids,
+            &lists.view,
+            buffers,
+            view.tile_count().div_ceil(8),
+        )?;
         r.submit();
         let [width, height] = view.size;
         let plane = view.padded_pixels();
         let gather = |slots: &[u32]| {
-            let pixel = |(x, y)| std::array::from_fn(|k| slots[k * plane + view.at(x, y)]);
-            (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).map(pixel).collect()
+            let pixel = |(x, y)| std::array::from_fn(|k| slots[k * plane + view.index_of(x, y)]);
+            (0..height)
+                .flat_map(|y| (0..width).map(move |x| (x, y)))
+                .map(pixel)
+                .collect()
         };
-        Ok(Shares { width, height, pixels: self.gpu.read_with(shares, KEPT * plane, gather)? })
+        Ok(Shares {
+            width,
+            height,
+            pixels: self.gpu.read_with(shares, IDS_PER_PIXEL * plane, gather)?,
+        })
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {
@@ -203,17 +304,54 @@ impl Engine for GpuEngine {
         let mut on_cpu = self.passes_on_cpu;
         let frozen = (channels == Channels::Feature).then_some(id);
         // Cached lists contain all Gaussians, so none is dropped.
-        let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
+        let view = if frozen.is_some() {
+            view.with_dropout(0.0, 0)
+        } else {
+            view
+        };
         let lists = self.forward(view, channels, frozen, &mut on_cpu)?;
         let view = lists.view;
-        self.loss = Some(Loss::fitting(self.loss.take(), &self.gpu, &view, planes(&view, options).len())?);
-        let target = self.targets.get(&id).filter(|t| t.0 == view.size).map(|t| &t.1);
-        let target = target.ok_or_else(|| Error::Invalid(format!("view {id} has no target image of {}x{} pixels", view.size[0], view.size[1])))?;
-        let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss) else { unreachable!("prepared above") };
+        self.loss = Some(Loss::fitting(
+            self.loss.take(),
+            &self.gpu,
+            &view,
+            planes(&view, options).len(),
+        )?);
+        let target = self
+            .targets
+            .get(&id)
+            .filter(|t| t.0 == view.size)
+            .map(|t| &t.1);
+        let target = target.ok_or_else(|| {
+            Error::Invalid(format!(
+                "view {id} has no target image of {}x{} pixels",
+                view.size[0], view.size[1]
+            ))
+        })?;
+        let (Some(g), Some(picture), Some(loss)) = (&self.gaussians, &self.picture, &self.loss)
+        else {
+            unreachable!("prepared above")
+        };
         let mut r = Recorder::new(&self.gpu, on_cpu);
-        loss.record(&self.kernels.training, &mut r, &view, options, &picture.frame, target)?;
+        loss.record(
+            &self.kernels.training,
+            &mut r,
+            &view,
+            options,
+            &picture.frame,
+            target,
+        )?;
         let blending = self.kernels.blending(kind(&view, channels));
-        self.slots.record(&self.gpu, blending, &mut r, channels, &lists, g, &picture.frame, &loss.gradient)?;
+        self.slots.record(
+            &self.gpu,
+            blending,
+            &mut r,
+            channels,
+            &lists,
+            g,
+            &picture.frame,
+            &loss.gradient,
+        )?;
         adam(&self.kernels.training, &mut r, g, step)?;
         r.submit();
         self.last = Some((view, channels));
@@ -244,6 +382,9 @@ impl Engine for GpuEngine {
     }
 
     fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
-        self.gpu.profile.as_ref().map_or_else(|| Ok(BTreeMap::new()), |p| p.take(&self.gpu))
+        self.gpu
+            .profile
+            .as_ref()
+            .map_or_else(|| Ok(BTreeMap::new()), |p| p.take(&self.gpu))
     }
 }

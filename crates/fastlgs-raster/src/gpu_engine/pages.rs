@@ -73,8 +73,16 @@ impl Gaussians {
     /// Writes trained values and moments.
     pub fn write(&self, gpu: &Gpu, state: &State) {
         for page in &self.pages {
-            for (buffer, all) in [(&page.params, &state.params), (&page.moment1, &state.moment1), (&page.moment2, &state.moment2)] {
-                gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(&page_of(all, self.n, page.first, page.n)));
+            for (buffer, all) in [
+                (&page.params, &state.params),
+                (&page.moment1, &state.moment1),
+                (&page.moment2, &state.moment2),
+            ] {
+                gpu.queue.write_buffer(
+                    buffer,
+                    0,
+                    bytemuck::cast_slice(&page_of(all, self.n, page.first, page.n)),
+                );
             }
         }
     }
@@ -87,7 +95,8 @@ impl Gaussians {
             let stride = stride(page.n);
             let values: Vec<f32> = gpu.read(what(page), channels * stride)?;
             for c in 0..channels {
-                out[c * self.n + page.first..][..page.n].copy_from_slice(&values[c * stride..][..page.n]);
+                out[c * self.n + page.first..][..page.n]
+                    .copy_from_slice(&values[c * stride..][..page.n]);
             }
         }
         Ok(out)
@@ -100,7 +109,14 @@ impl Gaussians {
             memory.state += bytes(&[&page.params, &page.moment1, &page.moment2]);
             memory.gaussians += page.gradients.size();
         }
-        memory.gaussians += bytes(&[&self.stats, &self.splats, &self.footprints, &self.offsets, &self.touched, &self.first_pair]);
+        memory.gaussians += bytes(&[
+            &self.stats,
+            &self.splats,
+            &self.footprints,
+            &self.offsets,
+            &self.touched,
+            &self.first_pair,
+        ]);
         memory.lists += self.sort.bytes() + self.scan.bytes();
     }
 }
@@ -108,5 +124,13 @@ impl Gaussians {
 /// Returns the Gaussians `first..first + n` of values `[channel][all]`, with the page's stride.
 fn page_of(values: &[f32], all: usize, first: usize, n: usize) -> Vec<f32> {
     let padding = std::iter::repeat_n(0.0, stride(n) - n);
-    values.chunks_exact(all).flat_map(|channel| channel[first..first + n].iter().copied().chain(padding.clone())).collect()
+    values
+        .chunks_exact(all)
+        .flat_map(|channel| {
+            channel[first..first + n]
+                .iter()
+                .copied()
+                .chain(padding.clone())
+        })
+        .collect()
 }

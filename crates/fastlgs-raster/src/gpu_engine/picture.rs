@@ -2,10 +2,12 @@
 
 use super::kernels::{GROUP, Training};
 use crate::channels::Channels;
-use crate::cpu::RUN;
-use crate::engine::{Losses, Memory, StepOptions, losses_of, planes};
+use crate::cpu::ROWS_PER_INVOCATION;
+use crate::engine::{Losses, Memory, StepOptions, losses_from_sums, planes};
 use crate::pass::{Groups, Recorder};
-use crate::shader::shaders::{LossGradientBuffers, SsimBackwardRowsBuffers, SsimColumnsBuffers, SsimRowsBuffers};
+use crate::shader::shaders::{
+    LossGradientBuffers, SsimBackwardRowsBuffers, SsimColumnsBuffers, SsimRowsBuffers,
+};
 use crate::shape::Shape;
 use crate::view::{Planes, View};
 use crate::{Gpu, Result};
@@ -19,16 +21,19 @@ pub struct Picture {
 
 impl Picture {
     /// Returns a frame buffer of the view's size; reuses `known` if its size is the same.
-    pub fn fitting(known: Option<Self>, gpu: &Gpu, view: &View) -> Result<Self> {
+    pub fn reuse_or_create(known: Option<Self>, gpu: &Gpu, view: &View) -> Result<Self> {
         match known.filter(|p| p.size == view.size) {
             Some(picture) => Ok(picture),
-            None => Ok(Self { size: view.size, frame: gpu.storage("the frame", 32 * view.padded_pixels() as u64)? }),
+            None => Ok(Self {
+                size: view.size,
+                frame: gpu.storage("the frame", 32 * view.padded_pixels() as u64)?,
+            }),
         }
     }
 }
 
 /// Bytes that every adapter can bind at once.
-const LARGEST: u64 = 128 << 20;
+const PORTABLE_BINDING_BYTES: u64 = 128 << 20;
 
 /// Buffers of the loss.
 pub struct Loss {
@@ -49,13 +54,17 @@ impl Loss {
         let pixels = view.padded_pixels() as u64;
         // Hardware adapters have room for all planes; the cache of a software adapter has not.
         let rows = 16 * pixels;
-        let at_once = if gpu.shape == Shape::Wide { 1 } else { (LARGEST.min(gpu.max_binding) / rows).clamp(1, 6) };
+        let at_once = if gpu.shape == Shape::Wide {
+            1
+        } else {
+            (PORTABLE_BINDING_BYTES.min(gpu.max_binding) / rows).clamp(1, 6)
+        };
         // Divide the planes into batches of equal size.
         let at_once = (planes as u64).div_ceil((planes as u64).div_ceil(at_once));
         if let Some(loss) = known.filter(|l| l.size == view.size && l.at_once as u64 == at_once) {
             return Ok(loss);
         }
-        let sums = 24 * u64::from(RUN as u32 * view.tile_count());
+        let sums = 24 * u64::from(ROWS_PER_INVOCATION as u32 * view.tile_count());
         Ok(Self {
             size: view.size,
             at_once: at_once as usize,
@@ -77,28 +86,86 @@ impl Loss {
         frame: &Buffer,
         targets: &Buffer,
     ) -> Result<()> {
-        let Self { gradient, rows, partials, ssim_sums, sums, .. } = self;
-        for some in planes(view, options).chunks(self.at_once) {
-            let (planes, plane) = (Planes::new(some), some[0]);
-            let by_row = Groups { flat: (plane.quads / 2 * plane.rows).div_ceil(GROUP), z: planes.count };
-            let by_column = Groups { flat: (plane.rows / 8 * plane.quads).div_ceil(GROUP), z: planes.count };
-            r.run(&passes.ssim_rows, &planes, SsimRowsBuffers { frame, targets, rows }, by_row)?;
-            r.run(&passes.ssim_columns, &planes, SsimColumnsBuffers { rows, partials, sums: ssim_sums }, by_column)?;
-            r.run(&passes.ssim_backward_rows, &planes, SsimBackwardRowsBuffers { partials, rows }, by_row)?;
-            r.run(&passes.loss_gradient, &planes, LossGradientBuffers { frame, targets, rows, gradient, sums }, by_column)?;
+        let Self {
+            gradient,
+            rows,
+            partials,
+            ssim_sums,
+            sums,
+            ..
+        } = self;
+        for batch in planes(view, options).chunks(self.at_once) {
+            let (planes, plane) = (Planes::new(batch), batch[0]);
+            let by_row = Groups {
+                flat: (plane.quads / 2 * plane.rows).div_ceil(GROUP),
+                z: planes.count,
+            };
+            let by_column = Groups {
+                flat: (plane.rows / 8 * plane.quads).div_ceil(GROUP),
+                z: planes.count,
+            };
+            r.run(
+                &passes.ssim_rows,
+                &planes,
+                SsimRowsBuffers {
+                    frame,
+                    targets,
+                    rows,
+                },
+                by_row,
+            )?;
+            r.run(
+                &passes.ssim_columns,
+                &planes,
+                SsimColumnsBuffers {
+                    rows,
+                    partials,
+                    sums: ssim_sums,
+                },
+                by_column,
+            )?;
+            r.run(
+                &passes.ssim_backward_rows,
+                &planes,
+                SsimBackwardRowsBuffers { partials, rows },
+                by_row,
+            )?;
+            r.run(
+                &passes.loss_gradient,
+                &planes,
+                LossGradientBuffers {
+                    frame,
+                    targets,
+                    rows,
+                    gradient,
+                    sums,
+                },
+                by_column,
+            )?;
         }
         Ok(())
     }
 
     /// Reads the losses of the last recorded step.
     pub fn read(&self, gpu: &Gpu, view: &View, channels: Channels) -> Result<Losses> {
-        let sums = 6 * RUN * view.tile_count() as usize;
-        Ok(losses_of(view, channels, &gpu.read(&self.ssim_sums, sums)?, &gpu.read(&self.sums, 4 * sums)?))
+        let sums = 6 * ROWS_PER_INVOCATION * view.tile_count() as usize;
+        Ok(losses_from_sums(
+            view,
+            channels,
+            &gpu.read(&self.ssim_sums, sums)?,
+            &gpu.read(&self.sums, 4 * sums)?,
+        ))
     }
 
     /// Adds its bytes to `memory`.
     pub fn count(&self, memory: &mut Memory) {
-        let own = [&self.gradient, &self.rows, &self.partials, &self.ssim_sums, &self.sums];
+        let own = [
+            &self.gradient,
+            &self.rows,
+            &self.partials,
+            &self.ssim_sums,
+            &self.sums,
+        ];
         memory.frame += own.iter().map(|b| b.size()).sum::<u64>();
     }
 }

@@ -2,8 +2,10 @@
 
 use super::kernels::Sorting;
 use crate::pass::Recorder;
-use crate::shader::shaders::{RadixCountBuffers, RadixScatterBuffers, ScanApplyBuffers, ScanChunksBuffers};
-use crate::view::Job;
+use crate::shader::shaders::{
+    RadixCountBuffers, RadixScatterBuffers, ScanApplyBuffers, ScanChunksBuffers,
+};
+use crate::view::ChunkJob;
 use crate::{Gpu, Result};
 use wgpu::Buffer;
 
@@ -25,7 +27,12 @@ impl Sort {
         let make = || gpu.storage(what, 4 * n as u64);
         let places = DIGITS * gpu.shape.chunks(n as u32).0;
         let histogram = gpu.storage(what, 4 * u64::from(places))?;
-        Ok(Self { keys: [make()?, make()?], values: [make()?, make()?], histogram, scan: Scan::new(gpu, what, places)? })
+        Ok(Self {
+            keys: [make()?, make()?],
+            values: [make()?, make()?],
+            histogram,
+            scan: Scan::new(gpu, what, places)?,
+        })
     }
 
     /// Returns the size of the buffers in bytes.
@@ -36,20 +43,49 @@ impl Sort {
 
     /// Sorts the first `n` keys by their lowest `bits`. Returns the index of the buffers that hold
     /// the result. The values are the previous positions of the keys.
-    pub fn record(&self, gpu: &Gpu, passes: &Sorting, r: &mut Recorder, n: u32, bits: u32) -> Result<usize> {
-        let mut side = 0;
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        passes: &Sorting,
+        r: &mut Recorder,
+        n: u32,
+        bits: u32,
+    ) -> Result<usize> {
+        let mut current = 0;
         let histogram = &self.histogram;
         let (chunks, groups) = gpu.shape.chunks(n);
         for (round, shift) in (0..bits).step_by(8).enumerate() {
-            let job = Job { n, shift, first: u32::from(round == 0), chunks };
-            let (keys, values) = (&self.keys[side], &self.values[side]);
-            r.run(&passes.radix_count, &job, RadixCountBuffers { keys, histogram }, groups)?;
-            self.scan.record(gpu, passes, r, histogram, DIGITS * chunks)?;
-            side = 1 - side;
-            let (keys_out, values_out) = (&self.keys[side], &self.values[side]);
-            r.run(&passes.radix_scatter, &job, RadixScatterBuffers { keys, values, histogram, keys_out, values_out }, groups)?;
+            let job = ChunkJob {
+                n,
+                shift,
+                first: u32::from(round == 0),
+                chunks,
+            };
+            let (keys, values) = (&self.keys[current], &self.values[current]);
+            r.run(
+                &passes.radix_count,
+                &job,
+                RadixCountBuffers { keys, histogram },
+                groups,
+            )?;
+            self.scan
+                .record(gpu, passes, r, histogram, DIGITS * chunks)?;
+            current = 1 - current;
+            let (keys_out, values_out) = (&self.keys[current], &self.values[current]);
+            r.run(
+                &passes.radix_scatter,
+                &job,
+                RadixScatterBuffers {
+                    keys,
+                    values,
+                    histogram,
+                    keys_out,
+                    values_out,
+                },
+                groups,
+            )?;
         }
-        Ok(side)
+        Ok(current)
     }
 }
 
@@ -61,7 +97,9 @@ pub struct Scan {
 impl Scan {
     /// Creates the buffer for at most `n` items.
     pub fn new(gpu: &Gpu, what: &str, n: u32) -> Result<Self> {
-        Ok(Self { totals: gpu.storage(what, 4 * (u64::from(gpu.shape.chunks(n).0) + 1))? })
+        Ok(Self {
+            totals: gpu.storage(what, 4 * (u64::from(gpu.shape.chunks(n).0) + 1))?,
+        })
     }
 
     /// Returns the size of the buffer in bytes.
@@ -71,12 +109,34 @@ impl Scan {
 
     /// Replaces `items` by their exclusive prefix sums. [`Self::total`] then reads the sum of all
     /// items.
-    pub fn record(&self, gpu: &Gpu, passes: &Sorting, r: &mut Recorder, items: &Buffer, n: u32) -> Result<()> {
+    pub fn record(
+        &self,
+        gpu: &Gpu,
+        passes: &Sorting,
+        r: &mut Recorder,
+        items: &Buffer,
+        n: u32,
+    ) -> Result<()> {
         let (chunks, groups) = gpu.shape.chunks(n);
-        let job = Job { n, shift: 0, first: 0, chunks };
+        let job = ChunkJob {
+            n,
+            shift: 0,
+            first: 0,
+            chunks,
+        };
         let totals = &self.totals;
-        r.run(&passes.scan_chunks, &job, ScanChunksBuffers { items, totals }, groups)?;
-        r.run(&passes.scan_apply, &job, ScanApplyBuffers { items, totals }, groups)
+        r.run(
+            &passes.scan_chunks,
+            &job,
+            ScanChunksBuffers { items, totals },
+            groups,
+        )?;
+        r.run(
+            &passes.scan_apply,
+            &job,
+            ScanApplyBuffers { items, totals },
+            groups,
+        )
     }
 
     /// Returns the sum of the `n` items of the last scan; `u32::MAX` if it exceeds 32 bits.

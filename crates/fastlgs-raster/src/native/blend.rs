@@ -2,7 +2,7 @@
 //! vector of 16 lanes two.
 
 use super::lists::{Band, Lists};
-use super::simd::{SUMS, Vector, dispatched};
+use super::simd::{SLOT_FLOATS, Vector, dispatched};
 use crate::cpu::{ALPHA_MIN, BATCH, LOG2_ALPHA_MAX, Splat};
 use crate::view::View;
 
@@ -80,26 +80,41 @@ impl<'a> Job<'a> {
     pub fn new(view: &View, tile: usize, lists: &'a Lists) -> Self {
         let (column, row) = (tile % view.tiles[0] as usize, tile / view.tiles[0] as usize);
         let band = &lists.bands[row];
-        Self { x: (column * EDGE) as f32, y: (row * EDGE) as f32, list: band.tile(column), band, lists, finished: view.finished }
+        Self {
+            x: (column * EDGE) as f32,
+            y: (row * EDGE) as f32,
+            list: band.tile(column),
+            band,
+            lists,
+            finished: view.min_transmittance,
+        }
     }
 
     /// Returns the Gaussians of the tile, front to back.
     pub fn gaussians(&self) -> impl Iterator<Item = u32> {
-        self.list.iter().map(|place| self.band.gaussians[*place as usize])
+        self.list
+            .iter()
+            .map(|place| self.band.gaussians[*place as usize])
     }
 }
 
 /// Returns 1 for pixels of the image and 0 for pixels of the padding.
-pub fn shown(view: &View, job: &Job) -> Tile {
+pub fn inside_image(view: &View, job: &Job) -> Tile {
     let [w, h] = view.size.map(|s| s as f32);
     if job.x + EDGE as f32 <= w && job.y + EDGE as f32 <= h {
         return [1.0; EDGE * EDGE];
     }
-    std::array::from_fn(|p| if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h { 1.0 } else { 0.0 })
+    std::array::from_fn(|p| {
+        if job.x + ((p % EDGE) as f32) < w && job.y + ((p / EDGE) as f32) < h {
+            1.0
+        } else {
+            0.0
+        }
+    })
 }
 
 /// A splat relative to a tile. log2 of its alpha is level + slope dy + qz dy^2.
-struct Placed<'a, V> {
+struct TileSplat<'a, V> {
     splat: &'a Splat,
     /// x offsets of a vector's pixels from the mean, the same for all vectors of the tile.
     dx: V,
@@ -113,7 +128,7 @@ struct Placed<'a, V> {
     pixels: std::iter::StepBy<std::ops::Range<usize>>,
 }
 
-impl<'a, V: Vector> Placed<'a, V> {
+impl<'a, V: Vector> TileSplat<'a, V> {
     #[inline(always)]
     fn new(job: &Job<'a>, gaussian: usize) -> Self {
         let splat = &job.lists.splats[gaussian];
@@ -123,9 +138,17 @@ impl<'a, V: Vector> Placed<'a, V> {
         let row = |y: f32| y.clamp(0.0, EDGE as f32) as i32 as usize;
         let rows = row((-reach - down - 0.5).ceil())..row((reach - down - 0.5).floor() + 1.0);
         let per_vector = V::LANES / EDGE;
-        let pixels = (rows.start / per_vector * V::LANES..rows.end.div_ceil(per_vector) * V::LANES).step_by(V::LANES);
+        let pixels = (rows.start / per_vector * V::LANES..rows.end.div_ceil(per_vector) * V::LANES)
+            .step_by(V::LANES);
         let level = V::splat(qx).mul(dx).madd(dx, V::splat(log_opacity));
-        Self { splat, dx, down, level, slope: V::splat(qy).mul(dx), pixels }
+        Self {
+            splat,
+            dx,
+            down,
+            level,
+            slope: V::splat(qy).mul(dx),
+            pixels,
+        }
     }
 
     /// Returns the y offsets from the mean of the vector that starts at pixel `p`.
@@ -141,7 +164,10 @@ impl<'a, V: Vector> Placed<'a, V> {
         let exponent = V::splat(qz).madd(dy, self.slope).madd(dy, self.level);
         // The minimum is needed because rounding lifts the exponent far out on a long, thin
         // Gaussian. A NaN passes the minimum and becomes 0 in the comparison.
-        V::splat(LOG2_ALPHA_MAX).min(exponent).exp2().at_least_or_zero(V::splat(ALPHA_MIN))
+        V::splat(LOG2_ALPHA_MAX)
+            .min(exponent)
+            .exp2()
+            .at_least_or_zero(V::splat(ALPHA_MIN))
     }
 
     /// Returns colour and feature, one vector for each channel.
@@ -149,7 +175,14 @@ impl<'a, V: Vector> Placed<'a, V> {
     fn values(&self) -> [V; 6] {
         let [_, [_, _, r, g], [b, f0, f1, f2]] = *self.splat;
         // Written out, because `map` is not inlined here.
-        [V::splat(r), V::splat(g), V::splat(b), V::splat(f0), V::splat(f1), V::splat(f2)]
+        [
+            V::splat(r),
+            V::splat(g),
+            V::splat(b),
+            V::splat(f0),
+            V::splat(f1),
+            V::splat(f2),
+        ]
     }
 }
 
@@ -161,7 +194,7 @@ fn finished(job: &Job<'_>, transmittance: &Tile) -> bool {
 
 /// Returns the blending weights for these alphas and subtracts them from the transmittance.
 #[inline(always)]
-fn taken<V: Vector>(alpha: V, transmittance: &mut [f32]) -> V {
+fn absorb<V: Vector>(alpha: V, transmittance: &mut [f32]) -> V {
     let light = V::load(transmittance);
     let w = alpha.mul(light);
     light.sub(w).store(transmittance);
@@ -180,13 +213,16 @@ dispatched! {
 }
 
 #[inline(always)]
-fn forward_body<V: Vector, const COLOR: bool, const FEATURE: bool>(job: &Job<'_>, out: &mut Blended) {
+fn forward_body<V: Vector, const COLOR: bool, const FEATURE: bool>(
+    job: &Job<'_>,
+    out: &mut Blended,
+) {
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
-            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
+            let placed = TileSplat::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let values = placed.values();
             for p in placed.pixels.clone() {
-                let w = taken(placed.alphas(placed.dy(p)), &mut out.transmittance[p..]);
+                let w = absorb(placed.alphas(placed.dy(p)), &mut out.transmittance[p..]);
                 for c in channels::<COLOR, FEATURE>() {
                     let sums = &mut out.sums[c][p..];
                     w.madd(values[c], V::load(sums)).store(sums);
@@ -204,11 +240,16 @@ dispatched! {
     /// Sums the blending weights of a tile's Gaussians by object id. The ids are in the order of
     /// their first occurrence.
     /// `transmittance` must be 1 in the image and 0 in the padding.
-    fn by_id(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) = by_id_body
+    fn weights_by_id(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) = by_id_body
 }
 
 #[inline(always)]
-fn by_id_body<V: Vector>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, sums: &mut Vec<(u16, Tile)>) {
+fn by_id_body<V: Vector>(
+    job: &Job<'_>,
+    ids: &[u16],
+    transmittance: &mut Tile,
+    sums: &mut Vec<(u16, Tile)>,
+) {
     sums.clear();
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
@@ -218,9 +259,9 @@ fn by_id_body<V: Vector>(job: &Job<'_>, ids: &[u16], transmittance: &mut Tile, s
                 sums.push((id, EMPTY));
                 sums.len() - 1
             });
-            let placed = Placed::<V>::new(job, g);
+            let placed = TileSplat::<V>::new(job, g);
             for p in placed.pixels.clone() {
-                let w = taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]);
+                let w = absorb(placed.alphas(placed.dy(p)), &mut transmittance[p..]);
                 let sum = &mut sums[place].1[p..];
                 w.add(V::load(sum)).store(sum);
             }
@@ -238,24 +279,30 @@ dispatched! {
 }
 
 #[inline(always)]
-fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Tile, sums: &mut Vec<f32>) {
+fn by_mask_body<V: Vector>(
+    job: &Job<'_>,
+    masks: &[Tile],
+    transmittance: &mut Tile,
+    sums: &mut Vec<f32>,
+) {
     sums.clear();
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
-            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
+            let placed = TileSplat::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let mut weights = EMPTY;
             for p in placed.pixels.clone() {
-                taken(placed.alphas(placed.dy(p)), &mut transmittance[p..]).store(&mut weights[p..]);
+                absorb(placed.alphas(placed.dy(p)), &mut transmittance[p..])
+                    .store(&mut weights[p..]);
             }
             // `V::sums` reduces SUMS vectors at a time.
-            for masks in masks.chunks(SUMS) {
-                let mut inside = [V::splat(0.0); SUMS];
+            for masks in masks.chunks(SLOT_FLOATS) {
+                let mut inside = [V::splat(0.0); SLOT_FLOATS];
                 for (sum, mask) in inside.iter_mut().zip(masks) {
                     for p in placed.pixels.clone() {
                         *sum = V::load(&weights[p..]).madd(V::load(&mask[p..]), *sum);
                     }
                 }
-                sums.extend(&V::sums(&inside)[..masks.len()]);
+                sums.extend(&V::lane_sums(&inside)[..masks.len()]);
             }
         }
         if finished(job, transmittance) {
@@ -267,7 +314,7 @@ fn by_mask_body<V: Vector>(job: &Job<'_>, masks: &[Tile], transmittance: &mut Ti
 dispatched! {
     /// Measures how much the pixels of a tile change without each Gaussian: the sum of squared
     /// colour differences, each difference times `brightness`. `changes` has one value for each
-    /// Gaussian of the list, up to where the tile is finished. On entry `behind` holds the tile's
+    /// Gaussian of the list, up to where the tile is finished. On entry `remaining` holds the tile's
     /// colours including the background.
     fn by_change(job: &Job<'_>, brightness: &[Tile; 3], behind: &mut [Tile; 3], transmittance: &mut Tile, changes: &mut Vec<f32>)
         = by_change_body
@@ -277,7 +324,7 @@ dispatched! {
 fn by_change_body<V: Vector>(
     job: &Job<'_>,
     brightness: &[Tile; 3],
-    behind: &mut [Tile; 3],
+    remaining: &mut [Tile; 3],
     transmittance: &mut Tile,
     changes: &mut Vec<f32>,
 ) {
@@ -285,16 +332,18 @@ fn by_change_body<V: Vector>(
     let one = V::splat(1.0);
     for batch in job.list.chunks(BATCH) {
         for &place in batch {
-            let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
+            let placed = TileSplat::<V>::new(job, job.band.gaussians[place as usize] as usize);
             let values = placed.values();
             let mut squares = V::splat(0.0);
             for p in placed.pixels.clone() {
                 let alpha = placed.alphas(placed.dy(p));
-                let w = taken(alpha, &mut transmittance[p..]);
+                let w = absorb(alpha, &mut transmittance[p..]);
                 // Without the Gaussian, the colour behind it increases by alpha / (1 - alpha) times
                 // itself.
                 let more = alpha.div(one.sub(alpha));
-                for ((behind, brightness), value) in behind.iter_mut().zip(brightness).zip(values) {
+                for ((behind, brightness), value) in
+                    remaining.iter_mut().zip(brightness).zip(values)
+                {
                     let own = w.mul(value);
                     let rest = V::load(&behind[p..]).sub(own);
                     rest.store(&mut behind[p..]);
@@ -313,7 +362,7 @@ fn by_change_body<V: Vector>(
 }
 
 /// Inputs of the backward pass for one tile.
-pub struct Given {
+pub struct BackwardInput {
     /// dL/d(colour, feature).
     pub gradient: [Tile; 6],
     /// R.g, with R the colour behind the Gaussians processed so far; docs/gradients.md, section 1.
@@ -326,26 +375,26 @@ pub struct Given {
 
 dispatched! {
     /// Adds the gradients of a tile to the slots of its band.
-    fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut Given, slots: &mut [[f32; SUMS]])
+    fn backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(job: &Job<'_>, given: &mut BackwardInput, slots: &mut [[f32; SLOT_FLOATS]])
         = backward_body
 }
 
 #[inline(always)]
 fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
     job: &Job<'_>,
-    given: &mut Given,
-    slots: &mut [[f32; SUMS]],
+    given: &mut BackwardInput,
+    slots: &mut [[f32; SLOT_FLOATS]],
 ) {
     let (zero, one) = (V::splat(0.0), V::splat(1.0));
     for &place in &job.list[..given.walked as usize] {
-        let placed = Placed::<V>::new(job, job.band.gaussians[place as usize] as usize);
+        let placed = TileSplat::<V>::new(job, job.band.gaussians[place as usize] as usize);
         let values = placed.values();
         let [mut p_sum, mut py_sum, mut pyy_sum] = [zero; 3];
         let mut sums = [zero; 6];
         for at in placed.pixels.clone() {
             let dy = placed.dy(at);
             let alpha = placed.alphas(dy);
-            let w = taken(alpha, &mut given.transmittance[at..]);
+            let w = absorb(alpha, &mut given.transmittance[at..]);
             let gradient = |c: usize| V::load(&given.gradient[c][at..]);
             for c in channels::<COLOR, FEATURE>() {
                 sums[c] = w.madd(gradient(c), sums[c]);
@@ -367,8 +416,24 @@ fn backward_body<V: Vector, const COLOR: bool, const FEATURE: bool, const MOVES:
         }
         let (px, pxy) = (p_sum.mul(placed.dx), py_sum.mul(placed.dx));
         let [r, g, b, f0, f1, f2] = sums;
-        let sums = V::sums(&[px, py_sum, px.mul(placed.dx), pxy, pyy_sum, p_sum, r, g, b, f0, f1, f2]);
-        slots[place as usize].iter_mut().zip(sums).for_each(|(slot, sum)| *slot += sum);
+        let sums = V::lane_sums(&[
+            px,
+            py_sum,
+            px.mul(placed.dx),
+            pxy,
+            pyy_sum,
+            p_sum,
+            r,
+            g,
+            b,
+            f0,
+            f1,
+            f2,
+        ]);
+        slots[place as usize]
+            .iter_mut()
+            .zip(sums)
+            .for_each(|(slot, sum)| *slot += sum);
     }
 }
 
@@ -385,17 +450,32 @@ mod tests {
         let mut out = Vec::new();
         for tile in 0..(view.tiles[0] * view.tiles[1]) as usize {
             let job = Job::new(view, tile, lists);
-            let shown = shown(view, &job);
-            let mut blended = Blended { sums: [EMPTY; 6], transmittance: shown, walked: 0 };
+            let transmittance = inside_image(view, &job);
+            let mut blended = Blended {
+                sums: [EMPTY; 6],
+                transmittance,
+                walked: 0,
+            };
             forward_body::<V, true, true>(&job, &mut blended);
             let mut colours: [Tile; 3] = std::array::from_fn(|c| blended.sums[c]);
-            let mut given = Given { gradient: blended.sums, r_dot_g: blended.transmittance, transmittance: shown, walked: blended.walked };
-            let mut slots = vec![[0.0; SUMS]; job.band.gaussians.len()];
+            let mut given = BackwardInput {
+                gradient: blended.sums,
+                r_dot_g: blended.transmittance,
+                transmittance,
+                walked: blended.walked,
+            };
+            let mut slots = vec![[0.0; SLOT_FLOATS]; job.band.gaussians.len()];
             backward_body::<V, true, true, true>(&job, &mut given, &mut slots);
             let (mut shares, mut inside, mut changes) = (Vec::new(), Vec::new(), Vec::new());
-            by_id_body::<V>(&job, ids, &mut shown.clone(), &mut shares);
-            by_mask_body::<V>(&job, masks, &mut shown.clone(), &mut inside);
-            by_change_body::<V>(&job, &[shown; 3], &mut colours, &mut shown.clone(), &mut changes);
+            by_id_body::<V>(&job, ids, &mut transmittance.clone(), &mut shares);
+            by_mask_body::<V>(&job, masks, &mut transmittance.clone(), &mut inside);
+            by_change_body::<V>(
+                &job,
+                &[transmittance; 3],
+                &mut colours,
+                &mut transmittance.clone(),
+                &mut changes,
+            );
             out.extend(blended.sums.concat());
             out.extend(blended.transmittance);
             out.extend(slots.concat());
@@ -420,8 +500,13 @@ mod tests {
         let view = View::new(&camera(93, 61), scene.len(), 1);
         let lists = Lists::new(&view, &transposed(&state.params, scene.len()));
         let ids: Vec<u16> = (0..scene.len() as u16).map(|k| k % 7).collect();
-        let masks: Vec<Tile> = (0..SUMS + 1).map(|k| std::array::from_fn(|p| f32::from(u8::from(p % (k + 2) == 0)))).collect();
-        let (eight, sixteen) = (by::<Portable<8>>(&view, &lists, &ids, &masks), by::<Portable<16>>(&view, &lists, &ids, &masks));
+        let masks: Vec<Tile> = (0..SLOT_FLOATS + 1)
+            .map(|k| std::array::from_fn(|p| f32::from(u8::from(p % (k + 2) == 0))))
+            .collect();
+        let (eight, sixteen) = (
+            by::<Portable<8>>(&view, &lists, &ids, &masks),
+            by::<Portable<16>>(&view, &lists, &ids, &masks),
+        );
         assert_eq!(eight.len(), sixteen.len());
         assert!(eight.iter().filter(|v| **v != 0.0).count() > eight.len() / 4);
         for (a, b) in eight.iter().zip(&sixteen) {

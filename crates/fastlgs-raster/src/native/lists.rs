@@ -14,9 +14,9 @@ pub(crate) struct Lists {
     /// One band for each row of tiles.
     pub bands: Vec<Band>,
     /// Positions of each Gaussian in the concatenated `gaussians` of all bands. Those of Gaussian
-    /// `g` are `places[first[g]..first[g + 1]]`.
+    /// `g` are `positions[first[g]..first[g + 1]]`.
     pub places: Vec<u32>,
-    /// Start of each Gaussian's range in `places`, and the end of the last range.
+    /// Start of each Gaussian's range in `positions`, and the end of the last range.
     pub first: Vec<u32>,
 }
 
@@ -49,9 +49,18 @@ impl Lists {
     pub fn new(view: &View, params: &[f32]) -> Self {
         let projected = project(view, params);
         let bands = bands(view, &projected);
-        let (first, places) = places(&bands, projected.len());
-        let reach = projected.par_iter().map(|p| p.footprint[1][0].sqrt() + ROUNDING).collect();
-        Self { splats: splats(&projected), reach, bands, places, first }
+        let (first, places) = positions(&bands, projected.len());
+        let reach = projected
+            .par_iter()
+            .map(|p| p.footprint[1][0].sqrt() + ROUNDING)
+            .collect();
+        Self {
+            splats: splats(&projected),
+            reach,
+            bands,
+            places,
+            first,
+        }
     }
 
     /// Projects the Gaussians again and keeps the lists. Only values that do not move geometry may
@@ -64,7 +73,8 @@ impl Lists {
     pub fn bytes(&self) -> usize {
         let words = |band: &Band| band.gaussians.len() + band.pairs.len() + band.ends.len();
         let words: usize = self.bands.iter().map(words).sum();
-        size_of_val(self.splats.as_slice()) + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
+        size_of_val(self.splats.as_slice())
+            + 4 * (words + self.reach.len() + self.places.len() + self.first.len())
     }
 
     /// Returns the places of a Gaussian, or an empty slice beyond the last Gaussian.
@@ -100,12 +110,20 @@ impl Band {
             }
         }
         next.pop();
-        Self { gaussians: touches.map(|t| t.gaussian).collect(), pairs, ends: next }
+        Self {
+            gaussians: touches.map(|t| t.gaussian).collect(),
+            pairs,
+            ends: next,
+        }
     }
 
     /// Returns the list of a tile: indices into `gaussians`, front to back.
     pub fn tile(&self, column: usize) -> &[u32] {
-        let start = if column == 0 { 0 } else { self.ends[column - 1] };
+        let start = if column == 0 {
+            0
+        } else {
+            self.ends[column - 1]
+        };
         &self.pairs[start as usize..self.ends[column] as usize]
     }
 }
@@ -115,14 +133,20 @@ const BLOCK: usize = 256;
 
 /// Projects all Gaussians from trained values `[n][channels]`.
 fn project(view: &View, params: &[f32]) -> Vec<Projected> {
-    let nothing = Projected { splat: [[0.0; 4]; 3], depth: NOT_DRAWN, footprint: [[0.0; 4]; 2] };
+    let nothing = Projected {
+        splat: [[0.0; 4]; 3],
+        depth: NOT_DRAWN,
+        footprint: [[0.0; 4]; 2],
+    };
     let mut projected = vec![nothing; view.gaussians as usize];
     let width = (params.len() / projected.len().max(1)).max(1);
     projected
         .par_chunks_mut(BLOCK)
         .zip(params.par_chunks(BLOCK * width))
         .enumerate()
-        .for_each(|(block, (out, params))| project_block(view, (block * BLOCK) as u32, width, params, out));
+        .for_each(|(block, (out, params))| {
+            project_block(view, (block * BLOCK) as u32, width, params, out)
+        });
     projected
 }
 
@@ -132,7 +156,13 @@ vectorised! {
 }
 
 #[inline(always)]
-fn project_block_body<const FMA: bool>(view: &View, first: u32, width: usize, params: &[f32], out: &mut [Projected]) {
+fn project_block_body<const FMA: bool>(
+    view: &View,
+    first: u32,
+    width: usize,
+    params: &[f32],
+    out: &mut [Projected],
+) {
     for (g, (params, out)) in (first..).zip(params.chunks_exact(width).zip(out)) {
         if let Some(drawn) = cpu::project_one(view, g, |c| params[c]) {
             *out = drawn;
@@ -147,9 +177,17 @@ fn splats(projected: &[Projected]) -> Vec<Splat> {
 /// Returns the drawn Gaussians by ascending depth. Equal depths are ordered by index.
 fn in_depth_order(projected: &[Projected]) -> Vec<u32> {
     let depths: Vec<u32> = projected.par_iter().map(|p| p.depth).collect();
-    let drawn = (0..).zip(&depths).filter(|(_, depth)| **depth != NOT_DRAWN).map(|(g, _)| g).collect();
+    let drawn = (0..)
+        .zip(&depths)
+        .filter(|(_, depth)| **depth != NOT_DRAWN)
+        .map(|(g, _)| g)
+        .collect();
     // Radix sort: the lower digit first, as the stable sort by the higher digit keeps its order.
-    [0, DIGIT].into_iter().fold(drawn, |order, shift| by_digit(&order, |g| (depths[g as usize] >> shift) as usize % (1 << DIGIT)))
+    [0, DIGIT].into_iter().fold(drawn, |order, shift| {
+        by_digit(&order, |g| {
+            (depths[g as usize] >> shift) as usize % (1 << DIGIT)
+        })
+    })
 }
 
 /// Bits of a radix digit. A depth key has two digits.
@@ -180,9 +218,15 @@ fn bands(view: &View, projected: &[Projected]) -> Vec<Band> {
         touches(view, projected, gaussians, &mut rows);
         rows
     };
-    let parts: Vec<Vec<Vec<Touch>>> = order.par_chunks(order.len().div_ceil(PARTS).max(1)).map(touched).collect();
+    let parts: Vec<Vec<Vec<Touch>>> = order
+        .par_chunks(order.len().div_ceil(PARTS).max(1))
+        .map(touched)
+        .collect();
     let band = |row: usize| Band::new(view.tiles[0], parts.iter().flat_map(|rows| &rows[row]));
-    (0..view.tiles[1] as usize).into_par_iter().map(band).collect()
+    (0..view.tiles[1] as usize)
+        .into_par_iter()
+        .map(band)
+        .collect()
 }
 
 /// Number of rows of tiles whose spans are computed together, so that the loop vectorises.
@@ -194,7 +238,12 @@ vectorised! {
 }
 
 #[inline(always)]
-fn touches_body<const FMA: bool>(view: &View, projected: &[Projected], gaussians: &[u32], rows: &mut [Vec<Touch>]) {
+fn touches_body<const FMA: bool>(
+    view: &View,
+    projected: &[Projected],
+    gaussians: &[u32],
+    rows: &mut [Vec<Touch>],
+) {
     for (k, &gaussian) in gaussians.iter().enumerate() {
         if let Some(later) = gaussians.get(k + AHEAD) {
             prefetch(&projected[*later as usize].footprint);
@@ -207,16 +256,27 @@ fn touches_body<const FMA: bool>(view: &View, projected: &[Projected], gaussians
                 let columns = span(footprint, first + k as u32, view.tiles[0]);
                 (starts[k], ends[k]) = (columns.start, columns.end);
             }
-            for (row, (start, end)) in (first..end).zip(starts.into_iter().zip(ends)).filter(|(_, (start, end))| start < end) {
-                rows[row as usize].push(Touch { gaussian, columns: start..end });
+            for (row, (start, end)) in (first..end)
+                .zip(starts.into_iter().zip(ends))
+                .filter(|(_, (start, end))| start < end)
+            {
+                rows[row as usize].push(Touch {
+                    gaussian,
+                    columns: start..end,
+                });
             }
         }
     }
 }
 
-/// Returns `first` and `places` of `Lists`.
-fn places(bands: &[Band], count: usize) -> (Vec<u32>, Vec<u32>) {
-    let all = || bands.iter().flat_map(|band| &band.gaussians).map(|g| *g as usize);
+/// Returns `first` and `positions` of `Lists`.
+fn positions(bands: &[Band], count: usize) -> (Vec<u32>, Vec<u32>) {
+    let all = || {
+        bands
+            .iter()
+            .flat_map(|band| &band.gaussians)
+            .map(|g| *g as usize)
+    };
     let mut first = vec![0; count + 1];
     all().for_each(|g| first[g + 1] += 1);
     for g in 0..count {
@@ -236,8 +296,12 @@ mod tests {
     use fastlgs_core::rng::Rng;
 
     /// Returns a Gaussian that has only a depth and a footprint.
-    fn of(depth: u32, footprint: Footprint) -> Projected {
-        Projected { splat: [[0.0; 4]; 3], depth, footprint }
+    fn projected_at(depth: u32, footprint: Footprint) -> Projected {
+        Projected {
+            splat: [[0.0; 4]; 3],
+            depth,
+            footprint,
+        }
     }
 
     #[test]
@@ -245,10 +309,15 @@ mod tests {
         let mut rng = Rng::new(3, "depths");
         let mut depths = vec![0, NOT_DRAWN, 0xfff, 0x1000, NOT_DRAWN - 1, 0xfff, 0, 0x1001];
         depths.extend((0..500).map(|_| (rng.uniform() * 300.0) as u32 * 0x777));
-        let projected: Vec<Projected> = depths.iter().map(|depth| of(*depth, [[0.0; 4]; 2])).collect();
-        let mut wanted: Vec<u32> = (0..depths.len() as u32).filter(|g| depths[*g as usize] != NOT_DRAWN).collect();
-        wanted.sort_by_key(|g| depths[*g as usize]);
-        assert_eq!(in_depth_order(&projected), wanted);
+        let projected: Vec<Projected> = depths
+            .iter()
+            .map(|depth| projected_at(*depth, [[0.0; 4]; 2]))
+            .collect();
+        let mut expected: Vec<u32> = (0..depths.len() as u32)
+            .filter(|g| depths[*g as usize] != NOT_DRAWN)
+            .collect();
+        expected.sort_by_key(|g| depths[*g as usize]);
+        assert_eq!(in_depth_order(&projected), expected);
         assert!(in_depth_order(&[]).is_empty());
     }
 
@@ -258,19 +327,38 @@ mod tests {
         let view = View::new(&crate::tests::camera(90, 150), 4, 0);
         let round = |x: f32, y: f32, r: f32| {
             let rows = |y: f32| (y / 8.0).floor().clamp(0.0, 19.0);
-            [[x, y, 0.0, 1.0], [r * r, 0.0, rows(y - r), rows(y + r) + 1.0]]
+            [
+                [x, y, 0.0, 1.0],
+                [r * r, 0.0, rows(y - r), rows(y + r) + 1.0],
+            ]
         };
-        let footprints = [round(40.0, 70.0, 65.0), round(3.0, 3.0, 1.5), round(88.0, 148.0, 30.0), round(45.0, 75.0, 300.0)];
-        let projected: Vec<Projected> = footprints.iter().zip([4, 3, 2, 1]).map(|(footprint, depth)| of(depth, *footprint)).collect();
+        let footprints = [
+            round(40.0, 70.0, 65.0),
+            round(3.0, 3.0, 1.5),
+            round(88.0, 148.0, 30.0),
+            round(45.0, 75.0, 300.0),
+        ];
+        let projected: Vec<Projected> = footprints
+            .iter()
+            .zip([4, 3, 2, 1])
+            .map(|(footprint, depth)| projected_at(depth, *footprint))
+            .collect();
         let bands = bands(&view, &projected);
         assert_eq!(bands.len(), 19);
         for (row, band) in (0..).zip(&bands) {
             let [first, end] = [2, 3].map(|k| footprints.map(|f| f[1][k] as u32));
             let within = |g: &u32| (first[*g as usize]..end[*g as usize]).contains(&row);
             for column in 0..view.tiles[0] {
-                let there = |g: &u32| within(g) && span(&footprints[*g as usize], row, view.tiles[0]).contains(&column);
+                let there = |g: &u32| {
+                    within(g)
+                        && span(&footprints[*g as usize], row, view.tiles[0]).contains(&column)
+                };
                 let wanted: Vec<u32> = [3, 2, 1, 0].into_iter().filter(there).collect();
-                let found: Vec<u32> = band.tile(column as usize).iter().map(|place| band.gaussians[*place as usize]).collect();
+                let found: Vec<u32> = band
+                    .tile(column as usize)
+                    .iter()
+                    .map(|place| band.gaussians[*place as usize])
+                    .collect();
                 assert_eq!(found, wanted, "row {row}, column {column}");
             }
         }

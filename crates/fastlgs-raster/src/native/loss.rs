@@ -1,6 +1,6 @@
 //! The loss (1 - lambda) L1 + lambda (1 - SSIM) and its gradient, computed row by row.
 
-use super::picture::Picture;
+use super::picture::TiledPlanes;
 use super::simd::{madd, vectorised};
 use crate::engine::Losses;
 use crate::view::Plane;
@@ -11,7 +11,7 @@ use rayon::prelude::*;
 #[derive(Default)]
 pub struct Scratch {
     /// Rendered value x, target value y and weight of each pixel, `[h][3][w]`.
-    compared: Vec<f32>,
+    samples: Vec<f32>,
     /// Derivatives of SSIM by three local moments, blurred along rows, `[h][3][w]`.
     blurred: Vec<f32>,
 }
@@ -26,7 +26,11 @@ vectorised! {
 }
 
 #[inline(always)]
-fn blur_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) {
+fn blur_body<const FMA: bool>(
+    window: &Window,
+    rows: &[&[f32]; 2 * SSIM_RADIUS + 1],
+    out: &mut [f32],
+) {
     let rows = rows.map(|row| &row[..out.len()]);
     for i in 0..out.len() {
         let mut sum = 0.0;
@@ -39,16 +43,32 @@ fn blur_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS +
 
 /// Blurs a row. `padded` is the row with SSIM_RADIUS zeros on both sides.
 fn blur_row(window: &Window, padded: &[f32], out: &mut [f32]) {
-    blur(window, &std::array::from_fn(|k| &padded[k..k + out.len()]), out);
+    blur(
+        window,
+        &std::array::from_fn(|k| &padded[k..k + out.len()]),
+        out,
+    );
 }
 
 /// Returns the weight and the row of each tap of the window around row `j`. `rows` holds rows of
 /// `line` floats. Taps outside the image have weight 0.
-fn taps<'a>(window: &Window, rows: &'a [f32], line: usize, j: usize) -> (Window, [&'a [f32]; 2 * SSIM_RADIUS + 1]) {
-    let held = |k: usize| (j + k).checked_sub(SSIM_RADIUS).and_then(|row| rows.get(row * line..(row + 1) * line));
+fn taps<'a>(
+    window: &Window,
+    rows: &'a [f32],
+    line: usize,
+    j: usize,
+) -> (Window, [&'a [f32]; 2 * SSIM_RADIUS + 1]) {
+    let held = |k: usize| {
+        (j + k)
+            .checked_sub(SSIM_RADIUS)
+            .and_then(|row| rows.get(row * line..(row + 1) * line))
+    };
     let taps: [_; 2 * SSIM_RADIUS + 1] = std::array::from_fn(held);
     let own = &rows[j * line..(j + 1) * line];
-    (std::array::from_fn(|k| taps[k].map_or(0.0, |_| window[k])), taps.map(|row| row.unwrap_or(own)))
+    (
+        std::array::from_fn(|k| taps[k].map_or(0.0, |_| window[k])),
+        taps.map(|row| row.unwrap_or(own)),
+    )
 }
 
 vectorised! {
@@ -58,16 +78,28 @@ vectorised! {
 }
 
 #[inline(always)]
-fn moments_body<const FMA: bool>(window: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], w: usize, out: &mut [f32]) {
+fn moments_body<const FMA: bool>(
+    window: &Window,
+    rows: &[&[f32]; 2 * SSIM_RADIUS + 1],
+    w: usize,
+    out: &mut [f32],
+) {
     let (x, y) = (rows.map(|row| &row[..w]), rows.map(|row| &row[w..2 * w]));
-    let mut lines = out.chunks_exact_mut(w + 2 * SSIM_RADIUS).map(|line| &mut line[SSIM_RADIUS..SSIM_RADIUS + w]);
+    let mut lines = out
+        .chunks_exact_mut(w + 2 * SSIM_RADIUS)
+        .map(|line| &mut line[SSIM_RADIUS..SSIM_RADIUS + w]);
     let [mx, my, squares, xy] = std::array::from_fn(|_| lines.next().expect("four lines"));
     for i in 0..w {
         let mut sums = [0.0; 4];
         for k in 0..window.len() {
             let (x, y) = (x[k][i], y[k][i]);
             let (wx, wy) = (window[k] * x, window[k] * y);
-            sums = [sums[0] + wx, sums[1] + wy, madd::<FMA>(wx, x, madd::<FMA>(wy, y, sums[2])), madd::<FMA>(wx, y, sums[3])];
+            sums = [
+                sums[0] + wx,
+                sums[1] + wy,
+                madd::<FMA>(wx, x, madd::<FMA>(wy, y, sums[2])),
+                madd::<FMA>(wx, y, sums[3]),
+            ];
         }
         [mx[i], my[i], squares[i], xy[i]] = sums;
     }
@@ -87,9 +119,13 @@ fn compare_body<const FMA: bool>(plane: &Plane, rendered: &[f32], packed: &[u32]
     let (packed, weight) = (&packed[..w], &mut weight[..w]);
     for i in 0..w {
         x[i] = plane.gain * rendered[i] + plane.offset;
-        let counts = packed[i] >= 0x8000_0000;
-        y[i] = if counts { (packed[i] >> shift & 255) as i32 as f32 / 255.0 } else { x[i] };
-        weight[i] = if counts { 1.0 } else { 0.0 };
+        let valid = packed[i] >= 0x8000_0000;
+        y[i] = if valid {
+            (packed[i] >> shift & 255) as i32 as f32 / 255.0
+        } else {
+            x[i]
+        };
+        weight[i] = if valid { 1.0 } else { 0.0 };
     }
 }
 
@@ -113,7 +149,7 @@ fn lanes<const ROWS: usize>(rows: [&[f32]; ROWS], first: usize) -> [[f32; LANES]
 
 /// Writes values to a row from index `first` on, up to the end of the row.
 #[inline(always)]
-fn put(row: &mut [f32], first: usize, values: &[f32; LANES]) {
+fn store_lanes(row: &mut [f32], first: usize, values: &[f32; LANES]) {
     let rest = &mut row[first..];
     match rest.first_chunk_mut() {
         Some(all) => *all = *values,
@@ -124,20 +160,35 @@ fn put(row: &mut [f32], first: usize, values: &[f32; LANES]) {
 impl Scratch {
     /// Returns the number of floats held.
     pub fn words(&self) -> usize {
-        self.compared.len() + self.blurred.len()
+        self.samples.len() + self.blurred.len()
     }
 
     /// Writes dL/d frame of one channel to `gradient` and its part of the loss to `losses`.
     /// `targets` is `[2][h][w]` without padding.
-    pub fn plane(&mut self, plane: &Plane, frame: &Picture<8>, targets: &[u32], gradient: &mut Picture<6>, losses: &mut Losses) {
+    pub fn plane(
+        &mut self,
+        plane: &Plane,
+        frame: &TiledPlanes<8>,
+        targets: &[u32],
+        gradient: &mut TiledPlanes<6>,
+        losses: &mut Losses,
+    ) {
         let [w, h] = plane.size.map(|s| s as usize);
         let channel = plane.channel as usize;
         let window = ssim_window();
-        self.compared.resize(3 * w * h, 0.0);
-        self.compared.par_chunks_exact_mut(3 * w).enumerate().for_each(|(j, out)| {
-            compare(plane, &frame.row(channel, j)[..w], &targets[(channel / 3 * h + j) * w..][..w], out);
-        });
-        let compared = &self.compared;
+        self.samples.resize(3 * w * h, 0.0);
+        self.samples
+            .par_chunks_exact_mut(3 * w)
+            .enumerate()
+            .for_each(|(j, out)| {
+                compare(
+                    plane,
+                    &frame.row(channel, j)[..w],
+                    &targets[(channel / 3 * h + j) * w..][..w],
+                    out,
+                );
+            });
+        let compared = &self.samples;
         self.blurred.resize(3 * w * h, 0.0);
         let per_row = self.blurred.par_chunks_exact_mut(3 * w).enumerate();
         let ssim: Vec<f64> = per_row
@@ -161,7 +212,14 @@ impl Scratch {
                     blur(&weights, &rows, by);
                     let light = [channel, 6].map(|c| &frame.row(c, j)[..w]);
                     let mut sums = [0.0; 4];
-                    gradients(plane, &compared[3 * w * j..][..3 * w], by, light, &mut row[channel * frame.width..][..w], &mut sums);
+                    gradients(
+                        plane,
+                        &compared[3 * w * j..][..3 * w],
+                        by,
+                        light,
+                        &mut row[channel * frame.width..][..w],
+                        &mut sums,
+                    );
                     sums
                 },
             )
@@ -189,23 +247,42 @@ struct Moments {
 
 impl Moments {
     fn new(w: usize) -> Self {
-        Self { padded: vec![0.0; 4 * (w + 2 * SSIM_RADIUS)], moments: vec![0.0; 4 * w], partials: vec![0.0; 3 * w] }
+        Self {
+            padded: vec![0.0; 4 * (w + 2 * SSIM_RADIUS)],
+            moments: vec![0.0; 4 * w],
+            partials: vec![0.0; 3 * w],
+        }
     }
 
     /// Returns the sum of SSIM over a row of pixels. Writes its derivatives by the moments, blurred
     /// along the row, to `out` `[3][w]`.
-    fn ssim(&mut self, window: &Window, weights: &Window, rows: &[&[f32]; 2 * SSIM_RADIUS + 1], out: &mut [f32]) -> f64 {
+    fn ssim(
+        &mut self,
+        window: &Window,
+        weights: &Window,
+        rows: &[&[f32]; 2 * SSIM_RADIUS + 1],
+        out: &mut [f32],
+    ) -> f64 {
         let w = out.len() / 3;
-        let Self { padded, moments: blurred, partials } = self;
+        let Self {
+            padded,
+            moments: blurred,
+            partials,
+        } = self;
         moments(weights, rows, w, padded);
         let lines = |padded: &mut [f32], out: &mut [f32]| {
-            let lines = padded.chunks_exact(w + 2 * SSIM_RADIUS).zip(out.chunks_exact_mut(w));
+            let lines = padded
+                .chunks_exact(w + 2 * SSIM_RADIUS)
+                .zip(out.chunks_exact_mut(w));
             lines.for_each(|(line, out)| blur_row(window, line, out));
         };
         lines(padded, blurred);
         let mut ssim = 0.0;
         derivatives(blurred, partials, &mut ssim);
-        for (line, row) in padded.chunks_exact_mut(w + 2 * SSIM_RADIUS).zip(partials.chunks_exact(w)) {
+        for (line, row) in padded
+            .chunks_exact_mut(w + 2 * SSIM_RADIUS)
+            .zip(partials.chunks_exact(w))
+        {
             line[SSIM_RADIUS..SSIM_RADIUS + w].copy_from_slice(row);
         }
         lines(padded, out);
@@ -244,7 +321,10 @@ fn derivatives_body<const FMA: bool>(moments: &[f32], out: &mut [f32], sum: &mut
             // Lanes beyond the row compare zeros and must not count.
             sums[i] += if first + i < w { ssim } else { 0.0 };
         }
-        [&mut *by_mean, by_square, by_product].into_iter().zip(&by).for_each(|(row, values)| put(row, first, values));
+        [&mut *by_mean, by_square, by_product]
+            .into_iter()
+            .zip(&by)
+            .for_each(|(row, values)| store_lanes(row, first, values));
     }
     *sum = sums.iter().map(|s| f64::from(*s)).sum();
 }
@@ -258,7 +338,14 @@ vectorised! {
 }
 
 #[inline(always)]
-fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], light: [&[f32]; 2], out: &mut [f32], sums: &mut [f64; 4]) {
+fn gradients_body<const FMA: bool>(
+    plane: &Plane,
+    compared: &[f32],
+    by: &[f32],
+    light: [&[f32]; 2],
+    out: &mut [f32],
+    sums: &mut [f64; 4],
+) {
     let w = out.len();
     let [x, y, weight] = [0, 1, 2].map(|m| &compared[m * w..(m + 1) * w]);
     let [rendered, transmittance] = light.map(|row| &row[..w]);
@@ -266,20 +353,22 @@ fn gradients_body<const FMA: bool>(plane: &Plane, compared: &[f32], by: &[f32], 
     let mut totals = [[0.0; LANES]; 4];
     for first in (0..w).step_by(LANES) {
         // Lanes beyond the row have weight 0.
-        let [x, y, weight, rendered, transmittance] = lanes([x, y, weight, rendered, transmittance], first);
+        let [x, y, weight, rendered, transmittance] =
+            lanes([x, y, weight, rendered, transmittance], first);
         let [by_mean, by_square, by_product] = lanes([by_mean, by_square, by_product], first);
         let mut values = [0.0; LANES];
         for i in 0..LANES {
             let sign = if x[i] > y[i] { 1.0 } else { 0.0 } - if x[i] < y[i] { 1.0 } else { 0.0 };
             let d_ssim = by_mean[i] + 2.0 * x[i] * by_square[i] + y[i] * by_product[i];
-            let value = weight[i] * plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim);
+            let value =
+                weight[i] * plane.scale * ((1.0 - plane.lambda) * sign - plane.lambda * d_ssim);
             totals[0][i] += weight[i] * (x[i] - y[i]).abs();
             totals[1][i] += value * rendered[i];
             totals[2][i] += value;
             totals[3][i] += plane.gain * value * transmittance[i];
             values[i] = plane.gain * value;
         }
-        put(out, first, &values);
+        store_lanes(out, first, &values);
     }
     *sums = totals.map(|lanes| lanes.iter().map(|sum| f64::from(*sum)).sum());
 }

@@ -10,17 +10,19 @@ mod simd;
 use crate::channels::Channels;
 use crate::cpu;
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered};
+use crate::engine::{
+    Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered,
+};
 use crate::view::{Step, View};
 use crate::{Error, Result};
-use blend::{Blended, EDGE, Given, Job, Tile};
+use blend::{BackwardInput, Blended, EDGE, Job, Tile};
 use fastlgs_core::Shares;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
-use fastlgs_core::shares::{KEPT, pack};
+use fastlgs_core::shares::{IDS_PER_PIXEL, pack};
 pub(crate) use lists::Lists;
-use picture::Picture;
+use picture::TiledPlanes;
 use rayon::prelude::*;
-use simd::{AHEAD, SUMS};
+use simd::{AHEAD, SLOT_FLOATS};
 use std::collections::{BTreeMap, HashMap};
 use std::time::Instant;
 
@@ -40,13 +42,13 @@ pub struct CpuEngine {
     gradients: Vec<f32>,
     stats: Vec<f32>,
     targets: HashMap<usize, TargetImage>,
-    frame: Picture<8>,
-    gradient: Picture<6>,
+    frame: TiledPlanes<8>,
+    gradient: TiledPlanes<6>,
     scratch: loss::Scratch,
-    walked: Vec<u32>,
+    processed: Vec<u32>,
     /// Gradient sums of a Gaussian over the tiles of one row. [`Lists::places`] holds indices into
     /// it.
-    slots: Vec<[f32; SUMS]>,
+    slots: Vec<[f32; SLOT_FLOATS]>,
     lists: Option<Lists>,
     /// Tile lists by target id, kept while geometry is frozen.
     cached: HashMap<usize, Lists>,
@@ -58,12 +60,14 @@ pub struct CpuEngine {
 /// back.
 pub(crate) fn transposed(columns: &[f32], n: usize) -> Vec<f32> {
     let channels = columns.len() / n.max(1);
-    (0..n).flat_map(|i| (0..channels).map(move |c| columns[c * n + i])).collect()
+    (0..n)
+        .flat_map(|i| (0..channels).map(move |c| columns[c * n + i]))
+        .collect()
 }
 
-/// Returns the `KEPT` ids with the largest weights as packed id weights, in descending order.
-fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
-    let mut best = [(0, 0.0); KEPT];
+/// Returns the `IDS_PER_PIXEL` ids with the largest weights as packed id weights, in descending order.
+fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; IDS_PER_PIXEL] {
+    let mut best = [(0, 0.0); IDS_PER_PIXEL];
     for (id, weight) in weights {
         let place = best.iter().position(|b| weight > b.1);
         if let Some(place) = place {
@@ -75,14 +79,30 @@ fn heaviest(weights: impl Iterator<Item = (u16, f32)>) -> [u32; KEPT] {
 }
 
 /// Blends a tile including the background. Channels that are not requested are 0.
-fn blended<const COLOR: bool, const FEATURE: bool>(view: &View, lists: &Lists, tile: usize) -> Blended {
+fn blended<const COLOR: bool, const FEATURE: bool>(
+    view: &View,
+    lists: &Lists,
+    tile: usize,
+) -> Blended {
     let job = Job::new(view, tile, lists);
-    let shown = blend::shown(view, &job);
-    let mut out = Blended { sums: [blend::EMPTY; 6], transmittance: shown, walked: 0 };
+    let shown = blend::inside_image(view, &job);
+    let mut out = Blended {
+        sums: [blend::EMPTY; 6],
+        transmittance: shown,
+        walked: 0,
+    };
     blend::forward::<COLOR, FEATURE>(&job, &mut out);
-    let background = view.background_color[..3].iter().chain(&view.background_feature[..3]);
+    let background = view.background_color[..3]
+        .iter()
+        .chain(&view.background_feature[..3]);
     let asked = [COLOR, COLOR, COLOR, FEATURE, FEATURE, FEATURE];
-    for ((sums, background), _) in out.sums.iter_mut().zip(background).zip(asked).filter(|(_, asked)| *asked) {
+    for ((sums, background), _) in out
+        .sums
+        .iter_mut()
+        .zip(background)
+        .zip(asked)
+        .filter(|(_, asked)| *asked)
+    {
         for (p, sum) in sums.iter_mut().enumerate() {
             *sum = shown[p] * (*sum + out.transmittance[p] * background);
         }
@@ -118,7 +138,10 @@ impl CpuEngine {
     /// whose cached lists are reused while geometry is frozen.
     fn list(&mut self, view: &View, frozen: Option<usize>) -> Result<()> {
         if view.gaussians as usize != self.n || self.n == 0 {
-            return Err(Error::Invalid(format!("the view expects {} Gaussians, but the engine holds {}", view.gaussians, self.n)));
+            return Err(Error::Invalid(format!(
+                "the view expects {} Gaussians, but the engine holds {}",
+                view.gaussians, self.n
+            )));
         }
         self.timed("lists", |s| {
             s.lists = match frozen.and_then(|id| s.cached.remove(&id)) {
@@ -135,16 +158,27 @@ impl CpuEngine {
     /// Renders the frame that the loss compares. Stores how many pairs each tile processes.
     fn blend(&mut self, view: &View, channels: Channels) {
         self.frame.prepare(view);
-        self.walked.resize(view.tile_count() as usize, 0);
-        let (lists, blended) = (self.lists.as_ref().expect("made before blending"), blended_by(channels));
+        self.processed.resize(view.tile_count() as usize, 0);
+        let (lists, blended) = (
+            self.lists.as_ref().expect("made before blending"),
+            blended_by(channels),
+        );
         let (width, tiles_x) = (self.frame.width, view.tiles[0] as usize);
-        let bands = self.frame.data.par_chunks_exact_mut(EDGE * 8 * width).zip(self.walked.par_chunks_exact_mut(tiles_x));
+        let bands = self
+            .frame
+            .data
+            .par_chunks_exact_mut(EDGE * 8 * width)
+            .zip(self.processed.par_chunks_exact_mut(tiles_x));
         bands.enumerate().for_each(|(row, (band, walked))| {
             for column in 0..tiles_x {
                 let tile = blended(view, lists, row * tiles_x + column);
                 walked[column] = tile.walked;
                 for (y, line) in band.chunks_exact_mut(8 * width).enumerate() {
-                    for (c, plane) in line.chunks_exact_mut(width).enumerate().filter(|(c, _)| rendered(channels, *c)) {
+                    for (c, plane) in line
+                        .chunks_exact_mut(width)
+                        .enumerate()
+                        .filter(|(c, _)| rendered(channels, *c))
+                    {
                         tile.write_row(c, y, &mut plane[column * EDGE..][..EDGE]);
                     }
                 }
@@ -152,9 +186,12 @@ impl CpuEngine {
         });
     }
 
-    fn blend_backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(&mut self, view: &View) {
+    fn blend_backward<const COLOR: bool, const FEATURE: bool, const MOVES: bool>(
+        &mut self,
+        view: &View,
+    ) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
-        self.slots.resize(lists.places.len(), [0.0; SUMS]);
+        self.slots.resize(lists.places.len(), [0.0; SLOT_FLOATS]);
         let tiles_x = view.tiles[0] as usize;
         // Each row of tiles owns a contiguous range of the slots.
         let mut bands = Vec::new();
@@ -164,13 +201,19 @@ impl CpuEngine {
             bands.push(own);
             rest = after;
         }
-        let (frame, gradient, walked) = (&self.frame, &self.gradient, &self.walked);
+        let (frame, gradient, walked) = (&self.frame, &self.gradient, &self.processed);
         bands.into_par_iter().enumerate().for_each(|(row, slots)| {
-            slots.fill([0.0; SUMS]);
+            slots.fill([0.0; SLOT_FLOATS]);
             for tile in row * tiles_x..(row + 1) * tiles_x {
                 let job = Job::new(view, tile, lists);
                 let trained = |c: usize| if c < 3 { COLOR } else { FEATURE };
-                let g: [Tile; 6] = std::array::from_fn(|c| if trained(c) { gradient.tile(c, &job) } else { blend::EMPTY });
+                let g: [Tile; 6] = std::array::from_fn(|c| {
+                    if trained(c) {
+                        gradient.tile(c, &job)
+                    } else {
+                        blend::EMPTY
+                    }
+                });
                 let mut r_dot_g = blend::EMPTY;
                 for c in 0..if MOVES { 6 } else { 3 } {
                     let light = frame.tile(c, &job);
@@ -178,7 +221,12 @@ impl CpuEngine {
                         *b += l * g;
                     }
                 }
-                let mut given = Given { gradient: g, r_dot_g, transmittance: blend::shown(view, &job), walked: walked[tile] };
+                let mut given = BackwardInput {
+                    gradient: g,
+                    r_dot_g,
+                    transmittance: blend::inside_image(view, &job),
+                    walked: walked[tile],
+                };
                 blend::backward::<COLOR, FEATURE, MOVES>(&job, &mut given, slots);
             }
         });
@@ -188,37 +236,76 @@ impl CpuEngine {
     fn update(&mut self, view: &View, channels: Channels, step: &Step) {
         let lists = self.lists.as_ref().expect("made by the forward pass");
         let (slots, width) = (&self.slots, channels_of(self.sh_degree));
-        let rates: Vec<f32> = (0..adam::BLOCK * width).map(|k| step.rates[(k % width).min(BASE_CHANNELS)]).collect();
+        let rates: Vec<f32> = (0..adam::BLOCK * width)
+            .map(|k| step.rates[(k % width).min(BASE_CHANNELS)])
+            .collect();
         let (lengths, counts) = self.stats.split_at_mut(self.n);
         let size = adam::BLOCK * width;
-        let blocks = self.params.par_chunks_mut(size).zip(self.moment1.par_chunks_mut(size)).zip(self.moment2.par_chunks_mut(size));
+        let blocks = self
+            .params
+            .par_chunks_mut(size)
+            .zip(self.moment1.par_chunks_mut(size))
+            .zip(self.moment2.par_chunks_mut(size));
         let blocks = blocks.zip(self.gradients.par_chunks_mut(size));
-        let stats = lengths.par_chunks_mut(adam::BLOCK).zip(counts.par_chunks_mut(adam::BLOCK));
-        blocks.zip(stats).enumerate().for_each(|(block, ((((params, moment1), moment2), gradients), (lengths, counts)))| {
-            for (k, (params, gradients)) in params.chunks_exact(width).zip(gradients.chunks_exact_mut(width)).enumerate() {
-                let i = block * adam::BLOCK + k;
-                let places = lists.places_of(i);
-                lists.places_of(i + AHEAD).iter().for_each(|place| simd::prefetch(&slots[*place as usize]));
-                let mut slot = [0.0; SUMS];
-                for place in places {
-                    let values = &slots[*place as usize];
-                    (0..SUMS).for_each(|k| slot[k] += values[k]);
+        let stats = lengths
+            .par_chunks_mut(adam::BLOCK)
+            .zip(counts.par_chunks_mut(adam::BLOCK));
+        blocks.zip(stats).enumerate().for_each(
+            |(block, ((((params, moment1), moment2), gradients), (lengths, counts)))| {
+                for (k, (params, gradients)) in params
+                    .chunks_exact(width)
+                    .zip(gradients.chunks_exact_mut(width))
+                    .enumerate()
+                {
+                    let i = block * adam::BLOCK + k;
+                    let places = lists.places_of(i);
+                    lists
+                        .places_of(i + AHEAD)
+                        .iter()
+                        .for_each(|place| simd::prefetch(&slots[*place as usize]));
+                    let mut slot = [0.0; SLOT_FLOATS];
+                    for place in places {
+                        let values = &slots[*place as usize];
+                        (0..SLOT_FLOATS).for_each(|k| slot[k] += values[k]);
+                    }
+                    let put = |c: usize, value: f32| gradients[c] = value;
+                    let gradient_length = cpu::backward_one(
+                        view,
+                        channels,
+                        |c| params[c],
+                        !places.is_empty(),
+                        &lists.splats[i],
+                        &slot,
+                        put,
+                    );
+                    if let Some(length) = gradient_length.filter(|_| channels.color()) {
+                        lengths[k] += length;
+                        counts[k] += 1.0;
+                    }
                 }
-                let put = |c: usize, value: f32| gradients[c] = value;
-                let drawn = cpu::backward_one(view, channels, |c| params[c], !places.is_empty(), &lists.splats[i], &slot, put);
-                if let Some(moved) = drawn.filter(|_| channels.color()) {
-                    lengths[k] += moved;
-                    counts[k] += 1.0;
-                }
-            }
-            adam::block(step, width, &rates, adam::Values { params, moment1, moment2, gradients });
-        });
+                adam::update_block(
+                    step,
+                    width,
+                    &rates,
+                    adam::Values {
+                        params,
+                        moment1,
+                        moment2,
+                        gradients,
+                    },
+                );
+            },
+        );
     }
 }
 
 impl Engine for CpuEngine {
     fn name(&self) -> String {
-        let vectors = if cfg!(target_arch = "x86_64") { x86_vectors() } else { "" };
+        let vectors = if cfg!(target_arch = "x86_64") {
+            x86_vectors()
+        } else {
+            ""
+        };
         format!("cpu ({} threads{vectors})", rayon::current_num_threads())
     }
 
@@ -240,8 +327,17 @@ impl Engine for CpuEngine {
 
     fn state(&self) -> Result<State> {
         let columns = |rows: &[f32]| transposed(rows, channels_of(self.sh_degree));
-        let (params, moment1, moment2) = (columns(&self.params), columns(&self.moment1), columns(&self.moment2));
-        Ok(State { sh_degree: self.sh_degree, params, moment1, moment2 })
+        let (params, moment1, moment2) = (
+            columns(&self.params),
+            columns(&self.moment1),
+            columns(&self.moment2),
+        );
+        Ok(State {
+            sh_degree: self.sh_degree,
+            params,
+            moment1,
+            moment2,
+        })
     }
 
     fn stats(&self) -> Result<Vec<f32>> {
@@ -264,30 +360,51 @@ impl Engine for CpuEngine {
         Ok(())
     }
 
-    fn forget_target(&mut self, id: usize) {
+    fn remove_target(&mut self, id: usize) {
         self.targets.remove(&id);
         self.cached.remove(&id);
     }
 
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
         self.list(&view, None)?;
-        let (lists, blended) = (self.lists.as_ref().expect("made a line above"), blended_by(channels));
-        let (mut frame, width) = (Frame::new(&View { pairs: lists.pairs() as u32, ..view }), view.size[0] as usize);
+        let (lists, blended) = (
+            self.lists.as_ref().expect("made a line above"),
+            blended_by(channels),
+        );
+        let (mut frame, width) = (
+            Frame::new(&View {
+                pairs: lists.pairs() as u32,
+                ..view
+            }),
+            view.size[0] as usize,
+        );
         // Splits each plane into the pixel rows of each row of tiles.
-        let mut planes: Vec<_> = frame.data.chunks_exact_mut(view.pixels()).map(|plane| plane.chunks_mut(EDGE * width)).collect();
-        let band = |_| -> Vec<&mut [f32]> { planes.iter_mut().filter_map(Iterator::next).collect() };
+        let mut planes: Vec<_> = frame
+            .data
+            .chunks_exact_mut(view.pixels())
+            .map(|plane| plane.chunks_mut(EDGE * width))
+            .collect();
+        let band =
+            |_| -> Vec<&mut [f32]> { planes.iter_mut().filter_map(Iterator::next).collect() };
         let bands: Vec<Vec<&mut [f32]>> = (0..view.tiles[1]).map(band).collect();
-        bands.into_par_iter().enumerate().for_each(|(row, mut band)| {
-            for column in 0..view.tiles[0] as usize {
-                let tile = blended(&view, lists, row * view.tiles[0] as usize + column);
-                let columns = column * EDGE..width.min((column + 1) * EDGE);
-                for (c, plane) in band.iter_mut().enumerate().filter(|(c, _)| rendered(channels, *c)) {
-                    for (y, line) in plane.chunks_exact_mut(width).enumerate() {
-                        tile.write_row(c, y, &mut line[columns.clone()]);
+        bands
+            .into_par_iter()
+            .enumerate()
+            .for_each(|(row, mut band)| {
+                for column in 0..view.tiles[0] as usize {
+                    let tile = blended(&view, lists, row * view.tiles[0] as usize + column);
+                    let columns = column * EDGE..width.min((column + 1) * EDGE);
+                    for (c, plane) in band
+                        .iter_mut()
+                        .enumerate()
+                        .filter(|(c, _)| rendered(channels, *c))
+                    {
+                        for (y, line) in plane.chunks_exact_mut(width).enumerate() {
+                            tile.write_row(c, y, &mut line[columns.clone()]);
+                        }
                     }
                 }
-            }
-        });
+            });
         Ok(frame)
     }
 
@@ -295,26 +412,36 @@ impl Engine for CpuEngine {
         check_ids(&view, ids, self.n)?;
         let lists = Lists::new(&view, &self.params);
         let [width, height] = view.size;
-        let mut pixels = vec![[0; KEPT]; view.pixels()];
-        pixels.par_chunks_mut(EDGE * width as usize).enumerate().for_each_init(Vec::new, |sums, (row, band)| {
-            for tile in row * view.tiles[0] as usize..(row + 1) * view.tiles[0] as usize {
-                let job = Job::new(&view, tile, &lists);
-                blend::by_id(&job, ids, &mut blend::shown(&view, &job), sums);
-                for (y, line) in band.chunks_exact_mut(width as usize).enumerate() {
-                    for (x, pixel) in line[job.x as usize..].iter_mut().take(EDGE).enumerate() {
-                        let at = |tile: &Tile| tile[y * EDGE + x];
-                        *pixel = heaviest(sums.iter().map(|(id, tile)| (*id, at(tile))));
+        let mut pixels = vec![[0; IDS_PER_PIXEL]; view.pixels()];
+        pixels
+            .par_chunks_mut(EDGE * width as usize)
+            .enumerate()
+            .for_each_init(Vec::new, |sums, (row, band)| {
+                for tile in row * view.tiles[0] as usize..(row + 1) * view.tiles[0] as usize {
+                    let job = Job::new(&view, tile, &lists);
+                    blend::weights_by_id(&job, ids, &mut blend::inside_image(&view, &job), sums);
+                    for (y, line) in band.chunks_exact_mut(width as usize).enumerate() {
+                        for (x, pixel) in line[job.x as usize..].iter_mut().take(EDGE).enumerate() {
+                            let at = |tile: &Tile| tile[y * EDGE + x];
+                            *pixel = heaviest(sums.iter().map(|(id, tile)| (*id, at(tile))));
+                        }
                     }
                 }
-            }
-        });
-        Ok(Shares { width, height, pixels })
+            });
+        Ok(Shares {
+            width,
+            height,
+            pixels,
+        })
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {
         let channels = options.channels;
         if self.targets.get(&id).is_none_or(|t| t.size != view.size) {
-            return Err(Error::Invalid(format!("target {id} of size {}x{} is missing; call set_target first", view.size[0], view.size[1])));
+            return Err(Error::Invalid(format!(
+                "target {id} of size {}x{} is missing; call set_target first",
+                view.size[0], view.size[1]
+            )));
         }
         if channels.feature() {
             // Pixels without a feature do not enter the loss.
@@ -323,14 +450,24 @@ impl Engine for CpuEngine {
         }
         let frozen = (channels == Channels::Feature).then_some(id);
         // Cached lists must contain all Gaussians, so no Gaussian is dropped.
-        let view = if frozen.is_some() { view.without(0.0, 0) } else { view };
+        let view = if frozen.is_some() {
+            view.with_dropout(0.0, 0)
+        } else {
+            view
+        };
         self.list(&view, frozen)?;
         self.timed("blend", |s| s.blend(&view, channels));
         self.timed("loss", |s| {
             s.gradient.prepare(&view);
             s.losses = Losses::default();
             for plane in planes(&view, options) {
-                s.scratch.plane(&plane, &s.frame, &s.targets[&id].color, &mut s.gradient, &mut s.losses);
+                s.scratch.plane(
+                    &plane,
+                    &s.frame,
+                    &s.targets[&id].color,
+                    &mut s.gradient,
+                    &mut s.losses,
+                );
             }
         });
         self.timed("blend_backward", |s| match channels {
@@ -343,7 +480,8 @@ impl Engine for CpuEngine {
         if let Some(id) = frozen
             && self.cached.values().map(Lists::bytes).sum::<usize>() < CACHE_LIMIT
         {
-            self.cached.extend(self.lists.take().map(|lists| (id, lists)));
+            self.cached
+                .extend(self.lists.take().map(|lists| (id, lists)));
         }
         Ok(())
     }
@@ -357,11 +495,19 @@ impl Engine for CpuEngine {
         let words = |lists: &Lists| lists.pairs() + 2 * lists.places.len();
         Memory {
             state: bytes(3 * self.params.len()),
-            lists: bytes(self.lists.as_ref().map_or(0, words) + SUMS * self.slots.len()),
+            lists: bytes(self.lists.as_ref().map_or(0, words) + SLOT_FLOATS * self.slots.len()),
             gaussians: bytes(self.gradients.len() + 14 * self.n),
             frame: bytes(self.frame.data.len() + self.gradient.data.len() + self.scratch.words()),
-            views: self.targets.values().map(|t| bytes(t.color.len())).sum::<u64>()
-                + self.cached.values().map(|l| bytes(words(l) + 14 * self.n)).sum::<u64>(),
+            views: self
+                .targets
+                .values()
+                .map(|t| bytes(t.color.len()))
+                .sum::<u64>()
+                + self
+                    .cached
+                    .values()
+                    .map(|l| bytes(words(l) + 14 * self.n))
+                    .sum::<u64>(),
         }
     }
 
@@ -371,7 +517,11 @@ impl Engine for CpuEngine {
     }
 
     fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>> {
-        Ok(self.profile.as_mut().map(std::mem::take).unwrap_or_default())
+        Ok(self
+            .profile
+            .as_mut()
+            .map(std::mem::take)
+            .unwrap_or_default())
     }
 }
 

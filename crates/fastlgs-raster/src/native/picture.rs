@@ -6,14 +6,14 @@ use rayon::prelude::*;
 
 /// Planes padded to whole tiles, `[row][C][padded width]`. A row of tiles is contiguous in memory.
 #[derive(Default)]
-pub struct Picture<const C: usize> {
+pub struct TiledPlanes<const C: usize> {
     /// Padded width in pixels.
     pub width: usize,
     /// Values of all planes.
     pub data: Vec<f32>,
 }
 
-impl<const C: usize> Picture<C> {
+impl<const C: usize> TiledPlanes<C> {
     /// Resizes the planes for a view.
     pub fn prepare(&mut self, view: &View) {
         self.width = (view.tiles[0] * TILE) as usize;
@@ -34,7 +34,9 @@ impl<const C: usize> Picture<C> {
     pub fn tile(&self, channel: usize, job: &Job) -> Tile {
         let mut tile = blend::EMPTY;
         for (y, row) in tile.chunks_exact_mut(TILE as usize).enumerate() {
-            row.copy_from_slice(&self.row(channel, job.y as usize + y)[job.x as usize..][..TILE as usize]);
+            row.copy_from_slice(
+                &self.row(channel, job.y as usize + y)[job.x as usize..][..TILE as usize],
+            );
         }
         tile
     }

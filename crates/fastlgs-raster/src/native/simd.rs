@@ -32,7 +32,7 @@ pub fn prefetch<T>(value: &T) {
 }
 
 /// Number of floats of a gradient slot.
-pub const SUMS: usize = 12;
+pub const SLOT_FLOATS: usize = 12;
 
 /// One SIMD register of floats.
 ///
@@ -65,7 +65,7 @@ pub trait Vector: Copy {
     /// Returns self, with 0 in lanes that are below `least` or NaN.
     fn at_least_or_zero(self, least: Self) -> Self;
     /// Returns the sum of the lanes of each vector.
-    fn sums(all: &[Self; SUMS]) -> [f32; SUMS];
+    fn lane_sums(all: &[Self; SLOT_FLOATS]) -> [f32; SLOT_FLOATS];
 
     /// Splits self into the nearest integers, as [`Self::times_power_of_two`] expects them, and the
     /// remainders.
@@ -82,7 +82,13 @@ pub trait Vector: Copy {
         let (k, f) = self.split();
         // Polynomial of degree 5 with p(0) = 1 and the least maximum relative error on [-1/2, 1/2].
         let mut p = Self::splat(1.326_472_7e-3);
-        for c in [9.671_513e-3, 5.550_733_6e-2, 2.402_224_2e-1, 6.931_47e-1, 1.0] {
+        for c in [
+            9.671_513e-3,
+            5.550_733_6e-2,
+            2.402_224_2e-1,
+            6.931_47e-1,
+            1.0,
+        ] {
             p = p.madd(f, Self::splat(c));
         }
         p.times_power_of_two(k)
@@ -106,7 +112,7 @@ pub struct Portable<const N: usize>([f32; N]);
 
 impl<const N: usize> Portable<N> {
     #[inline(always)]
-    fn with(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
+    fn zip_with(self, b: Self, f: impl Fn(f32, f32) -> f32) -> Self {
         Self(std::array::from_fn(|i| f(self.0[i], b.0[i])))
     }
 }
@@ -131,42 +137,44 @@ impl<const N: usize> Vector for Portable<N> {
 
     #[inline(always)]
     fn add(self, b: Self) -> Self {
-        self.with(b, |a, b| a + b)
+        self.zip_with(b, |a, b| a + b)
     }
 
     #[inline(always)]
     fn sub(self, b: Self) -> Self {
-        self.with(b, |a, b| a - b)
+        self.zip_with(b, |a, b| a - b)
     }
 
     #[inline(always)]
     fn mul(self, b: Self) -> Self {
-        self.with(b, |a, b| a * b)
+        self.zip_with(b, |a, b| a * b)
     }
 
     #[inline(always)]
     fn div(self, b: Self) -> Self {
-        self.with(b, |a, b| a / b)
+        self.zip_with(b, |a, b| a / b)
     }
 
     #[inline(always)]
     fn madd(self, b: Self, c: Self) -> Self {
-        Self(std::array::from_fn(|i| madd::<{ cfg!(target_arch = "aarch64") }>(self.0[i], b.0[i], c.0[i])))
+        Self(std::array::from_fn(|i| {
+            madd::<{ cfg!(target_arch = "aarch64") }>(self.0[i], b.0[i], c.0[i])
+        }))
     }
 
     #[inline(always)]
     fn max(self, b: Self) -> Self {
-        self.with(b, |a, b| if a > b { a } else { b })
+        self.zip_with(b, |a, b| if a > b { a } else { b })
     }
 
     #[inline(always)]
     fn min(self, b: Self) -> Self {
-        self.with(b, |a, b| if a < b { a } else { b })
+        self.zip_with(b, |a, b| if a < b { a } else { b })
     }
 
     #[inline(always)]
     fn at_least_or_zero(self, least: Self) -> Self {
-        self.with(least, |a, least| if a >= least { a } else { 0.0 })
+        self.zip_with(least, |a, least| if a >= least { a } else { 0.0 })
     }
 
     #[inline(always)]
@@ -176,11 +184,13 @@ impl<const N: usize> Vector for Portable<N> {
 
     #[inline(always)]
     fn times_power_of_two(self, k: Self) -> Self {
-        self.with(k, |a, k| f32::from_bits(a.to_bits().wrapping_add(k.to_bits() << 23)))
+        self.zip_with(k, |a, k| {
+            f32::from_bits(a.to_bits().wrapping_add(k.to_bits() << 23))
+        })
     }
 
     #[inline(always)]
-    fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
+    fn lane_sums(all: &[Self; SLOT_FLOATS]) -> [f32; SLOT_FLOATS] {
         std::array::from_fn(|k| {
             let (mut v, mut n) = (all[k].0, N);
             while n > 1 {
@@ -197,7 +207,7 @@ mod x86 {
     //! SIMD registers of x86-64. The functions of a type require the instructions that the type is
     //! named after; [`super::dispatched`] checks for them. Slices that are too short cause a panic.
 
-    use super::{SUMS, Vector};
+    use super::{SLOT_FLOATS, Vector};
     use std::arch::x86_64::*;
 
     /// Eight floats: AVX2 and FMA.
@@ -267,21 +277,40 @@ mod x86 {
         }
 
         #[inline(always)]
-        fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
-            let mut out = [0.0; SUMS];
+        fn lane_sums(all: &[Self; SLOT_FLOATS]) -> [f32; SLOT_FLOATS] {
+            let mut out = [0.0; SLOT_FLOATS];
             // SAFETY: see the module; `out` holds 8 + 4 floats.
             unsafe {
                 // Adds the halves of two vectors, then the quarters of four, then the eighths of
                 // eight.
                 let halves = |i: usize, j: usize| {
                     let (a, b) = (all[i].0, all[j].0);
-                    _mm256_add_ps(_mm256_permute2f128_ps::<0x20>(a, b), _mm256_permute2f128_ps::<0x31>(a, b))
+                    _mm256_add_ps(
+                        _mm256_permute2f128_ps::<0x20>(a, b),
+                        _mm256_permute2f128_ps::<0x31>(a, b),
+                    )
                 };
-                let quarters = |a, b| _mm256_add_ps(_mm256_shuffle_ps::<0x44>(a, b), _mm256_shuffle_ps::<0xee>(a, b));
-                let [low, high] = [quarters(halves(0, 4), halves(1, 5)), quarters(halves(2, 6), halves(3, 7))];
+                let quarters = |a, b| {
+                    _mm256_add_ps(
+                        _mm256_shuffle_ps::<0x44>(a, b),
+                        _mm256_shuffle_ps::<0xee>(a, b),
+                    )
+                };
+                let [low, high] = [
+                    quarters(halves(0, 4), halves(1, 5)),
+                    quarters(halves(2, 6), halves(3, 7)),
+                ];
                 _mm256_storeu_ps(out.as_mut_ptr(), _mm256_hadd_ps(low, high));
-                let half = |i: usize| _mm_add_ps(_mm256_castps256_ps128(all[i].0), _mm256_extractf128_ps::<1>(all[i].0));
-                let last = _mm_hadd_ps(_mm_hadd_ps(half(8), half(9)), _mm_hadd_ps(half(10), half(11)));
+                let half = |i: usize| {
+                    _mm_add_ps(
+                        _mm256_castps256_ps128(all[i].0),
+                        _mm256_extractf128_ps::<1>(all[i].0),
+                    )
+                };
+                let last = _mm_hadd_ps(
+                    _mm_hadd_ps(half(8), half(9)),
+                    _mm_hadd_ps(half(10), half(11)),
+                );
                 _mm_storeu_ps(out[8..].as_mut_ptr(), last);
             }
             out
@@ -331,13 +360,18 @@ mod x86 {
         }
 
         #[inline(always)]
-        fn sums(all: &[Self; SUMS]) -> [f32; SUMS] {
-            let mut halves = [Avx2::splat(0.0); SUMS];
+        fn lane_sums(all: &[Self; SLOT_FLOATS]) -> [f32; SLOT_FLOATS] {
+            let mut halves = [Avx2::splat(0.0); SLOT_FLOATS];
             for (half, v) in halves.iter_mut().zip(all) {
                 // SAFETY: see the module.
-                half.0 = unsafe { _mm256_add_ps(_mm512_castps512_ps256(v.0), _mm512_extractf32x8_ps::<1>(v.0)) };
+                half.0 = unsafe {
+                    _mm256_add_ps(
+                        _mm512_castps512_ps256(v.0),
+                        _mm512_extractf32x8_ps::<1>(v.0),
+                    )
+                };
             }
-            Avx2::sums(&halves)
+            Avx2::lane_sums(&halves)
         }
     }
 }
@@ -394,27 +428,65 @@ mod tests {
         for start in 0..values.len() - 32 {
             let (a, b) = (&values[start..], &values[start + 16..]);
             let (x, y) = (V::load(a), V::load(b));
-            let all = [read(x.add(y)), read(x.sub(y)), read(x.mul(y)), read(x.div(y)), read(x.max(y)), read(x.madd(y, V::splat(3.0)))];
+            let all = [
+                read(x.add(y)),
+                read(x.sub(y)),
+                read(x.mul(y)),
+                read(x.div(y)),
+                read(x.max(y)),
+                read(x.madd(y, V::splat(3.0))),
+            ];
             let (least, powers) = (read(x.at_least_or_zero(V::splat(a[3]))), read(x.exp2()));
             for i in 0..V::LANES {
-                let expected = [a[i] + b[i], a[i] - b[i], a[i] * b[i], a[i] / b[i], a[i].max(b[i]), a[i] * b[i] + 3.0];
+                let expected = [
+                    a[i] + b[i],
+                    a[i] - b[i],
+                    a[i] * b[i],
+                    a[i] / b[i],
+                    a[i].max(b[i]),
+                    a[i] * b[i] + 3.0,
+                ];
                 for (found, expected) in all.iter().zip(expected) {
-                    assert!((found[i] - expected).abs() <= 1e-6 * expected.abs().max(100.0), "{} and {}: {}", a[i], b[i], found[i]);
+                    assert!(
+                        (found[i] - expected).abs() <= 1e-6 * expected.abs().max(100.0),
+                        "{} and {}: {}",
+                        a[i],
+                        b[i],
+                        found[i]
+                    );
                 }
                 assert_eq!(least[i], if a[i] >= a[3] { a[i] } else { 0.0 });
-                assert!((powers[i] - a[i].exp2()).abs() <= 3e-7 * a[i].exp2(), "2^{}: {}", a[i], powers[i]);
+                assert!(
+                    (powers[i] - a[i].exp2()).abs() <= 3e-7 * a[i].exp2(),
+                    "2^{}: {}",
+                    a[i],
+                    powers[i]
+                );
             }
-            let rows: [V; SUMS] = std::array::from_fn(|k| V::load(&values[start + k..]));
-            for (k, sum) in V::sums(&rows).into_iter().enumerate() {
+            let rows: [V; SLOT_FLOATS] = std::array::from_fn(|k| V::load(&values[start + k..]));
+            for (k, sum) in V::lane_sums(&rows).into_iter().enumerate() {
                 let expected: f32 = values[start + k..][..V::LANES].iter().sum();
-                assert!((sum - expected).abs() < 1e-3, "sum {k}: {sum} instead of {expected}");
+                assert!(
+                    (sum - expected).abs() < 1e-3,
+                    "sum {k}: {sum} instead of {expected}"
+                );
             }
         }
         for low in [-1e9, -1000.5, -160.0, -127.3] {
-            assert!((0.0..1.2e-38).contains(&read(V::splat(low).exp2())[0]), "2^{low}");
+            assert!(
+                (0.0..1.2e-38).contains(&read(V::splat(low).exp2())[0]),
+                "2^{low}"
+            );
         }
         // Alphas are computed like this. NaN must give 0.
-        let alpha = |x: f32| read(V::splat(-0.5).min(V::splat(x)).exp2().at_least_or_zero(V::splat(0.01)))[0];
+        let alpha = |x: f32| {
+            read(
+                V::splat(-0.5)
+                    .min(V::splat(x))
+                    .exp2()
+                    .at_least_or_zero(V::splat(0.01)),
+            )[0]
+        };
         assert_eq!([f32::NAN, f32::NEG_INFINITY, -200.0].map(alpha), [0.0; 3]);
         assert_eq!([f32::INFINITY, 1e9].map(alpha), [alpha(-0.5); 2]);
         *checked += V::LANES as u32;
@@ -426,7 +498,10 @@ mod tests {
         check_body::<Portable<8>>(&mut checked);
         check_body::<Portable<16>>(&mut checked);
         widest(&mut checked);
-        println!("checked: portable vectors of 8 and 16 lanes, and vectors of {} lanes", checked - 24);
+        println!(
+            "checked: portable vectors of 8 and 16 lanes, and vectors of {} lanes",
+            checked - 24
+        );
         assert!(checked >= 32);
         #[cfg(target_arch = "x86_64")]
         if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {

@@ -1,9 +1,11 @@
 //! Tests of all gradients against finite differences of an independent renderer and loss in double
 //! precision.
 
-use super::{camera, shaped};
+use super::{camera, gpu_in_each_shape};
 use crate::density::State;
-use crate::{Channels, CpuEngine, Engine, Exposure, GpuEngine, Step, StepOptions, TargetImage, View, pack};
+use crate::{
+    Channels, CpuEngine, Engine, Exposure, GpuEngine, Step, StepOptions, TargetImage, View, pack,
+};
 use fastlgs_core::Gaussians;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of, rest_len};
 use fastlgs_core::rng::Rng;
@@ -15,7 +17,7 @@ const FEATURE_WEIGHT: f64 = 0.7;
 
 /// Trained values that are not stored with the Gaussians: background and exposure.
 #[derive(Clone)]
-struct Around {
+struct Surroundings {
     background: [f64; 6],
     gain: [f64; 3],
     offset: [f64; 3],
@@ -32,15 +34,17 @@ struct Splat {
 }
 
 /// Renders six planes with the formulas of the 3DGS paper, every Gaussian at every pixel.
-fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
+fn render(view: &View, params: &[f64], around: &Surroundings) -> Vec<f64> {
     let n = view.gaussians as usize;
     let at = |c: usize, i: usize| params[c * n + i];
     let vec3 = |c: usize, i: usize| DVec3::new(at(c, i), at(c + 1, i), at(c + 2, i));
     let pose = DMat4::from_cols_array(&view.world_to_camera.map(f64::from));
     let eye = pose.inverse().w_axis.truncate();
     let rotation = DMat3::from_mat4(pose);
-    let (focal, centre) =
-        (DVec2::new(view.focal[0].into(), view.focal[1].into()), DVec2::new(view.centre[0].into(), view.centre[1].into()));
+    let (focal, centre) = (
+        DVec2::new(view.focal[0].into(), view.focal[1].into()),
+        DVec2::new(view.centre[0].into(), view.centre[1].into()),
+    );
     let mut splats: Vec<Splat> = (0..n)
         .map(|i| {
             let t = pose.transform_point3(vec3(0, i));
@@ -49,24 +53,57 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
             let jacobian = DMat3::from_cols(
                 DVec3::new(focal.x / t.z, 0.0, 0.0),
                 DVec3::new(0.0, focal.y / t.z, 0.0),
-                DVec3::new(-focal.x * t.x / (t.z * t.z), -focal.y * t.y / (t.z * t.z), 0.0),
+                DVec3::new(
+                    -focal.x * t.x / (t.z * t.z),
+                    -focal.y * t.y / (t.z * t.z),
+                    0.0,
+                ),
             );
             let a = jacobian * rotation * m;
             let cov = a * a.transpose();
             let (xx, xy, yy) = (cov.x_axis.x, cov.x_axis.y, cov.y_axis.y);
-            let (dxx, dyy) = (xx + f64::from(crate::cpu::DILATION), yy + f64::from(crate::cpu::DILATION));
+            let (dxx, dyy) = (
+                xx + f64::from(crate::cpu::DILATION),
+                yy + f64::from(crate::cpu::DILATION),
+            );
             let det = dxx * dyy - xy * xy;
-            let kept = if view.antialias == 1 { ((xx * yy - xy * xy) / det).sqrt() } else { 1.0 };
+            let compensation = if view.antialias == 1 {
+                ((xx * yy - xy * xy) / det).sqrt()
+            } else {
+                1.0
+            };
             let direction = (vec3(0, i) - eye).normalize();
             let mut color = DVec3::splat(0.5) + 0.282_094_791_773_878_14 * vec3(11, i);
-            for (k, basis) in harmonics(direction).into_iter().take(rest_len(view.sh_degree)).enumerate() {
+            for (k, basis) in harmonics(direction)
+                .into_iter()
+                .take(rest_len(view.sh_degree))
+                .enumerate()
+            {
                 color += basis * vec3(17 + 3 * k, i);
             }
-            let values = [color.x.max(0.0), color.y.max(0.0), color.z.max(0.0), at(14, i), at(15, i), at(16, i)];
-            let left_out = crate::cpu::pcg3d(glam::UVec3::new(i as u32, view.draw, 2)).x < view.dropped;
-            let gain = if left_out { 0.0 } else { 1.0 / (1.0 - f64::from(view.dropped) / 4_294_967_296.0) };
-            let opacity = gain * kept / (1.0 + (-at(10, i)).exp());
-            Splat { depth: t.z, mean: focal * t.truncate() / t.z + centre, conic: [dyy / det, -xy / det, dxx / det], opacity, values }
+            let values = [
+                color.x.max(0.0),
+                color.y.max(0.0),
+                color.z.max(0.0),
+                at(14, i),
+                at(15, i),
+                at(16, i),
+            ];
+            let left_out =
+                crate::cpu::pcg3d(glam::UVec3::new(i as u32, view.draw, 2)).x < view.dropped;
+            let gain = if left_out {
+                0.0
+            } else {
+                1.0 / (1.0 - f64::from(view.dropped) / 4_294_967_296.0)
+            };
+            let opacity = gain * compensation / (1.0 + (-at(10, i)).exp());
+            Splat {
+                depth: t.z,
+                mean: focal * t.truncate() / t.z + centre,
+                conic: [dyy / det, -xy / det, dxx / det],
+                opacity,
+                values,
+            }
         })
         .collect();
     splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
@@ -75,9 +112,17 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
     for (j, i) in (0..h).flat_map(|j| (0..w).map(move |i| (j, i))) {
         let mut transmittance = 1.0;
         let mut sums = [0.0; 6];
-        for Splat { mean, conic, opacity, values, .. } in &splats {
+        for Splat {
+            mean,
+            conic,
+            opacity,
+            values,
+            ..
+        } in &splats
+        {
             let d = DVec2::new(i as f64 + 0.5, j as f64 + 0.5) - *mean;
-            let power = -0.5 * (conic[0] * d.x * d.x + 2.0 * conic[1] * d.x * d.y + conic[2] * d.y * d.y);
+            let power =
+                -0.5 * (conic[0] * d.x * d.x + 2.0 * conic[1] * d.x * d.y + conic[2] * d.y * d.y);
             let weight = transmittance * opacity * power.exp();
             (0..6).for_each(|c| sums[c] += weight * values[c]);
             transmittance *= 1.0 - opacity * power.exp();
@@ -94,7 +139,11 @@ fn render(view: &View, params: &[f64], around: &Around) -> Vec<f64> {
 fn harmonics(d: DVec3) -> [f64; 15] {
     let (x, y, z) = (d.x, d.y, d.z);
     let pi = std::f64::consts::PI;
-    let (c1, c2, c3) = ((3.0 / (4.0 * pi)).sqrt(), (15.0 / (4.0 * pi)).sqrt(), (5.0 / (16.0 * pi)).sqrt());
+    let (c1, c2, c3) = (
+        (3.0 / (4.0 * pi)).sqrt(),
+        (15.0 / (4.0 * pi)).sqrt(),
+        (5.0 / (16.0 * pi)).sqrt(),
+    );
     let (c4, c5) = ((35.0 / (32.0 * pi)).sqrt(), (105.0 / (4.0 * pi)).sqrt());
     let (c6, c7) = ((21.0 / (32.0 * pi)).sqrt(), (7.0 / (16.0 * pi)).sqrt());
     [
@@ -118,10 +167,12 @@ fn harmonics(d: DVec3) -> [f64; 15] {
 
 /// Returns (1 - lambda) L1 + lambda (1 - SSIM) of colour, plus the same of the feature times its
 /// weight.
-fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
+fn loss(planes: &[f64], target: &[f64], around: &Surroundings) -> f64 {
     let (w, h) = SIZE;
     let n = w * h;
-    let taps: Vec<f64> = (-5i32..=5).map(|k| (-f64::from(k * k) / (2.0 * 1.5 * 1.5)).exp()).collect();
+    let taps: Vec<f64> = (-5i32..=5)
+        .map(|k| (-f64::from(k * k) / (2.0 * 1.5 * 1.5)).exp())
+        .collect();
     let total: f64 = taps.iter().sum();
     let blurred = |values: &dyn Fn(usize) -> f64, i: usize, j: usize| -> f64 {
         let mut sum = 0.0;
@@ -137,7 +188,13 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
     };
     (0..6)
         .map(|c| {
-            let x = |p: usize| if c < 3 { around.gain[c] * planes[c * n + p] + around.offset[c] } else { planes[c * n + p] };
+            let x = |p: usize| {
+                if c < 3 {
+                    around.gain[c] * planes[c * n + p] + around.offset[c]
+                } else {
+                    planes[c * n + p]
+                }
+            };
             let y = |p: usize| target[c * n + p];
             let l1 = (0..n).map(|p| (x(p) - y(p)).abs()).sum::<f64>();
             let mut ssim = 0.0;
@@ -146,7 +203,8 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
                 let xx = blurred(&|p| x(p) * x(p), i, j) - mx * mx;
                 let yy = blurred(&|p| y(p) * y(p), i, j) - my * my;
                 let xy = blurred(&|p| x(p) * y(p), i, j) - mx * my;
-                ssim += (2.0 * mx * my + 1e-4) * (2.0 * xy + 9e-4) / ((mx * mx + my * my + 1e-4) * (xx + yy + 9e-4));
+                ssim += (2.0 * mx * my + 1e-4) * (2.0 * xy + 9e-4)
+                    / ((mx * mx + my * my + 1e-4) * (xx + yy + 9e-4));
             }
             let weight = if c < 3 { 1.0 } else { FEATURE_WEIGHT };
             weight * ((1.0 - LAMBDA) * l1 + LAMBDA * (n as f64 - ssim)) / (3 * n) as f64
@@ -158,22 +216,50 @@ fn loss(planes: &[f64], target: &[f64], around: &Around) -> f64 {
 /// cut-off. They are far enough to be drawn.
 fn scene(sh_degree: u32) -> Gaussians {
     let mut rng = Rng::new(11, "gradients");
-    let mut scene = Gaussians { sh_degree, ..Gaussians::default() };
+    let mut scene = Gaussians {
+        sh_degree,
+        ..Gaussians::default()
+    };
     for i in 0..6 {
         let mean = Vec3::new(0.4 * rng.normal(), 0.4 * rng.normal(), 0.8 * i as f32 - 1.6);
-        scene.push_sphere(mean, 1.0, rng.range(0.3, 0.6), [rng.range(0.3, 0.7), rng.range(0.3, 0.7), rng.range(0.3, 0.7)]);
-        scene.log_scales[i] = Vec3::new(rng.range(0.6, 1.0), rng.range(0.6, 1.0), rng.range(0.4, 0.9));
-        scene.rotations[i] = [1.0, 0.4 * rng.normal(), 0.4 * rng.normal(), 0.4 * rng.normal()];
+        scene.push_sphere(
+            mean,
+            1.0,
+            rng.range(0.3, 0.6),
+            [
+                rng.range(0.3, 0.7),
+                rng.range(0.3, 0.7),
+                rng.range(0.3, 0.7),
+            ],
+        );
+        scene.log_scales[i] = Vec3::new(
+            rng.range(0.6, 1.0),
+            rng.range(0.6, 1.0),
+            rng.range(0.4, 0.9),
+        );
+        scene.rotations[i] = [
+            1.0,
+            0.4 * rng.normal(),
+            0.4 * rng.normal(),
+            0.4 * rng.normal(),
+        ];
         scene.features[i] = Vec3::new(rng.uniform(), rng.uniform(), rng.uniform());
     }
-    scene.sh_rest.iter_mut().for_each(|v| *v = 0.05 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+    scene
+        .sh_rest
+        .iter_mut()
+        .for_each(|v| *v = 0.05 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
     scene
 }
 
 fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
     let scene = scene(sh_degree);
     let n = scene.len();
-    let around = Around { background: [0.1, 0.3, 0.2, 0.6, 0.5, 0.4], gain: [1.1, 0.95, 1.0], offset: [0.02, -0.01, 0.03] };
+    let around = Surroundings {
+        background: [0.1, 0.3, 0.2, 0.6, 0.5, 0.4],
+        gain: [1.1, 0.95, 1.0],
+        offset: [0.02, -0.01, 0.03],
+    };
     let [r, g, b, x, y, z] = around.background.map(|v| v as f32);
     let view = View {
         antialias,
@@ -182,50 +268,99 @@ fn check(engine: &mut dyn Engine, sh_degree: u32, antialias: u32) {
         ..View::new(&camera(SIZE.0 as u32, SIZE.1 as u32), n, sh_degree)
     };
     // This draw leaves out one of the six Gaussians.
-    let view = if sh_degree == 1 { view.without(0.2, 6) } else { view };
+    let view = if sh_degree == 1 {
+        view.with_dropout(0.2, 6)
+    } else {
+        view
+    };
     let wave = |i: usize| (127.0 + 100.0 * (i as f64 * 0.05).sin()) as u8;
     let pixels = SIZE.0 * SIZE.1;
-    let plane = |from: usize| (0..pixels).map(|p| pack([0, 1, 2].map(|c| wave((from + c) * pixels + p)), true)).collect();
-    let target = TargetImage { size: view.size, color: plane(0), feature: plane(3) };
-    let wanted: Vec<f64> = (0..6 * pixels).map(|i| f64::from(wave(i)) / 255.0).collect();
+    let plane = |from: usize| {
+        (0..pixels)
+            .map(|p| pack([0, 1, 2].map(|c| wave((from + c) * pixels + p)), true))
+            .collect()
+    };
+    let target = TargetImage {
+        size: view.size,
+        color: plane(0),
+        feature: plane(3),
+    };
+    let target_values: Vec<f64> = (0..6 * pixels)
+        .map(|i| f64::from(wave(i)) / 255.0)
+        .collect();
 
     engine.set_state(&State::of(&scene)).unwrap();
     engine.set_target(0, target).unwrap();
-    let exposure = Exposure { gain: around.gain.map(|v| v as f32), offset: around.offset.map(|v| v as f32) };
-    let options = StepOptions { channels: Channels::Coupled, lambda: LAMBDA as f32, feature_weight: FEATURE_WEIGHT as f32, exposure };
-    engine.step(view, 0, &options, &Step::new(1, 0..channels_of(sh_degree), &[0.0; BASE_CHANNELS + 1])).unwrap();
+    let exposure = Exposure {
+        gain: around.gain.map(|v| v as f32),
+        offset: around.offset.map(|v| v as f32),
+    };
+    let options = StepOptions {
+        channels: Channels::Coupled,
+        lambda: LAMBDA as f32,
+        feature_weight: FEATURE_WEIGHT as f32,
+        exposure,
+    };
+    engine
+        .step(
+            view,
+            0,
+            &options,
+            &Step::new(1, 0..channels_of(sh_degree), &[0.0; BASE_CHANNELS + 1]),
+        )
+        .unwrap();
     let (gradients, losses) = (engine.gradients().unwrap(), engine.losses().unwrap());
 
     let params: Vec<f64> = scene.to_channels().into_iter().map(f64::from).collect();
     let step = 1e-5;
-    let slope = |at: &dyn Fn(f64) -> f64| (at(step) - at(-step)) / (2.0 * step);
-    let what = format!("{}, degree {sh_degree}, antialias {antialias}", engine.name());
+    let central_difference = |at: &dyn Fn(f64) -> f64| (at(step) - at(-step)) / (2.0 * step);
+    let what = format!(
+        "{}, degree {sh_degree}, antialias {antialias}",
+        engine.name()
+    );
     for c in 0..channels_of(sh_degree) {
-        let largest = gradients[c * n..(c + 1) * n].iter().fold(0.0f32, |m, g| m.max(g.abs()));
+        let largest = gradients[c * n..(c + 1) * n]
+            .iter()
+            .fold(0.0f32, |m, g| m.max(g.abs()));
         for k in c * n..(c + 1) * n {
-            let difference = slope(&|delta| {
-                let mut moved = params.clone();
-                moved[k] += delta;
-                loss(&render(&view, &moved, &around), &wanted, &around)
+            let difference = central_difference(&|delta| {
+                let mut check_surroundings = params.clone();
+                check_surroundings[k] += delta;
+                loss(
+                    &render(&view, &check_surroundings, &around),
+                    &target_values,
+                    &around,
+                )
             });
             let (found, allowed) = (f64::from(gradients[k]), 2e-3 * f64::from(largest) + 1e-7);
-            assert!((difference - found).abs() <= allowed, "channel {c} of Gaussian {}: {found} against {difference} ({what})", k - c * n);
+            assert!(
+                (difference - found).abs() <= allowed,
+                "channel {c} of Gaussian {}: {found} against {difference} ({what})",
+                k - c * n
+            );
         }
     }
-    let moved = |what_moves: &str, found: f64, change: &dyn Fn(&mut Around, f64)| {
-        let difference = slope(&|delta| {
+    let moved = |what_moves: &str, found: f64, change: &dyn Fn(&mut Surroundings, f64)| {
+        let difference = central_difference(&|delta| {
             let mut around = around.clone();
             change(&mut around, delta);
-            loss(&render(&view, &params, &around), &wanted, &around)
+            loss(&render(&view, &params, &around), &target_values, &around)
         });
-        assert!((difference - found).abs() <= 2e-3 * difference.abs() + 1e-6, "{what_moves}: {found} against {difference} ({what})");
+        assert!(
+            (difference - found).abs() <= 2e-3 * difference.abs() + 1e-6,
+            "{what_moves}: {found} against {difference} ({what})"
+        );
     };
     for c in 0..6 {
-        moved("background", losses.by_background[c], &|a, delta| a.background[c] += delta);
+        moved("background", losses.by_background[c], &|a, delta| {
+            a.background[c] += delta
+        });
     }
     for c in 0..3 {
         moved("gain", losses.by_gain[c], &|a, delta| a.gain[c] += delta);
-        moved("offset", losses.by_offset[c], &|a, delta| a.offset[c] += delta);
+        moved("offset", losses.by_offset[c], &|a, delta| {
+            a.offset[c] += delta
+        });
     }
 }
 
@@ -236,15 +371,38 @@ fn check_limit(engine: &mut dyn Engine) {
     // 0.9 / (1 - 0.2) is above the largest opacity.
     scene.push_sphere(Vec3::ZERO, 1.0, 0.9, [1.0; 3]);
     let (w, h) = (SIZE.0 as u32, SIZE.1 as u32);
-    let drawn = |draw: u32| View::new(&camera(w, h), 1, 0).without(0.2, draw);
-    let is_drawn = |view: &View| crate::cpu::pcg3d(glam::UVec3::new(0, view.draw, 2)).x >= view.dropped;
-    let view = (0..).map(drawn).find(is_drawn).expect("most draws keep the Gaussian");
+    let drawn = |draw: u32| View::new(&camera(w, h), 1, 0).with_dropout(0.2, draw);
+    let is_drawn =
+        |view: &View| crate::cpu::pcg3d(glam::UVec3::new(0, view.draw, 2)).x >= view.dropped;
+    let view = (0..)
+        .map(drawn)
+        .find(is_drawn)
+        .expect("most draws keep the Gaussian");
     engine.set_state(&State::of(&scene)).unwrap();
-    let target = TargetImage { size: view.size, color: vec![pack([255; 3], true); SIZE.0 * SIZE.1], feature: Vec::new() };
+    let target = TargetImage {
+        size: view.size,
+        color: vec![pack([255; 3], true); SIZE.0 * SIZE.1],
+        feature: Vec::new(),
+    };
     engine.set_target(0, target).unwrap();
-    let exposure = Exposure { gain: [1.0; 3], offset: [0.0; 3] };
-    let options = StepOptions { channels: Channels::Color, lambda: 0.0, feature_weight: 0.0, exposure };
-    engine.step(view, 0, &options, &Step::new(1, 0..channels_of(0), &[0.0; BASE_CHANNELS + 1])).unwrap();
+    let exposure = Exposure {
+        gain: [1.0; 3],
+        offset: [0.0; 3],
+    };
+    let options = StepOptions {
+        channels: Channels::Color,
+        lambda: 0.0,
+        feature_weight: 0.0,
+        exposure,
+    };
+    engine
+        .step(
+            view,
+            0,
+            &options,
+            &Step::new(1, 0..channels_of(0), &[0.0; BASE_CHANNELS + 1]),
+        )
+        .unwrap();
     assert_eq!(engine.gradients().unwrap()[10], 0.0, "{}", engine.name());
 }
 
@@ -258,7 +416,7 @@ fn on_the_cpu() {
 
 #[test]
 fn on_the_gpu() {
-    for gpu in shaped() {
+    for gpu in gpu_in_each_shape() {
         let mut engine = GpuEngine::new(gpu);
         check_limit(&mut engine);
         for (sh_degree, antialias) in [(0, 1), (1, 0), (2, 1), (3, 0)] {

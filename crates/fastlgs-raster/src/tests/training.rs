@@ -2,7 +2,9 @@
 //! background.
 
 use super::{camera, cloud, gpu, target};
-use crate::{Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, TrainConfig, TrainReport, Trainer};
+use crate::{
+    Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, TrainConfig, TrainReport, Trainer,
+};
 use fastlgs_core::Camera;
 use fastlgs_core::dataset::SfmPoint;
 use glam::Vec3;
@@ -10,9 +12,23 @@ use glam::Vec3;
 fn views(count: usize) -> Vec<Target> {
     let around = |k: usize| {
         let angle = k as f32 * 0.3;
-        Camera::look_at(&format!("v{k}"), 4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
+        Camera::look_at(
+            &format!("v{k}"),
+            4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()),
+            Vec3::ZERO,
+            Vec3::Y,
+            64,
+            48,
+            0.9,
+        )
     };
-    (0..count).map(|k| Target { camera: around(k), image: target(64, 48), gain: [1.0; 3] }).collect()
+    (0..count)
+        .map(|k| Target {
+            camera: around(k),
+            image: target(64, 48),
+            gain: [1.0; 3],
+        })
+        .collect()
 }
 
 fn trainer(engine: Box<dyn Engine>, config: TrainConfig) -> Trainer {
@@ -37,7 +53,12 @@ fn resumes_to_the_same_bytes() {
         learn_background: true,
         ..TrainConfig::default()
     };
-    let start = || trainer(Box::new(GpuEngine::new(Gpu::open("auto").unwrap())), config.clone());
+    let start = || {
+        trainer(
+            Box::new(GpuEngine::new(Gpu::open("auto").unwrap())),
+            config.clone(),
+        )
+    };
     let bytes = |trainer: &Trainer, name: &str| {
         let path = dir.path().join(name);
         fastlgs_core::ply::write(&path, &trainer.gaussians().unwrap()).unwrap();
@@ -45,21 +66,42 @@ fn resumes_to_the_same_bytes() {
     };
     let checkpoint = dir.path().join("train");
     let mut whole = start();
-    whole.run(Some(&checkpoint), |_, _| Ok::<_, crate::Error>(())).unwrap();
+    whole
+        .run(Some(&checkpoint), |_, _| Ok::<_, crate::Error>(()))
+        .unwrap();
     let mut again = start();
     again.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
-    assert_eq!(bytes(&whole, "a.ply"), bytes(&again, "b.ply"), "twice in a row");
+    assert_eq!(
+        bytes(&whole, "a.ply"),
+        bytes(&again, "b.ply"),
+        "twice in a row"
+    );
     let mut resumed = start();
-    assert!(resumed.resume(&checkpoint).unwrap(), "a checkpoint was left at step 500");
+    assert!(
+        resumed.resume(&checkpoint).unwrap(),
+        "a checkpoint was left at step 500"
+    );
     let report = resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     assert_eq!(report.steps_here, 100);
     assert_eq!(bytes(&whole, "a.ply"), bytes(&resumed, "c.ply"), "resumed");
     assert_eq!(whole.exposures(), resumed.exposures());
-    let fewer = Trainer::new(Box::new(CpuEngine::new()), &cloud(200, 8, 0, false), views(23), config.clone()).unwrap();
+    let fewer = Trainer::new(
+        Box::new(CpuEngine::new()),
+        &cloud(200, 8, 0, false),
+        views(23),
+        config.clone(),
+    )
+    .unwrap();
     let message = { fewer }.resume(&checkpoint).unwrap_err().to_string();
     assert!(message.contains("other photos"), "{message}");
-    let other = TrainConfig { lambda: 0.3, ..config };
-    let message = trainer(Box::new(CpuEngine::new()), other).resume(&checkpoint).unwrap_err().to_string();
+    let other = TrainConfig {
+        lambda: 0.3,
+        ..config
+    };
+    let message = trainer(Box::new(CpuEngine::new()), other)
+        .resume(&checkpoint)
+        .unwrap_err()
+        .to_string();
     assert!(message.contains("other options"), "{message}");
 }
 
@@ -67,9 +109,14 @@ fn resumes_to_the_same_bytes() {
 fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
     let dir = tempfile::tempdir().unwrap();
     let checkpoint = dir.path().join("train");
-    let config = TrainConfig { iterations: 600, budget: Budget::Auto(400), feature_weight: 0.5, ..TrainConfig::default() };
+    let config = TrainConfig {
+        iterations: 600,
+        budget: Budget::Auto(400),
+        feature_weight: 0.5,
+        ..TrainConfig::default()
+    };
     let start = || trainer(Box::new(CpuEngine::new()), config.clone());
-    let towards = |trainer: &mut Trainer| trainer.towards(|_| Ok(target(64, 48).feature));
+    let set_codes = |trainer: &mut Trainer| trainer.set_codes(|_| Ok(target(64, 48).feature));
     let mut errors = Vec::new();
     let mut whole = start();
     let shaped = whole.run(Some(&checkpoint), |progress, trainer| {
@@ -79,57 +126,95 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
                 scene.features.fill(Vec3::splat(0.5));
                 Ok::<_, crate::Error>(())
             })?;
-            towards(trainer);
+            set_codes(trainer);
         }
         errors.push(progress.losses.feature_l1);
         Ok::<_, crate::Error>(())
     });
     shaped.unwrap();
     let after = |steps: usize| errors[steps / 20 - 1];
-    assert!(after(100) == 0.0 && after(120) > 0.0, "from step 100 on: {errors:?}");
+    assert!(
+        after(100) == 0.0 && after(120) > 0.0,
+        "from step 100 on: {errors:?}"
+    );
     assert!(after(600) < 0.9 * after(120), "{errors:?}");
     let mut resumed = start();
     assert!(!resumed.is_coupled() && resumed.resume(&checkpoint).unwrap() && resumed.is_coupled());
-    towards(&mut resumed);
+    set_codes(&mut resumed);
     resumed.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     assert!(whole.gaussians().unwrap() == resumed.gaussians().unwrap());
     let (by_color, _) = run(config.clone());
-    assert!(whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means, "masks change geometry");
+    assert!(
+        whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means,
+        "masks change geometry"
+    );
     let refused = start().couple(|_, _| Err(crate::Error::Invalid("no objects".to_owned())));
     assert!(refused.is_err());
 }
 
 #[test]
 fn what_views_look_through_stays_empty() {
-    let config = TrainConfig { iterations: 100, refine_until: 0.8, budget: Budget::Fixed(400), ..TrainConfig::default() };
+    let config = TrainConfig {
+        iterations: 100,
+        refine_until: 0.8,
+        budget: Budget::Fixed(400),
+        ..TrainConfig::default()
+    };
     let cameras: Vec<Camera> = views(24).into_iter().map(|view| view.camera).collect();
     // A wall behind the cloud, observed by three cameras.
     let steps = || (-20..=20).map(|k| 0.1 * k as f32);
     let wall = steps().flat_map(|x| steps().map(move |y| Vec3::new(x, y, 3.0)));
-    let wall: Vec<SfmPoint> = wall.map(|position| SfmPoint { position, color: [0; 3], seen_by: vec![0, 1, 2] }).collect();
+    let wall: Vec<SfmPoint> = wall
+        .map(|position| SfmPoint {
+            position,
+            color: [0; 3],
+            seen_by: vec![0, 1, 2],
+        })
+        .collect();
     let free = FreeSpace::of(&cameras, &[], &wall);
-    let left = |keep_free: bool| {
+    let in_free_space = |keep_free: bool| {
         let mut trainer = trainer(Box::new(CpuEngine::new()), config.clone());
         if keep_free {
-            trainer.keep_free(free.clone());
+            trainer.set_free_space(free.clone());
         }
         trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
-        trainer.gaussians().unwrap().means.iter().filter(|mean| free.holds(**mean)).count()
+        trainer
+            .gaussians()
+            .unwrap()
+            .means
+            .iter()
+            .filter(|mean| free.holds(**mean))
+            .count()
     };
-    let [as_it_is, kept_free] = [false, true].map(left);
-    assert!(as_it_is > 20 && 10 * kept_free < as_it_is, "{as_it_is} Gaussians in free space without the rule, {kept_free} with it");
+    let [unrestricted, kept_free] = [false, true].map(in_free_space);
+    assert!(
+        unrestricted > 20 && 10 * kept_free < unrestricted,
+        "{unrestricted} Gaussians in free space without the rule, {kept_free} with it"
+    );
 }
 
 #[test]
 fn density_control_keeps_the_budget() {
-    let (_, report) = run(TrainConfig { iterations: 800, budget: Budget::Fixed(300), ..TrainConfig::default() });
-    assert!(report.gaussians <= 300 && report.gaussians > 200, "{}", report.gaussians);
+    let (_, report) = run(TrainConfig {
+        iterations: 800,
+        budget: Budget::Fixed(300),
+        ..TrainConfig::default()
+    });
+    assert!(
+        report.gaussians <= 300 && report.gaussians > 200,
+        "{}",
+        report.gaussians
+    );
     assert!(report.removals.is_empty());
 }
 
 #[test]
 fn an_automatic_budget_removes_what_changes_little() {
-    let (_, report) = run(TrainConfig { iterations: 800, budget: Budget::Auto(1000), ..TrainConfig::default() });
+    let (_, report) = run(TrainConfig {
+        iterations: 800,
+        budget: Budget::Auto(1000),
+        ..TrainConfig::default()
+    });
     assert_eq!(report.removals.len(), 2);
     assert!(report.removals.iter().all(|r| r.after <= r.before));
     assert_eq!(report.gaussians, report.removals[1].after);
@@ -144,18 +229,42 @@ fn exposure_and_background_are_learned() {
     (targets[0].image.color, targets[1].image.color) = (gray(100), gray(110));
     let mut scene = cloud(1, 1, 0, false);
     scene.means[0] = Vec3::new(0.0, 500.0, 0.0);
-    let config = TrainConfig { iterations: 600, exposure: true, learn_background: true, background: [0.5; 3], ..TrainConfig::default() };
-    let config = TrainConfig { refine_until: 0.0, ..config };
+    let config = TrainConfig {
+        iterations: 600,
+        exposure: true,
+        learn_background: true,
+        background: [0.5; 3],
+        ..TrainConfig::default()
+    };
+    let config = TrainConfig {
+        refine_until: 0.0,
+        ..config
+    };
     let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &scene, targets, config).unwrap();
     let report = trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
-    let seen = |k: usize| trainer.exposures()[k].gain[0] * report.background[0] + trainer.exposures()[k].offset[0];
-    assert!((seen(0) - 100.0 / 255.0).abs() < 0.01 && (seen(1) - 110.0 / 255.0).abs() < 0.01, "{} {}", seen(0), seen(1));
+    let seen = |k: usize| {
+        trainer.exposures()[k].gain[0] * report.background[0] + trainer.exposures()[k].offset[0]
+    };
+    assert!(
+        (seen(0) - 100.0 / 255.0).abs() < 0.01 && (seen(1) - 110.0 / 255.0).abs() < 0.01,
+        "{} {}",
+        seen(0),
+        seen(1)
+    );
 }
 
 #[test]
 fn nothing_to_train_is_said() {
     let engine = Box::new(CpuEngine::new());
-    let message = Trainer::new(engine, &cloud(5, 1, 0, false), Vec::new(), TrainConfig::default()).err().unwrap().to_string();
+    let message = Trainer::new(
+        engine,
+        &cloud(5, 1, 0, false),
+        Vec::new(),
+        TrainConfig::default(),
+    )
+    .err()
+    .unwrap()
+    .to_string();
     assert!(message.contains("no training views"), "{message}");
     assert!(camera(4, 4).check().is_ok());
 }

@@ -13,14 +13,20 @@ use fastlgs_core::Camera;
 const ALIGNING: [usize; 3] = [2, 1, 0];
 /// Smallest PSNR gain of the validation views, in dB, for which all views are aligned. With exact
 /// poses the gain is some hundredths.
-const ALIGNMENT_PAYS: f64 = 0.3;
+const MIN_ALIGNMENT_GAIN: f64 = 0.3;
 
 impl Trainer {
     /// Returns a view's camera at the pose from which the current scene looks most like its photo.
     pub(super) fn aligned(&mut self, target: &Target, exposure: &Exposure) -> Result<Camera> {
         let degree = self.course.config.degree(self.course.iteration);
         let (course, gaussians) = (&self.course, self.engine.len());
-        align::align(self.engine.as_mut(), |camera| view_of(course, gaussians, camera, degree), target, exposure, ALIGNING)
+        align::align(
+            self.engine.as_mut(),
+            |camera| view_of(course, gaussians, camera, degree),
+            target,
+            exposure,
+            ALIGNING,
+        )
     }
 
     /// Aligns the training views to the current scene, and keeps their mean pose.
@@ -38,11 +44,22 @@ impl Trainer {
                 let target = watched.get(id)?;
                 moved.cameras[id] = self.aligned(&target, &self.known_exposure(&target))?;
             }
-            let gain = self.quality(&moved, None)?.zip(self.quality(&watched, None)?).map_or(0.0, |(after, before)| after - before);
-            tracing::info!(gain, "PSNR gain of the validation views by alignment, in dB");
+            let gain = self
+                .quality(&moved, None)?
+                .zip(self.quality(&watched, None)?)
+                .map_or(0.0, |(after, before)| after - before);
+            tracing::info!(
+                gain,
+                "PSNR gain of the validation views by alignment, in dB"
+            );
             self.course.alignment_gain = Some(gain);
         }
-        if self.course.config.alignment == Alignment::Auto && self.course.alignment_gain.is_some_and(|gain| gain < ALIGNMENT_PAYS) {
+        if self.course.config.alignment == Alignment::Auto
+            && self
+                .course
+                .alignment_gain
+                .is_some_and(|gain| gain < MIN_ALIGNMENT_GAIN)
+        {
             return Ok(());
         }
         let before = self.cameras();

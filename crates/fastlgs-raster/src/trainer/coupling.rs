@@ -19,17 +19,24 @@ impl Trainer {
 
     /// Returns the channels that the next step trains.
     pub(super) fn channels(&self) -> Channels {
-        if self.course.coupled { Channels::Coupled } else { self.course.config.channels }
+        if self.course.coupled {
+            Channels::Coupled
+        } else {
+            self.course.config.channels
+        }
     }
 
     /// Starts to train the feature, which then moves geometry too.
     ///
     /// `features` gets the current Gaussians and the training cameras, and sets the initial
-    /// features. [`Trainer::towards`] sets the codes that views are trained towards.
+    /// features. [`Trainer::set_codes`] sets the codes that views are trained towards.
     ///
     /// # Errors
     /// When the device fails, or `features` returns an error. Then nothing has changed.
-    pub fn couple<E: From<Error>>(&mut self, features: impl FnOnce(&mut Gaussians, &[Camera]) -> Result<(), E>) -> Result<(), E> {
+    pub fn couple<E: From<Error>>(
+        &mut self,
+        features: impl FnOnce(&mut Gaussians, &[Camera]) -> Result<(), E>,
+    ) -> Result<(), E> {
         let mut state = self.engine.state()?;
         state.keep_finite();
         let mut scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
@@ -37,7 +44,9 @@ impl Trainer {
         let count = state.len();
         for (axis, channel) in FEATURE.enumerate() {
             let values = state.params[channel * count..][..count].iter_mut();
-            values.zip(&scene.features).for_each(|(value, feature)| *value = feature[axis]);
+            values
+                .zip(&scene.features)
+                .for_each(|(value, feature)| *value = feature[axis]);
         }
         self.engine.set_state(&state)?;
         self.course.coupled = true;
@@ -46,8 +55,8 @@ impl Trainer {
 
     /// Sets the code images of the views. `codes` returns the pixels of a view in the format of
     /// [`TargetImage::feature`](crate::TargetImage::feature), the same on every call.
-    pub fn towards(&mut self, codes: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) {
+    pub fn set_codes(&mut self, codes: impl Fn(usize) -> Result<Vec<u32>> + Send + Sync + 'static) {
         self.targets = self.targets.clone().with_features(codes);
-        self.hide();
+        self.unload_targets();
     }
 }

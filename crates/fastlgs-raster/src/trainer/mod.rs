@@ -23,7 +23,7 @@ use fastlgs_core::metrics::psnr;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
 use serde::Serialize;
-use shown::Shown;
+use shown::LoadedTargets;
 use std::path::Path;
 use std::time::Instant;
 
@@ -75,9 +75,9 @@ pub struct Trainer {
     /// Standard deviation of the photos' brightness.
     contrast: f32,
     /// Space in which density control removes Gaussians.
-    free: FreeSpace,
+    free_space: FreeSpace,
     course: Course,
-    shown: Shown,
+    shown: LoadedTargets,
 }
 
 /// Returns the view of a camera with the options and the background of a run.
@@ -96,40 +96,70 @@ impl Trainer {
     ///
     /// # Errors
     /// When there is nothing to train, it does not fit the device, or an image cannot be read.
-    pub fn new(mut engine: Box<dyn Engine>, scene: &Gaussians, targets: impl Into<Targets>, config: TrainConfig) -> Result<Self> {
+    pub fn new(
+        mut engine: Box<dyn Engine>,
+        scene: &Gaussians,
+        targets: impl Into<Targets>,
+        config: TrainConfig,
+    ) -> Result<Self> {
         let mut targets: Targets = targets.into();
         if scene.is_empty() || targets.is_empty() {
-            return Err(Error::Invalid("nothing to train: there are no points or no training views".to_owned()));
+            return Err(Error::Invalid(
+                "nothing to train: there are no points or no training views".to_owned(),
+            ));
         }
         engine.set_state(&State::of(&scene.clone().with_sh_degree(config.sh_degree)))?;
         if config.exposure {
             targets = targets.without_clipped();
         }
-        let (contrast, pictures) = targets.survey()?;
+        let (contrast, pictures) = targets.contrast_and_fingerprint()?;
         let first = scene.to_channels().into_iter().map(f32::to_bits);
-        let background = Learned::new(std::array::from_fn(|c| if c < 3 { config.background[c] } else { 0.0 }));
+        let background = Learned::new(std::array::from_fn(|c| {
+            if c < 3 { config.background[c] } else { 0.0 }
+        }));
         let course = Course {
             iteration: 0,
             gaussians: scene.len(),
             order: Vec::new(),
             rng: Rng::new(config.seed, "train"),
             removals: Vec::new(),
-            exposures: targets.gains().iter().filter(|_| config.exposure).map(|gain| LearnedExposure::from_gain(*gain)).collect(),
+            exposures: targets
+                .gains()
+                .iter()
+                .filter(|_| config.exposure)
+                .map(|gain| LearnedExposure::from_gain(*gain))
+                .collect(),
             background,
-            views: targets.cameras.iter().map(|c| (c.name.clone(), [c.width, c.height])).collect(),
-            shown: fingerprint([pictures as u32, (pictures >> 32) as u32].into_iter().chain(first)),
+            views: targets
+                .cameras
+                .iter()
+                .map(|c| (c.name.clone(), [c.width, c.height]))
+                .collect(),
+            shown: fingerprint(
+                [pictures as u32, (pictures >> 32) as u32]
+                    .into_iter()
+                    .chain(first),
+            ),
             poses: targets.cameras.iter().map(|c| c.world_to_camera).collect(),
             alignment_gain: None,
             coupled: false,
             config,
         };
         let extent = scene_extent(&targets.cameras);
-        Ok(Self { engine, extent, contrast, free: FreeSpace::default(), targets, course, shown: Shown::default() })
+        Ok(Self {
+            engine,
+            extent,
+            contrast,
+            free_space: FreeSpace::default(),
+            targets,
+            course,
+            shown: LoadedTargets::default(),
+        })
     }
 
     /// Sets the free space for the current cameras. Density control removes Gaussians in it.
-    pub fn keep_free(&mut self, free: FreeSpace) {
-        self.free = free;
+    pub fn set_free_space(&mut self, free: FreeSpace) {
+        self.free_space = free;
     }
 
     /// Returns the next training view: every view once in random order, then again. Under an
@@ -138,7 +168,9 @@ impl Trainer {
         let growing = matches!(self.course.config.budget, Budget::Auto(_)) && self.grows();
         if self.course.order.is_empty() {
             let count = self.targets.len();
-            self.course.order = (0..count).filter(|&i| !(growing && budget::is_watched(i, count))).collect();
+            self.course.order = (0..count)
+                .filter(|&i| !(growing && budget::is_watched(i, count)))
+                .collect();
             self.course.rng.shuffle(&mut self.course.order);
         }
         self.course.order.pop().expect("filled above")
@@ -155,14 +187,23 @@ impl Trainer {
 
     fn step(&mut self) -> Result<()> {
         let id = self.next_view();
-        self.show(id)?;
+        self.load_target(id)?;
         let config = self.course.config.clone();
         let iteration = self.course.iteration;
         let camera = &self.targets.cameras[id];
-        let camera = if config.coarse(iteration) { camera.halved() } else { camera.clone() };
+        let camera = if config.coarse(iteration) {
+            camera.halved()
+        } else {
+            camera.clone()
+        };
         let degree = config.degree(iteration);
         let channels = self.channels();
-        let options = StepOptions { channels, lambda: config.lambda, feature_weight: config.feature_weight, exposure: self.exposure(id) };
+        let options = StepOptions {
+            channels,
+            lambda: config.lambda,
+            feature_weight: config.feature_weight,
+            exposure: self.exposure(id),
+        };
         let rates = config.rates(iteration, self.extent);
         let trained = match channels {
             Channels::Feature => FEATURE.start..BASE_CHANNELS,
@@ -170,9 +211,16 @@ impl Trainer {
         };
         let mut step = Step::new(iteration + 1, trained, &rates);
         step.opacity_weight = config.opacity_weight(iteration, self.engine.len(), self.contrast);
-        let left_out = config.left_out(iteration, self.targets.len());
-        self.engine.step(self.view(&camera, degree).trained().without(left_out, config.draw(iteration)), id, &options, &step)?;
-        self.make_room(id);
+        let left_out = config.dropout(iteration, self.targets.len());
+        self.engine.step(
+            self.view(&camera, degree)
+                .for_training()
+                .with_dropout(left_out, config.step_seed(iteration)),
+            id,
+            &options,
+            &step,
+        )?;
+        self.enforce_limit(id);
         if config.exposure || config.learn_background {
             let losses = self.engine.losses()?;
             if let Some(exposure) = self.course.exposures.get_mut(id) {
@@ -182,7 +230,9 @@ impl Trainer {
             if config.learn_background {
                 // The background feature stays 0, because queries expect no other.
                 let [r, g, b, ..] = losses.by_background;
-                self.course.background.step([r, g, b, 0.0, 0.0, 0.0], BACKGROUND_RATE);
+                self.course
+                    .background
+                    .step([r, g, b, 0.0, 0.0, 0.0], BACKGROUND_RATE);
             }
         }
         self.course.iteration += 1;
@@ -194,11 +244,30 @@ impl Trainer {
         let mut state = self.engine.state()?;
         let config = &self.course.config;
         let before = state.len();
-        let budget = if self.grows() { config.budget.most() } else { before };
-        let limits = density::Config { budget, ..density::Config::default() };
-        let counts = density::refine(&mut state, &self.engine.stats()?, self.extent, &limits, &mut self.course.rng);
-        let floaters = state.remove_in(|mean| self.free.holds(mean));
-        tracing::debug!(iteration = self.course.iteration, gaussians = state.len(), ?counts, floaters, "density control");
+        let budget = if self.grows() {
+            config.budget.max_gaussians()
+        } else {
+            before
+        };
+        let limits = density::Config {
+            budget,
+            ..density::Config::default()
+        };
+        let counts = density::refine(
+            &mut state,
+            &self.engine.stats()?,
+            self.extent,
+            &limits,
+            &mut self.course.rng,
+        );
+        let floaters = state.remove_where(|mean| self.free_space.holds(mean));
+        tracing::debug!(
+            iteration = self.course.iteration,
+            gaussians = state.len(),
+            ?counts,
+            floaters,
+            "density control"
+        );
         state.sort_along_curve();
         self.replace(&state)
     }
@@ -220,13 +289,23 @@ impl Trainer {
     }
 
     fn exposure(&self, id: usize) -> Exposure {
-        self.course.exposures.get(id).map_or_else(Exposure::default, LearnedExposure::exposure)
+        self.course
+            .exposures
+            .get(id)
+            .map_or_else(Exposure::default, LearnedExposure::exposure)
     }
 
     /// Returns the exposure of a view that is not trained on, from its measured brightness. Without
     /// it, differences in brightness would hide changes of quality.
     fn known_exposure(&self, target: &Target) -> Exposure {
-        if self.course.config.exposure { Exposure { gain: target.gain, ..Exposure::default() } } else { Exposure::default() }
+        if self.course.config.exposure {
+            Exposure {
+                gain: target.gain,
+                ..Exposure::default()
+            }
+        } else {
+            Exposure::default()
+        }
     }
 
     /// Returns the mean PSNR in dB of the current scene on any views, over the pixels that count.
@@ -242,10 +321,17 @@ impl Trainer {
         for id in 0..views.len() {
             let target = views.get(id)?;
             let (image, gain) = (&target.image, self.known_exposure(&target).gain);
-            let frame = self.engine.render(self.view(&target.camera, degree), Channels::Color)?;
+            let frame = self
+                .engine
+                .render(self.view(&target.camera, degree), Channels::Color)?;
             let (mut rendered, mut wanted) = (Vec::new(), Vec::new());
             for c in 0..3 {
-                for (value, packed) in frame.channels(c, c + 1).iter().zip(&image.color).filter(|(_, p)| p.to_le_bytes()[3] == 255) {
+                for (value, packed) in frame
+                    .channels(c, c + 1)
+                    .iter()
+                    .zip(&image.color)
+                    .filter(|(_, p)| p.to_le_bytes()[3] == 255)
+                {
                     rendered.push((gain[c] * value).clamp(0.0, 1.0));
                     wanted.push(f32::from(packed.to_le_bytes()[c]) / 255.0);
                 }
@@ -271,7 +357,7 @@ impl Trainer {
         let first = self.course.iteration;
         let mut started = Instant::now();
         // The time of `report` does not count.
-        let mut aside = 0.0;
+        let mut report_seconds = 0.0;
         while self.course.iteration < self.course.config.iterations {
             self.step()?;
             let iteration = self.course.iteration;
@@ -297,18 +383,35 @@ impl Trainer {
                 let losses = self.engine.losses()?;
                 // For normally distributed errors, mean square = pi/2 x squared mean absolute
                 // error.
-                let psnr = -10.0 * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2).max(1e-12).log10();
-                let seconds = started.elapsed().as_secs_f64() - aside - self.shown.reading;
+                let psnr = -10.0
+                    * (losses.color_l1.powi(2) * std::f64::consts::FRAC_PI_2)
+                        .max(1e-12)
+                        .log10();
+                let seconds = started.elapsed().as_secs_f64() - report_seconds - self.shown.reading;
                 let reporting = Instant::now();
-                report(&Progress { iteration, losses, psnr, gaussians: self.engine.len(), seconds }, self)?;
-                aside += reporting.elapsed().as_secs_f64();
+                report(
+                    &Progress {
+                        iteration,
+                        losses,
+                        psnr,
+                        gaussians: self.engine.len(),
+                        seconds,
+                    },
+                    self,
+                )?;
+                report_seconds += reporting.elapsed().as_secs_f64();
             }
-            if let Some(path) = checkpoint.filter(|_| iteration.is_multiple_of(500) && iteration < self.course.config.iterations) {
+            if let Some(path) = checkpoint.filter(|_| {
+                iteration.is_multiple_of(500) && iteration < self.course.config.iterations
+            }) {
                 self.save(path)?;
             }
         }
         self.engine.losses()?;
-        let (seconds, steps) = (started.elapsed().as_secs_f64() - aside - self.shown.reading, self.course.iteration - first);
+        let (seconds, steps) = (
+            started.elapsed().as_secs_f64() - report_seconds - self.shown.reading,
+            self.course.iteration - first,
+        );
         Ok(TrainReport {
             iterations: self.course.iteration,
             steps_here: steps,
@@ -333,9 +436,16 @@ impl Trainer {
             tracing::warn!(lost, "removed Gaussians whose values are not finite");
         }
         if state.is_empty() {
-            return Err(Error::Invalid("training diverged: no Gaussian has finite values; check the camera poses".to_owned()));
+            return Err(Error::Invalid(
+                "training diverged: no Gaussian has finite values; check the camera poses"
+                    .to_owned(),
+            ));
         }
-        Ok(Gaussians::from_channels(&state.params, state.sh_degree, None))
+        Ok(Gaussians::from_channels(
+            &state.params,
+            state.sh_degree,
+            None,
+        ))
     }
 
     /// Renders the current scene from any camera.
@@ -343,12 +453,19 @@ impl Trainer {
     /// # Errors
     /// As [`Engine::render`].
     pub fn render(&mut self, camera: &Camera) -> Result<Frame> {
-        self.engine.render(self.view(camera, self.course.config.degree(self.course.iteration)), Channels::Both)
+        self.engine.render(
+            self.view(camera, self.course.config.degree(self.course.iteration)),
+            Channels::Both,
+        )
     }
 
     /// Returns the exposures of the training views; empty if they are not learned.
     pub fn exposures(&self) -> Vec<Exposure> {
-        self.course.exposures.iter().map(LearnedExposure::exposure).collect()
+        self.course
+            .exposures
+            .iter()
+            .map(LearnedExposure::exposure)
+            .collect()
     }
 
     /// Writes a checkpoint: `path.json`, and the tensor file that it names.
@@ -357,7 +474,10 @@ impl Trainer {
     /// When a file cannot be written; the previous checkpoint then remains.
     pub fn save(&self, path: &Path) -> Result<()> {
         let state = self.engine.state()?;
-        let course = Course { gaussians: state.len(), ..self.course.clone() };
+        let course = Course {
+            gaussians: state.len(),
+            ..self.course.clone()
+        };
         checkpoint::save(path, &course, &state, &self.engine.stats()?)
     }
 
@@ -366,24 +486,33 @@ impl Trainer {
     /// # Errors
     /// When the checkpoint is damaged, or belongs to another configuration.
     pub fn resume(&mut self, path: &Path) -> Result<bool> {
-        let Some((course, state, stats)) = checkpoint::load(path)? else { return Ok(false) };
+        let Some((course, state, stats)) = checkpoint::load(path)? else {
+            return Ok(false);
+        };
         let other = match () {
             () if course.config != self.course.config => Some("with other options"),
             () if course.views != self.course.views => Some("from other photos"),
-            () if course.shown != 0 && course.shown != self.course.shown => Some("from other images, objects or first Gaussians"),
+            () if course.shown != 0 && course.shown != self.course.shown => {
+                Some("from other images, objects or first Gaussians")
+            }
             () => None,
         };
         if let Some(other) = other {
             let header = path.with_extension("json");
             let header = header.display();
-            return Err(Error::Invalid(format!("{header}: the checkpoint was made {other}; train without resuming, or delete it")));
+            return Err(Error::Invalid(format!(
+                "{header}: the checkpoint was made {other}; train without resuming, or delete it"
+            )));
         }
         self.engine.set_state(&state)?;
         self.engine.set_stats(&stats)?;
         for (camera, pose) in self.targets.cameras.iter_mut().zip(&course.poses) {
             camera.world_to_camera = *pose;
         }
-        tracing::info!(iteration = course.iteration, "training continues from its checkpoint");
+        tracing::info!(
+            iteration = course.iteration,
+            "training continues from its checkpoint"
+        );
         self.course = course;
         Ok(true)
     }

@@ -9,7 +9,7 @@ use std::time::Instant;
 const ROOM: usize = 1 << 30;
 
 /// The target images that are on the device.
-pub(super) struct Shown {
+pub(super) struct LoadedTargets {
     /// Whether they have half the resolution.
     coarse: bool,
     /// Bytes of each view's image.
@@ -21,18 +21,23 @@ pub(super) struct Shown {
     pub reading: f64,
 }
 
-impl Default for Shown {
+impl Default for LoadedTargets {
     fn default() -> Self {
-        Self { coarse: false, views: BTreeMap::new(), room: ROOM, reading: 0.0 }
+        Self {
+            coarse: false,
+            views: BTreeMap::new(),
+            room: ROOM,
+            reading: 0.0,
+        }
     }
 }
 
 impl Trainer {
     /// Loads the target image of a view onto the device, at the resolution of the next step.
-    pub(super) fn show(&mut self, id: usize) -> Result<()> {
+    pub(super) fn load_target(&mut self, id: usize) -> Result<()> {
         let coarse = self.course.config.coarse(self.course.iteration);
         if self.shown.coarse != coarse {
-            self.hide();
+            self.unload_targets();
             self.shown.coarse = coarse;
         }
         if !self.shown.views.contains_key(&id) {
@@ -48,16 +53,18 @@ impl Trainer {
     }
 
     /// Removes all target images from the device, because they are outdated.
-    pub(super) fn hide(&mut self) {
-        std::mem::take(&mut self.shown.views).into_keys().for_each(|id| self.engine.forget_target(id));
+    pub(super) fn unload_targets(&mut self) {
+        std::mem::take(&mut self.shown.views)
+            .into_keys()
+            .for_each(|id| self.engine.remove_target(id));
     }
 
     /// Removes the image of view `id` after its step if the limit is exceeded. Each view is used
     /// once before any is used again, so no other choice causes fewer reads.
-    pub(super) fn make_room(&mut self, id: usize) {
+    pub(super) fn enforce_limit(&mut self, id: usize) {
         if self.shown.views.values().sum::<usize>() > self.shown.room {
             self.shown.views.remove(&id);
-            self.engine.forget_target(id);
+            self.engine.remove_target(id);
         }
     }
 }
@@ -78,26 +85,64 @@ mod tests {
     fn views(reads: Arc<AtomicUsize>, broken: usize) -> Targets {
         let around = |k: usize| {
             let angle = k as f32 * 0.3;
-            Camera::look_at(&format!("v{k}"), 4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()), Vec3::ZERO, Vec3::Y, 64, 48, 0.9)
+            Camera::look_at(
+                &format!("v{k}"),
+                4.0 * Vec3::new(angle.sin(), 0.1, -angle.cos()),
+                Vec3::ZERO,
+                Vec3::Y,
+                64,
+                48,
+                0.9,
+            )
         };
-        let image = || TargetImage { feature: Vec::new(), ..target(64, 48) };
-        let whole: Targets = (0..VIEWS).map(|k| Target { camera: around(k), image: image(), gain: [1.0; 3] }).collect::<Vec<_>>().into();
+        let image = || TargetImage {
+            feature: Vec::new(),
+            ..target(64, 48)
+        };
+        let whole: Targets = (0..VIEWS)
+            .map(|k| Target {
+                camera: around(k),
+                image: image(),
+                gain: [1.0; 3],
+            })
+            .collect::<Vec<_>>()
+            .into();
         let (cameras, gains) = (whole.cameras.clone(), vec![[1.0; 3]; VIEWS]);
         Targets::new(cameras, gains, move |id| {
             let gone = reads.fetch_add(1, Ordering::Relaxed) >= broken;
-            if gone { Err(Error::Picture("the photo is gone".into())) } else { Ok(whole.get(id)?.image) }
+            if gone {
+                Err(Error::Picture("the photo is gone".into()))
+            } else {
+                Ok(whole.get(id)?.image)
+            }
         })
     }
 
     /// Runs a training with room for `room` bytes of images. Returns its Gaussians, the number of
     /// reads, and the bytes of images on the device at the end.
-    fn run(room: Option<usize>, broken: usize) -> crate::Result<(fastlgs_core::Gaussians, usize, u64)> {
+    fn run(
+        room: Option<usize>,
+        broken: usize,
+    ) -> crate::Result<(fastlgs_core::Gaussians, usize, u64)> {
         let reads = Arc::new(AtomicUsize::new(0));
-        let config = TrainConfig { iterations: 240, budget: Budget::Fixed(400), ..TrainConfig::default() };
-        let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &cloud(200, 8, 0, false), views(reads.clone(), broken), config)?;
+        let config = TrainConfig {
+            iterations: 240,
+            budget: Budget::Fixed(400),
+            ..TrainConfig::default()
+        };
+        let mut trainer = Trainer::new(
+            Box::new(CpuEngine::new()),
+            &cloud(200, 8, 0, false),
+            views(reads.clone(), broken),
+            config,
+        )?;
         trainer.shown.room = room.unwrap_or(trainer.shown.room);
         trainer.run(None, |_, _| Ok::<_, Error>(()))?;
-        Ok((trainer.gaussians()?, reads.load(Ordering::Relaxed), trainer.engine.memory().views))
+        Ok((
+            trainer.gaussians()?,
+            reads.load(Ordering::Relaxed),
+            trainer.engine.memory().views,
+        ))
     }
 
     #[test]
@@ -110,13 +155,19 @@ mod tests {
         assert!(all == same, "the limit does not change the Gaussians");
         // At half the resolution, an image has a quarter of the bytes, and all fit.
         assert!(held <= 5 * picture as u64, "{held} bytes are held");
-        assert!((4 * VIEWS..15 * VIEWS).contains(&read), "{read} pictures were read");
+        assert!(
+            (4 * VIEWS..15 * VIEWS).contains(&read),
+            "{read} pictures were read"
+        );
     }
 
     #[test]
     fn a_picture_that_went_missing_ends_the_run_in_words() {
         let message = run(Some(0), 3 * VIEWS).unwrap_err().to_string();
         assert_eq!(message, "the photo is gone");
-        assert!(run(None, 0).is_err(), "a missing photo ends the run before the first step");
+        assert!(
+            run(None, 0).is_err(),
+            "a missing photo ends the run before the first step"
+        );
     }
 }

@@ -16,7 +16,11 @@ impl Trainer {
     /// Returns the validation views: training views that are held out while the scene grows.
     pub(super) fn watched(&self) -> Targets {
         let count = self.targets.len();
-        self.targets.some((0..count).filter(|&i| budget::is_watched(i, count)).collect())
+        self.targets.subset(
+            (0..count)
+                .filter(|&i| budget::is_watched(i, count))
+                .collect(),
+        )
     }
 
     /// Returns the lowest SH degree that loses at most [`budget::DEGREE_LOSS`] dB on the validation
@@ -25,11 +29,19 @@ impl Trainer {
     /// # Errors
     /// As [`crate::engine::Engine::render`].
     pub fn needed_degree(&mut self) -> Result<u32> {
-        let (highest, watched) = (self.course.config.degree(self.course.iteration), self.watched());
+        let (highest, watched) = (
+            self.course.config.degree(self.course.iteration),
+            self.watched(),
+        );
         let automatic = matches!(self.course.config.budget, Budget::Auto(_));
-        let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else { return Ok(highest) };
+        let Some(best) = self.quality(&watched, Some(highest))?.filter(|_| automatic) else {
+            return Ok(highest);
+        };
         for degree in 0..highest {
-            if self.quality(&watched, Some(degree))?.is_some_and(|db| best - db <= budget::DEGREE_LOSS) {
+            if self
+                .quality(&watched, Some(degree))?
+                .is_some_and(|db| best - db <= budget::DEGREE_LOSS)
+            {
                 return Ok(degree);
             }
         }
@@ -41,16 +53,21 @@ impl Trainer {
         let mut whole = self.engine.state()?;
         whole.keep_finite();
         let changes = self.changes(&whole)?;
-        let judges = self.judges();
+        let judges = self.cost_views();
         let psnr_before = self.quality(&judges, None)?;
-        let mut removal =
-            Removal { iteration: self.course.iteration, before: whole.len(), after: whole.len(), psnr_before, psnr_after: None };
-        for places in budget::candidates(&changes.each, changes.error) {
+        let mut removal = Removal {
+            iteration: self.course.iteration,
+            before: whole.len(),
+            after: whole.len(),
+            psnr_before,
+            psnr_after: None,
+        };
+        for places in budget::candidates(&changes.scores, changes.error) {
             let mut state = whole.clone();
             state.keep(&places);
             self.replace(&state)?;
             (removal.after, removal.psnr_after) = (state.len(), self.quality(&judges, None)?);
-            if removal.is_bearable() {
+            if removal.is_acceptable() {
                 break;
             }
         }
@@ -66,16 +83,24 @@ impl Trainer {
         let mut changes = Changes::of(&scene);
         for id in 0..self.targets.len() {
             let target = self.targets.get(id)?;
-            changes.see(&view_of(&self.course, scene.len(), &target.camera, degree), Some((&target.image, self.exposure(id))));
+            changes.add_view(
+                &view_of(&self.course, scene.len(), &target.camera, degree),
+                Some((&target.image, self.exposure(id))),
+            );
         }
         Ok(changes)
     }
 
     /// Returns the views that measure the cost of a removal: the validation views, else every tenth
     /// view.
-    pub(super) fn judges(&self) -> Targets {
+    pub(super) fn cost_views(&self) -> Targets {
         let watched = self.watched();
-        if watched.is_empty() { self.targets.some((0..self.targets.len()).step_by(budget::WATCHED).collect()) } else { watched }
+        if watched.is_empty() {
+            self.targets
+                .subset((0..self.targets.len()).step_by(budget::WATCHED).collect())
+        } else {
+            watched
+        }
     }
 }
 
@@ -88,7 +113,15 @@ mod tests {
 
     #[test]
     fn of_two_that_hide_each_other_one_stays() {
-        let camera = Camera::look_at("a", Vec3::new(0.0, 0.0, -4.0), Vec3::ZERO, Vec3::Y, 64, 48, 0.8);
+        let camera = Camera::look_at(
+            "a",
+            Vec3::new(0.0, 0.0, -4.0),
+            Vec3::ZERO,
+            Vec3::Y,
+            64,
+            48,
+            0.8,
+        );
         let mut scene = Gaussians::default();
         // Each large Gaussian hides the other, so each alone could be removed. The small one is
         // needed.
@@ -97,12 +130,27 @@ mod tests {
         scene.push_sphere(Vec3::NEG_Z, 0.1, 0.99, [0.9; 3]);
         let counts = |p: i32| (p % 64 - 32).pow(2) + (p / 64 - 24).pow(2) < 12 * 12;
         let color = (0..64 * 48).map(|p| pack([180; 3], counts(p))).collect();
-        let target = Target { camera, image: TargetImage { size: [64, 48], color, feature: Vec::new() }, gain: [1.0; 3] };
-        let config = TrainConfig { budget: Budget::Auto(10), ..TrainConfig::default() };
-        let mut trainer = Trainer::new(Box::new(CpuEngine::new()), &scene, vec![target], config).unwrap();
+        let target = Target {
+            camera,
+            image: TargetImage {
+                size: [64, 48],
+                color,
+                feature: Vec::new(),
+            },
+            gain: [1.0; 3],
+        };
+        let config = TrainConfig {
+            budget: Budget::Auto(10),
+            ..TrainConfig::default()
+        };
+        let mut trainer =
+            Trainer::new(Box::new(CpuEngine::new()), &scene, vec![target], config).unwrap();
         trainer.prune().unwrap();
         let removal = trainer.course.removals[0];
         assert_eq!((removal.before, removal.after), (3, 2), "{removal:?}");
-        assert!((removal.psnr_before.unwrap() - removal.psnr_after.unwrap()).abs() < 1.0, "{removal:?}");
+        assert!(
+            (removal.psnr_before.unwrap() - removal.psnr_after.unwrap()).abs() < 1.0,
+            "{removal:?}"
+        );
     }
 }

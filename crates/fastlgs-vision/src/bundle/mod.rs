@@ -16,9 +16,9 @@ use problem::{Lens, Observation, Pose, Problem, Values};
 use serde::{Deserialize, Serialize};
 
 /// Tolerance of matches in each round, in multiples of [`TOLERANCE`]: loose while poses are rough.
-const ROUNDS: [f32; 4] = [4.0, 4.0, 2.0, 1.0];
+const ROUND_TOLERANCES: [f32; 4] = [4.0, 4.0, 2.0, 1.0];
 /// Smallest number of photos with the same lens for which the lens is adjusted.
-const PHOTOS_OF_A_LENS: usize = 5;
+const MIN_PHOTOS_PER_LENS: usize = 5;
 
 /// Result of a bundle adjustment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -41,47 +41,84 @@ pub struct Report {
 /// Refines `cameras` to fit `matches` best, in the world frame of the given cameras.
 ///
 /// Returns `None` if a round finds no tracks; `cameras` may have changed by then.
-pub fn adjust(cameras: &mut [Camera], keypoints: &[Keypoints], matches: &[PairMatches]) -> Option<Report> {
+pub fn adjust(
+    cameras: &mut [Camera],
+    keypoints: &[Keypoints],
+    matches: &[PairMatches],
+) -> Option<Report> {
     let given = cameras.to_vec();
     let obeying = |cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32| -> Vec<Track> {
-        let matches: Vec<PairMatches> = matches.iter().map(|m| m.obeying(cameras, keypoints, tolerance)).collect();
+        let matches: Vec<PairMatches> = matches
+            .iter()
+            .map(|m| m.obeying(cameras, keypoints, tolerance))
+            .collect();
         tracks(cameras, keypoints, &matches, tolerance)
     };
     let before = quality(&obeying(&given, keypoints, TOLERANCE));
     let lens = lenses(&given);
-    let mut values =
-        Values { poses: Vec::new(), lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)], points: Vec::new() };
-    for round in ROUNDS {
+    let mut values = Values {
+        poses: Vec::new(),
+        lenses: vec![Lens::default(); lens.iter().flatten().max().map_or(0, |l| l + 1)],
+        points: Vec::new(),
+    };
+    for round in ROUND_TOLERANCES {
         // Remove the distortion estimated so far: otherwise matches near corners exceed the
         // tolerance.
-        let tracks = obeying(cameras, &straight(keypoints, cameras, &lens, &values.lenses), round * TOLERANCE);
+        let tracks = obeying(
+            cameras,
+            &straight(keypoints, cameras, &lens, &values.lenses),
+            round * TOLERANCE,
+        );
         if tracks.is_empty() {
             return None;
         }
-        let problem = Problem { cameras: &given, lens: lens.clone(), seen: observations(&tracks, keypoints) };
+        let problem = Problem {
+            cameras: &given,
+            lens: lens.clone(),
+            seen: observations(&tracks, keypoints),
+        };
         values.poses = cameras.iter().map(Pose::of).collect();
         values.points = tracks.iter().map(|t| t.position.as_dvec3()).collect();
         problem.solve(&mut values);
         values.apply(&problem, cameras);
     }
     keep_gauge(cameras, &given);
-    let after = obeying(cameras, &straight(keypoints, cameras, &lens, &values.lenses), TOLERANCE);
+    let after = obeying(
+        cameras,
+        &straight(keypoints, cameras, &lens, &values.lenses),
+        TOLERANCE,
+    );
     let lens_of = |view: usize| lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
     Some(Report {
         error: [before.0, quality(&after).0],
         observations: [before.1, quality(&after).1],
         moved: movements(&given, cameras, &after),
-        focal: (0..cameras.len()).map(|v| lens_of(v).log_focal.exp() as f32).collect(),
+        focal: (0..cameras.len())
+            .map(|v| lens_of(v).log_focal.exp() as f32)
+            .collect(),
         k1: (0..cameras.len()).map(|v| lens_of(v).k1 as f32).collect(),
     })
 }
 
 /// Returns the key points as lenses without distortion would show them.
-fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>], lenses: &[Lens]) -> Vec<Keypoints> {
+fn straight(
+    keypoints: &[Keypoints],
+    cameras: &[Camera],
+    lens: &[Option<usize>],
+    lenses: &[Lens],
+) -> Vec<Keypoints> {
     let mut out = keypoints.to_vec();
     for (view, points) in out.iter_mut().enumerate() {
-        let Some(bend) = lens[view].map(|l| Distortion { k1: lenses[l].k1 as f32, ..Distortion::default() }) else { continue };
-        points.positions.iter_mut().for_each(|p| *p = bend.straight_pixel(&cameras[view], *p));
+        let Some(bend) = lens[view].map(|l| Distortion {
+            k1: lenses[l].k1 as f32,
+            ..Distortion::default()
+        }) else {
+            continue;
+        };
+        points
+            .positions
+            .iter_mut()
+            .for_each(|p| *p = bend.undistort_pixel(&cameras[view], *p));
     }
     out
 }
@@ -89,40 +126,65 @@ fn straight(keypoints: &[Keypoints], cameras: &[Camera], lens: &[Option<usize>],
 /// Returns the root mean square reprojection error in pixels and the number of observations.
 fn quality(tracks: &[Track]) -> (f32, usize) {
     let count: usize = tracks.iter().map(|t| t.seen.len()).sum();
-    let square: f32 = tracks.iter().map(|t| t.error * t.error * t.seen.len() as f32).sum();
+    let square: f32 = tracks
+        .iter()
+        .map(|t| t.error * t.error * t.seen.len() as f32)
+        .sum();
     ((square / count.max(1) as f32).sqrt(), count)
 }
 
 /// Returns the lens index of each camera: cameras of equal size and intrinsics share one. `None` if
-/// fewer than `PHOTOS_OF_A_LENS` cameras share it; it is then not adjusted.
+/// fewer than `MIN_PHOTOS_PER_LENS` cameras share it; it is then not adjusted.
 fn lenses(cameras: &[Camera]) -> Vec<Option<usize>> {
-    let same = |a: &Camera, b: &Camera| (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy);
-    let mut known: Vec<&Camera> = Vec::new();
+    let same = |a: &Camera, b: &Camera| {
+        (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
+    };
+    let mut shared_lenses: Vec<&Camera> = Vec::new();
     for camera in cameras {
         let sharing = cameras.iter().filter(|other| same(camera, other)).count();
-        if sharing >= PHOTOS_OF_A_LENS && !known.iter().any(|other| same(camera, other)) {
-            known.push(camera);
+        if sharing >= MIN_PHOTOS_PER_LENS && !shared_lenses.iter().any(|other| same(camera, other))
+        {
+            shared_lenses.push(camera);
         }
     }
-    cameras.iter().map(|camera| known.iter().position(|other| same(camera, other))).collect()
+    cameras
+        .iter()
+        .map(|camera| shared_lenses.iter().position(|other| same(camera, other)))
+        .collect()
 }
 
 fn observations(tracks: &[Track], keypoints: &[Keypoints]) -> Vec<Vec<Observation>> {
-    let of = |&(view, k): &(usize, usize)| Observation { view, pixel: keypoints[view].positions[k].as_dvec2() };
-    tracks.iter().map(|track| track.seen.iter().map(of).collect()).collect()
+    let of = |&(view, k): &(usize, usize)| Observation {
+        view,
+        pixel: keypoints[view].positions[k].as_dvec2(),
+    };
+    tracks
+        .iter()
+        .map(|track| track.seen.iter().map(of).collect())
+        .collect()
 }
 
 /// Moves all cameras by the similarity that best aligns them with `given` (fixes the gauge).
 fn keep_gauge(cameras: &mut [Camera], given: &[Camera]) {
     let extent = fastlgs_core::camera::scene_extent(given);
     // Points in front of and above the cameras also fix the rotation about a line of cameras.
-    let places = |c: &Camera| {
+    let anchors = |c: &Camera| {
         let axes = c.world_to_camera.transpose();
-        [c.centre(), c.centre() + extent * c.forward(), c.centre() - extent * axes.y_axis.truncate()]
+        [
+            c.centre(),
+            c.centre() + extent * c.forward(),
+            c.centre() - extent * axes.y_axis.truncate(),
+        ]
     };
-    let pairs: Vec<(Vec3, Vec3)> = cameras.iter().zip(given).flat_map(|(now, then)| places(now).into_iter().zip(places(then))).collect();
+    let pairs: Vec<(Vec3, Vec3)> = cameras
+        .iter()
+        .zip(given)
+        .flat_map(|(now, then)| anchors(now).into_iter().zip(anchors(then)))
+        .collect();
     if let Some(back) = Similarity::between(&pairs) {
-        cameras.iter_mut().for_each(|camera| back.move_camera(camera));
+        cameras
+            .iter_mut()
+            .for_each(|camera| back.move_camera(camera));
     }
 }
 
@@ -160,9 +222,16 @@ mod tests {
             let size = if rng.uniform() < 0.1 { 30.0 } else { 0.5 };
             size * Vec2::new(rng.normal(), rng.normal())
         };
-        let keypoints: Vec<Keypoints> = cameras.iter().map(|c| ring::seen(c, &cloud, &mut error)).collect();
+        let keypoints: Vec<Keypoints> = cameras
+            .iter()
+            .map(|c| ring::seen(c, &cloud, &mut error))
+            .collect();
         let near = |a: usize| (a + 1..count.min(a + 6)).map(move |b| (a, b));
-        let matched = |(a, b): (usize, usize)| PairMatches { a, b, pairs: match_all(&keypoints[a], &keypoints[b]) };
+        let matched = |(a, b): (usize, usize)| PairMatches {
+            a,
+            b,
+            pairs: match_all(&keypoints[a], &keypoints[b]),
+        };
         let matches = (0..count).flat_map(near).map(matched).collect();
         (cameras, keypoints, matches)
     }
@@ -170,10 +239,20 @@ mod tests {
     /// Median distance in pixels between the projections of points around the origin by two
     /// cameras.
     fn off(a: &[Camera], b: &[Camera]) -> f32 {
-        let points: Vec<Vec3> = (0..8).map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5).collect();
+        let points: Vec<Vec3> = (0..8)
+            .map(|k| Vec3::new((k & 1) as f32, (k >> 1 & 1) as f32, (k >> 2) as f32) - 0.5)
+            .collect();
         let see = |c: &Camera, p: &Vec3| c.to_pixel(c.world_to_camera.transform_point3(*p));
-        let mut all: Vec<f32> =
-            a.iter().zip(b).flat_map(|(a, b)| points.iter().map(|p| see(a, p).distance(see(b, p))).collect::<Vec<_>>()).collect();
+        let mut all: Vec<f32> = a
+            .iter()
+            .zip(b)
+            .flat_map(|(a, b)| {
+                points
+                    .iter()
+                    .map(|p| see(a, p).distance(see(b, p)))
+                    .collect::<Vec<_>>()
+            })
+            .collect();
         all.sort_by(f32::total_cmp);
         all[all.len() / 2]
     }
@@ -182,8 +261,15 @@ mod tests {
     /// depend on the world frame.
     fn turned(a: &[Camera], b: &[Camera]) -> f32 {
         let turn = |c: &Camera| Quat::from_mat4(&c.world_to_camera);
-        let turns = |all: &[Camera]| all.windows(2).map(|pair| turn(&pair[1]) * turn(&pair[0]).inverse()).collect::<Vec<_>>();
-        let angles = turns(a).into_iter().zip(turns(b)).map(|(a, b)| a.angle_between(b));
+        let turns = |all: &[Camera]| {
+            all.windows(2)
+                .map(|pair| turn(&pair[1]) * turn(&pair[0]).inverse())
+                .collect::<Vec<_>>()
+        };
+        let angles = turns(a)
+            .into_iter()
+            .zip(turns(b))
+            .map(|(a, b)| a.angle_between(b));
         a[0].fx * angles.sum::<f32>() / (a.len() - 1) as f32
     }
 
@@ -193,32 +279,53 @@ mod tests {
         let mut cameras = truth.clone();
         let mut rng = Rng::new(8, "poses");
         for camera in &mut cameras {
-            let turn = Quat::from_scaled_axis(0.012 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
-            camera.world_to_camera = Mat4::from_translation(0.02 * Vec3::new(rng.normal(), rng.normal(), rng.normal()))
-                * Mat4::from_quat(turn)
-                * camera.world_to_camera;
+            let turn =
+                Quat::from_scaled_axis(0.012 * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
+            camera.world_to_camera =
+                Mat4::from_translation(0.02 * Vec3::new(rng.normal(), rng.normal(), rng.normal()))
+                    * Mat4::from_quat(turn)
+                    * camera.world_to_camera;
         }
         let given = cameras.clone();
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
         let [before, after] = [turned(&given, &truth), turned(&cameras, &truth)];
         // In a small cloud, rotation and translation look alike, so their remaining errors
         // compensate.
-        assert!(before > 3.0 && after < 0.2 * before, "{before} px before, {after} after");
-        assert!(report.error[1] < 0.9 && report.observations[1] > 2 * report.observations[0], "{report:?}");
-        assert!(report.moved.iter().all(|m| (0.3..20.0).contains(m)), "{:?}", report.moved);
+        assert!(
+            before > 3.0 && after < 0.2 * before,
+            "{before} px before, {after} after"
+        );
+        assert!(
+            report.error[1] < 0.9 && report.observations[1] > 2 * report.observations[0],
+            "{report:?}"
+        );
+        assert!(
+            report.moved.iter().all(|m| (0.3..20.0).contains(m)),
+            "{:?}",
+            report.moved
+        );
     }
 
     #[test]
     fn a_wrong_focal_length_and_a_bent_lens_are_found() {
         let (truth, mut keypoints, matches) = noisy_ring(24);
         let mut cameras = truth.clone();
-        cameras.iter_mut().for_each(|c| (c.fx, c.fy) = (1.03 * c.fx, 1.03 * c.fy));
+        cameras
+            .iter_mut()
+            .for_each(|c| (c.fx, c.fy) = (1.03 * c.fx, 1.03 * c.fy));
         for pixel in keypoints.iter_mut().flat_map(|k| &mut k.positions) {
             let ray = truth[0].ray(*pixel).truncate();
-            *pixel = Vec2::new(truth[0].fx, truth[0].fy) * ray * (1.0 - 0.05 * ray.length_squared()) + Vec2::new(truth[0].cx, truth[0].cy);
+            *pixel =
+                Vec2::new(truth[0].fx, truth[0].fy) * ray * (1.0 - 0.05 * ray.length_squared())
+                    + Vec2::new(truth[0].cx, truth[0].cy);
         }
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
-        assert!((report.focal[0] * 1.03 - 1.0).abs() < 0.005 && (report.k1[0] + 0.05).abs() < 0.02, "{} {}", report.focal[0], report.k1[0]);
+        assert!(
+            (report.focal[0] * 1.03 - 1.0).abs() < 0.005 && (report.k1[0] + 0.05).abs() < 0.02,
+            "{} {}",
+            report.focal[0],
+            report.k1[0]
+        );
     }
 
     #[test]
@@ -226,7 +333,12 @@ mod tests {
         let (truth, keypoints, matches) = noisy_ring(24);
         let mut cameras = truth.clone();
         let report = adjust(&mut cameras, &keypoints, &matches).unwrap();
-        assert!(off(&cameras, &truth) < 0.2 && (report.focal[0] - 1.0).abs() < 0.003, "{} {}", off(&cameras, &truth), report.focal[0]);
+        assert!(
+            off(&cameras, &truth) < 0.2 && (report.focal[0] - 1.0).abs() < 0.003,
+            "{} {}",
+            off(&cameras, &truth),
+            report.focal[0]
+        );
         assert!(adjust(&mut cameras, &keypoints, &[]).is_none());
     }
 }

@@ -8,9 +8,9 @@ use rayon::prelude::*;
 /// Prior standard deviation of a lens: of the logarithm of its focal length, and of k1.
 const LENS_DEVIATION: f64 = 0.1;
 /// Smallest number of observations for which a camera's pose is adjusted.
-const FEW: usize = 20;
+const MIN_OBSERVATIONS: usize = 20;
 /// Scale of Cauchy's loss in pixels: larger errors count less.
-const SOFT: f64 = 1.0;
+const LOSS_SCALE: f64 = 1.0;
 /// Largest number of Levenberg-Marquardt steps in a round.
 const STEPS: usize = 12;
 
@@ -51,25 +51,31 @@ pub(super) struct Problem<'a> {
 }
 
 /// Number of parameters of a pose: rotation vector and translation.
-const OWN: usize = 6;
+const POSE_PARAMETERS: usize = 6;
 /// Number of parameters of a pose and its lens.
-const ALL: usize = OWN + 2;
+const CAMERA_PARAMETERS: usize = POSE_PARAMETERS + 2;
 /// Derivatives of a pixel by rotation, translation and lens of its camera.
-type ByCamera = SMatrix<f64, 2, ALL>;
+type ByCamera = SMatrix<f64, 2, CAMERA_PARAMETERS>;
 /// Block of the normal matrix that couples the parameters of a camera with a point.
-type Coupling = SMatrix<f64, ALL, 3>;
+type Coupling = SMatrix<f64, CAMERA_PARAMETERS, 3>;
 
 impl Pose {
     pub fn of(camera: &Camera) -> Self {
         let pose = camera.world_to_camera.as_dmat4();
-        Self { rotation: DMat3::from_mat4(pose), translation: pose.w_axis.truncate() }
+        Self {
+            rotation: DMat3::from_mat4(pose),
+            translation: pose.w_axis.truncate(),
+        }
     }
 
     /// Returns this pose followed by a small rotation and translation: q becomes exp(turn) q +
     /// shift.
     fn nudged(&self, turn: DVec3, shift: DVec3) -> Self {
         let turn = DMat3::from_quat(DQuat::from_scaled_axis(turn));
-        Self { rotation: turn * self.rotation, translation: turn * self.translation + shift }
+        Self {
+            rotation: turn * self.rotation,
+            translation: turn * self.translation + shift,
+        }
     }
 }
 
@@ -77,12 +83,19 @@ impl Values {
     /// Writes poses and focal lengths into `cameras`; their other values stay unchanged.
     pub fn apply(&self, problem: &Problem, cameras: &mut [Camera]) {
         for (view, camera) in cameras.iter_mut().enumerate() {
-            let Pose { rotation, translation } = self.poses[view];
-            let mut pose = DMat4::from_mat3(DMat3::from_quat(DQuat::from_mat3(&rotation).normalize()));
+            let Pose {
+                rotation,
+                translation,
+            } = self.poses[view];
+            let mut pose =
+                DMat4::from_mat3(DMat3::from_quat(DQuat::from_mat3(&rotation).normalize()));
             pose.w_axis = translation.extend(1.0);
             camera.world_to_camera = pose.as_mat4();
             let factor = problem.lens[view].map_or(1.0, |l| self.lenses[l].log_focal.exp()) as f32;
-            (camera.fx, camera.fy) = (problem.cameras[view].fx * factor, problem.cameras[view].fy * factor);
+            (camera.fx, camera.fy) = (
+                problem.cameras[view].fx * factor,
+                problem.cameras[view].fy * factor,
+            );
         }
     }
 
@@ -90,16 +103,28 @@ impl Values {
     /// each lens; `points` has one shift for each point.
     fn stepped(&self, cameras: &DVector<f64>, points: &[DVec3]) -> Self {
         let three = |k: usize| DVec3::new(cameras[k], cameras[k + 1], cameras[k + 2]);
-        let lenses_at = OWN * self.poses.len();
+        let lenses_at = POSE_PARAMETERS * self.poses.len();
         Self {
-            poses: self.poses.iter().enumerate().map(|(v, pose)| pose.nudged(three(OWN * v), three(OWN * v + 3))).collect(),
+            poses: self
+                .poses
+                .iter()
+                .enumerate()
+                .map(|(v, pose)| {
+                    pose.nudged(three(POSE_PARAMETERS * v), three(POSE_PARAMETERS * v + 3))
+                })
+                .collect(),
             lenses: (self.lenses.iter().enumerate())
                 .map(|(l, lens)| Lens {
                     log_focal: lens.log_focal + cameras[lenses_at + 2 * l],
                     k1: lens.k1 + cameras[lenses_at + 2 * l + 1],
                 })
                 .collect(),
-            points: self.points.iter().zip(points).map(|(p, d)| *p + *d).collect(),
+            points: self
+                .points
+                .iter()
+                .zip(points)
+                .map(|(p, d)| *p + *d)
+                .collect(),
         }
     }
 }
@@ -118,63 +143,107 @@ impl Problem<'_> {
         let lens = self.lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
         let ray = q.truncate() / q.z;
         let focal = DVec2::new(camera.fx.into(), camera.fy.into()) * lens.log_focal.exp();
-        (q.z > 0.0).then(|| focal * ray * (1.0 + lens.k1 * ray.length_squared()) + DVec2::new(camera.cx.into(), camera.cy.into()))
+        (q.z > 0.0).then(|| {
+            focal * ray * (1.0 + lens.k1 * ray.length_squared())
+                + DVec2::new(camera.cx.into(), camera.cy.into())
+        })
     }
 
     /// Returns the sum of Cauchy's loss over all observations, plus the prior of the lenses.
     fn cost(&self, values: &Values) -> f64 {
         let of_point = |(seen, point): (&Vec<Observation>, &DVec3)| -> f64 {
             let loss = |o: &Observation| {
-                self.project(values, o.view, *point).map_or(1e3, |p| (1.0 + (p - o.pixel).length_squared() / (SOFT * SOFT)).ln())
+                self.project(values, o.view, *point).map_or(1e3, |p| {
+                    (1.0 + (p - o.pixel).length_squared() / (LOSS_SCALE * LOSS_SCALE)).ln()
+                })
             };
             seen.iter().map(loss).sum()
         };
-        let of_points: Vec<f64> = self.seen.par_iter().zip(&values.points).map(of_point).collect();
-        let of_lenses = values.lenses.iter().map(|l| (l.log_focal.powi(2) + l.k1.powi(2)) / (LENS_DEVIATION * LENS_DEVIATION));
+        let of_points: Vec<f64> = self
+            .seen
+            .par_iter()
+            .zip(&values.points)
+            .map(of_point)
+            .collect();
+        let of_lenses = values
+            .lenses
+            .iter()
+            .map(|l| (l.log_focal.powi(2) + l.k1.powi(2)) / (LENS_DEVIATION * LENS_DEVIATION));
         of_points.into_iter().sum::<f64>() + of_lenses.sum::<f64>()
     }
 
     /// Returns the residual of an observation and its derivatives by camera and by point, weighted
     /// by the loss. Returns `None` if the point is behind the camera.
-    fn linear(&self, values: &Values, o: &Observation, point: DVec3) -> Option<(SVector<f64, 2>, ByCamera, Matrix2x3<f64>)> {
+    fn linear(
+        &self,
+        values: &Values,
+        o: &Observation,
+        point: DVec3,
+    ) -> Option<(SVector<f64, 2>, ByCamera, Matrix2x3<f64>)> {
         let (camera, pose) = (&self.cameras[o.view], &values.poses[o.view]);
         let q = pose.rotation * point + pose.translation;
         let residual = self.project(values, o.view, point)? - o.pixel;
         let lens = self.lens[o.view].map_or_else(Lens::default, |l| values.lenses[l]);
-        let (ray, focal) = (q.truncate() / q.z, DVec2::new(camera.fx.into(), camera.fy.into()) * lens.log_focal.exp());
+        let (ray, focal) = (
+            q.truncate() / q.z,
+            DVec2::new(camera.fx.into(), camera.fy.into()) * lens.log_focal.exp(),
+        );
         let (r2, radial) = (ray.length_squared(), 1.0 + lens.k1 * ray.length_squared());
         // Rows of d(pixel)/d(ray). `by_q` multiplies them by the derivative of the division by z.
         let by_ray = [
-            focal.x * DVec2::new(radial + 2.0 * lens.k1 * ray.x * ray.x, 2.0 * lens.k1 * ray.x * ray.y),
-            focal.y * DVec2::new(2.0 * lens.k1 * ray.x * ray.y, radial + 2.0 * lens.k1 * ray.y * ray.y),
+            focal.x
+                * DVec2::new(
+                    radial + 2.0 * lens.k1 * ray.x * ray.x,
+                    2.0 * lens.k1 * ray.x * ray.y,
+                ),
+            focal.y
+                * DVec2::new(
+                    2.0 * lens.k1 * ray.x * ray.y,
+                    radial + 2.0 * lens.k1 * ray.y * ray.y,
+                ),
         ];
         let by_q = by_ray.map(|row| (row / q.z).extend(-row.dot(ray) / q.z));
         // q moves by turn x q + shift.
         let by_turn = by_q.map(|row| q.cross(row));
         let by_point = by_q.map(|row| pose.rotation.transpose() * row);
         let by_lens = [0, 1].map(|k| [focal[k] * ray[k] * radial, focal[k] * ray[k] * r2]);
-        let weight = (1.0 / (1.0 + residual.length_squared() / (SOFT * SOFT))).sqrt() / SOFT;
-        let adjusts_lens = if self.lens[o.view].is_some() { weight } else { 0.0 };
+        let weight = (1.0 / (1.0 + residual.length_squared() / (LOSS_SCALE * LOSS_SCALE))).sqrt()
+            / LOSS_SCALE;
+        let adjusts_lens = if self.lens[o.view].is_some() {
+            weight
+        } else {
+            0.0
+        };
         let camera = ByCamera::from_fn(|r, c| match c {
             0..3 => weight * by_turn[r][c],
             3..6 => weight * by_q[r][c - 3],
             _ => adjusts_lens * by_lens[r][c - 6],
         });
         let point = Matrix2x3::from_fn(|r, c| weight * by_point[r][c]);
-        Some((SVector::from([weight * residual.x, weight * residual.y]), camera, point))
+        Some((
+            SVector::from([weight * residual.x, weight * residual.y]),
+            camera,
+            point,
+        ))
     }
 
     /// Returns the columns of a view's pose parameters, then those of its lens.
-    fn columns(&self, view: usize) -> [usize; ALL] {
+    fn columns(&self, view: usize) -> [usize; CAMERA_PARAMETERS] {
         // A lens that is not adjusted has zero derivatives, so any column will do.
-        let lens = OWN * self.cameras.len() + 2 * self.lens[view].unwrap_or(0);
-        std::array::from_fn(|k| if k < OWN { OWN * view + k } else { lens + k - OWN })
+        let lens = POSE_PARAMETERS * self.cameras.len() + 2 * self.lens[view].unwrap_or(0);
+        std::array::from_fn(|k| {
+            if k < POSE_PARAMETERS {
+                POSE_PARAMETERS * view + k
+            } else {
+                lens + k - POSE_PARAMETERS
+            }
+        })
     }
 
     /// Returns the number of columns of all cameras and lenses. It counts at least one lens, so
     /// that [`Self::columns`] are always valid.
     fn width(&self, values: &Values) -> usize {
-        OWN * self.cameras.len() + 2 * values.lenses.len().max(1)
+        POSE_PARAMETERS * self.cameras.len() + 2 * values.lenses.len().max(1)
     }
 
     /// Returns the normal equations of the cameras, and for each point the values from which its
@@ -184,15 +253,29 @@ impl Problem<'_> {
         const PARTS: usize = 4;
         let width = self.width(values);
         let size = self.seen.len().div_ceil(PARTS).max(1);
-        let parts: Vec<(Reduced, Vec<Eliminated>)> = (self.seen.par_chunks(size).zip(values.points.par_chunks(size)))
-            .map(|(seen, points)| {
-                let mut reduced = Reduced { matrix: DMatrix::zeros(width, width), right: DVector::zeros(width) };
-                let eliminated =
-                    seen.iter().zip(points).map(|(seen, point)| self.eliminate_one(values, seen, *point, damping, &mut reduced)).collect();
-                (reduced, eliminated)
-            })
-            .collect();
-        let mut all = Reduced { matrix: DMatrix::zeros(width, width), right: DVector::zeros(width) };
+        let parts: Vec<(Reduced, Vec<Eliminated>)> = (self
+            .seen
+            .par_chunks(size)
+            .zip(values.points.par_chunks(size)))
+        .map(|(seen, points)| {
+            let mut reduced = Reduced {
+                matrix: DMatrix::zeros(width, width),
+                right: DVector::zeros(width),
+            };
+            let eliminated = seen
+                .iter()
+                .zip(points)
+                .map(|(seen, point)| {
+                    self.eliminate_one(values, seen, *point, damping, &mut reduced)
+                })
+                .collect();
+            (reduced, eliminated)
+        })
+        .collect();
+        let mut all = Reduced {
+            matrix: DMatrix::zeros(width, width),
+            right: DVector::zeros(width),
+        };
         let mut eliminated = Vec::new();
         for (reduced, some) in parts {
             all.matrix += reduced.matrix;
@@ -202,19 +285,34 @@ impl Problem<'_> {
         (all, eliminated)
     }
 
-    fn eliminate_one(&self, values: &Values, seen: &[Observation], point: DVec3, damping: f64, reduced: &mut Reduced) -> Eliminated {
+    fn eliminate_one(
+        &self,
+        values: &Values,
+        seen: &[Observation],
+        point: DVec3,
+        damping: f64,
+        reduced: &mut Reduced,
+    ) -> Eliminated {
         let (mut own, mut right) = (SMatrix::<f64, 3, 3>::zeros(), SVector::<f64, 3>::zeros());
         let mut couplings: Vec<(usize, Coupling)> = Vec::with_capacity(seen.len());
         for o in seen {
-            let Some((residual, by_camera, by_point)) = self.linear(values, o, point) else { continue };
+            let Some((residual, by_camera, by_point)) = self.linear(values, o, point) else {
+                continue;
+            };
             own += by_point.transpose() * by_point;
             right -= by_point.transpose() * residual;
             couplings.push((o.view, by_camera.transpose() * by_point));
             let columns = self.columns(o.view);
-            let (normal, side) = (by_camera.transpose() * by_camera, by_camera.transpose() * residual);
+            let (normal, side) = (
+                by_camera.transpose() * by_camera,
+                by_camera.transpose() * residual,
+            );
             for (r, row) in columns.into_iter().enumerate() {
                 reduced.right[row] -= side[r];
-                columns.iter().enumerate().for_each(|(c, column)| reduced.matrix[(row, *column)] += normal[(r, c)]);
+                columns
+                    .iter()
+                    .enumerate()
+                    .for_each(|(c, column)| reduced.matrix[(row, *column)] += normal[(r, c)]);
             }
         }
         (0..3).for_each(|k| own[(k, k)] *= 1.0 + damping);
@@ -222,15 +320,23 @@ impl Problem<'_> {
         for (view, coupling) in &couplings {
             let through = coupling * inverse;
             let (rows, side) = (self.columns(*view), through * right);
-            rows.iter().enumerate().for_each(|(r, row)| reduced.right[*row] -= side[r]);
+            rows.iter()
+                .enumerate()
+                .for_each(|(r, row)| reduced.right[*row] -= side[r]);
             for (other, back) in &couplings {
                 let (columns, product) = (self.columns(*other), through * back.transpose());
                 for (c, column) in columns.into_iter().enumerate() {
-                    rows.iter().enumerate().for_each(|(r, row)| reduced.matrix[(*row, column)] -= product[(r, c)]);
+                    rows.iter()
+                        .enumerate()
+                        .for_each(|(r, row)| reduced.matrix[(*row, column)] -= product[(r, c)]);
                 }
             }
         }
-        Eliminated { inverse, right, couplings }
+        Eliminated {
+            inverse,
+            right,
+            couplings,
+        }
     }
 
     /// Takes at most `STEPS` Levenberg-Marquardt steps; stops when the relative gain is below 1e-4.
@@ -242,13 +348,14 @@ impl Problem<'_> {
             let (mut reduced, eliminated) = self.eliminate(values, damping);
             for (l, lens) in values.lenses.iter().enumerate() {
                 for (k, value) in [lens.log_focal, lens.k1].into_iter().enumerate() {
-                    let column = OWN * self.cameras.len() + 2 * l + k;
+                    let column = POSE_PARAMETERS * self.cameras.len() + 2 * l + k;
                     reduced.matrix[(column, column)] += 1.0 / (LENS_DEVIATION * LENS_DEVIATION);
                     reduced.right[column] -= value / (LENS_DEVIATION * LENS_DEVIATION);
                 }
             }
             for k in 0..reduced.right.len() {
-                let moves = k >= OWN * self.cameras.len() || counts[k / OWN] >= FEW;
+                let moves = k >= POSE_PARAMETERS * self.cameras.len()
+                    || counts[k / POSE_PARAMETERS] >= MIN_OBSERVATIONS;
                 // Parameters without enough data stay fixed: cameras with few observations, lenses
                 // that are not adjusted.
                 if !moves || reduced.matrix[(k, k)] <= 0.0 {
@@ -263,7 +370,10 @@ impl Problem<'_> {
                 continue;
             };
             let step = factors.solve(&reduced.right);
-            let points: Vec<DVec3> = eliminated.iter().map(|e| e.step(&step, |view| self.columns(view))).collect();
+            let points: Vec<DVec3> = eliminated
+                .iter()
+                .map(|e| e.step(&step, |view| self.columns(view)))
+                .collect();
             let next = values.stepped(&step, &points);
             let new_cost = self.cost(&next);
             tracing::trace!(cost, new_cost, damping, "bundle adjustment");
@@ -289,10 +399,15 @@ struct Eliminated {
 }
 
 impl Eliminated {
-    fn step(&self, cameras: &DVector<f64>, columns: impl Fn(usize) -> [usize; ALL]) -> DVec3 {
+    fn step(
+        &self,
+        cameras: &DVector<f64>,
+        columns: impl Fn(usize) -> [usize; CAMERA_PARAMETERS],
+    ) -> DVec3 {
         let mut right = self.right;
         for (view, coupling) in &self.couplings {
-            let of_camera = SVector::<f64, ALL>::from(columns(*view).map(|k| cameras[k]));
+            let of_camera =
+                SVector::<f64, CAMERA_PARAMETERS>::from(columns(*view).map(|k| cameras[k]));
             right -= coupling.transpose() * of_camera;
         }
         let step = self.inverse * right;
@@ -312,27 +427,63 @@ mod tests {
 
     #[test]
     fn slopes_are_those_of_finite_differences() {
-        let camera = Camera::look_at("a", Vec3::new(0.3, -0.2, -4.0), Vec3::ZERO, Vec3::Y, 320, 240, 0.9);
-        let problem = Problem { cameras: std::slice::from_ref(&camera), lens: vec![Some(0)], seen: Vec::new() };
+        let camera = Camera::look_at(
+            "a",
+            Vec3::new(0.3, -0.2, -4.0),
+            Vec3::ZERO,
+            Vec3::Y,
+            320,
+            240,
+            0.9,
+        );
+        let problem = Problem {
+            cameras: std::slice::from_ref(&camera),
+            lens: vec![Some(0)],
+            seen: Vec::new(),
+        };
         let point = DVec3::new(0.7, -0.5, 0.4);
-        let values = Values { poses: vec![Pose::of(&camera)], lenses: vec![Lens { log_focal: 0.02, k1: -0.1 }], points: vec![point] };
+        let values = Values {
+            poses: vec![Pose::of(&camera)],
+            lenses: vec![Lens {
+                log_focal: 0.02,
+                k1: -0.1,
+            }],
+            points: vec![point],
+        };
         // The key point lies off the projection, so that the loss has a gradient and a weight.
-        let observation = Observation { view: 0, pixel: problem.project(&values, 0, point).unwrap() + DVec2::new(0.4, -0.7) };
+        let observation = Observation {
+            view: 0,
+            pixel: problem.project(&values, 0, point).unwrap() + DVec2::new(0.4, -0.7),
+        };
         let (residual, by_camera, by_point) = problem.linear(&values, &observation, point).unwrap();
         let weight = residual.norm() / DVec2::new(0.4, -0.7).length();
-        let seen = |camera: [f64; ALL], moved: DVec3| {
+        let seen = |camera: [f64; CAMERA_PARAMETERS], moved: DVec3| {
             let values = values.stepped(&DVector::from_row_slice(&camera), &[moved]);
             problem.project(&values, 0, values.points[0]).unwrap()
         };
         const H: f64 = 1e-5;
-        for k in 0..ALL + 3 {
+        for k in 0..CAMERA_PARAMETERS + 3 {
             let at = |size: f64| {
-                if k < ALL { seen(along(k, size), DVec3::ZERO) } else { seen([0.0; ALL], DVec3::from(along::<3>(k - ALL, size))) }
+                if k < CAMERA_PARAMETERS {
+                    seen(along(k, size), DVec3::ZERO)
+                } else {
+                    seen(
+                        [0.0; CAMERA_PARAMETERS],
+                        DVec3::from(along::<3>(k - CAMERA_PARAMETERS, size)),
+                    )
+                }
             };
             let slope = weight * (at(H) - at(-H)) / (2.0 * H);
-            let told = if k < ALL { by_camera.column(k) } else { by_point.column(k - ALL) };
-            let apart = (slope - DVec2::new(told[0], told[1])).length();
-            assert!(apart < 1e-5 * slope.length().max(1.0), "parameter {k}: {slope} by finite differences, {told} analytically");
+            let analytic = if k < CAMERA_PARAMETERS {
+                by_camera.column(k)
+            } else {
+                by_point.column(k - CAMERA_PARAMETERS)
+            };
+            let apart = (slope - DVec2::new(analytic[0], analytic[1])).length();
+            assert!(
+                apart < 1e-5 * slope.length().max(1.0),
+                "parameter {k}: {slope} by finite differences, {analytic} analytically"
+            );
         }
     }
 }

@@ -23,13 +23,25 @@ unsafe extern "C" {
 /// # Errors
 /// When OpenCV refuses the picture.
 pub fn telea(picture: &mut RgbImage, hole: &GrayImage, radius: f32) -> Result<()> {
-    assert_eq!(picture.dimensions(), hole.dimensions(), "the hole must have the size of the picture");
+    assert_eq!(
+        picture.dimensions(),
+        hole.dimensions(),
+        "the hole must have the size of the picture"
+    );
     let (width, height) = (side(picture.width())?, side(picture.height())?);
     // SAFETY: `picture` holds 3 x width x height bytes, which are read and written. `hole` holds
     // width x height bytes, which are only read. The function writes at most `reason_size` bytes to
     // `reason`, including the final zero.
     checked("inpainting", |reason, reason_size| unsafe {
-        fastlgs_opencv_inpaint(picture.as_mut_ptr(), hole.as_ptr(), width, height, radius, reason, reason_size)
+        fastlgs_opencv_inpaint(
+            picture.as_mut_ptr(),
+            hole.as_ptr(),
+            width,
+            height,
+            radius,
+            reason,
+            reason_size,
+        )
     })?;
     Ok(())
 }

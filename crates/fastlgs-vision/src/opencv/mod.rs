@@ -8,7 +8,11 @@ use std::ffi::{CStr, c_char, c_int};
 
 /// Converts the side of a picture, in pixels, to OpenCV's integer type.
 fn side(length: u32) -> Result<c_int> {
-    c_int::try_from(length).map_err(|_| Error::Invalid(format!("OpenCV cannot process a picture with a side of {length} pixels; use a smaller picture")))
+    c_int::try_from(length).map_err(|_| {
+        Error::Invalid(format!(
+            "OpenCV cannot process a picture with a side of {length} pixels; use a smaller picture"
+        ))
+    })
 }
 
 /// Calls a C function that returns a number from 0 on, or -1 with a reason. The function writes the

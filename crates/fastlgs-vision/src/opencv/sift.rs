@@ -51,6 +51,9 @@ pub fn detect(photo: &GrayImage, most: usize) -> Result<Found> {
     descriptors.truncate(count);
     // OpenCV counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels
     // from the photo's corner.
-    let positions = positions[..count].iter().map(|[x, y]| Vec2::new(x + 0.25, y + 0.25)).collect();
+    let positions = positions[..count]
+        .iter()
+        .map(|[x, y]| Vec2::new(x + 0.25, y + 0.25))
+        .collect();
     Ok((positions, descriptors))
 }

@@ -1,5 +1,5 @@
-//! Where a group belongs: the similarity that brings its matched points together, first of triangulated points, then of all matches'
-//! epipolar geometry.
+//! Fits the similarity that aligns a group of photos with the others: first to triangulated points,
+//! then to the epipolar geometry of all matches.
 
 use super::links::{FEW, Link};
 use crate::keypoints::{Keypoints, epipolar_residual, fundamental};
@@ -12,16 +12,18 @@ use glam::Vec3;
 use nalgebra::{SMatrix, SVector};
 use std::collections::HashMap;
 
-/// Trials of the robust fit.
+/// RANSAC iterations.
 const TRIALS: usize = 2000;
-/// Largest reprojection error of a point that supports a fit, as a share of the photo's width.
+/// Largest reprojection error of an inlier, as a share of the photo's width.
 const MAX_ERROR: f32 = 0.02;
-/// Smallest share of supporting pairs. Points of wrong matches support a wrong fit only by chance, one in a thousand.
+/// Smallest share of inliers of an accepted fit. A pair from a wrong match supports a wrong fit
+/// with a chance of about 1 in 1,000.
 const MIN_SUPPORT: f32 = 0.12;
-/// Least parallax of a point that a fit uses, in radians: beyond, its depth is noise.
+/// Smallest parallax of a point that a fit uses, in radians. At smaller angles its depth is noise.
 const MIN_PARALLAX: f32 = 0.03;
 
-/// A point of the group to move, where it belongs, and the key point there.
+/// A matched point: its position in the group that moves, its target position, and the key point
+/// there.
 #[derive(Clone, Copy)]
 pub(super) struct Pair {
     pub from: Vec3,
@@ -30,14 +32,31 @@ pub(super) struct Pair {
     pub pixel: glam::Vec2,
 }
 
-/// Where the key points of each photo lie by the poses of its own group.
-pub(super) fn points_of(cameras: &[Camera], keypoints: &[Keypoints], links: &[Link], group: &[usize]) -> HashMap<(usize, usize), Vec3> {
+/// Triangulates the key points of each photo with the poses of its own group. Returns world
+/// positions by (view, key point), averaged over all inlier matches.
+pub(super) fn points_of(
+    cameras: &[Camera],
+    keypoints: &[Keypoints],
+    links: &[Link],
+    group: &[usize],
+) -> HashMap<(usize, usize), Vec3> {
     let mut sums: HashMap<(usize, usize), (Vec3, f32)> = HashMap::new();
-    for link in links.iter().filter(|l| l.agrees() && group[l.a] == group[l.b]) {
+    for link in links
+        .iter()
+        .filter(|l| l.agrees() && group[l.a] == group[l.b])
+    {
         for &(i, j) in &link.right {
-            let (pa, pb) = (keypoints[link.a].positions[i], keypoints[link.b].positions[j]);
-            let parallax = |p: &Vec3| (*p - cameras[link.a].centre()).angle_between(*p - cameras[link.b].centre()) > MIN_PARALLAX;
-            if let Some(point) = intersect(&cameras[link.a], pa, &cameras[link.b], pb, TOLERANCE).filter(parallax) {
+            let (pa, pb) = (
+                keypoints[link.a].positions[i],
+                keypoints[link.b].positions[j],
+            );
+            let parallax = |p: &Vec3| {
+                (*p - cameras[link.a].centre()).angle_between(*p - cameras[link.b].centre())
+                    > MIN_PARALLAX
+            };
+            if let Some(point) =
+                intersect(&cameras[link.a], pa, &cameras[link.b], pb, TOLERANCE).filter(parallax)
+            {
                 for key in [(link.a, i), (link.b, j)] {
                     let sum = sums.entry(key).or_default();
                     *sum = (sum.0 + point, sum.1 + 1.0);
@@ -45,10 +64,13 @@ pub(super) fn points_of(cameras: &[Camera], keypoints: &[Keypoints], links: &[Li
             }
         }
     }
-    sums.into_iter().map(|(key, (sum, count))| (key, sum / count)).collect()
+    sums.into_iter()
+        .map(|(key, (sum, count))| (key, sum / count))
+        .collect()
 }
 
-/// Matched points on both sides of the links; `moves` tells the photos that are to be moved.
+/// Returns the triangulated points on both sides of the links; `moves` selects the photos that
+/// move.
 pub(super) fn pairs_between(
     across: &[&Link],
     moves: impl Fn(usize) -> bool,
@@ -58,27 +80,46 @@ pub(super) fn pairs_between(
     let mut pairs = Vec::new();
     for link in across {
         for &(i, j) in &link.all {
-            let (inner, outer) = if moves(link.b) { ((link.a, i), (link.b, j)) } else { ((link.b, j), (link.a, i)) };
+            let (inner, outer) = if moves(link.b) {
+                ((link.a, i), (link.b, j))
+            } else {
+                ((link.b, j), (link.a, i))
+            };
             if let (Some(&to), Some(&from)) = (points.get(&inner), points.get(&outer)) {
-                pairs.push(Pair { from, to, view: inner.0, pixel: keypoints[inner.0].positions[inner.1] });
+                pairs.push(Pair {
+                    from,
+                    to,
+                    view: inner.0,
+                    pixel: keypoints[inner.0].positions[inner.1],
+                });
             }
         }
     }
     pairs
 }
 
-/// The similarity that most pairs support (RANSAC over three pairs, then least squares); none where few do.
+/// Returns the similarity that most pairs support: RANSAC over three pairs, then least squares over
+/// the inliers. Returns `None` if too few pairs support it.
 pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<Similarity> {
     if pairs.len() < FEW {
-        tracing::debug!(pairs = pairs.len(), "too few pairs");
+        tracing::debug!(pairs = pairs.len(), "too few point pairs for a similarity");
         return None;
     }
     let supports = |s: &Similarity, p: &Pair| {
         let camera = &cameras[p.view];
-        reprojection_error(camera, s.apply(p.from), p.pixel).is_some_and(|error| error < MAX_ERROR * camera.width as f32)
+        reprojection_error(camera, s.apply(p.from), p.pixel)
+            .is_some_and(|error| error < MAX_ERROR * camera.width as f32)
     };
-    let supporters = |s: &Similarity| pairs.iter().filter(|p| supports(s, p)).copied().collect::<Vec<_>>();
-    let placing = |pairs: &[Pair]| Similarity::between(&pairs.iter().map(|p| (p.from, p.to)).collect::<Vec<_>>());
+    let supporters = |s: &Similarity| {
+        pairs
+            .iter()
+            .filter(|p| supports(s, p))
+            .copied()
+            .collect::<Vec<_>>()
+    };
+    let placing = |pairs: &[Pair]| {
+        Similarity::between(&pairs.iter().map(|p| (p.from, p.to)).collect::<Vec<_>>())
+    };
     let mut best: Vec<Pair> = Vec::new();
     for _ in 0..TRIALS {
         let three: [Pair; 3] = std::array::from_fn(|_| pairs[rng.below(pairs.len())]);
@@ -97,11 +138,15 @@ pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<S
         best = refined;
     }
     tracing::debug!(pairs = pairs.len(), support = best.len(), "similarity");
-    (best.len() >= FEW && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32).then(|| placing(&best)).flatten()
+    (best.len() >= FEW && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32)
+        .then(|| placing(&best))
+        .flatten()
 }
 
-/// Fits the epipolar geometry of all matches across: Gauss-Newton on the seven parameters of a small similarity after
-/// `first`, with weights that fade out wrong matches.
+/// Refines `first` on the epipolar geometry of all matches between the groups.
+///
+/// Gauss-Newton on the seven parameters of a small similarity applied after `first`. The residuals
+/// are Sampson distances in pixels. Geman-McClure weights reduce the effect of wrong matches.
 pub(super) fn refined(
     first: Similarity,
     across: &[&Link],
@@ -119,13 +164,19 @@ pub(super) fn refined(
         };
         let of_link = |l: &&Link| {
             let f = fundamental(&placed(l.a), &placed(l.b));
-            let error = |&(i, j): &(usize, usize)| epipolar_residual(&f, keypoints[l.a].positions[i], keypoints[l.b].positions[j]);
+            let error = |&(i, j): &(usize, usize)| {
+                epipolar_residual(&f, keypoints[l.a].positions[i], keypoints[l.b].positions[j])
+            };
             l.all.iter().map(error).collect::<Vec<_>>()
         };
         across.iter().flat_map(of_link).collect()
     };
     let weight = |r: f32, width: f32| 1.0 / (1.0 + (r / width).powi(2)).powi(2);
-    let cost = |r: &[f32], width: f32| r.iter().map(|r| 1.0 - 1.0 / (1.0 + (r / width).powi(2))).sum::<f32>();
+    let cost = |r: &[f32], width: f32| {
+        r.iter()
+            .map(|r| 1.0 - 1.0 / (1.0 + (r / width).powi(2)))
+            .sum::<f32>()
+    };
     let mut best = first;
     for width in [8.0, 8.0, 4.0, 4.0, 2.0, 2.0, 2.0, 2.0] {
         let now = residuals(&best);
@@ -134,7 +185,11 @@ pub(super) fn refined(
             .map(|k| {
                 let mut delta = [0.0; 7];
                 delta[k] = STEP;
-                residuals(&best.nudged(&delta)).iter().zip(&now).map(|(a, b)| (a - b) / STEP).collect()
+                residuals(&best.nudged(&delta))
+                    .iter()
+                    .zip(&now)
+                    .map(|(a, b)| (a - b) / STEP)
+                    .collect()
             })
             .collect();
         let (mut normal, mut right) = (SMatrix::<f64, 7, 7>::zeros(), SVector::<f64, 7>::zeros());
@@ -145,7 +200,9 @@ pub(super) fn refined(
             right -= w * f64::from(*r) * row;
         }
         (0..7).for_each(|i| normal[(i, i)] *= 1.0 + 1e-3);
-        let Some(delta) = normal.lu().solve(&right) else { break };
+        let Some(delta) = normal.lu().solve(&right) else {
+            break;
+        };
         let next = best.nudged(&std::array::from_fn(|k| delta[k] as f32));
         if cost(&residuals(&next), width) < cost(&now, width) {
             best = next;

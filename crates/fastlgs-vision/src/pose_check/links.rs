@@ -1,4 +1,5 @@
-//! What contradicts: matches of two photos against the epipolar geometry of their poses, and the groups of photos that agree.
+//! Matches of photo pairs, tested against the epipolar geometry of their poses, and the groups of
+//! photos that agree.
 
 use crate::keypoints::Keypoints;
 use crate::matching::matches;
@@ -6,16 +7,17 @@ use crate::tracks::{PairMatches, TOLERANCE, overlapping_pairs};
 use fastlgs_core::Camera;
 use rayon::prelude::*;
 
-/// Photos before and after (by name) that each is compared with.
+/// Number of photos before and after each photo, by name, that it is compared with.
 pub(super) const WINDOW: usize = 4;
-/// Photos that look at the same by their poses, each is compared with.
+/// Number of overlapping photos, according to the poses, that each photo is compared with.
 pub(super) const OVERLAPPING: usize = 6;
-/// Least cosine between viewing directions: beyond, SIFT matches are mostly repeated texture.
+/// Smallest cosine between the viewing directions of an overlapping pair. At larger angles, SIFT
+/// matches are mostly repeated texture.
 pub(super) const SAME_DIRECTION: f32 = 0.75;
-/// Fewest matches that say something.
+/// Smallest number of matches, or of inliers, that counts as evidence.
 pub(super) const FEW: usize = 25;
 
-/// Two photos' matches, and those that obey the poses.
+/// Matches of two photos as (key point in a, key point in b), and their epipolar inliers (`right`).
 pub(super) struct Link {
     pub a: usize,
     pub b: usize,
@@ -33,9 +35,21 @@ impl Link {
     }
 }
 
-/// The matches that obey the poses.
-pub(super) fn right(cameras: &[Camera], keypoints: &[Keypoints], a: usize, b: usize, all: &[(usize, usize)]) -> Vec<(usize, usize)> {
-    PairMatches { a, b, pairs: all.to_vec() }.obeying(cameras, keypoints, TOLERANCE).pairs
+/// Returns the matches within `TOLERANCE` pixels of their epipolar lines.
+pub(super) fn right(
+    cameras: &[Camera],
+    keypoints: &[Keypoints],
+    a: usize,
+    b: usize,
+    all: &[(usize, usize)],
+) -> Vec<(usize, usize)> {
+    PairMatches {
+        a,
+        b,
+        pairs: all.to_vec(),
+    }
+    .obeying(cameras, keypoints, TOLERANCE)
+    .pairs
 }
 
 pub(super) fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
@@ -48,7 +62,11 @@ pub(super) fn links(cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
     matched(pairs, cameras, keypoints)
 }
 
-pub(super) fn matched(pairs: Vec<(usize, usize)>, cameras: &[Camera], keypoints: &[Keypoints]) -> Vec<Link> {
+pub(super) fn matched(
+    pairs: Vec<(usize, usize)>,
+    cameras: &[Camera],
+    keypoints: &[Keypoints],
+) -> Vec<Link> {
     let link = |(a, b): (usize, usize)| {
         let all = matches(&keypoints[a], &keypoints[b]);
         let right = right(cameras, keypoints, a, b, &all);
@@ -57,7 +75,8 @@ pub(super) fn matched(pairs: Vec<(usize, usize)>, cameras: &[Camera], keypoints:
     pairs.into_par_iter().map(link).collect()
 }
 
-/// Group of each photo: the strongest agreeing links join first, and two groups never join against a majority of links.
+/// Returns the group of each photo. Agreeing links join groups in descending order of inliers. Two
+/// groups are not joined if as many links between them contradict as agree.
 pub(super) fn groups(n: usize, links: &[Link]) -> Vec<usize> {
     let mut group: Vec<usize> = (0..n).collect();
     let mut agreeing: Vec<&Link> = links.iter().filter(|l| l.agrees()).collect();
@@ -67,7 +86,8 @@ pub(super) fn groups(n: usize, links: &[Link]) -> Vec<usize> {
         if a == b {
             continue;
         }
-        let across = |l: &&Link| (group[l.a], group[l.b]) == (a, b) || (group[l.a], group[l.b]) == (b, a);
+        let across =
+            |l: &&Link| (group[l.a], group[l.b]) == (a, b) || (group[l.a], group[l.b]) == (b, a);
         let (mut pro, mut contra) = (0, 0);
         for l in links.iter().filter(across) {
             pro += usize::from(l.agrees());

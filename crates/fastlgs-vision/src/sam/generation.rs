@@ -1,4 +1,5 @@
-//! Automatic mask generation: a grid of prompts over the photo and over crops of it, filters, and of overlapping masks the best.
+//! Automatic mask generation: a grid of point prompts over the photo and its crops, filters, and
+//! non-maximum suppression.
 
 use super::exports::{Exports, Logits};
 use super::windows::Grid;
@@ -9,17 +10,20 @@ use fastlgs_core::Level;
 use image::{RgbImage, imageops};
 use std::collections::HashSet;
 
-/// Prompts in one inference.
+/// Largest number of prompts in one inference.
 const BATCH: usize = 64;
-/// Masks at logits of plus and minus this are compared for stability.
+/// Logit offset of the stability score: IoU of the masks thresholded at plus and minus this value.
 const STABILITY_OFFSET: f32 = 1.0;
-/// Cells below which a mask is judged at the size of the photo: on the coarse grid a border of one cell would be much of it.
+/// Masks with fewer cells have their stability measured at the size of the photo. On the coarse
+/// grid, a border of one cell would be a large share of them.
 const FEW_CELLS: usize = 400;
-/// Overlap of neighbouring crops as a share of the photo's shorter side.
+/// Overlap of neighbouring crops, as a share of the photo's shorter side.
 const OVERLAP: f32 = 512.0 / 1500.0;
-/// What ends this close to a crop's border, as a share of the photo's longer side, was cut off by it: 20 pixels of 1,024.
+/// A mask that ends within this distance of a crop's border is treated as cut off. Share of the
+/// photo's longer side: 20 of 1,024 pixels.
 const BORDER: f32 = 20.0 / 1024.0;
-/// Shares of a photo above which a mask is a whole, or a part, where a prompt gives a single one.
+/// Smallest area, as a share of the photo, of a whole and of a part. Used if the decoder returns
+/// one mask per prompt.
 const SHARES: [f32; 2] = [0.03, 0.005];
 
 /// A mask that passed the filters.
@@ -28,25 +32,44 @@ pub struct Candidate {
     pub level: Level,
     pub predicted_iou: f32,
     pub stability: f32,
-    /// At the photo's size.
+    /// Mask in pixels of the photo, or of the crop until it is placed.
     pub mask: BitMask,
-    /// Side of the crop that it was found in, as a share of the photo's.
+    /// Width of the crop it was found in, as a share of the photo's width.
     crop: f32,
 }
 
-/// Left, top, width and height of each crop of a layer: 0 is the photo, each further one halves the sides, with some overlap.
+/// Returns left, top, width and height of each crop of a layer. Layer 0 is the photo; layer k has
+/// 2^k x 2^k overlapping crops.
 fn crops([w, h]: [u32; 2], layer: u32) -> Vec<[u32; 4]> {
     let n = 1 << layer;
     let overlap = (OVERLAP * w.min(h) as f32 * 2.0 / n as f32) as u32;
-    let side = |all: u32| if n == 1 { all } else { (overlap * (n - 1) + all).div_ceil(n) };
+    let side = |all: u32| {
+        if n == 1 {
+            all
+        } else {
+            (overlap * (n - 1) + all).div_ceil(n)
+        }
+    };
     let [width, height] = [side(w), side(h)];
-    let step = |k: u32, own: u32| if n == 1 { 0 } else { k * own.saturating_sub(overlap) };
+    let step = |k: u32, own: u32| {
+        if n == 1 {
+            0
+        } else {
+            k * own.saturating_sub(overlap)
+        }
+    };
     let all = (0..n).flat_map(|y| (0..n).map(move |x| [step(x, width), step(y, height)]));
-    all.map(|[x, y]| [x, y, width.min(w - x), height.min(h - y)]).collect()
+    all.map(|[x, y]| [x, y, width.min(w - x), height.min(h - y)])
+        .collect()
 }
 
-/// All masks of a photo that pass the filters, and whether a prompt gave only one.
-pub fn masks(exports: &Exports, photo: &RgbImage, config: &Config) -> Result<(Vec<Candidate>, bool)> {
+/// Returns all masks of a photo that pass the filters, and whether the decoder returned one mask
+/// per prompt.
+pub fn masks(
+    exports: &Exports,
+    photo: &RgbImage,
+    config: &Config,
+) -> Result<(Vec<Candidate>, bool)> {
     let (mut all, mut single) = (Vec::new(), false);
     for layer in 0..=config.crop_layers {
         for crop in crops([photo.width(), photo.height()], layer) {
@@ -55,19 +78,32 @@ pub fn masks(exports: &Exports, photo: &RgbImage, config: &Config) -> Result<(Ve
         }
     }
     if config.crop_layers > 0 {
-        // What was found in a smaller crop is drawn more finely.
-        all = thinned(all, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| 1.0 / c.crop);
+        // Masks from smaller crops are preferred: they have a finer resolution.
+        all = thinned(
+            all,
+            config.box_nms,
+            |a, b| a.level == b.level || config.across_levels,
+            |c| 1.0 / c.crop,
+        );
     }
     Ok((all, single))
 }
 
-fn of_crop(exports: &Exports, photo: &RgbImage, crop: [u32; 4], config: &Config, single: &mut bool) -> Result<Vec<Candidate>> {
+fn of_crop(
+    exports: &Exports,
+    photo: &RgbImage,
+    crop: [u32; 4],
+    config: &Config,
+    single: &mut bool,
+) -> Result<Vec<Candidate>> {
     let [x0, y0, width, height] = crop;
     let part = imageops::crop_imm(photo, x0, y0, width, height).to_image();
     let encoded = exports.encode(&part)?;
     let n = config.points_per_side;
     let at = |k: u32| (k as f32 + 0.5) / n as f32;
-    let grid: Vec<[f32; 2]> = (0..n).flat_map(|y| (0..n).map(move |x| [at(x), at(y)])).collect();
+    let grid: Vec<[f32; 2]> = (0..n)
+        .flat_map(|y| (0..n).map(move |x| [at(x), at(y)]))
+        .collect();
     let batch = exports.fixed_batch();
     let mut found: Vec<Candidate> = Vec::new();
     for points in grid.chunks(batch.unwrap_or_else(|| exports.most_prompts(&encoded).min(BATCH))) {
@@ -78,20 +114,31 @@ fn of_crop(exports: &Exports, photo: &RgbImage, crop: [u32; 4], config: &Config,
             let mut own = of_prompt(&logits, prompt, [width, height], config);
             if logits.masks == 1 {
                 *single = true;
-                own.iter_mut().for_each(|c| c.level = by_size(&c.mask, photo));
+                own.iter_mut()
+                    .for_each(|c| c.level = by_size(&c.mask, photo));
             }
-            found.extend(own.into_iter().filter_map(|candidate| placed(candidate, photo, crop)));
+            found.extend(
+                own.into_iter()
+                    .filter_map(|candidate| placed(candidate, photo, crop)),
+            );
         }
-        // What repeats a better one goes as it comes in, so that memory hardly grows with the prompts.
+        // Duplicates are removed after each batch, so that memory hardly grows with the number of
+        // prompts.
         if config.box_nms < 1.0 {
             found = without_copies(found);
         }
     }
-    Ok(thinned(found, config.box_nms, |a, b| a.level == b.level || config.across_levels, |c| c.predicted_iou))
+    Ok(thinned(
+        found,
+        config.box_nms,
+        |a, b| a.level == b.level || config.across_levels,
+        |c| c.predicted_iou,
+    ))
 }
 
-/// Of candidates of one level with the same box the best. Whatever the others would drop for their boxes it drops as well, so that the order
-/// in which prompts are asked decides nothing.
+/// Keeps the best of all candidates with the same level and box.
+/// The kept one suppresses the same boxes as the removed ones, so the result does not depend on the
+/// order of prompts.
 fn without_copies(mut candidates: Vec<Candidate>) -> Vec<Candidate> {
     candidates.sort_by(|a, b| b.predicted_iou.total_cmp(&a.predicted_iou));
     let mut seen = HashSet::new();
@@ -99,10 +146,10 @@ fn without_copies(mut candidates: Vec<Candidate>) -> Vec<Candidate> {
     candidates
 }
 
-/// The masks of a prompt that the model believes in, at the size of the crop.
+/// Returns the masks of a prompt that pass the filters, at the size of the crop.
 fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) -> Vec<Candidate> {
     let cells = logits.rows * logits.columns;
-    // Of four masks the first is meant for prompts of several points.
+    // The first of four masks is for prompts of several points.
     let skipped = usize::from(logits.masks == 4);
     let grid = |mask: usize| Grid {
         logits: &logits.values[(prompt * logits.masks + mask) * cells..][..cells],
@@ -110,7 +157,9 @@ fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) ->
         shown: logits.shown,
         scale: logits.scale,
     };
-    let mut masks: Vec<(usize, usize)> = (skipped..logits.masks).map(|mask| (grid(mask).area(0.0), mask)).collect();
+    let mut masks: Vec<(usize, usize)> = (skipped..logits.masks)
+        .map(|mask| (grid(mask).area(0.0), mask))
+        .collect();
     masks.sort_by_key(|m| std::cmp::Reverse(m.0));
     let mut out = Vec::new();
     for ((area, mask), level) in masks.into_iter().zip(Level::ALL) {
@@ -119,37 +168,70 @@ fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) ->
             continue;
         }
         let grid = grid(mask);
-        let Some(window) = grid.window(-STABILITY_OFFSET) else { continue };
+        let Some(window) = grid.window(-STABILITY_OFFSET) else {
+            continue;
+        };
         let few = area < FEW_CELLS;
-        let above = |threshold: f32| if few { window.area(crop, threshold) } else { grid.area(threshold) };
+        let above = |threshold: f32| {
+            if few {
+                window.area(crop, threshold)
+            } else {
+                grid.area(threshold)
+            }
+        };
         let stability = above(STABILITY_OFFSET) as f32 / above(-STABILITY_OFFSET).max(1) as f32;
         if stability < config.stability {
             continue;
         }
         if let Some(mask) = window.mask(crop) {
-            out.push(Candidate { level, predicted_iou, stability, mask, crop: 1.0 });
+            out.push(Candidate {
+                level,
+                predicted_iou,
+                stability,
+                mask,
+                crop: 1.0,
+            });
         }
     }
     out
 }
 
-/// The level of a mask of which no more is known than its share of the photo.
+/// Returns the level of a mask by its share of the photo's area.
 fn by_size(mask: &BitMask, photo: &RgbImage) -> Level {
     let share = mask.area() as f32 / (photo.width() * photo.height()) as f32;
     Level::ALL[SHARES.iter().filter(|s| share < **s).count()]
 }
 
-/// A crop's mask in the photo; none if the crop's border cut it off.
-fn placed(candidate: Candidate, photo: &RgbImage, [x0, y0, width, height]: [u32; 4]) -> Option<Candidate> {
+/// Moves a mask from crop to photo coordinates. Returns `None` if the crop's border cut it off.
+fn placed(
+    candidate: Candidate,
+    photo: &RgbImage,
+    [x0, y0, width, height]: [u32; 4],
+) -> Option<Candidate> {
     let near = (BORDER * photo.width().max(photo.height()) as f32) as u32;
     let [l, t, r, b] = candidate.mask.bounds;
-    let inner = [(l, x0 == 0), (t, y0 == 0), (width - r, x0 + width == photo.width()), (height - b, y0 + height == photo.height())];
-    let cut_off = inner.iter().any(|(distance, at_photos_border)| !at_photos_border && *distance <= near);
-    let mask = BitMask { bounds: [l + x0, t + y0, r + x0, b + y0], ..candidate.mask };
-    (!cut_off).then_some(Candidate { mask, crop: width as f32 / photo.width() as f32, ..candidate })
+    let inner = [
+        (l, x0 == 0),
+        (t, y0 == 0),
+        (width - r, x0 + width == photo.width()),
+        (height - b, y0 + height == photo.height()),
+    ];
+    let cut_off = inner
+        .iter()
+        .any(|(distance, at_photos_border)| !at_photos_border && *distance <= near);
+    let mask = BitMask {
+        bounds: [l + x0, t + y0, r + x0, b + y0],
+        ..candidate.mask
+    };
+    (!cut_off).then_some(Candidate {
+        mask,
+        crop: width as f32 / photo.width() as f32,
+        ..candidate
+    })
 }
 
-/// Of candidates whose boxes overlap by more than `most`, and that compete, the one with the highest score; of equal ones the first.
+/// Non-maximum suppression: of competing candidates whose boxes have an IoU above `most`, keeps the
+/// one with the highest score. Of equal scores it keeps the first.
 fn thinned(
     mut candidates: Vec<Candidate>,
     most: f32,
@@ -159,15 +241,18 @@ fn thinned(
     candidates.sort_by(|a, b| score(b).total_cmp(&score(a)));
     let mut kept: Vec<Candidate> = Vec::new();
     for c in candidates {
-        if !kept.iter().any(|k| compete(k, &c) && box_iou(k.mask.bounds, c.mask.bounds) > most) {
+        if !kept
+            .iter()
+            .any(|k| compete(k, &c) && box_iou(k.mask.bounds, c.mask.bounds) > most)
+        {
             kept.push(c);
         }
     }
     kept
 }
 
-/// Of the masks of a level those that repeat no better one, are no small part of another, and are good enough at all: what LangSplat's
-/// preprocessing leaves of SAM's masks.
+/// Mask suppression of LangSplat's preprocessing, for the masks of one level. It removes masks that
+/// repeat a better one, small parts of another mask, and masks with a low score.
 pub fn suppressed(mut candidates: Vec<Candidate>, rule: &Suppression) -> Vec<Candidate> {
     let score = |c: &Candidate| c.predicted_iou * c.stability;
     candidates.sort_by(|a, b| score(b).total_cmp(&score(a)));
@@ -179,9 +264,16 @@ pub fn suppressed(mut candidates: Vec<Candidate>, rule: &Suppression) -> Vec<Can
         repeats || (own >= rule.held && theirs < 0.5 && own * theirs < rule.inner)
     };
     let all = 0..candidates.len();
-    let stays = |k: &usize| score(&candidates[*k]) > rule.score && !all.clone().any(|other| other != *k && gives_way(*k, other));
-    let mut kept: Vec<Candidate> = all.clone().filter(stays).map(|k| candidates[k].clone()).collect();
-    // A level is never left empty.
+    let stays = |k: &usize| {
+        score(&candidates[*k]) > rule.score
+            && !all.clone().any(|other| other != *k && gives_way(*k, other))
+    };
+    let mut kept: Vec<Candidate> = all
+        .clone()
+        .filter(stays)
+        .map(|k| candidates[k].clone())
+        .collect();
+    // At least one mask remains: otherwise up to three of the best are kept.
     if kept.is_empty() {
         candidates.truncate(3);
         kept = candidates;
@@ -194,39 +286,65 @@ mod tests {
     use super::*;
 
     fn candidate(bounds: [u32; 4], predicted_iou: f32) -> Candidate {
-        let mask = BitMask::of(bounds, |_, _| true).unwrap();
-        Candidate { level: Level::Whole, predicted_iou, stability: 1.0, mask, crop: 1.0 }
+        let mask = BitMask::from_fn(bounds, |_, _| true).unwrap();
+        Candidate {
+            level: Level::Whole,
+            predicted_iou,
+            stability: 1.0,
+            mask,
+            crop: 1.0,
+        }
     }
 
     #[test]
     fn crops_cover_the_photo_and_overlap() {
         assert_eq!(crops([1500, 1000], 0), [[0, 0, 1500, 1000]]);
         let four = crops([1500, 1000], 1);
-        // 341 pixels of overlap: (341 + 1500) / 2 and (341 + 1000) / 2, rounded up.
+        // Overlap of 341 pixels: (341 + 1500) / 2 and (341 + 1000) / 2, rounded up.
         assert_eq!(four[0], [0, 0, 921, 671]);
-        assert_eq!((four[3][0] + four[3][2], four[3][1] + four[3][3]), (1500, 1000));
+        assert_eq!(
+            (four[3][0] + four[3][2], four[3][1] + four[3][3]),
+            (1500, 1000)
+        );
         assert_eq!(crops([40, 30], 2).len(), 16);
     }
 
     #[test]
     fn what_a_crop_cut_off_is_left_to_the_others() {
         let photo = RgbImage::new(200, 100);
-        let of = |bounds: [u32; 4], crop: [u32; 4]| placed(candidate(bounds, 1.0), &photo, crop).map(|c| c.mask.bounds);
-        assert_eq!(of([0, 40, 30, 60], [0, 0, 120, 100]), Some([0, 40, 30, 60]), "the photo's own border cuts nothing");
+        let of = |bounds: [u32; 4], crop: [u32; 4]| {
+            placed(candidate(bounds, 1.0), &photo, crop).map(|c| c.mask.bounds)
+        };
+        assert_eq!(
+            of([0, 40, 30, 60], [0, 0, 120, 100]),
+            Some([0, 40, 30, 60]),
+            "a mask at the photo's own border is not cut off"
+        );
         assert_eq!(of([90, 40, 119, 60], [0, 0, 120, 100]), None);
-        assert_eq!(of([10, 40, 40, 60], [80, 0, 120, 100]), Some([90, 40, 120, 60]));
+        assert_eq!(
+            of([10, 40, 40, 60], [80, 0, 120, 100]),
+            Some([90, 40, 120, 60])
+        );
     }
 
     #[test]
     fn the_better_of_two_boxes_stays() {
-        let all = vec![candidate([0, 0, 10, 10], 0.8), candidate([0, 0, 10, 9], 0.9), candidate([20, 0, 30, 10], 0.7)];
+        let all = vec![
+            candidate([0, 0, 10, 10], 0.8),
+            candidate([0, 0, 10, 9], 0.9),
+            candidate([20, 0, 30, 10], 0.7),
+        ];
         let kept = thinned(all, 0.7, |_, _| true, |c| c.predicted_iou);
-        assert_eq!(kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(), [0.9, 0.7]);
+        assert_eq!(
+            kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(),
+            [0.9, 0.7]
+        );
     }
 
     #[test]
     fn the_order_of_prompts_decides_nothing() {
-        // The middle one, best but for the last, overlaps both; the first comes back when the last drops the middle one.
+        // The second overlaps the first and the third. The third suppresses the second, so the
+        // first remains.
         let of = |x: u32, score: f32| candidate([x, 0, x + 100, 10], score);
         let all = [of(0, 0.8), of(12, 0.9), of(24, 0.95), of(24, 0.85)];
         for order in [[0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]] {
@@ -236,17 +354,45 @@ mod tests {
                 found = without_copies(found);
             }
             let kept = thinned(found, 0.7, |_, _| true, |c| c.predicted_iou);
-            assert_eq!(kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(), [0.95, 0.8], "{order:?}");
+            assert_eq!(
+                kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(),
+                [0.95, 0.8],
+                "{order:?}"
+            );
         }
     }
 
     #[test]
     fn repetitions_and_small_parts_go() {
-        let rule = Suppression { iou: 0.8, score: 0.7, inner: 0.5, held: 0.85 };
-        let scores = |all: Vec<Candidate>| suppressed(all, &rule).iter().map(|c| c.predicted_iou).collect::<Vec<_>>();
-        // The second repeats the first, the third is a small part of it, the fourth is too bad, the fifth is alone.
-        let all = [([0, 0, 10, 10], 0.95), ([0, 0, 10, 9], 0.9), ([0, 0, 3, 3], 0.8), ([20, 0, 30, 10], 0.6), ([40, 0, 50, 10], 0.75)];
-        assert_eq!(scores(all.map(|(b, s)| candidate(b, s)).to_vec()), [0.95, 0.75]);
-        assert_eq!(scores(vec![candidate([0, 0, 10, 10], 0.3)]), [0.3], "never none");
+        let rule = Suppression {
+            iou: 0.8,
+            score: 0.7,
+            inner: 0.5,
+            held: 0.85,
+        };
+        let scores = |all: Vec<Candidate>| {
+            suppressed(all, &rule)
+                .iter()
+                .map(|c| c.predicted_iou)
+                .collect::<Vec<_>>()
+        };
+        // The second repeats the first, the third is a small part of it, the fourth has a low
+        // score, the fifth is separate.
+        let all = [
+            ([0, 0, 10, 10], 0.95),
+            ([0, 0, 10, 9], 0.9),
+            ([0, 0, 3, 3], 0.8),
+            ([20, 0, 30, 10], 0.6),
+            ([40, 0, 50, 10], 0.75),
+        ];
+        assert_eq!(
+            scores(all.map(|(b, s)| candidate(b, s)).to_vec()),
+            [0.95, 0.75]
+        );
+        assert_eq!(
+            scores(vec![candidate([0, 0, 10, 10], 0.3)]),
+            [0.3],
+            "at least one mask remains"
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) from ONNX exports: `exports` asks the models, `generation` asks about
-//! the whole photo, `windows` keeps what they answer.
+//! Segment Anything (Kirillov et al. 2023; SAM 2: Ravi et al. 2024) from ONNX exports. `exports`
+//! runs the models, `generation` finds the masks of a photo, and `windows` stores mask logits.
 
 pub(crate) mod exports;
 pub(crate) mod generation;
@@ -16,38 +16,40 @@ use image::RgbImage;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-/// Changes with what is made of the same models' answers.
+/// Version of the mask generation. Increase it whenever the same models give other masks.
 pub const VERSION: u32 = 2;
 
-/// Constants of mask generation; the defaults are those of SAM's own generator, but that a whole does not drop a part of like bounds.
+/// Options of mask generation. The defaults are those of SAM's own generator, except that masks of
+/// different levels do not suppress each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Config {
-    /// Point prompts along each side of the photo, and of each crop.
+    /// Number of point prompts along each side of the photo and of each crop.
     pub points_per_side: u32,
-    /// Least IoU that the model predicts for its own mask.
+    /// Smallest IoU that the model predicts for its own mask, 0 to 1.
     pub predicted_iou: f32,
-    /// Least IoU of the masks cut at logits of plus and minus one.
+    /// Smallest stability: IoU of the masks thresholded at logits of plus and minus one.
     pub stability: f32,
-    /// IoU of boxes from which the worse of two masks is dropped.
+    /// Box IoU above which the worse of two masks is removed; 1 keeps all.
     pub box_nms: f32,
-    /// Whether that holds between masks of different levels too.
+    /// Whether masks of different levels suppress each other too.
     pub across_levels: bool,
-    /// Layers of crops beside the photo itself: the k-th has 4^k.
+    /// Number of crop layers besides the photo itself; layer k has 4^k crops.
     pub crop_layers: u32,
-    /// What is dropped of a level's masks in the end.
+    /// Suppression among the masks of each level, after all crops are merged.
     pub suppression: Option<Suppression>,
 }
 
-/// When a mask gives way to another one of its level.
+/// Thresholds at which a mask is suppressed by another mask of its level.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Suppression {
-    /// IoU above which it repeats a better one.
+    /// Mask IoU above which a mask repeats a better one.
     pub iou: f32,
-    /// Predicted IoU times stability that a mask needs.
+    /// Score, predicted IoU times stability, that a mask must exceed.
     pub score: f32,
-    /// Product of the shares that two have in common, below which the one that lies in the other goes.
+    /// Limit of the product of the intersection's shares of both masks. Below it, a contained mask
+    /// that covers less than half of the other is suppressed.
     pub inner: f32,
-    /// Share from which one lies in the other.
+    /// Share of a mask in the intersection from which the mask counts as contained in the other.
     pub held: f32,
 }
 
@@ -66,37 +68,49 @@ impl Default for Config {
 }
 
 impl Config {
-    /// What LangSplat asks of SAM, whose pipeline the paper follows: laxer filters, one layer of crops, and suppression by masks.
+    /// Returns the options of LangSplat, whose pipeline the paper follows: laxer filters, one layer
+    /// of crops, and mask suppression.
     pub fn langsplat() -> Self {
-        let suppression = Some(Suppression { iou: 0.8, score: 0.7, inner: 0.5, held: 0.85 });
-        Self { predicted_iou: 0.7, stability: 0.85, crop_layers: 1, suppression, ..Self::default() }
+        let suppression = Some(Suppression {
+            iou: 0.8,
+            score: 0.7,
+            inner: 0.5,
+            held: 0.85,
+        });
+        Self {
+            predicted_iou: 0.7,
+            stability: 0.85,
+            crop_layers: 1,
+            suppression,
+            ..Self::default()
+        }
     }
 }
 
-/// Holes and islands below this share of the photo are removed.
+/// Holes and islands with a smaller share of the photo's area are removed.
 const SPECK: f32 = 2e-4;
-/// Mask IoU from which a mask of a finer level is the same as one of a coarser level.
+/// Mask IoU above which a mask of a finer level repeats one of a coarser level.
 const SAME: f32 = 0.9;
 
-/// So many photos without a mask, and none with, are too many.
+/// Number of photos without a mask, before any photo with one, at which segmentation fails.
 const IN_NONE: usize = 5;
 
-/// Image encoder and prompt decoder.
+/// Segmenter with SAM's image encoder and prompt decoder.
 pub struct Sam {
     exports: Exports,
     config: Config,
     told: std::sync::Once,
-    /// Whether any photo had a mask yet.
+    /// Whether any photo had a mask.
     found: AtomicBool,
-    /// Photos that had none.
+    /// Number of photos without a mask.
     without: AtomicUsize,
 }
 
 impl Sam {
-    /// Loads an encoder and the decoder that belongs to it.
+    /// Loads an encoder and its decoder.
     ///
     /// # Errors
-    /// When a file is missing or of no known kind.
+    /// A missing file, or a model of an unknown kind.
     pub fn load(encoder: &Path, decoder: &Path, config: Config) -> Result<Self> {
         Ok(Self {
             exports: Exports::load(encoder, decoder)?,
@@ -119,7 +133,7 @@ impl Segmenter for Sam {
         let (found, single) = generation::masks(&self.exports, photo, &self.config)?;
         if single {
             self.told.call_once(|| {
-                tracing::warn!("SAM gives one mask a prompt: what is a whole, a part or a part of a part is told by its size")
+                tracing::warn!("this SAM export returns one mask per prompt; the level of each mask is derived from its area")
             });
         }
         let mut levels: [Vec<Candidate>; 3] = Default::default();
@@ -134,23 +148,42 @@ impl Segmenter for Sam {
         }
         for level in 1..levels.len() {
             let (coarser, finer) = levels.split_at_mut(level);
-            let same = |a: &BitMask, b: &BitMask| box_iou(a.bounds, b.bounds) > 0.5 && a.iou(b) > SAME;
-            finer[0].retain(|c| !coarser.iter().flatten().any(|other| same(&other.mask, &c.mask)));
+            let same =
+                |a: &BitMask, b: &BitMask| box_iou(a.bounds, b.bounds) > 0.5 && a.iou(b) > SAME;
+            finer[0].retain(|c| {
+                !coarser
+                    .iter()
+                    .flatten()
+                    .any(|other| same(&other.mask, &c.mask))
+            });
         }
         if levels.iter().any(|level| !level.is_empty()) {
             self.found.store(true, Ordering::Relaxed);
         } else {
-            // A photo may be blurred or empty; where none has a mask, something else is wrong.
+            // A single photo may be blurred or empty. If no photo has a mask, the models are
+            // probably wrong.
             tracing::warn!("SAM found no mask in '{view}'");
-            if !self.found.load(Ordering::Relaxed) && self.without.fetch_add(1, Ordering::Relaxed) + 1 >= IN_NONE {
-                return Err(self.exports.refuse("it found no mask in any photo so far; are encoder and decoder of one model?"));
+            if !self.found.load(Ordering::Relaxed)
+                && self.without.fetch_add(1, Ordering::Relaxed) + 1 >= IN_NONE
+            {
+                return Err(self.exports.refuse("it found no mask in any of the first photos; check that encoder and decoder belong to the same model"));
             }
         }
         let told = |c: Candidate| {
             let runs = c.mask.runs(width, height);
-            Mask { level: c.level, predicted_iou: c.predicted_iou, stability: c.stability, track: None, runs }
+            Mask {
+                level: c.level,
+                predicted_iou: c.predicted_iou,
+                stability: c.stability,
+                track: None,
+                runs,
+            }
         };
-        Ok(MaskList { width, height, masks: levels.into_iter().flatten().map(told).collect() })
+        Ok(MaskList {
+            width,
+            height,
+            masks: levels.into_iter().flatten().map(told).collect(),
+        })
     }
 }
 
@@ -166,7 +199,7 @@ mod tests {
     const DARK_RED: [u8; 3] = [150, 15, 15];
     const BLUE: [u8; 3] = [20, 20, 230];
 
-    /// A red thing with a dark part, and a blue thing with a hole of one pixel, on grey.
+    /// A red object with a dark part, and a blue object with a hole of one pixel, on grey.
     fn photo() -> RgbImage {
         RgbImage::from_fn(120, 80, |x, y| {
             Rgb(match (x, y) {
@@ -181,7 +214,10 @@ mod tests {
 
     fn sam(export: SamExport, config: Config) -> Option<(tempfile::TempDir, Sam)> {
         let dir = tempfile::tempdir().unwrap();
-        let (encoder, decoder) = (dir.path().join("encoder.onnx"), dir.path().join("decoder.onnx"));
+        let (encoder, decoder) = (
+            dir.path().join("encoder.onnx"),
+            dir.path().join("decoder.onnx"),
+        );
         toy_models::sam(export, &encoder, &decoder);
         if let Err(e) = crate::places::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
@@ -191,7 +227,7 @@ mod tests {
         Some((dir, Sam::load(&encoder, &decoder, config).unwrap()))
     }
 
-    /// IoU of the best label.
+    /// Returns the largest IoU of a label with the pixels of `member`.
     fn agree(map: &fastlgs_core::LabelMap, member: impl Fn(u32, u32) -> bool) -> f32 {
         let best = (1..=map.max()).map(|l| {
             let (mut common, mut either) = (0.0, 0.0);
@@ -207,64 +243,168 @@ mod tests {
 
     #[test]
     fn every_export_gives_the_same_masks_at_their_levels() {
-        let config = Config { points_per_side: 12, ..Config::default() };
+        let config = Config {
+            points_per_side: 12,
+            ..Config::default()
+        };
         let official = [true, false].map(|batched| SamExport::Official { batched });
-        let others = [SamExport::Efficient, SamExport::Transformers, SamExport::Edge, SamExport::Second, SamExport::Half];
+        let others = [
+            SamExport::Efficient,
+            SamExport::Transformers,
+            SamExport::Edge,
+            SamExport::Second,
+            SamExport::Half,
+        ];
         for export in official.into_iter().chain(others) {
-            let Some((_dir, sam)) = sam(export, config) else { return };
+            let Some((_dir, sam)) = sam(export, config) else {
+                return;
+            };
             let found = sam.segment("", &photo()).unwrap();
             let [whole, part, subpart] = Level::ALL.map(|level| found.painted(level));
             let red = |x: u32, y: u32| (10..60).contains(&x) && (10..50).contains(&y);
             let blue = |x: u32, y: u32| (70..110).contains(&x) && (40..70).contains(&y);
             let dark = |x: u32, y: u32| (20..32).contains(&x) && (20..32).contains(&y);
-            // Interpolated borders of half-resolution masks cost a row of pixels; the hole is filled.
-            assert!(agree(&whole, red) > 0.9, "{export:?}: {}", agree(&whole, red));
-            assert!(agree(&whole, blue) > 0.9, "{export:?}: {}", agree(&whole, blue));
-            assert!(agree(&whole, dark) < 0.5, "{export:?}: the part is no whole");
-            assert!(agree(&part, dark) > 0.75, "{export:?}: {}", agree(&part, dark));
-            assert_eq!(part.at(100, 50), 0, "{export:?}: a part that is the whole is not repeated");
-            assert_eq!(subpart.at(100, 50), 0, "{export:?}: nor is a subpart");
+            // The interpolated borders of half-resolution masks lose a row of pixels; the hole is
+            // filled.
+            assert!(
+                agree(&whole, red) > 0.9,
+                "{export:?}: {}",
+                agree(&whole, red)
+            );
+            assert!(
+                agree(&whole, blue) > 0.9,
+                "{export:?}: {}",
+                agree(&whole, blue)
+            );
+            assert!(
+                agree(&whole, dark) < 0.5,
+                "{export:?}: the dark part must not be a whole"
+            );
+            assert!(
+                agree(&part, dark) > 0.75,
+                "{export:?}: {}",
+                agree(&part, dark)
+            );
+            assert_eq!(
+                part.at(100, 50),
+                0,
+                "{export:?}: the part level must not repeat a whole"
+            );
+            assert_eq!(
+                subpart.at(100, 50),
+                0,
+                "{export:?}: the subpart level must not repeat a whole"
+            );
         }
     }
 
     #[test]
     fn crops_and_suppression_leave_the_same_things() {
-        let config = Config { points_per_side: 8, ..Config::langsplat() };
-        let Some((_dir, sam)) = sam(SamExport::Official { batched: true }, config) else { return };
+        let config = Config {
+            points_per_side: 8,
+            ..Config::langsplat()
+        };
+        let Some((_dir, sam)) = sam(SamExport::Official { batched: true }, config) else {
+            return;
+        };
         let found = sam.segment("", &photo()).unwrap();
         let whole = found.painted(Level::Whole);
-        assert!(agree(&whole, |x, y| (10..60).contains(&x) && (10..50).contains(&y)) > 0.9);
-        assert!(agree(&whole, |x, y| (70..110).contains(&x) && (40..70).contains(&y)) > 0.9);
-        let areas: Vec<usize> = found.masks.iter().filter(|m| m.level == Level::Whole).map(|m| m.runs.area()).collect();
-        assert!(areas.iter().all(|a| *a > 0) && areas.len() < 8, "what several crops found is there once: {areas:?}");
+        assert!(
+            agree(&whole, |x, y| (10..60).contains(&x)
+                && (10..50).contains(&y))
+                > 0.9
+        );
+        assert!(
+            agree(&whole, |x, y| (70..110).contains(&x)
+                && (40..70).contains(&y))
+                > 0.9
+        );
+        let areas: Vec<usize> = found
+            .masks
+            .iter()
+            .filter(|m| m.level == Level::Whole)
+            .map(|m| m.runs.area())
+            .collect();
+        assert!(
+            areas.iter().all(|a| *a > 0) && areas.len() < 8,
+            "masks that several crops found must not be repeated: {areas:?}"
+        );
     }
 
     #[test]
     fn a_single_mask_a_prompt_gets_its_level_by_its_size() {
-        let config = Config { points_per_side: 12, ..Config::default() };
-        let Some((_dir, sam)) = sam(SamExport::Single, config) else { return };
+        let config = Config {
+            points_per_side: 12,
+            ..Config::default()
+        };
+        let Some((_dir, sam)) = sam(SamExport::Single, config) else {
+            return;
+        };
         let found = sam.segment("", &photo()).unwrap();
-        assert!(agree(&found.painted(Level::Whole), |x, y| (10..60).contains(&x) && (10..50).contains(&y)) > 0.9);
-        assert!(found.masks.iter().all(|m| (m.level == Level::Whole) == (m.runs.area() >= 288)), "3 % of 9,600 pixels");
+        assert!(
+            agree(&found.painted(Level::Whole), |x, y| (10..60).contains(&x)
+                && (10..50).contains(&y))
+                > 0.9
+        );
+        assert!(
+            found
+                .masks
+                .iter()
+                .all(|m| (m.level == Level::Whole) == (m.runs.area() >= 288)),
+            "wholes have at least 3 % of 9,600 pixels"
+        );
     }
 
     #[test]
     fn filters_drop_what_the_model_doubts() {
-        let config = Config { points_per_side: 4, predicted_iou: 0.99, ..Config::default() };
-        let Some((_dir, sam)) = sam(SamExport::Transformers, config) else { return };
-        // One such photo may be empty; many are a sign.
+        let config = Config {
+            points_per_side: 4,
+            predicted_iou: 0.99,
+            ..Config::default()
+        };
+        let Some((_dir, sam)) = sam(SamExport::Transformers, config) else {
+            return;
+        };
+        // A few photos may have no mask; after IN_NONE photos it is an error.
         let mut photos = (0..IN_NONE).map(|_| sam.segment("", &photo()));
-        assert!(photos.by_ref().take(IN_NONE - 1).all(|list| list.unwrap().masks.is_empty()));
-        assert!(photos.next().unwrap().err().unwrap().to_string().contains("no mask"));
+        assert!(
+            photos
+                .by_ref()
+                .take(IN_NONE - 1)
+                .all(|list| list.unwrap().masks.is_empty())
+        );
+        assert!(
+            photos
+                .next()
+                .unwrap()
+                .err()
+                .unwrap()
+                .to_string()
+                .contains("no mask")
+        );
     }
 
     #[test]
     fn other_models_are_refused_by_name() {
-        let Some((dir, _)) = sam(SamExport::Transformers, Config::default()) else { return };
+        let Some((dir, _)) = sam(SamExport::Transformers, Config::default()) else {
+            return;
+        };
         let encoder = dir.path().join("encoder.onnx");
-        let error = Sam::load(&encoder, &encoder, Config::default()).err().unwrap().to_string();
-        assert!(error.contains("encoder.onnx") && error.contains("pixel_values"), "{error}");
-        let missing = Sam::load(&dir.path().join("none.onnx"), &encoder, Config::default()).err().unwrap().to_string();
-        assert!(missing.contains("none.onnx") && missing.contains("models pull"), "{missing}");
+        let error = Sam::load(&encoder, &encoder, Config::default())
+            .err()
+            .unwrap()
+            .to_string();
+        assert!(
+            error.contains("encoder.onnx") && error.contains("pixel_values"),
+            "{error}"
+        );
+        let missing = Sam::load(&dir.path().join("none.onnx"), &encoder, Config::default())
+            .err()
+            .unwrap()
+            .to_string();
+        assert!(
+            missing.contains("none.onnx") && missing.contains("models pull"),
+            "{missing}"
+        );
     }
 }

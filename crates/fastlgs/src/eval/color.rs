@@ -1,53 +1,83 @@
-//! How well colour is shown where the scene was not trained: as given, with each view's pose aligned to the scene, and with each photo's
-//! exposure fitted as well.
+//! Measures colour on held-out views: with the given poses, with aligned poses, and with aligned
+//! poses and fitted exposures.
 
 use crate::compared::Compared;
 use crate::{Result, Session, train};
 use fastlgs_core::{Camera, metrics};
 use fastlgs_raster::{Target, align};
 
-/// Means over the held-out views.
+/// Colour accuracy: means over the held-out views.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Quality {
     /// PSNR in dB.
     pub psnr: f64,
     /// SSIM.
     pub ssim: f64,
-    /// PSNR where each view's pose is aligned to the scene first: what wrong poses of the held-out photos do not spoil.
+    /// PSNR in dB after the pose of each view is aligned to the scene. Wrong poses of the held-out
+    /// photos do not lower it.
     pub psnr_aligned: f64,
-    /// PSNR where, beyond that, a gain and an offset a channel is fitted to each photo: what their exposures do not spoil.
+    /// PSNR in dB after a gain and an offset of each channel are fitted to each photo as well.
+    /// Different exposures do not lower it.
     pub psnr_affine: f64,
 }
 
-/// Quality of the held-out views of which any pixel counts; none where there are none.
+/// Measures the held-out views in which any pixel counts; `None` if there are none.
 pub fn quality(scene: &mut Session) -> Result<Option<Quality>> {
     let cameras = scene.manifest.held_out(&scene.cameras);
-    let background = train::Background { color: scene.trained.background, learn: false };
+    let background = train::Background {
+        color: scene.trained.background,
+        learn: false,
+    };
     let mut sum = Quality::default();
     let mut views = 0;
     for camera in &cameras {
         let target = train::target(&scene.folder, camera, None, &background)?;
         let given = scene.render(camera)?;
-        let Some(compared) = Compared::of(&target, given.channels(0, 3)) else { continue };
+        let Some(compared) = Compared::of(&target, given.channels(0, 3)) else {
+            continue;
+        };
         views += 1;
         sum.psnr += compared.psnr();
         let [w, h] = [camera.width, camera.height].map(|side| side as usize);
         sum.ssim += metrics::ssim(&compared.rendered, &compared.photo, w, h, &compared.counts);
         let camera = aligned(scene, &target)?;
         let aligned = scene.render(&camera)?;
-        let Some(mut compared) = Compared::of(&target, aligned.channels(0, 3)) else { continue };
+        let Some(mut compared) = Compared::of(&target, aligned.channels(0, 3)) else {
+            continue;
+        };
         sum.psnr_aligned += compared.psnr();
         compared.fit_exposure();
         sum.psnr_affine += compared.psnr();
     }
     let mean = |v: f64| v / f64::from(views);
-    let Quality { psnr, ssim, psnr_aligned, psnr_affine } = sum;
-    let all = Quality { psnr: mean(psnr), ssim: mean(ssim), psnr_aligned: mean(psnr_aligned), psnr_affine: mean(psnr_affine) };
+    let Quality {
+        psnr,
+        ssim,
+        psnr_aligned,
+        psnr_affine,
+    } = sum;
+    let all = Quality {
+        psnr: mean(psnr),
+        ssim: mean(ssim),
+        psnr_aligned: mean(psnr_aligned),
+        psnr_affine: mean(psnr_affine),
+    };
     Ok((views > 0).then_some(all))
 }
 
 fn aligned(scene: &mut Session, target: &Target) -> Result<Camera> {
-    let Session { engine, gaussians, trained, .. } = scene;
+    let Session {
+        engine,
+        gaussians,
+        trained,
+        ..
+    } = scene;
     let frame = |camera: &Camera| trained.view(camera, gaussians);
-    Ok(align::align(engine.as_mut(), frame, target, &Default::default(), align::STEPS)?)
+    Ok(align::align(
+        engine.as_mut(),
+        frame,
+        target,
+        &Default::default(),
+        align::STEPS,
+    )?)
 }

@@ -1,4 +1,4 @@
-//! Accuracy on held-out views. The rules are in `docs/evaluation.md`.
+//! Measures accuracy on held-out views. `docs/evaluation.md` defines the measures.
 
 mod color;
 
@@ -17,29 +17,31 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// What is measured.
+/// Options of an evaluation.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// Folder of labels in the layout of LERF-OVS, 3D-OVS or SPIn-NeRF; without it only colour is measured.
+    /// Folder of labels in the layout of LERF-OVS, 3D-OVS or SPIn-NeRF. Without it, only colour is
+    /// measured.
     #[cfg_attr(feature = "clap", arg(long))]
     pub labels: Option<PathBuf>,
-    /// What names the thing in SPIn-NeRF's masks, instead of their folder's name.
+    /// Name of the object in SPIn-NeRF masks, instead of the name of their folder.
     #[cfg_attr(feature = "clap", arg(long, value_name = "TEXT"))]
     pub label_text: Option<String>,
-    /// Decide pixels as in the paper: by the distance of the rendered code to the object's, on the 0..255 scale.
+    /// Decide pixels as in the paper: largest distance of a rendered code from the code of its
+    /// object, on a scale of 0 to 255.
     #[cfg_attr(feature = "clap", arg(long, value_name = "DISTANCE"))]
     pub tau_ac: Option<f32>,
-    /// Share of the names of absent things that may be answered all the same.
+    /// Accepted share of absent names that are answered, 0 to 1.
     #[cfg_attr(feature = "clap", arg(long, value_name = "SHARE", default_value_t = QueryConfig::default().false_alarms))]
     pub false_alarms: f32,
-    /// Texts that must not be found, one a line; a list of everyday things is built in.
+    /// File of absent names, one a line, instead of the built-in list of everyday objects.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub absent: Option<PathBuf>,
-    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    /// CLIP text tower, for scenes with imported embeddings, or if its file has moved.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub clip_text: Option<PathBuf>,
 }
@@ -47,110 +49,119 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         let false_alarms = QueryConfig::default().false_alarms;
-        Self { scene: PathBuf::new(), labels: None, label_text: None, tau_ac: None, false_alarms, absent: None, clip_text: None }
+        Self {
+            scene: PathBuf::new(),
+            labels: None,
+            label_text: None,
+            tau_ac: None,
+            false_alarms,
+            absent: None,
+            clip_text: None,
+        }
     }
 }
 
-/// What was measured. Figures are means over all labels of all views, unless said otherwise; `docs/evaluation.md` defines them.
+/// Report of an evaluation. Values are means over all labels of all views, unless stated otherwise.
+/// `docs/evaluation.md` defines them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Report {
     /// The scene folder.
     pub scene: PathBuf,
-    /// Labelled views.
+    /// Number of labelled views.
     pub views_scored: usize,
-    /// Labels that were scored.
+    /// Number of labels that were scored.
     pub labels_scored: usize,
-    /// Labels that there are.
+    /// Number of all labels.
     pub labels_total: usize,
-    /// IoU of the texts' masks.
+    /// mIoU of the answers with the labels.
     pub miou: Option<f64>,
-    /// The same by label.
+    /// mIoU by label.
     pub miou_by_label: BTreeMap<String, Option<f64>>,
-    /// Recall of the texts' masks.
+    /// Recall: share of the pixels of a label that the answer covers.
     pub macc: Option<f64>,
-    /// Boundary IoU of the texts' masks.
+    /// Boundary IoU of the answers.
     pub boundary_iou: Option<f64>,
-    /// Boundary IoU of the object that fits each label best.
+    /// Boundary IoU of the best object for each label.
     pub oracle_boundary_iou: Option<f64>,
-    /// Whether the relevancy's peak lies in a box of the label.
+    /// Localisation accuracy: share of labels whose relevancy peak lies in one of their boxes.
     pub loc_acc: Option<f64>,
-    /// IoU of the object that fits each label best.
+    /// Oracle mIoU: IoU of the best object for each label.
     pub oracle_miou: Option<f64>,
-    /// The same by label.
+    /// Oracle mIoU by label.
     pub oracle_by_label: BTreeMap<String, Option<f64>>,
-    /// Share of a label's pixels that no best object of another label claims.
+    /// Share of the pixels of a label that the best object of no other label covers.
     pub apart: Option<f64>,
-    /// Whether the first-ranked object lies in the label.
+    /// Share of labels that contain more than half of the first-ranked object.
     pub text_top1: Option<f64>,
-    /// Share of labels whose best object is among the first 1, 3 and 5 for its text.
+    /// Share of labels whose best object has a rank of at most 1, 3 and 5.
     pub oracle_ranked: [Option<f64>; 3],
-    /// By label: the place of its best object among all for its text, from 1 on; the worst over the views.
+    /// By label: rank of its best object, from 1 on; the worst over the views.
     pub oracle_rank_by_label: BTreeMap<String, usize>,
-    /// What became of the texts.
+    /// Number of labels by outcome.
     pub outcomes: BTreeMap<Outcome, usize>,
-    /// Area under the curve of present against absent texts.
+    /// AUROC of the scores of present and absent names.
     pub absent_auroc: Option<f64>,
-    /// Absent texts that were asked.
+    /// Number of absent names.
     pub absent_texts: usize,
-    /// Those that were not found.
+    /// Number of absent names that were not found.
     pub absent_rejected: usize,
-    /// Share of these, with colours before them, that were not found.
+    /// Share of absent names with a colour in front that were not found.
     pub absent_colored_rejected: Option<f64>,
-    /// The absent text that scored highest.
+    /// Absent name with the largest score.
     pub absent_best: Option<Absent>,
-    /// Best score of each absent text.
+    /// Largest score by absent name.
     pub absent_scores: BTreeMap<String, f64>,
-    /// Best score of each label's text.
+    /// Largest score by label.
     pub present_scores: BTreeMap<String, f64>,
     /// PSNR of the held-out views in dB.
     pub psnr: Option<f64>,
-    /// The same, with the pose of each held-out view aligned to the scene first.
+    /// PSNR in dB after the pose of each held-out view is aligned to the scene.
     pub psnr_aligned: Option<f64>,
-    /// And with a gain and an offset a channel fitted to each of these photos.
+    /// PSNR in dB after a gain and an offset of each channel are fitted to each photo as well.
     pub psnr_affine: Option<f64>,
     /// SSIM of the held-out views.
     pub ssim: Option<f64>,
-    /// Gaussians.
+    /// Number of Gaussians.
     pub gaussians: usize,
-    /// Objects and parts.
+    /// Number of objects, parts included.
     pub objects: usize,
-    /// Bytes of everything that queries need.
+    /// Size of all files that queries need, in bytes.
     pub scene_bytes: u64,
-    /// Milliseconds of the first text in a view.
+    /// Milliseconds of the first query in a view, rendering included.
     pub query_ms_first: Option<f64>,
-    /// Milliseconds of the next ones.
+    /// Milliseconds of each further query in the same view.
     pub query_ms_next: Option<f64>,
-    /// Size of the views.
+    /// Size of the first view, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
-    /// The device's name.
+    /// Name of the device.
     pub adapter: String,
 }
 
-/// What became of a label's text.
+/// Outcome of the query for a label.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// The mask has an IoU of a half at least.
+    /// The answer has an IoU of at least 0.5.
     Right,
-    /// Said to be not found.
+    /// No object was found.
     Refused,
-    /// A part of the best object was taken, or what it is a part of.
+    /// The first target is a part of the best object, or contains it.
     WrongLevel,
-    /// Something else was taken.
+    /// The first target is another object.
     WrongObject,
-    /// The best object was taken; its mask, or what others add to it, does not fit.
+    /// The first target is the best object, but the mask of the answer does not fit.
     WrongMask,
 }
 
-/// IoU from which an answer is right.
+/// Least IoU of a right answer.
 const RIGHT: f64 = 0.5;
 
-/// A text that names nothing in the scene.
+/// An absent name with its score.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Absent {
-    /// The text.
+    /// The name.
     pub text: String,
-    /// Its best score.
+    /// Its largest score over all objects.
     pub score: f64,
 }
 
@@ -180,14 +191,14 @@ fn mean(values: &[f64]) -> Option<f64> {
 /// Measures accuracy on held-out views.
 ///
 /// # Errors
-/// A scene that was never trained, labels that fit no held-out view, or a device that fails.
+/// A scene that is not trained, labels of a view that is not held out, or a device that fails.
 pub fn eval(config: &Config, run: &Run) -> Result<Report> {
     let mut session = Session::open(&config.scene, run.device)?;
     session.clip_text.clone_from(&config.clip_text);
     eval_session(session, config)
 }
 
-/// The same for a scene that is open already.
+/// Measures accuracy of an opened scene.
 ///
 /// # Errors
 /// As [`eval`].
@@ -196,23 +207,39 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
     let label_text = config.label_text.as_deref();
-    let views = config.labels.as_deref().map(|folder| labels::load(folder, label_text)).transpose()?.unwrap_or_default();
-    let query = QueryConfig { false_alarms: config.false_alarms, ..QueryConfig::default() };
+    let views = config
+        .labels
+        .as_deref()
+        .map(|folder| labels::load(folder, label_text))
+        .transpose()?
+        .unwrap_or_default();
+    let query = QueryConfig {
+        false_alarms: config.false_alarms,
+        ..QueryConfig::default()
+    };
     let total: usize = views.iter().map(|v| v.labels.len()).sum();
     let mut sums = Sums::default();
     for view in &views {
-        let index = scene.folder.view_index(&scene.cameras, &view.name).context("labels")?;
+        let index = scene
+            .folder
+            .view_index(&scene.cameras, &view.name)
+            .context("the labels do not fit the scene")?;
         let camera = scene.cameras[index].clone();
         if !scene.manifest.is_held_out(index, &camera.name) {
-            bail!("'{}' is labelled but was trained on; preprocess with --holdout or --holdout-labels so that it is held out", camera.name);
+            bail!(
+                "'{}' has labels but was trained on; preprocess the photos again with --holdout or --holdout-labels, so that it is held out",
+                camera.name
+            );
         }
-        scene.field(&camera, config.tau_ac)?; // compiles the kernels
+        scene.field(&camera, config.tau_ac)?; // compiles the shaders before the timing
         let started = Instant::now();
         let field = scene.field(&camera, config.tau_ac)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         let mut best = Vec::new();
         for (k, label) in view.labels.iter().enumerate() {
-            let (ms, masks) = score_label(&scene, &grid, &query, view, label, &camera, &field, &mut sums)?;
+            let (ms, masks) = score_label(
+                &scene, &grid, &query, view, label, &camera, &field, &mut sums,
+            )?;
             if k == 0 {
                 sums.first_ms.push(render_ms + ms)
             } else {
@@ -223,10 +250,18 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         sums.apart.extend(apart(&best));
     }
     let absent = absent_scores(config, &scene, &grid, &views)?;
-    let rejected = |absent: &[(String, f64)]| absent.iter().filter(|a| a.1 < f64::from(query.min_score())).count();
+    let rejected = |absent: &[(String, f64)]| {
+        absent
+            .iter()
+            .filter(|a| a.1 < f64::from(query.min_score()))
+            .count()
+    };
     let colored = colored_absent_scores(&absent, &scene, &grid)?;
     let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
-    let auroc = metrics::auroc(&sums.present, &absent.iter().map(|a| a.1).collect::<Vec<_>>());
+    let auroc = metrics::auroc(
+        &sums.present,
+        &absent.iter().map(|a| a.1).collect::<Vec<_>>(),
+    );
     let camera = &scene.cameras[0];
     Ok(Report {
         scene: config.scene.clone(),
@@ -234,26 +269,55 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         labels_scored: sums.iou.len(),
         labels_total: total,
         miou: mean(&sums.iou),
-        miou_by_label: sums.by_label.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
+        miou_by_label: sums
+            .by_label
+            .iter()
+            .map(|(k, v)| (k.clone(), mean(v)))
+            .collect(),
         macc: mean(&sums.recall),
         boundary_iou: mean(&sums.boundary),
         oracle_boundary_iou: mean(&sums.oracle_boundary),
         loc_acc: mean(&sums.localised),
         oracle_miou: mean(&sums.oracle.values().flatten().copied().collect::<Vec<_>>()),
-        oracle_by_label: sums.oracle.iter().map(|(k, v)| (k.clone(), mean(v))).collect(),
+        oracle_by_label: sums
+            .oracle
+            .iter()
+            .map(|(k, v)| (k.clone(), mean(v)))
+            .collect(),
         apart: mean(&sums.apart),
         text_top1: mean(&sums.top1),
-        oracle_ranked: [1, 3, 5]
-            .map(|first| mean(&sums.ranks.values().flatten().map(|rank| f64::from(u8::from(*rank <= first))).collect::<Vec<_>>())),
-        oracle_rank_by_label: sums.ranks.iter().filter_map(|(k, v)| Some((k.clone(), *v.iter().max()?))).collect(),
+        oracle_ranked: [1, 3, 5].map(|first| {
+            mean(
+                &sums
+                    .ranks
+                    .values()
+                    .flatten()
+                    .map(|rank| f64::from(u8::from(*rank <= first)))
+                    .collect::<Vec<_>>(),
+            )
+        }),
+        oracle_rank_by_label: sums
+            .ranks
+            .iter()
+            .filter_map(|(k, v)| Some((k.clone(), *v.iter().max()?)))
+            .collect(),
         outcomes: sums.outcomes,
         absent_auroc: (!auroc.is_nan()).then_some(auroc),
         absent_texts: absent.len(),
         absent_rejected: rejected(&absent),
-        absent_colored_rejected: (!colored.is_empty()).then(|| rejected(&colored) as f64 / colored.len() as f64),
+        absent_colored_rejected: (!colored.is_empty())
+            .then(|| rejected(&colored) as f64 / colored.len() as f64),
         absent_scores: absent.iter().cloned().collect(),
-        absent_best: loudest.map(|(text, score)| Absent { text: text.clone(), score: *score }),
-        present_scores: sums.labels.iter().cloned().zip(sums.present.iter().copied()).collect(),
+        absent_best: loudest.map(|(text, score)| Absent {
+            text: text.clone(),
+            score: *score,
+        }),
+        present_scores: sums
+            .labels
+            .iter()
+            .cloned()
+            .zip(sums.present.iter().copied())
+            .collect(),
         psnr: color.map(|c| c.psnr),
         psnr_aligned: color.map(|c| c.psnr_aligned),
         psnr_affine: color.map(|c| c.psnr_affine),
@@ -268,32 +332,51 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
     })
 }
 
-/// A label's true pixels, and those of the object that fits it best.
+/// Masks of a label and of the object that fits it best.
 struct Best {
     truth: Vec<bool>,
     found: Vec<bool>,
 }
 
-/// For each label, the share of its pixels that no best object of a label elsewhere claims: 1 where things are told apart, even where
-/// they are not found. Objects that two labels share tell neither apart.
+/// Returns for each label the share of its pixels that the best object of no other label covers.
+/// The share is 1 if the objects are separate, even if no text finds them. Labels that overlap are
+/// not compared. An object that is the best one of two labels separates neither.
 fn apart(best: &[Best]) -> Vec<f64> {
     let pixels = best.first().map_or(0, |b| b.truth.len());
-    let at = |p: usize, mask: fn(&Best) -> &Vec<bool>| (0..best.len()).filter(|&k| mask(&best[k])[p]).collect::<Vec<_>>();
-    let there: Vec<[Vec<usize>; 2]> = (0..pixels).into_par_iter().map(|p| [at(p, |b| &b.truth), at(p, |b| &b.found)]).collect();
-    let overlapping: BTreeSet<(usize, usize)> =
-        there.iter().flat_map(|[truth, _]| truth.iter().flat_map(move |a| truth.iter().map(move |b| (*a, *b)))).collect();
+    let at = |p: usize, mask: fn(&Best) -> &Vec<bool>| {
+        (0..best.len())
+            .filter(|&k| mask(&best[k])[p])
+            .collect::<Vec<_>>()
+    };
+    let there: Vec<[Vec<usize>; 2]> = (0..pixels)
+        .into_par_iter()
+        .map(|p| [at(p, |b| &b.truth), at(p, |b| &b.found)])
+        .collect();
+    let overlapping: BTreeSet<(usize, usize)> = there
+        .iter()
+        .flat_map(|[truth, _]| {
+            truth
+                .iter()
+                .flat_map(move |a| truth.iter().map(move |b| (*a, *b)))
+        })
+        .collect();
     let mut counts = vec![[0usize; 2]; best.len()];
     for [truth, found] in &there {
         for &own in truth {
-            let mixed = found.iter().any(|other| !overlapping.contains(&(own, *other)));
+            let mixed = found
+                .iter()
+                .any(|other| !overlapping.contains(&(own, *other)));
             counts[own][0] += usize::from(mixed);
             counts[own][1] += 1;
         }
     }
-    counts.iter().map(|[mixed, all]| 1.0 - *mixed as f64 / (*all).max(1) as f64).collect()
+    counts
+        .iter()
+        .map(|[mixed, all]| 1.0 - *mixed as f64 / (*all).max(1) as f64)
+        .collect()
 }
 
-/// Scores one label; returns the milliseconds of the query beyond rendering, and the masks.
+/// Scores one label. Returns the milliseconds of the query without rendering, and the masks.
 fn score_label(
     scene: &Session,
     grid: &Grid,
@@ -307,30 +390,53 @@ fn score_label(
     let (w, h) = (camera.width, camera.height);
     let truth = view.mask(label, w, h);
     if !truth.contains(&true) {
-        bail!("the label '{}' of '{}' covers no pixel at {w}x{h}", label.category, view.name);
+        bail!(
+            "the label '{}' of '{}' covers no pixel at {w}x{h}; correct or remove this label",
+            label.category,
+            view.name
+        );
     }
     // The text encoder is loaded once, before the first query is timed.
     scene.text_query("warm up")?;
     let started = Instant::now();
-    let query::Found { ranked, targets } = Ask::Text(label.category.clone()).meaning(scene, &[])?.find(grid, field, camera, config)?;
+    let query::Found { ranked, targets } = Ask::Text(label.category.clone())
+        .meaning(scene, &[])?
+        .find(grid, field, camera, config)?;
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
     let iou = metrics::iou(&mask, &truth);
     sums.iou.push(iou);
-    sums.by_label.entry(label.category.clone()).or_default().push(iou);
+    sums.by_label
+        .entry(label.category.clone())
+        .or_default()
+        .push(iou);
     sums.recall.push(metrics::recall(&mask, &truth));
-    // 2 % of the diagonal, as Cheng et al. propose.
+    // Width of the boundary: 2 % of the diagonal (Cheng et al., Boundary IoU).
     let band = (0.02 * f64::from(w).hypot(f64::from(h))).round().max(1.0) as u32;
-    sums.boundary.push(metrics::boundary_iou(&mask, &truth, w, h, band));
+    sums.boundary
+        .push(metrics::boundary_iou(&mask, &truth, w, h, band));
     let relevancy = field.relevancy(grid, &ranked);
-    sums.localised.push(f64::from(u8::from(metrics::localised(&relevancy, w, h, &view.boxes(label, w, h)))));
+    sums.localised.push(f64::from(u8::from(metrics::peak_in_box(
+        &relevancy,
+        w,
+        h,
+        &view.boxes(label, w, h),
+    ))));
     sums.labels.push(label.category.clone());
     sums.present.push(f64::from(query::best_score(&ranked)));
-    // Oracle: the best single object. Text top-1: does the first-ranked object mostly lie in the label?
+    // Oracle: the best single object. Top-1: whether more than half of the first-ranked object lies
+    // in the label.
     let object_mask = |id: u16| field.mask(grid, &[Hit { id, score: 0.0 }]);
     let (oracle, found, id) = best_object(grid, field, &truth);
-    sums.oracle_boundary.push(metrics::boundary_iou(&found, &truth, w, h, band));
-    sums.ranks.entry(label.category.clone()).or_default().push(ranked.iter().position(|h| h.id == id).map_or(ranked.len(), |k| k) + 1);
+    sums.oracle_boundary
+        .push(metrics::boundary_iou(&found, &truth, w, h, band));
+    sums.ranks.entry(label.category.clone()).or_default().push(
+        ranked
+            .iter()
+            .position(|h| h.id == id)
+            .map_or(ranked.len(), |k| k)
+            + 1,
+    );
     let outcome = match targets.first() {
         None => Outcome::Refused,
         _ if iou >= RIGHT => Outcome::Right,
@@ -339,30 +445,46 @@ fn score_label(
         Some(_) => Outcome::WrongObject,
     };
     *sums.outcomes.entry(outcome).or_default() += 1;
-    sums.oracle.entry(label.category.clone()).or_default().push(oracle);
+    sums.oracle
+        .entry(label.category.clone())
+        .or_default()
+        .push(oracle);
     let inside = |mask: Vec<bool>| {
-        let (hit, all) = mask.iter().zip(&truth).filter(|(m, _)| **m).fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
+        let (hit, all) = mask
+            .iter()
+            .zip(&truth)
+            .filter(|(m, _)| **m)
+            .fold((0, 0), |(h, a), (_, t)| (h + usize::from(*t), a + 1));
         all > 0 && 2 * hit > all
     };
-    sums.top1.push(f64::from(u8::from(ranked.first().is_some_and(|r| inside(object_mask(r.id))))));
+    sums.top1.push(f64::from(u8::from(
+        ranked.first().is_some_and(|r| inside(object_mask(r.id))),
+    )));
     Ok((ms, Best { truth, found }))
 }
 
-/// IoU, mask and id of the object that fits a mask best; id 0 where there are no objects.
+/// Returns IoU, mask and id of the object that fits a mask best; id 0 if there are no objects.
 pub fn best_object(grid: &Grid, field: &Field, truth: &[bool]) -> (f64, Vec<bool>, u16) {
-    let masks = candidates(grid, field, truth).into_iter().map(|id| (field.mask(grid, &[Hit { id, score: 0.0 }]), id));
+    let masks = candidates(grid, field, truth)
+        .into_iter()
+        .map(|id| (field.mask(grid, &[Hit { id, score: 0.0 }]), id));
     let tried = masks.map(|(mask, id)| (metrics::iou(&mask, truth), mask, id));
-    tried.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_else(|| (0.0, vec![false; truth.len()], 0))
+    tried
+        .max_by(|a, b| a.0.total_cmp(&b.0))
+        .unwrap_or_else(|| (0.0, vec![false; truth.len()], 0))
 }
 
-/// The objects that come nearest to a mask by their pixels: one of them is the best.
+/// Returns the five objects with the largest IoU with a mask, counted in one pass over the pixels.
+/// The best object is one of them.
 fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
     const MOST: usize = 5;
     let mut counts = vec![[0usize; 2]; grid.objects.len() + 1];
     let mut inside = truth.iter().map(|inside| usize::from(*inside));
-    field.each(grid, |objects| {
+    field.for_each_pixel(grid, |objects| {
         let inside = inside.next().unwrap_or(0);
-        objects.iter().for_each(|id| counts[usize::from(*id)][inside] += 1);
+        objects
+            .iter()
+            .for_each(|id| counts[usize::from(*id)][inside] += 1);
     });
     let all = truth.iter().filter(|t| **t).count();
     let iou = |id: &u16| {
@@ -375,29 +497,56 @@ fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
     ids
 }
 
-/// Best scores of texts that name nothing in the scene.
-fn absent_scores(options: &Config, scene: &Session, grid: &Grid, views: &[LabelledView]) -> Result<Vec<(String, f64)>> {
+/// Returns the largest score of each absent name. Names that occur in a label are left out; without
+/// labels, the result is empty.
+fn absent_scores(
+    options: &Config,
+    scene: &Session,
+    grid: &Grid,
+    views: &[LabelledView],
+) -> Result<Vec<(String, f64)>> {
     let texts: Vec<String> = match &options.absent {
-        Some(path) => std::fs::read_to_string(path).with_context(|| path.display().to_string())?.lines().map(str::to_owned).collect(),
+        Some(path) => std::fs::read_to_string(path)
+            .with_context(|| path.display().to_string())?
+            .lines()
+            .map(str::to_owned)
+            .collect(),
         None => ABSENT.iter().map(|s| (*s).to_owned()).collect(),
     };
-    let named = |text: &str| views.iter().flat_map(|v| &v.labels).any(|l| l.category.to_lowercase().contains(&text.to_lowercase()));
+    let named = |text: &str| {
+        views
+            .iter()
+            .flat_map(|v| &v.labels)
+            .any(|l| l.category.to_lowercase().contains(&text.to_lowercase()))
+    };
     if views.is_empty() {
         return Ok(Vec::new());
     }
     let texts = texts.iter().map(|text| text.trim());
-    texts.filter(|text| !text.is_empty() && !named(text)).map(|text| scored(scene, grid, text.to_owned())).collect()
+    texts
+        .filter(|text| !text.is_empty() && !named(text))
+        .map(|text| scored(scene, grid, text.to_owned()))
+        .collect()
 }
 
-/// The same for these texts with a colour before them.
-fn colored_absent_scores(absent: &[(String, f64)], scene: &Session, grid: &Grid) -> Result<Vec<(String, f64)>> {
-    let texts = absent.iter().flat_map(|(text, _)| COLORS.map(|color| format!("{color} {text}")));
+/// Returns the largest score of each absent name with a colour in front.
+fn colored_absent_scores(
+    absent: &[(String, f64)],
+    scene: &Session,
+    grid: &Grid,
+) -> Result<Vec<(String, f64)>> {
+    let texts = absent
+        .iter()
+        .flat_map(|(text, _)| COLORS.map(|color| format!("{color} {text}")));
     texts.map(|text| scored(scene, grid, text)).collect()
 }
 
-/// A text with its best score.
+/// Returns a text with its largest score over all objects.
 fn scored(scene: &Session, grid: &Grid, text: String) -> Result<(String, f64)> {
-    let score = f64::from(query::best_score(&query::rank(grid, &scene.text_query(&text)?)));
+    let score = f64::from(query::best_score(&query::rank(
+        grid,
+        &scene.text_query(&text)?,
+    )));
     Ok((text, score))
 }
 
@@ -408,11 +557,22 @@ mod tests {
     #[test]
     fn twins_are_apart_where_each_has_its_own_object() {
         let mask = |pixels: &str| pixels.bytes().map(|b| b == b'x').collect::<Vec<_>>();
-        let best = |truth: &str, found: &str| Best { truth: mask(truth), found: mask(found) };
-        // One pixel of the left twin is claimed by the right one's object; the pair around both claims all and is not compared.
-        let both = [best("xx....", "x....."), best("....xx", ".x..xx"), best("xx..xx", "xxxxxx")];
+        let best = |truth: &str, found: &str| Best {
+            truth: mask(truth),
+            found: mask(found),
+        };
+        // The object of the right twin covers one pixel of the left twin. The label of the pair
+        // overlaps both twins, so it is not compared with them.
+        let both = [
+            best("xx....", "x....."),
+            best("....xx", ".x..xx"),
+            best("xx..xx", "xxxxxx"),
+        ];
         assert_eq!(apart(&both), [0.5, 1.0, 1.0]);
         // One object for both twins.
-        assert_eq!(apart(&[best("xx..", "xxxx"), best("..xx", "xxxx")]), [0.0, 0.0]);
+        assert_eq!(
+            apart(&[best("xx..", "xxxx"), best("..xx", "xxxx")]),
+            [0.0, 0.0]
+        );
     }
 }

@@ -56,7 +56,10 @@ pub struct Config {
     pub holdout: usize,
     /// Hold out the photos that these labels name (LERF-OVS, 3D-OVS or SPIn-NeRF), instead of every
     /// N-th.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "DIR", conflicts_with = "holdout"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "DIR", conflicts_with = "holdout")
+    )]
     pub holdout_labels: Option<PathBuf>,
     /// How to compute poses for photos without them.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
@@ -103,8 +106,11 @@ impl Default for Config {
 fn convention_parser() -> impl clap::builder::TypedValueParser<Value = PoseConvention> {
     use clap::builder::{PossibleValuesParser, TypedValueParser};
     let all = PoseConvention::ALL;
-    PossibleValuesParser::new(all.map(PoseConvention::name))
-        .map(move |name| all.into_iter().find(|convention| convention.name() == name).expect("one of them"))
+    PossibleValuesParser::new(all.map(PoseConvention::name)).map(move |name| {
+        all.into_iter()
+            .find(|convention| convention.name() == name)
+            .expect("one of them")
+    })
 }
 
 /// Parses a size such as `500M` into bytes. K, M and G are powers of 1,000.
@@ -118,7 +124,11 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
         "G" | "GB" => 1e9,
         _ => return Err(format!("'{unit}' is not a unit of size; use K, M or G")),
     };
-    let bytes = number.parse::<f64>().ok().filter(|n| *n > 0.0).ok_or_else(|| format!("'{text}' is not a positive size; write one such as 4G"))?;
+    let bytes = number
+        .parse::<f64>()
+        .ok()
+        .filter(|n| *n > 0.0)
+        .ok_or_else(|| format!("'{text}' is not a positive size; write one such as 4G"))?;
     Ok((bytes * factor) as u64)
 }
 
@@ -202,16 +212,22 @@ impl Brightness {
     ///
     /// # Errors
     /// A note that cannot be read.
-    pub fn of(manifest: &Manifest) -> crate::Result<Self> {
-        let Some(note) = manifest.notes.get(BRIGHTNESS) else { return Ok(Self::default()) };
+    pub fn from_manifest(manifest: &Manifest) -> crate::Result<Self> {
+        let Some(note) = manifest.notes.get(BRIGHTNESS) else {
+            return Ok(Self::default());
+        };
         serde_json::from_value(note.clone()).map_err(|error| {
             let mend = "run 'fastlgs preprocess' again";
-            crate::Error::Invalid(format!("scene.json: the brightness of the photos cannot be read ({error}); {mend}"))
+            crate::Error::Invalid(format!(
+                "scene.json: the brightness of the photos cannot be read ({error}); {mend}"
+            ))
         })
     }
 
     pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {
-        manifest.notes.insert(BRIGHTNESS.to_owned(), serde_json::to_value(self)?);
+        manifest
+            .notes
+            .insert(BRIGHTNESS.to_owned(), serde_json::to_value(self)?);
         Ok(())
     }
 

@@ -1,7 +1,7 @@
 //! Segments the training photos.
 
 use super::config::Config;
-use super::photos::Known;
+use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::error::{Context, bail};
 use crate::eyes::SegmenterKind;
@@ -20,40 +20,74 @@ use std::collections::BTreeMap;
 pub(super) fn segment(
     config: &Config,
     segmenter: &dyn Segmenter,
-    training: &[Known],
+    training: &[PreparedPhoto],
     folder: &SceneFolder,
     cache: &Cache,
     run: &Run,
 ) -> Result<(usize, BTreeMap<String, f64>)> {
     let work = run.work("masks", training.len() as u64);
     let identity = config.eyes.segmenter_identity()?;
-    let of_photo = |photo: &Known| -> Result<[usize; 3]> {
+    let of_photo = |photo: &PreparedPhoto| -> Result<[usize; 3]> {
         let name = &photo.camera.name;
-        let make = || segmenter.segment(name, &folder.photo(name)?).with_context(|| format!("segmenting {name}"));
+        let make = || {
+            segmenter
+                .segment(name, &folder.photo(name)?)
+                .with_context(|| format!("segmenting {name}"))
+        };
         let mut list = match &identity {
-            Some(identity) => cache.get("masks", &cache::key(&[b"list", &photo.key, identity.as_bytes()]), make)?,
+            Some(identity) => cache.get(
+                "masks",
+                &cache::key(&[b"list", &photo.key, identity.as_bytes()]),
+                make,
+            )?,
             None => make()?,
         };
-        if photo.bend != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
+        if photo.removed_k1 != 0.0 && config.eyes.segmenter == SegmenterKind::Import {
             // Imported masks show the photo before its additional distortion was removed.
-            list = list.undistorted(&photo.camera, &Distortion { k1: photo.bend, ..Distortion::default() });
+            list = list.undistorted(
+                &photo.camera,
+                &Distortion {
+                    k1: photo.removed_k1,
+                    ..Distortion::default()
+                },
+            );
         }
-        list.masks.retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
+        list.masks
+            .retain(|mask| config.eyes.keeps(mask.level) && mask.runs.area() > 0);
         list.save(&folder.masks_path(name))?;
         work.advance()?;
         Ok(Level::ALL.map(|level| list.count(level)))
     };
-    let counts = training.par_iter().map(of_photo).collect::<Result<Vec<_>>>()?;
+    let counts = training
+        .par_iter()
+        .map(of_photo)
+        .collect::<Result<Vec<_>>>()?;
     if counts.iter().flatten().all(|count| *count == 0) {
-        bail!("{}: no mask was found in any training photo; check the segmenter or the imported masks", config.photos.display());
+        bail!(
+            "{}: no mask was found in any training photo; check the segmenter or the imported masks",
+            config.photos.display()
+        );
     }
-    let without: Vec<&str> =
-        training.iter().zip(&counts).filter(|(_, c)| c.iter().all(|n| *n == 0)).map(|(p, _)| p.camera.name.as_str()).collect();
+    let without: Vec<&str> = training
+        .iter()
+        .zip(&counts)
+        .filter(|(_, c)| c.iter().all(|n| *n == 0))
+        .map(|(p, _)| p.camera.name.as_str())
+        .collect();
     if !without.is_empty() && config.eyes.segmenter == SegmenterKind::Import {
-        run.warn(&format!("{} of {} photos have no mask, or only empty ones: {}", without.len(), training.len(), without.join(", ")));
+        run.warn(&format!(
+            "{} of {} photos have no mask, or only empty ones: {}",
+            without.len(),
+            training.len(),
+            without.join(", ")
+        ));
     }
     let mean = |k: usize| counts.iter().map(|c| c[k]).sum::<usize>() as f64 / training.len() as f64;
-    let kept = Level::ALL.into_iter().filter(|level| config.eyes.keeps(*level));
-    let means = kept.map(|level| (level.name().to_owned(), mean(level as usize))).collect();
+    let kept = Level::ALL
+        .into_iter()
+        .filter(|level| config.eyes.keeps(*level));
+    let means = kept
+        .map(|level| (level.name().to_owned(), mean(level as usize)))
+        .collect();
     Ok((counts.iter().flatten().sum(), means))
 }

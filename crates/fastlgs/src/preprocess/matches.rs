@@ -1,6 +1,6 @@
 //! Matches key points of overlapping photos, and counts the matches between their masks.
 
-use super::photos::Known;
+use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::{Error, Result, Run, masks};
 use fastlgs_core::{Camera, SceneFolder};
@@ -15,15 +15,27 @@ use std::collections::{BTreeMap, BTreeSet};
 /// Matches each photo with its `neighbours` nearest photos, which the given poses decide. Photos in
 /// `lost`, whose poses are wrong, are matched with all others. Matches that contradict the poses
 /// are kept.
-pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, cache: &Cache, run: &Run) -> Result<Vec<PairMatches>> {
+pub(super) fn match_photos(
+    photos: &[PreparedPhoto],
+    lost: &[usize],
+    neighbours: usize,
+    cache: &Cache,
+    run: &Run,
+) -> Result<Vec<PairMatches>> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
-    let mut chosen: BTreeSet<(usize, usize)> = tracks::overlapping_pairs(&cameras, neighbours).into_iter().collect();
+    let mut chosen: BTreeSet<(usize, usize)> = tracks::overlapping_pairs(&cameras, neighbours)
+        .into_iter()
+        .collect();
     for &photo in lost {
-        chosen.extend((0..photos.len()).filter(|other| *other != photo).map(|other| (photo.min(other), photo.max(other))));
+        chosen.extend(
+            (0..photos.len())
+                .filter(|other| *other != photo)
+                .map(|other| (photo.min(other), photo.max(other))),
+        );
     }
     let work = run.work("matches", chosen.len() as u64);
     let match_pair = |(a, b): (usize, usize)| {
-        let pairs = of_pair(photos, a, b, cache)?;
+        let pairs = cached_matches(photos, a, b, cache)?;
         work.advance()?;
         Ok::<_, Error>(PairMatches { a, b, pairs })
     };
@@ -32,16 +44,42 @@ pub(super) fn match_photos(photos: &[Known], lost: &[usize], neighbours: usize, 
 }
 
 /// Returns the matches of photos `a` and `b` as pairs of key point indices. They are cached.
-pub(super) fn of_pair(photos: &[Known], a: usize, b: usize, cache: &Cache) -> Result<Vec<(usize, usize)>> {
-    let inputs = [&photos[a].key, &photos[b].key, keypoints::version().as_bytes()];
-    cache.get("matches", &cache::key(&inputs), || Ok(matching::matches(&photos[a].points, &photos[b].points)))
+pub(super) fn cached_matches(
+    photos: &[PreparedPhoto],
+    a: usize,
+    b: usize,
+    cache: &Cache,
+) -> Result<Vec<(usize, usize)>> {
+    let inputs = [
+        &photos[a].key,
+        &photos[b].key,
+        keypoints::version().as_bytes(),
+    ];
+    cache.get("matches", &cache::key(&inputs), || {
+        Ok(matching::matches(&photos[a].points, &photos[b].points))
+    })
 }
 
 /// Returns the matches between the photos in `kept` that agree with the poses. Photos are
 /// renumbered by their position in `kept`.
-pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
-    let place: BTreeMap<usize, usize> = kept.iter().enumerate().map(|(new, old)| (*old, new)).collect();
-    let renumbered = |m: &PairMatches| Some(PairMatches { a: *place.get(&m.a)?, b: *place.get(&m.b)?, pairs: m.pairs.clone() });
+pub(super) fn consistent_matches(
+    kept: &[usize],
+    matches: &[PairMatches],
+    cameras: &[Camera],
+    points: &[Keypoints],
+) -> Vec<PairMatches> {
+    let place: BTreeMap<usize, usize> = kept
+        .iter()
+        .enumerate()
+        .map(|(new, old)| (*old, new))
+        .collect();
+    let renumbered = |m: &PairMatches| {
+        Some(PairMatches {
+            a: *place.get(&m.a)?,
+            b: *place.get(&m.b)?,
+            pairs: m.pairs.clone(),
+        })
+    };
     let obeying = |m: PairMatches| m.obeying(cameras, points, tracks::TOLERANCE);
     matches.iter().filter_map(renumbered).map(obeying).collect()
 }
@@ -49,32 +87,51 @@ pub(super) fn between(kept: &[usize], matches: &[PairMatches], cameras: &[Camera
 /// Matches the same pairs of photos again along the epipolar lines of their poses. The result is
 /// for points and masks. It cannot verify poses, because every match on an epipolar line agrees
 /// with them.
-pub(super) fn guided(matches: &[PairMatches], cameras: &[Camera], points: &[Keypoints]) -> Vec<PairMatches> {
+pub(super) fn guided(
+    matches: &[PairMatches],
+    cameras: &[Camera],
+    points: &[Keypoints],
+) -> Vec<PairMatches> {
     let match_pair = |m: &PairMatches| {
         let f = keypoints::fundamental(&cameras[m.a], &cameras[m.b]);
-        PairMatches { pairs: matching::guided(&points[m.a], &points[m.b], &f, tracks::TOLERANCE), ..*m }
+        PairMatches {
+            pairs: matching::guided(&points[m.a], &points[m.b], &f, tracks::TOLERANCE),
+            ..*m
+        }
     };
     matches.par_iter().map(match_pair).collect()
 }
 
 /// Least number of matches with another photo; a photo with fewer counts as isolated.
-const FEW: usize = 15;
+const MIN_MATCHES: usize = 15;
 
 /// Returns a warning if photos overlap with no other photo, else `None`. It names the isolated
 /// photo with the largest angle to its nearest photo.
 pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Option<String> {
     let mut most = vec![0; cameras.len()];
     for m in matches {
-        [m.a, m.b].into_iter().for_each(|photo| most[photo] = most[photo].max(m.pairs.len()));
+        [m.a, m.b]
+            .into_iter()
+            .for_each(|photo| most[photo] = most[photo].max(m.pairs.len()));
     }
-    let alone: Vec<usize> = (0..cameras.len()).filter(|&photo| most[photo] < FEW).collect();
-    let turned = |a: usize, b: usize| cameras[a].forward().angle_between(cameras[b].forward()).to_degrees();
+    let alone: Vec<usize> = (0..cameras.len())
+        .filter(|&photo| most[photo] < MIN_MATCHES)
+        .collect();
+    let turned = |a: usize, b: usize| {
+        cameras[a]
+            .forward()
+            .angle_between(cameras[b].forward())
+            .to_degrees()
+    };
     let gap = |&photo: &usize| {
         let others = (0..cameras.len()).filter(|other| *other != photo);
         let nearest = others.min_by(|a, b| turned(photo, *a).total_cmp(&turned(photo, *b)))?;
         Some((photo, nearest, turned(photo, nearest)))
     };
-    let (photo, nearest, degrees) = alone.iter().filter_map(gap).max_by(|a, b| a.2.total_cmp(&b.2))?;
+    let (photo, nearest, degrees) = alone
+        .iter()
+        .filter_map(gap)
+        .max_by(|a, b| a.2.total_cmp(&b.2))?;
     Some(format!(
         "{} of {} photos overlap too little with any other to reconstruct shapes; the largest gap is {degrees:.0} degrees, from {} to {}: \
          take photos between them",
@@ -86,15 +143,32 @@ pub(super) fn warn_of_gaps(cameras: &[Camera], matches: &[PairMatches]) -> Optio
 }
 
 /// Counts the key point matches between the masks of matched photos (level whole).
-pub(super) fn between_masks(folder: &SceneFolder, cameras: &[Camera], points: &[Keypoints], matches: &[PairMatches]) -> Result<Pairs> {
+pub(super) fn between_masks(
+    folder: &SceneFolder,
+    cameras: &[Camera],
+    points: &[Keypoints],
+    matches: &[PairMatches],
+) -> Result<Pairs> {
     let of_view = |(view, camera): (usize, &Camera)| -> Result<Vec<u16>> {
-        let map = masks::whole(folder, camera)?;
+        let map = masks::whole_masks(folder, camera)?;
         // Removing distortion can move key points beyond the edges of the photo.
-        let inside = |p: &Vec2| p.x >= 0.0 && p.y >= 0.0 && p.x < map.width as f32 && p.y < map.height as f32;
-        let label = |p: &Vec2| if inside(p) { map.at(p.x as u32, p.y as u32) } else { 0 };
+        let inside = |p: &Vec2| {
+            p.x >= 0.0 && p.y >= 0.0 && p.x < map.width as f32 && p.y < map.height as f32
+        };
+        let label = |p: &Vec2| {
+            if inside(p) {
+                map.at(p.x as u32, p.y as u32)
+            } else {
+                0
+            }
+        };
         Ok(points[view].positions.iter().map(label).collect())
     };
-    let label_at: Vec<Vec<u16>> = cameras.iter().enumerate().map(of_view).collect::<Result<_>>()?;
+    let label_at: Vec<Vec<u16>> = cameras
+        .iter()
+        .enumerate()
+        .map(of_view)
+        .collect::<Result<_>>()?;
     let mut out = Pairs::new();
     for m in matches {
         for &(i, j) in &m.pairs {
@@ -114,12 +188,35 @@ mod tests {
 
     #[test]
     fn the_largest_gap_is_named() {
-        let eye = |degrees: f32| 4.0 * Vec3::new(degrees.to_radians().sin(), 0.0, -degrees.to_radians().cos());
-        let camera = |degrees: f32| Camera::look_at(&format!("{degrees}.png"), eye(degrees), Vec3::ZERO, Vec3::Y, 64, 48, 0.9);
+        let eye = |degrees: f32| {
+            4.0 * Vec3::new(degrees.to_radians().sin(), 0.0, -degrees.to_radians().cos())
+        };
+        let camera = |degrees: f32| {
+            Camera::look_at(
+                &format!("{degrees}.png"),
+                eye(degrees),
+                Vec3::ZERO,
+                Vec3::Y,
+                64,
+                48,
+                0.9,
+            )
+        };
         let cameras = [camera(0.0), camera(10.0), camera(60.0)];
-        let shared = |a, b, count| PairMatches { a, b, pairs: vec![(0, 0); count] };
+        let shared = |a, b, count| PairMatches {
+            a,
+            b,
+            pairs: vec![(0, 0); count],
+        };
         let warning = warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 4)]).unwrap();
-        assert!(warning.starts_with("1 of 3 photos") && warning.contains("50 degrees, from 60.png to 10.png"), "{warning}");
-        assert_eq!(warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 40)]), None);
+        assert!(
+            warning.starts_with("1 of 3 photos")
+                && warning.contains("50 degrees, from 60.png to 10.png"),
+            "{warning}"
+        );
+        assert_eq!(
+            warn_of_gaps(&cameras, &[shared(0, 1, 80), shared(1, 2, 40)]),
+            None
+        );
     }
 }

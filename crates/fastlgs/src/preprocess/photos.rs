@@ -6,9 +6,9 @@ use crate::cache::{self, Cache, Key};
 use crate::error::{Context, bail};
 use crate::{Result, Run};
 use fastlgs_core::dataset::{Dataset, PosedPhoto};
-use fastlgs_core::image_io::WayUp;
+use fastlgs_core::image_io::OrientationRule;
 use fastlgs_core::mask_image::MaskImage;
-use fastlgs_core::undistort::{Distortion, imaged, undistort, undistort_gray};
+use fastlgs_core::undistort::{Distortion, coverage_mask, undistort, undistort_gray};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
 use fastlgs_vision::photo_quality::{self, Impression};
@@ -28,7 +28,7 @@ pub struct Photo {
     /// Mask of the pixels that count: those below 128 are ignored.
     ignore: Option<GrayImage>,
     /// Share of the photo that its mask file keeps; `None` without a mask file.
-    drawn: Option<Extent>,
+    mask_extent: Option<Extent>,
 }
 
 /// Share of the pixels of a photo that a mask covers.
@@ -51,7 +51,7 @@ impl Extent {
 
 /// Data of a prepared photo that stays in memory. Pixels stay on disk, so that memory suffices for
 /// thousands of photos.
-pub(super) struct Known {
+pub(super) struct PreparedPhoto {
     pub camera: Camera,
     /// Fingerprint of the pixels.
     pub key: Key,
@@ -63,19 +63,31 @@ pub(super) struct Known {
     pub points: Keypoints,
     /// Colour at each key point.
     pub colors: Vec<[u8; 3]>,
-    /// Radial term that `straighten` removed in addition to the stated distortion; 0 if none.
-    pub bend: f32,
+    /// Radial term that `remove_distortion` removed in addition to the stated distortion; 0 if none.
+    pub removed_k1: f32,
 }
 
 /// Warns about blurred and repeated photos, which are used nevertheless.
-pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec<String>) {
+pub(super) fn warn_of_bad_photos(photos: &[PreparedPhoto], run: &Run, warnings: &mut Vec<String>) {
     let seen: Vec<Impression> = photos.iter().map(|p| p.impression.clone()).collect();
-    for (list, what) in
-        [(photo_quality::blurred(&seen), "are blurred"), (photo_quality::repeated(&seen), "are nearly identical to the photo before them")]
-    {
+    for (list, what) in [
+        (photo_quality::blurred(&seen), "are blurred"),
+        (
+            photo_quality::repeated(&seen),
+            "are nearly identical to the photo before them",
+        ),
+    ] {
         if !list.is_empty() {
-            let names: Vec<&str> = list.iter().map(|&i| photos[i].camera.name.as_str()).collect();
-            let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), names.join(", "));
+            let names: Vec<&str> = list
+                .iter()
+                .map(|&i| photos[i].camera.name.as_str())
+                .collect();
+            let warning = format!(
+                "{} of {} photos {what}: {}",
+                list.len(),
+                photos.len(),
+                names.join(", ")
+            );
             run.warn(&warning);
             warnings.push(warning);
         }
@@ -87,27 +99,61 @@ pub(super) fn warn_of_bad_photos(photos: &[Known], run: &Run, warnings: &mut Vec
 /// # Errors
 /// The mask files ignore every pixel of all photos that have one, or no pixel of them; or all
 /// photos are fully transparent.
-pub(super) fn check_masks(photos: &[Known], run: &Run, warnings: &mut Vec<String>) -> Result<()> {
-    let masked: Vec<&Known> = photos.iter().filter(|p| p.drawn.is_some()).collect();
-    let leaving = |extent| masked.iter().filter(|p| p.drawn == Some(extent)).map(|p| p.camera.name.as_str()).collect::<Vec<_>>();
+pub(super) fn check_masks(
+    photos: &[PreparedPhoto],
+    run: &Run,
+    warnings: &mut Vec<String>,
+) -> Result<()> {
+    let masked: Vec<&PreparedPhoto> = photos.iter().filter(|p| p.drawn.is_some()).collect();
+    let leaving = |extent| {
+        masked
+            .iter()
+            .filter(|p| p.drawn == Some(extent))
+            .map(|p| p.camera.name.as_str())
+            .collect::<Vec<_>>()
+    };
     let (nothing, everything) = (leaving(Extent::Nothing), leaving(Extent::Everything));
-    let transparent: Vec<&str> = photos.iter().filter(|p| p.opaque == Extent::Nothing).map(|p| p.camera.name.as_str()).collect();
+    let transparent: Vec<&str> = photos
+        .iter()
+        .filter(|p| p.opaque == Extent::Nothing)
+        .map(|p| p.camera.name.as_str())
+        .collect();
     if !masked.is_empty() && nothing.len() == masked.len() {
-        bail!("the masks of all {} masked photos leave nothing to train on, because black pixels are ignored; check whether the masks are inverted", masked.len());
+        bail!(
+            "the masks of all {} masked photos leave nothing to train on, because black pixels are ignored; check whether the masks are inverted",
+            masked.len()
+        );
     }
     if !masked.is_empty() && everything.len() == masked.len() {
-        bail!("the masks of all {} masked photos ignore no pixel; check that they are the right files and that ignored pixels are black", masked.len());
+        bail!(
+            "the masks of all {} masked photos ignore no pixel; check that they are the right files and that ignored pixels are black",
+            masked.len()
+        );
     }
     if transparent.len() == photos.len() {
-        bail!("all {} photos are fully transparent; export them with their colours", photos.len());
+        bail!(
+            "all {} photos are fully transparent; export them with their colours",
+            photos.len()
+        );
     }
     for (list, what) in [
-        (nothing, "have masks that ignore every pixel, so that training does not use them"),
+        (
+            nothing,
+            "have masks that ignore every pixel, so that training does not use them",
+        ),
         (everything, "have masks that ignore no pixel"),
-        (transparent, "are fully transparent and show only the background"),
+        (
+            transparent,
+            "are fully transparent and show only the background",
+        ),
     ] {
         if !list.is_empty() {
-            let warning = format!("{} of {} photos {what}: {}", list.len(), photos.len(), list.join(", "));
+            let warning = format!(
+                "{} of {} photos {what}: {}",
+                list.len(),
+                photos.len(),
+                list.join(", ")
+            );
             run.warn(&warning);
             warnings.push(warning);
         }
@@ -116,7 +162,11 @@ pub(super) fn check_masks(photos: &[Known], run: &Run, warnings: &mut Vec<String
 }
 
 /// Sets the colour of points that come without one to the mean over the photos that show them.
-pub(super) fn color_points(dataset: &mut Dataset, photos: &[Known], folder: &SceneFolder) -> Result<()> {
+pub(super) fn color_points(
+    dataset: &mut Dataset,
+    photos: &[PreparedPhoto],
+    folder: &SceneFolder,
+) -> Result<()> {
     if dataset.shown_in.is_empty() {
         return Ok(());
     }
@@ -124,15 +174,27 @@ pub(super) fn color_points(dataset: &mut Dataset, photos: &[Known], folder: &Sce
     for (index, known) in photos.iter().enumerate() {
         let pixels = folder.photo(&known.camera.name)?;
         let shows = |list: &Vec<u32>| list.is_empty() || list.contains(&(index as u32));
-        for (point, sum) in dataset.points.iter().zip(&mut sums).zip(&dataset.shown_in).filter(|(_, list)| shows(list)).map(|p| p.0) {
-            if let Some((place, _)) = known.camera.see(point.position) {
+        for (point, sum) in dataset
+            .points
+            .iter()
+            .zip(&mut sums)
+            .zip(&dataset.shown_in)
+            .filter(|(_, list)| shows(list))
+            .map(|p| p.0)
+        {
+            if let Some((place, _)) = known.camera.pixel_and_depth(point.position) {
                 let (x, y) = (place as u32 % pixels.width(), place as u32 / pixels.width());
                 let [r, g, b] = pixels.get_pixel(x, y).0.map(u32::from);
                 *sum = [sum[0] + r, sum[1] + g, sum[2] + b, sum[3] + 1];
             }
         }
     }
-    for (point, [r, g, b, count]) in dataset.points.iter_mut().zip(sums).filter(|(_, sum)| sum[3] > 0) {
+    for (point, [r, g, b, count]) in dataset
+        .points
+        .iter_mut()
+        .zip(sums)
+        .filter(|(_, sum)| sum[3] > 0)
+    {
         point.color = [r, g, b].map(|sum| (sum / count) as u8);
     }
     Ok(())
@@ -143,19 +205,30 @@ const BYTES_A_PIXEL: u64 = 12;
 
 /// Loads all photos, writes the prepared photos into the scene folder, and detects their key
 /// points. `config.memory` limits how many are loaded at once.
-pub(super) fn load(dataset: &Dataset, config: &Config, folder: &SceneFolder, cache: &Cache, run: &Run) -> Result<Vec<Known>> {
+pub(super) fn load(
+    dataset: &Dataset,
+    config: &Config,
+    folder: &SceneFolder,
+    cache: &Cache,
+    run: &Run,
+) -> Result<Vec<PreparedPhoto>> {
     let work = run.work("photos", dataset.photos.len() as u64);
-    let largest = dataset.photos.iter().map(|p| u64::from(p.camera.width) * u64::from(p.camera.height)).max().unwrap_or(1);
+    let largest = dataset
+        .photos
+        .iter()
+        .map(|p| u64::from(p.camera.width) * u64::from(p.camera.height))
+        .max()
+        .unwrap_or(1);
     let together = (config.memory / (BYTES_A_PIXEL * largest.max(1))).clamp(1, 256) as usize;
     let mut photos = Vec::with_capacity(dataset.photos.len());
     for some in dataset.photos.chunks(together) {
-        let loaded: Vec<Result<Known>> = some
+        let loaded: Vec<Result<PreparedPhoto>> = some
             .par_iter()
             .map(|posed| {
                 let photo = load_photo(posed, config.max_side)?;
                 save_photo(&photo, folder)?;
                 work.advance()?;
-                known(photo, cache)
+                prepare(photo, cache)
             })
             .collect();
         for photo in loaded {
@@ -171,26 +244,63 @@ fn fingerprint(camera: &Camera, pixels: &RgbImage) -> Key {
 
 /// Detects key points, and measures colours, sharpness and coverage of a prepared photo. Key points
 /// are cached.
-fn known(Photo { camera, pixels, alpha, drawn, .. }: Photo, cache: &Cache) -> Result<Known> {
-    let covered = |alpha: GrayImage| Extent::of(alpha.pixels().filter(|p| p[0] > 0).count(), alpha.pixels().len());
+fn prepare(
+    Photo {
+        camera,
+        pixels,
+        alpha,
+        mask_extent: drawn,
+        ..
+    }: Photo,
+    cache: &Cache,
+) -> Result<PreparedPhoto> {
+    let covered = |alpha: GrayImage| {
+        Extent::of(
+            alpha.pixels().filter(|p| p[0] > 0).count(),
+            alpha.pixels().len(),
+        )
+    };
     let opaque = alpha.map_or(Extent::Everything, covered);
     let key = fingerprint(&camera, &pixels);
     let inputs = cache::key(&[&key, keypoints::version().as_bytes()]);
-    let points = cache.get("key points", &inputs, || Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?))?;
-    let color = |p: &Vec2| pixels.get_pixel((p.x as u32).min(pixels.width() - 1), (p.y as u32).min(pixels.height() - 1)).0;
+    let points = cache.get("key points", &inputs, || {
+        Ok(keypoints::detect(&image::imageops::grayscale(&pixels))?)
+    })?;
+    let color = |p: &Vec2| {
+        pixels
+            .get_pixel(
+                (p.x as u32).min(pixels.width() - 1),
+                (p.y as u32).min(pixels.height() - 1),
+            )
+            .0
+    };
     let colors = points.positions.iter().map(color).collect();
-    Ok(Known { impression: Impression::of(&pixels), drawn, opaque, camera, key, points, colors, bend: 0.0 })
+    Ok(PreparedPhoto {
+        impression: Impression::of(&pixels),
+        drawn,
+        opaque,
+        camera,
+        key,
+        points,
+        colors,
+        removed_k1: 0.0,
+    })
 }
 
 /// Writes a prepared photo with its masks into the scene folder.
 fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
     let name = &photo.camera.name;
     image_io::save_png(&folder.photo_path(name), photo.pixels.clone())?;
-    for (mask, path) in [(&photo.alpha, folder.alpha_path(name)), (&photo.ignore, folder.ignore_path(name))] {
+    for (mask, path) in [
+        (&photo.alpha, folder.alpha_path(name)),
+        (&photo.ignore, folder.ignore_path(name)),
+    ] {
         match mask {
             Some(mask) => image_io::save_png(&path, mask.clone())?,
             // A mask of an earlier run does not belong to this photo.
-            None if path.is_file() => std::fs::remove_file(&path).with_context(|| path.display().to_string())?,
+            None if path.is_file() => {
+                std::fs::remove_file(&path).with_context(|| path.display().to_string())?
+            }
             None => {}
         }
     }
@@ -199,18 +309,48 @@ fn save_photo(photo: &Photo, folder: &SceneFolder) -> Result<()> {
 
 /// Removes additional radial distortion from the prepared photos and their key points. `k1` holds
 /// the radial term of each photo, for the current focal length of its camera.
-pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder) -> Result<()> {
+pub(super) fn remove_distortion(
+    photos: &mut [PreparedPhoto],
+    k1: &[f32],
+    folder: &SceneFolder,
+) -> Result<()> {
     photos.par_iter_mut().zip(k1).try_for_each(|(known, &k1)| {
-        let (camera, lens) = (known.camera.clone(), Distortion { k1, ..Distortion::default() });
-        let known_mask = |path: PathBuf| path.is_file().then(|| image_io::load_gray(&path)).transpose();
-        let (alpha, ignore) = (known_mask(folder.alpha_path(&camera.name))?, known_mask(folder.ignore_path(&camera.name))?);
+        let (camera, lens) = (
+            known.camera.clone(),
+            Distortion {
+                k1,
+                ..Distortion::default()
+            },
+        );
+        let known_mask = |path: PathBuf| {
+            path.is_file()
+                .then(|| image_io::load_gray(&path))
+                .transpose()
+        };
+        let (alpha, ignore) = (
+            known_mask(folder.alpha_path(&camera.name))?,
+            known_mask(folder.ignore_path(&camera.name))?,
+        );
         let mask = |mask: &GrayImage| undistort_gray(mask, &camera, &lens);
-        let ignore = in_both(ignore.as_ref().map(mask), imaged(&camera, &lens));
+        let ignore = in_both(ignore.as_ref().map(mask), coverage_mask(&camera, &lens));
         let color = |photo: &RgbImage| undistort(photo, &camera, &lens);
         let (pixels, alpha) = resampled(&folder.photo(&camera.name)?, alpha.as_ref(), color, mask);
-        (known.key, known.bend) = (fingerprint(&camera, &pixels), k1);
-        known.points.positions.iter_mut().for_each(|p| *p = lens.straight_pixel(&camera, *p));
-        save_photo(&Photo { camera, pixels, alpha, ignore, drawn: known.drawn }, folder)
+        (known.key, known.removed_k1) = (fingerprint(&camera, &pixels), k1);
+        known
+            .points
+            .positions
+            .iter_mut()
+            .for_each(|p| *p = lens.undistort_pixel(&camera, *p));
+        save_photo(
+            &Photo {
+                camera,
+                pixels,
+                alpha,
+                ignore,
+                mask_extent: known.drawn,
+            },
+            folder,
+        )
     })
 }
 
@@ -218,7 +358,9 @@ pub(super) fn straighten(photos: &mut [Known], k1: &[f32], folder: &SceneFolder)
 fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage> {
     match (one, other) {
         (Some(mut one), Some(other)) => {
-            one.pixels_mut().zip(other.pixels()).for_each(|(a, b)| a[0] = a[0].min(b[0]));
+            one.pixels_mut()
+                .zip(other.pixels())
+                .for_each(|(a, b)| a[0] = a[0].min(b[0]));
             Some(one)
         }
         (one, other) => one.or(other),
@@ -231,11 +373,18 @@ fn in_both(one: Option<GrayImage>, other: Option<GrayImage>) -> Option<GrayImage
 /// # Errors
 /// The photo or its mask cannot be read, or its proportions differ from those of its camera.
 pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
-    let way_up = if posed.upright { WayUp::Upright } else { WayUp::AsPosed(posed.camera.width, posed.camera.height) };
+    let way_up = if posed.upright {
+        OrientationRule::Upright
+    } else {
+        OrientationRule::AsPosed(posed.camera.width, posed.camera.height)
+    };
     let image_io::Photo { pixels: raw, alpha } = image_io::load_photo(&posed.path, way_up)?;
     // The size of the file is authoritative: some tools scale photos and keep the file of the
     // poses.
-    let camera = posed.camera.resized(raw.width(), raw.height()).shrunk_to(max_side);
+    let camera = posed
+        .camera
+        .resized(raw.width(), raw.height())
+        .shrunk_to(max_side);
     if !is_alike(raw.dimensions(), (posed.camera.width, posed.camera.height)) {
         bail!(
             "{}: the photo is {}x{}, but its camera is {}x{}; check whether it was rotated or cropped after the poses were computed",
@@ -246,10 +395,20 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
             posed.camera.height
         );
     }
-    let mask = |mask: &GrayImage| undistort_gray(&image_io::resize_gray(mask, camera.width, camera.height), &camera, &posed.distortion);
+    let mask = |mask: &GrayImage| {
+        undistort_gray(
+            &image_io::resize_gray(mask, camera.width, camera.height),
+            &camera,
+            &posed.distortion,
+        )
+    };
     let color = |photo: &RgbImage| {
         let small = image_io::resize(photo, camera.width, camera.height);
-        if posed.distortion.is_none() { small } else { undistort(&small, &camera, &posed.distortion) }
+        if posed.distortion.is_none() {
+            small
+        } else {
+            undistort(&small, &camera, &posed.distortion)
+        }
     };
     let (pixels, alpha) = resampled(&raw, alpha.as_ref(), color, mask);
     let (mut ignore, mut drawn) = (None, None);
@@ -257,13 +416,24 @@ pub fn load_photo(posed: &PosedPhoto, max_side: u32) -> Result<Photo> {
         let own = MaskImage::load(path)?;
         if !is_alike((own.width, own.height), raw.dimensions()) {
             let (width, height) = raw.dimensions();
-            bail!("{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped", path.display(), own.width, own.height);
+            bail!(
+                "{}: the mask is {}x{}, but its photo is {width}x{height}; check whether it was rotated or cropped",
+                path.display(),
+                own.width,
+                own.height
+            );
         }
         drawn = Some(Extent::of(own.area(), own.inside.len()));
         ignore = Some(mask(&own.to_gray()));
     }
-    let ignore = in_both(ignore, imaged(&camera, &posed.distortion));
-    Ok(Photo { pixels, alpha, ignore, drawn, camera })
+    let ignore = in_both(ignore, coverage_mask(&camera, &posed.distortion));
+    Ok(Photo {
+        pixels,
+        alpha,
+        ignore,
+        mask_extent: drawn,
+        camera,
+    })
 }
 
 /// Returns whether two sizes have the same proportions within 2 %, which allows for rounding.
@@ -279,7 +449,9 @@ fn resampled(
     color: impl Fn(&RgbImage) -> RgbImage,
     mask: impl Fn(&GrayImage) -> GrayImage,
 ) -> (RgbImage, Option<GrayImage>) {
-    let Some(alpha) = alpha else { return (color(pixels), None) };
+    let Some(alpha) = alpha else {
+        return (color(pixels), None);
+    };
     let times = |photo: &mut RgbImage, alpha: &GrayImage, factor: fn(f32) -> f32| {
         for (pixel, covered) in photo.pixels_mut().zip(alpha.pixels()) {
             let factor = factor(f32::from(covered[0]) / 255.0);
@@ -289,7 +461,9 @@ fn resampled(
     let mut weighted = pixels.clone();
     times(&mut weighted, alpha, |covered| covered);
     let (mut pixels, alpha) = (color(&weighted), mask(alpha));
-    times(&mut pixels, &alpha, |covered| if covered > 0.0 { 1.0 / covered } else { 0.0 });
+    times(&mut pixels, &alpha, |covered| {
+        if covered > 0.0 { 1.0 / covered } else { 0.0 }
+    });
     (pixels, Some(alpha))
 }
 
@@ -303,19 +477,39 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let photos = dir.path().join("photos");
         for (name, color) in [("a.png", [200, 10, 20]), ("b.png", [100, 30, 40])] {
-            image_io::save_png(&photos.join("images").join(name), RgbImage::from_pixel(64, 64, Rgb(color))).unwrap();
+            image_io::save_png(
+                &photos.join("images").join(name),
+                RgbImage::from_pixel(64, 64, Rgb(color)),
+            )
+            .unwrap();
         }
         let model = photos.join("sparse/0");
         std::fs::create_dir_all(&model).unwrap();
         let write = |name: &str, text: &str| std::fs::write(model.join(name), text).unwrap();
         write("cameras.txt", "1 PINHOLE 64 64 60 60 32 32\n");
-        write("images.txt", "1 1 0 0 0 0 0 4 1 a.png\n\n2 1 0 0 0 0 0 4 1 b.png\n\n");
+        write(
+            "images.txt",
+            "1 1 0 0 0 0 0 4 1 a.png\n\n2 1 0 0 0 0 0 4 1 b.png\n\n",
+        );
         // Both photos show the first point; only the second photo shows the second point.
-        write("points3D.txt", "1 0 0 0 0 0 0 0.5 1 0 2 0\n2 0.1 0 0 0 0 0 0.5 2 1\n");
+        write(
+            "points3D.txt",
+            "1 0 0 0 0 0 0 0.5 1 0 2 0\n2 0.1 0 0 0 0 0 0.5 2 1\n",
+        );
         let mut dataset = fastlgs_core::dataset::load(&photos).unwrap();
         let folder = SceneFolder::new(dir.path().join("scene"));
-        let (cache, run) = (Cache::new(&folder), Run { device: "cpu", seed: 0, progress: &crate::Silent });
-        let config = Config { photos, ..Config::default() };
+        let (cache, run) = (
+            Cache::new(&folder),
+            Run {
+                device: "cpu",
+                seed: 0,
+                progress: &crate::Silent,
+            },
+        );
+        let config = Config {
+            photos,
+            ..Config::default()
+        };
         let known = load(&dataset, &config, &folder, &cache, &run).unwrap();
         color_points(&mut dataset, &known, &folder).unwrap();
         let colors: Vec<[u8; 3]> = dataset.points.iter().map(|point| point.color).collect();
@@ -327,9 +521,22 @@ mod tests {
         // The left half is white. The right half is transparent and black, as files store it.
         let pixels = RgbImage::from_fn(6, 2, |x, _| Rgb([if x < 3 { 255 } else { 0 }; 3]));
         let alpha = GrayImage::from_fn(6, 2, |x, _| Luma([if x < 3 { 255 } else { 0 }]));
-        let (half, covered) = resampled(&pixels, Some(&alpha), |p| image_io::resize(p, 3, 1), |m| image_io::resize_gray(m, 3, 1));
+        let (half, covered) = resampled(
+            &pixels,
+            Some(&alpha),
+            |p| image_io::resize(p, 3, 1),
+            |m| image_io::resize_gray(m, 3, 1),
+        );
         let covered = covered.unwrap();
-        assert!((1..255).contains(&covered.get_pixel(1, 0)[0]), "{covered:?}");
-        assert!(half.pixels().zip(covered.pixels()).all(|(p, a)| a[0] == 0 || p[0] >= 254), "{half:?}");
+        assert!(
+            (1..255).contains(&covered.get_pixel(1, 0)[0]),
+            "{covered:?}"
+        );
+        assert!(
+            half.pixels()
+                .zip(covered.pixels())
+                .all(|(p, a)| a[0] == 0 || p[0] >= 254),
+            "{half:?}"
+        );
     }
 }

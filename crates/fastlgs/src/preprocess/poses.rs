@@ -1,7 +1,7 @@
 //! Poses: computes missing ones, and verifies and corrects given ones.
 
 use super::config::{Adjusted, Poses, Sfm};
-use super::photos::Known;
+use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::error::bail;
 use crate::progress::Work;
@@ -22,11 +22,26 @@ use std::path::{Path, PathBuf};
 ///
 /// # Errors
 /// No tool is installed, it fails or places no photo, or the run is cancelled.
-pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm, run: &Run) -> Result<Dataset> {
-    let images = structure::photos_in(&dataset::images_folder(photos).unwrap_or_else(|| photos.join("images")))?;
+pub(super) fn find(
+    photos: &Path,
+    folder: &SceneFolder,
+    cache: &Cache,
+    sfm: Sfm,
+    run: &Run,
+) -> Result<Dataset> {
+    let images = structure::photos_in(
+        &dataset::images_folder(photos).unwrap_or_else(|| photos.join("images")),
+    )?;
     let mut inputs = vec![format!("{sfm:?} {} {}", run.seed, keypoints::version()).into_bytes()];
     for image in &images {
-        inputs.extend([image.file_name().unwrap_or_default().as_encoded_bytes().to_vec(), cache::key(&[&fs::read(image)?]).to_vec()]);
+        inputs.extend([
+            image
+                .file_name()
+                .unwrap_or_default()
+                .as_encoded_bytes()
+                .to_vec(),
+            cache::key(&[&fs::read(image)?]).to_vec(),
+        ]);
     }
     let key = cache::key(&inputs.iter().map(Vec::as_slice).collect::<Vec<_>>());
     let model = folder.root.join("sparse/0");
@@ -34,13 +49,21 @@ pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm,
         let tool = Tool::find(sfm == Sfm::Colmap)?;
         // `colmap` counts pixels as stored in the file; our key points are in the upright photo
         // (EXIF).
-        Ok((matches!(tool, Tool::Pycolmap(_)), reconstruct(&tool, photos, &images, folder, run)?))
+        Ok((
+            matches!(tool, Tool::Pycolmap(_)),
+            reconstruct(&tool, photos, &images, folder, run)?,
+        ))
     })?;
     for (name, bytes) in files {
-        fs::write_atomic(&model.join(name), |file| std::io::Write::write_all(file, &bytes))?;
+        fs::write_atomic(&model.join(name), |file| {
+            std::io::Write::write_all(file, &bytes)
+        })?;
     }
     let mut dataset = dataset::load_model(photos, &model)?;
-    dataset.photos.iter_mut().for_each(|photo| photo.upright = upright);
+    dataset
+        .photos
+        .iter_mut()
+        .for_each(|photo| photo.upright = upright);
     // The convention of a computed model is known.
     dataset.conventions.truncate(1);
     Ok(dataset)
@@ -54,31 +77,43 @@ pub(super) fn find(photos: &Path, folder: &SceneFolder, cache: &Cache, sfm: Sfm,
 /// equally well, but not the usual one.
 pub(super) fn settle_convention(
     dataset: &mut Dataset,
-    photos: &mut [Known],
+    photos: &mut [PreparedPhoto],
     asked: Option<PoseConvention>,
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<()> {
     let standard = dataset.conventions[0];
-    let names = |list: &[PoseConvention]| list.iter().map(|c| c.name()).collect::<Vec<_>>().join(", ");
+    let names =
+        |list: &[PoseConvention]| list.iter().map(|c| c.name()).collect::<Vec<_>>().join(", ");
     let chosen = match asked {
         Some(asked) if !dataset.conventions.contains(&asked) => {
             let all = names(&dataset.conventions);
-            bail!("pose_convention {}: the file of the poses cannot have this convention; choose one of {all}", asked.name());
+            bail!(
+                "pose_convention {}: the file of the poses cannot have this convention; choose one of {all}",
+                asked.name()
+            );
         }
         Some(asked) => asked,
         None if dataset.conventions.len() < 2 => standard,
         None => {
-            let keypoints: Vec<Keypoints> = photos.iter().map(|photo| photo.points.clone()).collect();
+            let keypoints: Vec<Keypoints> =
+                photos.iter().map(|photo| photo.points.clone()).collect();
             let matches = pose_convention::sample(&keypoints);
             let conventions = dataset.conventions.clone();
             let by = |convention: PoseConvention| {
-                dataset.read_poses_by(convention);
-                let pose = |(known, posed): (&Known, &PosedPhoto)| Camera {
+                dataset.apply_convention(convention);
+                let pose = |(known, posed): (&PreparedPhoto, &PosedPhoto)| Camera {
                     world_to_camera: posed.camera.world_to_camera,
                     ..known.camera.clone()
                 };
-                (convention, photos.iter().zip(&dataset.photos).map(pose).collect::<Vec<_>>())
+                (
+                    convention,
+                    photos
+                        .iter()
+                        .zip(&dataset.photos)
+                        .map(pose)
+                        .collect::<Vec<_>>(),
+                )
             };
             let candidates: Vec<_> = conventions.into_iter().map(by).collect();
             match pose_convention::judge(&candidates, &keypoints, &matches) {
@@ -104,7 +139,7 @@ pub(super) fn settle_convention(
             }
         }
     };
-    dataset.read_poses_by(chosen);
+    dataset.apply_convention(chosen);
     for (known, posed) in photos.iter_mut().zip(&dataset.photos) {
         posed.camera.check().map_err(crate::Error::Invalid)?;
         known.camera.world_to_camera = posed.camera.world_to_camera;
@@ -114,20 +149,45 @@ pub(super) fn settle_convention(
 
 /// Runs structure from motion. Returns names and contents of the files of the model that places
 /// most photos.
-fn reconstruct(tool: &Tool, photos: &Path, images: &[PathBuf], folder: &SceneFolder, run: &Run) -> Result<Vec<(String, Vec<u8>)>> {
+fn reconstruct(
+    tool: &Tool,
+    photos: &Path,
+    images: &[PathBuf],
+    folder: &SceneFolder,
+    run: &Run,
+) -> Result<Vec<(String, Vec<u8>)>> {
     let work = run.work("poses", 0);
-    run.warn(&format!("{}: no poses were found; structure from motion computes them, which takes minutes", photos.display()));
-    let folders = images.first().and_then(|image| image.parent()).map(dataset::folders_within).unwrap_or_default();
+    run.warn(&format!(
+        "{}: no poses were found; structure from motion computes them, which takes minutes",
+        photos.display()
+    ));
+    let folders = images
+        .first()
+        .and_then(|image| image.parent())
+        .map(dataset::folders_within)
+        .unwrap_or_default();
     if !folders.is_empty() {
-        run.warn(&format!("photos in subfolders of images/ are not read ({}): move them to images/", folders.join(", ")));
+        run.warn(&format!(
+            "photos in subfolders of images/ are not read ({}): move them to images/",
+            folders.join(", ")
+        ));
     }
     let partial = folder.root.join(PARTIAL);
-    let found = structure::reconstruct(tool, images, &partial, run.seed, |stage, line| told(&work, stage, line));
+    let found = structure::reconstruct(tool, images, &partial, run.seed, |stage, line| {
+        report_line(&work, stage, line)
+    });
     work.check()?;
     let model = found?;
     let mut files = Vec::new();
-    for entry in model.read_dir().map_err(fastlgs_core::Error::io(&model))?.flatten() {
-        files.push((entry.file_name().to_string_lossy().into_owned(), fs::read(&entry.path())?));
+    for entry in model
+        .read_dir()
+        .map_err(fastlgs_core::Error::io(&model))?
+        .flatten()
+    {
+        files.push((
+            entry.file_name().to_string_lossy().into_owned(),
+            fs::read(&entry.path())?,
+        ));
     }
     files.sort();
     let _ = std::fs::remove_dir_all(&partial);
@@ -135,7 +195,7 @@ fn reconstruct(tool: &Tool, photos: &Path, images: &[PathBuf], folder: &SceneFol
 }
 
 /// Reports a line that a tool printed. Returns whether to continue.
-fn told(work: &Work, stage: &str, line: &str) -> bool {
+fn report_line(work: &Work, stage: &str, line: &str) -> bool {
     work.note(&format!("{stage}: {line}"));
     work.check().is_ok()
 }
@@ -148,13 +208,16 @@ const CHECK_SIDE: u32 = 480;
 /// many poses are wrong, all poses are computed again. Held-out photos take part, as in structure
 /// from motion.
 pub(super) fn check(
-    photos: &mut [Known],
+    photos: &mut [PreparedPhoto],
     folder: &SceneFolder,
     cache: &Cache,
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<pose_check::Report> {
-    let given: Vec<Camera> = photos.iter().map(|p| p.camera.shrunk_to(CHECK_SIDE)).collect();
+    let given: Vec<Camera> = photos
+        .iter()
+        .map(|p| p.camera.shrunk_to(CHECK_SIDE))
+        .collect();
     let told = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
     let seed = run.seed.to_le_bytes();
@@ -163,46 +226,63 @@ pub(super) fn check(
     let detected = OnceCell::new();
     let points = || -> Result<&Vec<Keypoints>> {
         if detected.get().is_none() {
-            let small = photos.iter().zip(&given).any(|(p, c)| p.camera.width != c.width);
-            let found = if small { detect_small(folder, &given, run)? } else { photos.iter().map(|p| p.points.clone()).collect() };
+            let small = photos
+                .iter()
+                .zip(&given)
+                .any(|(p, c)| p.camera.width != c.width);
+            let found = if small {
+                detect_small(folder, &given, run)?
+            } else {
+                photos.iter().map(|p| p.points.clone()).collect()
+            };
             let _ = detected.set(found);
         }
         Ok(detected.get().expect("set above"))
     };
-    let poses = |cameras: &[Camera]| cameras.iter().map(|c| c.world_to_camera).collect::<Vec<_>>();
-    let (mut report, mut mended) = cache.get("poses", &key, || {
+    let poses = |cameras: &[Camera]| {
+        cameras
+            .iter()
+            .map(|c| c.world_to_camera)
+            .collect::<Vec<_>>()
+    };
+    let (mut report, mut corrected_poses) = cache.get("poses", &key, || {
         let mut cameras = given.clone();
         let report = pose_check::repair(&mut cameras, points()?, run.seed);
         Ok((report, poses(&cameras)))
     })?;
-    if doubted(&report) > 0 && doubted(&report) * DOUBTED >= given.len() {
+    if wrong_pose_count(&report) > 0 && wrong_pose_count(&report) * WRONG_POSES_RATIO >= given.len()
+    {
         let anew = cache.get("poses anew", &key, || {
-            let found = anew(&given, points()?, &report, folder, run)?;
+            let found = recompute_poses(&given, points()?, &report, folder, run)?;
             Ok(found.map(|(cameras, report)| (report, poses(&cameras))))
         });
         match anew {
-            Ok(anew) => (report, mended) = anew.unwrap_or((report, mended)),
+            Ok(anew) => (report, corrected_poses) = anew.unwrap_or((report, corrected_poses)),
             // Errors are not cached: the next run tries again, also after pycolmap is installed.
             Err(Error::Vision(error)) => {
-                let warning =
-                    format!("many poses contradict the photos, but computing all poses again failed: {error}; only single groups of cameras are corrected");
+                let warning = format!(
+                    "many poses contradict the photos, but computing all poses again failed: {error}; only single groups of cameras are corrected"
+                );
                 run.warn(&warning);
                 warnings.push(warning);
             }
             Err(error) => return Err(error),
         }
     }
-    photos.iter_mut().zip(mended).for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
+    photos
+        .iter_mut()
+        .zip(corrected_poses)
+        .for_each(|(photo, pose)| photo.camera.world_to_camera = pose);
     Ok(report)
 }
 
 /// Folder in the scene for the temporary files of structure from motion.
 const PARTIAL: &str = "sfm.partial";
 /// All poses are computed again if at least one of this many photos has a wrong pose.
-const DOUBTED: usize = 10;
+const WRONG_POSES_RATIO: usize = 10;
 
 /// Returns the number of wrong poses: moved ones, and those that could not be corrected.
-fn doubted(report: &pose_check::Report) -> usize {
+fn wrong_pose_count(report: &pose_check::Report) -> usize {
     report.moved.len() + report.contradictory.len()
 }
 
@@ -210,7 +290,7 @@ fn doubted(report: &pose_check::Report) -> usize {
 /// one seldom works. The result is in the frame of the given poses that were right.
 ///
 /// Returns `None` unless fewer of the new poses contradict the photos, and no more photos are lost.
-fn anew(
+fn recompute_poses(
     given: &[Camera],
     points: &[Keypoints],
     checked: &pose_check::Report,
@@ -219,29 +299,50 @@ fn anew(
 ) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
     let Tool::Pycolmap(python) = Tool::find(false)? else {
         let mend = "this needs pycolmap, but only the program 'colmap' is installed; run 'fastlgs models install-offline' to install pycolmap";
-        return Err(Error::Vision(fastlgs_vision::Error::Missing(mend.to_owned())));
+        return Err(Error::Vision(fastlgs_vision::Error::Missing(
+            mend.to_owned(),
+        )));
     };
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
-    let say = |stage: &str, line: &str| told(&work, stage, line);
+    let say = |stage: &str, line: &str| report_line(&work, stage, line);
     let partial = folder.root.join(PARTIAL);
     let found = structure::placed_anew(&python, &files, given, points, &partial, run.seed, say);
     let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
     let found = found?;
-    let Some((mut cameras, mut moved)) = frame::kept(given, &found, run.seed) else { return Ok(None) };
+    let Some((mut cameras, mut moved)) = frame::align(given, &found, run.seed) else {
+        return Ok(None);
+    };
     let again = pose_check::repair(&mut cameras, points, run.seed);
     let unplaced = (0..given.len()).filter(|&photo| found[photo].is_none());
-    let lost: BTreeSet<usize> = unplaced.chain(again.contradictory.iter().copied()).collect();
-    let doubted_now = lost.iter().chain(&again.moved).collect::<BTreeSet<_>>().len();
-    tracing::info!(doubted = doubted(checked), doubted_now, lost = lost.len(), "all poses were computed again");
+    let lost: BTreeSet<usize> = unplaced
+        .chain(again.contradictory.iter().copied())
+        .collect();
+    let doubted_now = lost
+        .iter()
+        .chain(&again.moved)
+        .collect::<BTreeSet<_>>()
+        .len();
+    tracing::info!(
+        doubted = wrong_pose_count(checked),
+        doubted_now,
+        lost = lost.len(),
+        "all poses were computed again"
+    );
     // Corrected photos are trained on, lost ones are not.
-    if doubted_now >= doubted(checked) || lost.len() > checked.contradictory.len() {
+    if doubted_now >= wrong_pose_count(checked) || lost.len() > checked.contradictory.len() {
         return Ok(None);
     }
     moved.extend(again.moved);
     let moved = moved.difference(&lost).copied().collect();
-    Ok(Some((cameras, pose_check::Report { moved, contradictory: lost.into_iter().collect() })))
+    Ok(Some((
+        cameras,
+        pose_check::Report {
+            moved,
+            contradictory: lost.into_iter().collect(),
+        },
+    )))
 }
 
 /// A photo supports the pose of another one with at least this many matches, of which more than
@@ -250,18 +351,32 @@ const SUPPORT: (usize, f32) = (15, 0.5);
 
 /// Marks photos as contradictory whose cameras lie far outside of all others, and whose poses no
 /// other photo supports.
-pub(super) fn leave_out_lost(photos: &[Known], cache: &Cache, checked: &mut pose_check::Report) -> Result<()> {
+pub(super) fn leave_out_lost(
+    photos: &[PreparedPhoto],
+    cache: &Cache,
+    checked: &mut pose_check::Report,
+) -> Result<()> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
-    let outside = camera::far_outside(&cameras);
-    let doubtful: Vec<usize> = (0..photos.len()).filter(|photo| outside[*photo] && !checked.contradictory.contains(photo)).collect();
+    let outside = camera::outlier_cameras(&cameras);
+    let doubtful: Vec<usize> = (0..photos.len())
+        .filter(|photo| outside[*photo] && !checked.contradictory.contains(photo))
+        .collect();
     for lost in doubtful {
         let mut supported = false;
         for other in (0..photos.len()).filter(|other| !outside[*other]) {
             let (a, b) = (lost.min(other), lost.max(other));
-            let found = PairMatches { a, b, pairs: super::matches::of_pair(photos, a, b, cache)? };
-            let obeying = found.obeying(&cameras, &points, tracks::TOLERANCE).pairs.len();
-            supported |= found.pairs.len() >= SUPPORT.0 && obeying as f32 > SUPPORT.1 * found.pairs.len() as f32;
+            let found = PairMatches {
+                a,
+                b,
+                pairs: super::matches::cached_matches(photos, a, b, cache)?,
+            };
+            let obeying = found
+                .obeying(&cameras, &points, tracks::TOLERANCE)
+                .pairs
+                .len();
+            supported |= found.pairs.len() >= SUPPORT.0
+                && obeying as f32 > SUPPORT.1 * found.pairs.len() as f32;
         }
         if !supported {
             checked.moved.retain(|photo| *photo != lost);
@@ -274,28 +389,58 @@ pub(super) fn leave_out_lost(photos: &[Known], cache: &Cache, checked: &mut pose
 
 /// Computes the poses of contradictory photos by resection from matched key points, and updates
 /// `checked`.
-pub(super) fn place(photos: &mut [Known], checked: &mut pose_check::Report, matches: &[PairMatches]) {
+pub(super) fn place(
+    photos: &mut [PreparedPhoto],
+    checked: &mut pose_check::Report,
+    matches: &[PairMatches],
+) {
     if checked.contradictory.is_empty() {
         return;
     }
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
     let placed = resection::place(&mut cameras, &checked.contradictory, &points, matches);
-    photos.iter_mut().zip(cameras).for_each(|(photo, camera)| photo.camera = camera);
-    checked.contradictory.retain(|photo| !placed.contains(photo));
+    photos
+        .iter_mut()
+        .zip(cameras)
+        .for_each(|(photo, camera)| photo.camera = camera);
+    checked
+        .contradictory
+        .retain(|photo| !placed.contains(photo));
     checked.moved.extend(placed);
     checked.moved.sort_unstable();
 }
 
 /// Warns about photos whose poses were wrong.
-pub(super) fn warn(photos: &[Known], checked: &pose_check::Report, run: &Run, warnings: &mut Vec<String>) {
-    let names = |list: &[usize]| list.iter().map(|&i| photos[i].camera.name.as_str()).collect::<Vec<_>>().join(", ");
+pub(super) fn warn(
+    photos: &[PreparedPhoto],
+    checked: &pose_check::Report,
+    run: &Run,
+    warnings: &mut Vec<String>,
+) {
+    let names = |list: &[usize]| {
+        list.iter()
+            .map(|&i| photos[i].camera.name.as_str())
+            .collect::<Vec<_>>()
+            .join(", ")
+    };
     for (list, what) in [
-        (&checked.moved, "contradicted the photos and were corrected by key point matches"),
-        (&checked.contradictory, "contradict the photos and could not be corrected; these views are not trained on"),
+        (
+            &checked.moved,
+            "contradicted the photos and were corrected by key point matches",
+        ),
+        (
+            &checked.contradictory,
+            "contradict the photos and could not be corrected; these views are not trained on",
+        ),
     ] {
         if !list.is_empty() {
-            let warning = format!("the poses of {} of {} photos {what}: {}", list.len(), photos.len(), names(list));
+            let warning = format!(
+                "the poses of {} of {} photos {what}: {}",
+                list.len(),
+                photos.len(),
+                names(list)
+            );
             run.warn(&warning);
             warnings.push(warning);
         }
@@ -316,28 +461,28 @@ fn detect_small(folder: &SceneFolder, cameras: &[Camera], run: &Run) -> Result<V
 
 /// Largest number of photos for which [`Poses::Check`] adjusts all cameras. Time grows with the
 /// cube of their number.
-const ADJUSTED: usize = 600;
+const MAX_ADJUSTED_PHOTOS: usize = 600;
 /// Displacement at the corners, in pixels, above which a found distortion is removed from the
 /// photos. Resampling reduces sharpness.
-const BENT: f32 = 1.0;
+const MAX_CORNER_SHIFT: f32 = 1.0;
 /// Adjusted poses are used if the reprojection error falls below this share of its old value. The
 /// error of exact poses falls slightly, too, because adjustment also fits the noise of key points.
-const MENDED: f32 = 0.9;
+const MAX_ERROR_RATIO: f32 = 0.9;
 
 /// Runs bundle adjustment on all cameras, and removes the lens distortion that it finds. The given
 /// poses stay if they fit almost as well, unless `asked` is [`Poses::Refine`]. They may come from
 /// larger photos, and are then more exact.
 pub(super) fn adjust(
-    photos: &mut [Known],
+    photos: &mut [PreparedPhoto],
     matches: &[PairMatches],
     asked: Poses,
     folder: &SceneFolder,
     run: &Run,
     warnings: &mut Vec<String>,
 ) -> Result<Option<Adjusted>> {
-    if photos.len() > ADJUSTED && asked != Poses::Refine {
+    if photos.len() > MAX_ADJUSTED_PHOTOS && asked != Poses::Refine {
         let warning = format!(
-            "poses and lenses of more than {ADJUSTED} photos are not adjusted, because it takes long; set 'poses' to 'refine' to adjust them"
+            "poses and lenses of more than {MAX_ADJUSTED_PHOTOS} photos are not adjusted, because it takes long; set 'poses' to 'refine' to adjust them"
         );
         run.warn(&warning);
         warnings.push(warning);
@@ -346,23 +491,37 @@ pub(super) fn adjust(
     let mut cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
     let work = run.work("bundle adjustment", 0);
-    let Some(report) = bundle::adjust(&mut cameras, &points, matches) else { return Ok(None) };
+    let Some(report) = bundle::adjust(&mut cameras, &points, matches) else {
+        return Ok(None);
+    };
     drop(work);
     let mut moved = report.moved.clone();
     moved.sort_by(f32::total_cmp);
     let explained = report.observations[1] as f32 / report.observations[0].max(1) as f32;
-    let used = asked == Poses::Refine || report.error[1] < MENDED * report.error[0];
+    let used = asked == Poses::Refine || report.error[1] < MAX_ERROR_RATIO * report.error[0];
     if used {
-        photos.iter_mut().zip(cameras).for_each(|(photo, camera)| photo.camera = camera);
+        photos
+            .iter_mut()
+            .zip(cameras)
+            .for_each(|(photo, camera)| photo.camera = camera);
     }
     let bend = |(camera, k1): (&Camera, &f32)| {
         let corner = camera.ray(glam::Vec2::ZERO).truncate();
         k1.abs() * corner.length().powi(3) * camera.fx
     };
-    let bent = photos.iter().map(|p| &p.camera).zip(&report.k1).map(bend).fold(0.0, f32::max);
-    let k1 = report.k1.iter().copied().fold(0.0, |a: f32, b| if b.abs() > a.abs() { b } else { a });
-    if used && bent > BENT {
-        super::photos::straighten(photos, &report.k1, folder)?;
+    let bent = photos
+        .iter()
+        .map(|p| &p.camera)
+        .zip(&report.k1)
+        .map(bend)
+        .fold(0.0, f32::max);
+    let k1 = report
+        .k1
+        .iter()
+        .copied()
+        .fold(0.0, |a: f32, b| if b.abs() > a.abs() { b } else { a });
+    if used && bent > MAX_CORNER_SHIFT {
+        super::photos::remove_distortion(photos, &report.k1, folder)?;
         let warning = format!(
             "the lens distorts the photos by {bent:.1} pixels at their corners, which the given poses do not state; the photos were straightened \
              (\"k1\": {k1:.4} in transforms.json, or a radial term in COLMAP's camera model, removes it at full size; labels drawn on the photos are \

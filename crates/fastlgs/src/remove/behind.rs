@@ -1,23 +1,31 @@
-//! Which Gaussians photos saw past the thing.
+//! Decides which Gaussians remain when an object is removed.
 
 use crate::{Result, Session};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_raster::lift;
 use glam::Vec3;
 
-/// Views that must have seen a Gaussian.
+/// Least number of views that must show a Gaussian outside of the hidden pixels.
 const WITNESSES: u8 = 2;
-/// Pixels that it must have coloured in each, as its blending weights add up.
+/// Least sum of blending weights of a Gaussian in such a view, in pixels.
 const SHARE: f32 = 0.5;
 
-/// For each Gaussian whether two views show it outside the pixels that the thing may have coloured (`hidden`), or none shows or has it within
-/// them. The others are the thing's own, or lie in or under it, where training put whatever did no harm.
+/// Returns for each Gaussian whether it remains. `views` holds the hidden pixels of each view:
+/// those that the object may have coloured.
+///
+/// A Gaussian remains if two views show it outside of the hidden pixels. It also remains if no view
+/// shows it, or its centre, within them. All others belong to the object or lie inside or below it,
+/// where photos do not constrain training.
 pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
     let mut witnesses = vec![0u8; session.gaussians.len()];
     let mut within = vec![false; session.gaussians.len()];
     for (camera, hidden) in views {
         let labels = hidden.iter().map(|hidden| u16::from(!hidden)).collect();
-        let map = LabelMap { width: camera.width, height: camera.height, labels };
+        let map = LabelMap {
+            width: camera.width,
+            height: camera.height,
+            labels,
+        };
         for vote in lift::votes(&session.gaussians, &session.view(camera), &map) {
             within[vote.gaussian as usize] |= vote.label == 0;
             if vote.label == 1 && vote.weight >= SHARE {
@@ -26,7 +34,20 @@ pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool
             }
         }
     }
-    let is_within = |mean: Vec3| views.iter().any(|(camera, hidden)| camera.see(mean).is_some_and(|(pixel, _)| hidden[pixel]));
-    let stays = |((count, within), mean): ((u8, bool), &Vec3)| count >= WITNESSES || !(within || is_within(*mean));
-    Ok(witnesses.into_iter().zip(within).zip(&session.gaussians.means).map(stays).collect())
+    let is_within = |mean: Vec3| {
+        views.iter().any(|(camera, hidden)| {
+            camera
+                .pixel_and_depth(mean)
+                .is_some_and(|(pixel, _)| hidden[pixel])
+        })
+    };
+    let stays = |((count, within), mean): ((u8, bool), &Vec3)| {
+        count >= WITNESSES || !(within || is_within(*mean))
+    };
+    Ok(witnesses
+        .into_iter()
+        .zip(within)
+        .zip(&session.gaussians.means)
+        .map(stays)
+        .collect())
 }

@@ -1,4 +1,4 @@
-//! The scene folder that is left when a thing was removed.
+//! Writes the scene folder of a scene without the removed object.
 
 use crate::staged::StagedOutput;
 use crate::{Result, Session, clear, train};
@@ -9,18 +9,27 @@ use image::{GrayImage, Luma, Rgb, RgbImage};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// What is not taken over: it speaks of the photos as they were.
+/// Files that are not copied, because they describe the original photos.
 const LEFT_BEHIND: [&str; 2] = ["masks/objects", "embeddings.safetensors"];
 
-/// Share of a mask's pixels that must be hidden for it to be one of the thing.
+/// Share of hidden pixels from which a mask belongs to the removed object.
 const OF_THE_THING: f64 = 0.5;
 
-/// A view, and the pixels that the thing may have coloured.
+/// A view and its hidden pixels: those that the object may have coloured.
 type Hidden = (Camera, Vec<bool>);
 
-/// Writes the scene that `session` holds now to `output`: photos to train on show it without the thing; in photos that are held out, which still
-/// show the thing, those pixels do not count.
-pub fn write(output: &Path, session: &mut Session, grid: &Grid, views: &[Hidden], what: &str) -> Result<()> {
+/// Writes the scene that `session` holds to `output`. `what` names the removed object in the
+/// manifest.
+///
+/// In training photos, rendered colours replace the hidden pixels. Held-out photos still show the
+/// object, so their hidden pixels are ignored.
+pub fn write(
+    output: &Path,
+    session: &mut Session,
+    grid: &Grid,
+    views: &[Hidden],
+    what: &str,
+) -> Result<()> {
     let scene = SceneFolder::new(output);
     let staged = StagedOutput::new(&scene, "remove")?;
     let folder = &staged.folder;
@@ -31,27 +40,45 @@ pub fn write(output: &Path, session: &mut Session, grid: &Grid, views: &[Hidden]
         let w = camera.width;
         if held_out.iter().any(|c| c.name == camera.name) {
             let path = folder.ignore_path(&camera.name);
-            let before = path.is_file().then(|| image_io::load_gray(&path)).transpose()?;
+            let before = path
+                .is_file()
+                .then(|| image_io::load_gray(&path))
+                .transpose()?;
             let counts = |x: u32, y: u32| before.as_ref().map_or(255, |b| b.get_pixel(x, y)[0]);
-            let mask = GrayImage::from_fn(w, camera.height, |x, y| Luma([if hidden[(y * w + x) as usize] { 0 } else { counts(x, y) }]));
+            let mask = GrayImage::from_fn(w, camera.height, |x, y| {
+                Luma([if hidden[(y * w + x) as usize] {
+                    0
+                } else {
+                    counts(x, y)
+                }])
+            });
             image_io::save_png(&path, mask)?;
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
         let counts = counting(folder, &camera.name, hidden.len())?;
-        patch(&mut photo, hidden, &counts, session.render(camera)?.channels(0, 3));
+        patch(
+            &mut photo,
+            hidden,
+            &counts,
+            session.render(camera)?.channels(0, 3),
+        );
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
             let mut masks = folder.masks(camera)?;
             let (width, height) = (masks.width, masks.height);
             masks.masks.retain(|mask| {
-                let own = mask.runs.places(width, height).filter(|p| hidden[*p]).count();
+                let own = mask
+                    .runs
+                    .places(width, height)
+                    .filter(|p| hidden[*p])
+                    .count();
                 (own as f64) < OF_THE_THING * mask.runs.area() as f64
             });
             masks.save(&folder.masks_path(&camera.name))?;
         }
     }
-    // Numbers of masks are others now.
+    // The masks have other labels now, so the pairs of the original scene are invalid.
     evidence::save_pairs(folder, &Pairs::new())?;
     grid.save(folder)?;
     ply::write(&folder.ply_path(), &session.gaussians)?;
@@ -59,31 +86,49 @@ pub fn write(output: &Path, session: &mut Session, grid: &Grid, views: &[Hidden]
     if compact.is_file() {
         std::fs::remove_file(&compact).map_err(Error::io(&compact))?;
     }
-    // It is not what `make` made.
+    // The result is not an output of `make`.
     manifest.notes.remove(train::MADE);
-    let removed = manifest.notes.entry("removed".to_owned()).or_insert_with(|| serde_json::json!([]));
-    removed.as_array_mut().into_iter().for_each(|list| list.push(what.into()));
+    let removed = manifest
+        .notes
+        .entry("removed".to_owned())
+        .or_insert_with(|| serde_json::json!([]));
+    removed
+        .as_array_mut()
+        .into_iter()
+        .for_each(|list| list.push(what.into()));
     if let Some(train) = manifest.notes.get_mut("train") {
-        (train["gaussians"], train["objects"]) = (session.gaussians.len().into(), grid.objects.len().into());
+        (train["gaussians"], train["objects"]) =
+            (session.gaussians.len().into(), grid.objects.len().into());
         train["clear"] = clear::count(&session.gaussians).into();
     }
-    let maps = session.manifest.training(&session.cameras).into_iter().map(|camera| SceneFolder::objects_name(&camera.name));
+    let maps = session
+        .manifest
+        .training(&session.cameras)
+        .into_iter()
+        .map(|camera| SceneFolder::objects_name(&camera.name));
     staged.publish(&scene, &[], maps, &manifest)
 }
 
-/// The pixels of a photo that it shows: opaque ones that no mask blackens.
+/// Returns the pixels of a photo that count: opaque ones that no mask ignores.
 fn counting(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
     let mut counts = vec![true; pixels];
-    for path in [folder.alpha_path(name), folder.ignore_path(name)].into_iter().filter(|path| path.is_file()) {
-        counts.iter_mut().zip(image_io::load_gray(&path)?.pixels()).for_each(|(counts, p)| *counts &= p[0] >= 128);
+    for path in [folder.alpha_path(name), folder.ignore_path(name)]
+        .into_iter()
+        .filter(|path| path.is_file())
+    {
+        counts
+            .iter_mut()
+            .zip(image_io::load_gray(&path)?.pixels())
+            .for_each(|(counts, p)| *counts &= p[0] >= 128);
     }
     Ok(counts)
 }
 
-/// Factors within which photos differ in brightness.
+/// Smallest and largest gain of a photo relative to its render.
 const GAINS: [f32; 2] = [0.25, 4.0];
 
-/// Shows a rendered picture, `[3][h][w]`, where a photo is hidden, as bright as the rest of the photo is, as far as it `counts`.
+/// Replaces the hidden pixels of a photo by rendered colours, `[3][h][w]`. A gain for each channel
+/// matches the brightness of the visible pixels that count.
 fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) {
     let n = hidden.len();
     let gain: [f32; 3] = std::array::from_fn(|c| {
@@ -92,17 +137,30 @@ fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) 
             .zip(&color[c * n..(c + 1) * n])
             .zip(hidden.iter().zip(counts))
             .filter(|(_, (hidden, counts))| !**hidden && **counts);
-        let (shown, rendered) = open.fold((0.0, 0.0), |(a, b), ((p, v), _)| (a + f32::from(p[c]) / 255.0, b + v.clamp(0.0, 1.0)));
-        if rendered > 0.0 { (shown / rendered).clamp(GAINS[0], GAINS[1]) } else { 1.0 }
+        let (shown, rendered) = open.fold((0.0, 0.0), |(a, b), ((p, v), _)| {
+            (a + f32::from(p[c]) / 255.0, b + v.clamp(0.0, 1.0))
+        });
+        if rendered > 0.0 {
+            (shown / rendered).clamp(GAINS[0], GAINS[1])
+        } else {
+            1.0
+        }
     });
     for (p, pixel) in photo.pixels_mut().enumerate().filter(|(p, _)| hidden[*p]) {
-        *pixel = Rgb(std::array::from_fn(|c| (255.0 * (gain[c] * color[c * n + p]).clamp(0.0, 1.0) + 0.5) as u8));
+        *pixel = Rgb(std::array::from_fn(|c| {
+            (255.0 * (gain[c] * color[c * n + p]).clamp(0.0, 1.0) + 0.5) as u8
+        }));
     }
 }
 
-/// Copies the files of a scene, as far as they are there and speak of the scene as it will be.
+/// Copies the files of a scene that exist, except those in `LEFT_BEHIND`.
 fn copy(files: &BTreeSet<String>, from: &Path, to: &Path) -> Result<()> {
-    let stays = |file: &&String| !LEFT_BEHIND.iter().any(|left| Path::new(file).starts_with(left)) && from.join(file).is_file();
+    let stays = |file: &&String| {
+        !LEFT_BEHIND
+            .iter()
+            .any(|left| Path::new(file).starts_with(left))
+            && from.join(file).is_file()
+    };
     for file in files.iter().filter(stays) {
         let (old, new) = (from.join(file), to.join(file));
         let parent = new.parent().unwrap_or(to);
@@ -118,10 +176,10 @@ mod tests {
 
     #[test]
     fn a_patch_is_as_bright_as_its_photo() {
-        // The photo is half as bright as the scene, in which its right half is hidden.
+        // The visible half of the photo is half as bright as the render; the right half is hidden.
         let mut photo = RgbImage::from_fn(8, 2, |x, _| Rgb([if x < 4 { 50 } else { 255 }; 3]));
         let hidden: Vec<bool> = (0..16).map(|p| p % 8 >= 4).collect();
-        // What does not count says nothing about it.
+        // A pixel that does not count does not affect the gain.
         photo.put_pixel(0, 0, Rgb([255; 3]));
         let counts: Vec<bool> = (0..16).map(|p| p != 0).collect();
         patch(&mut photo, &hidden, &counts, &[100.0 / 255.0; 3 * 16]);

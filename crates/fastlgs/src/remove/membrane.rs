@@ -1,13 +1,14 @@
-//! Values for pixels of which nothing is known, from those around them.
+//! Fills unknown pixels from the known pixels around them.
 
 use fastlgs_vision::inpaint::Inpainter;
 
-/// The smoothest filling: a membrane over the hole, held by its rim (Laplace's equation). It continues planes of inverse depth exactly, and
-/// invents no texture.
+/// Fills a hole smoothly: solves the Laplace equation with the pixels at its border as boundary
+/// values. It continues planes of inverse depth exactly, and adds no texture.
 pub struct Membrane;
 
-/// Relaxation beyond each step's mean, and steps: enough for holes some hundred pixels wide.
+/// Factor of successive over-relaxation.
 const OVER: f32 = 1.9;
+/// Number of iterations, enough for holes that are a few hundred pixels wide.
 const STEPS: usize = 400;
 
 impl Inpainter for Membrane {
@@ -21,9 +22,14 @@ impl Membrane {
     /// Fills `hole` in each plane of `[planes][height][width]`.
     pub fn span(planes: &mut [f32], hole: &[bool], width: usize) {
         let inside: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
-        let around: Vec<Vec<usize>> = inside.iter().map(|p| neighbours(*p, width, hole.len())).collect();
+        let around: Vec<Vec<usize>> = inside
+            .iter()
+            .map(|p| neighbours(*p, width, hole.len()))
+            .collect();
         for plane in planes.chunks_exact_mut(hole.len()) {
-            inwards(plane, hole, width, |known| known.iter().sum::<f32>() / known.len() as f32);
+            inwards(plane, hole, width, |known| {
+                known.iter().sum::<f32>() / known.len() as f32
+            });
             for _ in 0..STEPS {
                 for (p, near) in inside.iter().zip(&around) {
                     let mean = near.iter().map(|q| plane[*q]).sum::<f32>() / near.len() as f32;
@@ -34,35 +40,46 @@ impl Membrane {
     }
 }
 
-/// Labels of a picture, with those of `hole` continued from the pixels around it.
+/// Returns the labels of an image. Each pixel of `hole` gets the label of a known neighbour, ring
+/// by ring.
 pub fn continued(labels: &[u16], hole: &[bool], width: usize) -> Vec<u16> {
     let mut labels = labels.to_vec();
     inwards(&mut labels, hole, width, |known| known[0]);
     labels
 }
 
-/// Gives the pixels of `hole` values, ring by ring, each from the known ones beside it.
+/// Fills the pixels of `hole` ring by ring. `value` computes a pixel from its known neighbours.
 fn inwards<T: Copy>(values: &mut [T], hole: &[bool], width: usize, value: impl Fn(&[T]) -> T) {
     let mut open = hole.to_vec();
     let mut rest: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
     while !rest.is_empty() {
         let beside = |p: &usize| {
-            let known: Vec<T> = neighbours(*p, width, hole.len()).into_iter().filter(|q| !open[*q]).map(|q| values[q]).collect();
+            let known: Vec<T> = neighbours(*p, width, hole.len())
+                .into_iter()
+                .filter(|q| !open[*q])
+                .map(|q| values[q])
+                .collect();
             (!known.is_empty()).then(|| (*p, value(&known)))
         };
         let ring: Vec<(usize, T)> = rest.iter().filter_map(beside).collect();
         if ring.is_empty() {
             break;
         }
-        ring.into_iter().for_each(|(p, value)| (values[p], open[p]) = (value, false));
+        ring.into_iter()
+            .for_each(|(p, value)| (values[p], open[p]) = (value, false));
         rest.retain(|p| open[*p]);
     }
 }
 
-/// The up to four pixels beside a pixel.
+/// Returns the indices of the up to four direct neighbours of a pixel.
 fn neighbours(p: usize, width: usize, pixels: usize) -> Vec<usize> {
     let x = p % width;
-    let beside = [(x > 0).then(|| p - 1), (x + 1 < width).then_some(p + 1), p.checked_sub(width), Some(p + width).filter(|q| *q < pixels)];
+    let beside = [
+        (x > 0).then(|| p - 1),
+        (x + 1 < width).then_some(p + 1),
+        p.checked_sub(width),
+        Some(p + width).filter(|q| *q < pixels),
+    ];
     beside.into_iter().flatten().collect()
 }
 
@@ -74,12 +91,24 @@ mod tests {
     fn a_plane_is_continued() {
         let (width, height) = (40, 30);
         let value = |p: usize| 0.1 + 0.02 * (p % width) as f32 - 0.01 * (p / width) as f32;
-        let hole: Vec<bool> = (0..width * height).map(|p| (8..32).contains(&(p % width)) && (6..25).contains(&(p / width))).collect();
-        let mut planes: Vec<f32> =
-            (0..2 * width * height).map(|p| if hole[p % hole.len()] { 9.0 } else { value(p % hole.len()) }).collect();
+        let hole: Vec<bool> = (0..width * height)
+            .map(|p| (8..32).contains(&(p % width)) && (6..25).contains(&(p / width)))
+            .collect();
+        let mut planes: Vec<f32> = (0..2 * width * height)
+            .map(|p| {
+                if hole[p % hole.len()] {
+                    9.0
+                } else {
+                    value(p % hole.len())
+                }
+            })
+            .collect();
         Membrane::span(&mut planes, &hole, width);
         for (p, found) in planes.iter().enumerate() {
-            assert!((found - value(p % hole.len())).abs() < 1e-3, "pixel {p}: {found}");
+            assert!(
+                (found - value(p % hole.len())).abs() < 1e-3,
+                "pixel {p}: {found}"
+            );
         }
     }
 }

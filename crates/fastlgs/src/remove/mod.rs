@@ -1,8 +1,10 @@
-//! A thing is taken out of a scene, and what lay behind it is put in its place (paper, applications: object removal with inpainting).
+//! Removes an object from a scene, and fills the gaps behind it (paper, object removal with
+//! inpainting).
 //!
-//! What other photos saw past the thing is there once its Gaussians are gone. What no photo saw is filled in one view after the other, the
-//! largest gap first: inverse depth is continued into the gap, colour by an inpainter, and each of its pixels becomes a Gaussian, which the next view sees.
-//! So the filling is one surface and not one opinion a view.
+//! Where other photos show the surface behind the object, it appears once the Gaussians of the
+//! object are gone. Gaps that no photo shows are filled view by view, the largest gap first.
+//! Inverse depth is continued into the gap, and an inpainter computes its colours. Each pixel of
+//! the gap becomes a Gaussian, which later views contain, so that all views agree on one surface.
 
 mod behind;
 mod folder;
@@ -24,26 +26,30 @@ use membrane::Membrane;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// What is removed.
+/// Options of a removal.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
 pub struct Config {
     /// Trained scene folder.
     pub scene: PathBuf,
-    /// What is removed, in words.
+    /// Text that names the object to remove.
     #[cfg_attr(feature = "clap", arg(required_unless_present = "object"))]
     pub text: Option<String>,
-    /// The object with this number instead; `query` tells numbers.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "ID", conflicts_with = "text"))]
+    /// Id of the object to remove, instead of a text; `query` reports ids.
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "ID", conflicts_with = "text")
+    )]
     pub object: Option<u16>,
     /// Scene folder to write.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
-    /// What colours places that no photo saw: membrane (the smoothest), opencv (Telea's), or an ONNX file like LaMa's.
+    /// Inpainter for regions that no photo shows: membrane (smoothest), opencv (Telea), or an ONNX
+    /// file such as LaMa.
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME|FILE", default_value_t = Self::default().inpainter))]
     pub inpainter: String,
-    /// CLIP's text tower, for scenes whose embeddings were imported, or when the file has moved.
+    /// CLIP text tower, for scenes with imported embeddings, or if its file has moved.
     #[cfg_attr(feature = "clap", arg(long, value_name = "FILE"))]
     pub clip_text: Option<PathBuf>,
 }
@@ -51,59 +57,85 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         let inpainter = "membrane".to_owned();
-        Self { scene: PathBuf::new(), text: None, object: None, output: PathBuf::new(), inpainter, clip_text: None }
+        Self {
+            scene: PathBuf::new(),
+            text: None,
+            object: None,
+            output: PathBuf::new(),
+            inpainter,
+            clip_text: None,
+        }
     }
 }
 
-/// What was removed, and what took its place.
+/// Report of a removal.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Report {
-    /// The scene that it was in.
+    /// Folder of the original scene.
     pub scene: PathBuf,
-    /// The scene without it.
+    /// Folder of the new scene.
     pub output: PathBuf,
-    /// Numbers of the objects that were removed, in the first scene.
+    /// Ids of the removed objects in the original scene.
     pub objects: Vec<u16>,
-    /// Gaussians that were removed.
+    /// Number of Gaussians that were removed.
     pub removed: usize,
-    /// Gaussians that were made where no photo saw anything.
+    /// Number of Gaussians that were added in gaps.
     pub filled: usize,
-    /// Share of the thing's pixels, over all photos, behind which other photos saw something.
+    /// Share of the hidden pixels of all training photos behind which other photos show a surface.
     pub seen: f64,
-    /// Objects that are left.
+    /// Number of remaining objects.
     pub left: usize,
 }
 
-/// By how many pixels masks are widened: five times a window of 5x5 (paper).
+/// Dilation of masks in x and y, in pixels: five times a window of 5x5 (paper).
 const WIDENED: [u32; 2] = [10; 2];
 /// Opacity of the Gaussians that fill a gap.
 const SOLID: f32 = 0.95;
-/// Their radius in distances of pixels: so wide, neighbours leave no gaps.
+/// Radius of these Gaussians in pixel spacings at their depth: wide enough to close the space
+/// between neighbours.
 const RADIUS: f32 = 0.7;
-/// Share of a view's pixels below which a gap is left alone.
+/// Share of the pixels of a view up to which a gap is not filled.
 const SMALL: f64 = 1e-5;
-/// Transmittance from which nothing is where a pixel looks.
+/// Transmittance above which a pixel is empty.
 const EMPTY: f32 = 0.5;
 
-/// Removes a thing from a scene; the result is a scene like any other, which does not know it.
+/// Removes the objects that `config` names, fills the gaps, and writes a new scene.
 ///
 /// # Errors
-/// A text that names nothing in the scene, an object that it does not have, a folder that exists already, or a device that fails.
+/// A text or id without an object, an output folder that holds a scene, photos that are missing, or
+/// a device that fails.
 pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     let (output, scene) = (resolved(&config.output)?, resolved(&config.scene)?);
     if output.starts_with(&scene) || scene.starts_with(&output) {
-        bail!("{}: it lies in the scene itself; name a folder beside {}", config.output.display(), config.scene.display());
+        bail!(
+            "{}: the output folder and the scene must not contain each other; choose a folder beside {}",
+            config.output.display(),
+            config.scene.display()
+        );
     }
     if SceneFolder::open(&config.output).is_ok() {
-        bail!("{}: there is a scene already; name a folder that is not there yet", config.output.display());
+        bail!(
+            "{}: this folder already holds a scene; choose a folder that does not exist yet",
+            config.output.display()
+        );
     }
     let _lock = SceneLock::take(&config.output, "remove")?;
-    let inpainter: Box<dyn Inpainter> =
-        if config.inpainter == "membrane" { Box::new(Membrane) } else { inpaint::named(&config.inpainter).context("--inpainter")? };
+    let inpainter: Box<dyn Inpainter> = if config.inpainter == "membrane" {
+        Box::new(Membrane)
+    } else {
+        inpaint::by_name(&config.inpainter).context("the inpainter cannot be opened")?
+    };
     let mut session = Session::open(&config.scene, run.device)?;
     session.clip_text.clone_from(&config.clip_text);
-    if session.cameras.iter().any(|camera| !session.folder.photo_path(&camera.name).is_file()) {
-        bail!("{}: its photos are not there; remove the thing from the scene that was trained, not from an export", config.scene.display());
+    if session
+        .cameras
+        .iter()
+        .any(|camera| !session.folder.photo_path(&camera.name).is_file())
+    {
+        bail!(
+            "{}: its prepared photos are not there; remove the object from the trained scene, not from an export",
+            config.scene.display()
+        );
     }
     let grid = session.grid()?;
     let targets = targets(config, &mut session, &grid)?;
@@ -111,22 +143,45 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
     let (mut hidden, mut shown) = (Vec::new(), Vec::new());
     for camera in session.cameras.clone() {
-        let widened = |field: Field| metrics::dilate(&field.mask(&grid, &targets), camera.width, camera.height, WIDENED);
+        let widened = |field: Field| {
+            metrics::dilate(
+                &field.mask(&grid, &targets),
+                camera.width,
+                camera.height,
+                WIDENED,
+            )
+        };
         let thing = widened(session.field(&camera, None)?);
         if trained_on(&camera) {
-            // What is seen through the thing is not hidden by it.
-            shown.push((camera.clone(), if session.trained.clear > 0 { widened(session.field_of_shown(&camera)?) } else { thing.clone() }));
+            // A transparent object does not hide the surface behind it.
+            shown.push((
+                camera.clone(),
+                if session.trained.clear > 0 {
+                    widened(session.field_of_shown(&camera)?)
+                } else {
+                    thing.clone()
+                },
+            ));
         }
         hidden.push((camera, thing));
     }
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
     let mut stays = behind::seen(&session, &shown)?;
-    // No photo shows what is clear.
-    stays.iter_mut().enumerate().for_each(|(i, stays)| *stays |= clear::is_clear(&session.gaussians, i));
-    selection::gaussians(&session.gaussians, &grid, &objects).into_iter().for_each(|i| stays[i] = false);
+    // Photos do not show transparent Gaussians, so all of them remain, except those of the removed
+    // objects.
+    stays
+        .iter_mut()
+        .enumerate()
+        .for_each(|(i, stays)| *stays |= clear::is_clear(&session.gaussians, i));
+    selection::gaussians(&session.gaussians, &grid, &objects)
+        .into_iter()
+        .for_each(|i| stays[i] = false);
     let left: Vec<usize> = (0..stays.len()).filter(|i| stays[*i]).collect();
     if left.is_empty() {
-        bail!("{}: nothing of the scene would be left", config.scene.display());
+        bail!(
+            "{}: no Gaussians of the scene would remain; choose a smaller object",
+            config.scene.display()
+        );
     }
     let removed = stays.len() - left.len();
     let rest = session.gaussians.select(&left);
@@ -137,60 +192,103 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
         gaps.push(gap(&mut session, camera, hidden)?);
     }
     let count = |pixels: &mut dyn Iterator<Item = usize>| pixels.sum::<usize>() as f64;
-    let seen = 1.0 - count(&mut gaps.iter().map(|g| set(g))) / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
+    let seen = 1.0
+        - count(&mut gaps.iter().map(|g| set(g)))
+            / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
     let filled = fill(&mut session, &grid, &shown, &gaps, &*inpainter, run)?;
 
     let (left_over, ids) = grid.without(&objects);
     for id in &mut session.gaussians.object_ids {
         *id = ids.get(usize::from(*id)).copied().unwrap_or(0);
     }
-    let what = config.text.clone().unwrap_or_else(|| format!("object {}", objects[0]));
+    let what = config
+        .text
+        .clone()
+        .unwrap_or_else(|| format!("object {}", objects[0]));
     folder::write(&config.output, &mut session, &left_over, &hidden, &what)?;
-    Ok(Report { scene: config.scene.clone(), output: config.output.clone(), objects, removed, filled, seen, left: left_over.objects.len() })
+    Ok(Report {
+        scene: config.scene.clone(),
+        output: config.output.clone(),
+        objects,
+        removed,
+        filled,
+        seen,
+        left: left_over.objects.len(),
+    })
 }
 
 fn set(pixels: &[bool]) -> usize {
     pixels.iter().filter(|p| **p).count()
 }
 
-/// The objects that are meant.
+/// Returns the objects that `config` names.
+///
+/// # Errors
+/// There is no such object.
 fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hit>> {
     let root = config.scene.display();
     if let Some(id) = config.object {
         if id == 0 || usize::from(id) > grid.objects.len() {
-            bail!("{root}: it has objects 1 to {}, none is {id}", grid.objects.len());
+            bail!(
+                "{root}: its object ids are 1 to {}, and none is {id}; choose one of them",
+                grid.objects.len()
+            );
         }
         return Ok(vec![Hit { id, score: 1.0 }]);
     }
     let text = config.text.clone().unwrap_or_default();
-    let camera = session.cameras.first().cloned().with_context(|| format!("{root}: the scene has no views"))?;
+    let camera = session
+        .cameras
+        .first()
+        .cloned()
+        .with_context(|| format!("{root}: the scene has no views"))?;
     let field = session.field(&camera, None)?;
-    let found = Ask::Text(text.clone()).meaning(session, &[])?.find(grid, &field, &camera, &QueryConfig::default())?;
+    let found = Ask::Text(text.clone()).meaning(session, &[])?.find(
+        grid,
+        &field,
+        &camera,
+        &QueryConfig::default(),
+    )?;
     if found.targets.is_empty() {
-        bail!("{root}: '{text}' is not found; name the object by its number with --object ('fastlgs query --point X,Y' tells it)");
+        bail!(
+            "{root}: '{text}' is not found; name the object by its id with --object ('fastlgs query --point X,Y' reports ids)"
+        );
     }
     Ok(found.targets)
 }
 
-/// Colours of what is there, without the background that shines through: at the rim of a gap that is up to half of the light.
+/// Renders colours without the share of the background, `[3][h][w]`. At the border of a gap, this
+/// share is up to half of the light.
 fn solid_colors(session: &mut Session, camera: &Camera) -> Result<Vec<f32>> {
     let frame = session.render(camera)?;
     let behind = session.trained.background;
     let transmittance = frame.channels(6, 7);
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
-        channel.map(move |(color, t)| if *t < EMPTY { (color - t * behind[c]) / (1.0 - t) } else { *color })
+        channel.map(move |(color, t)| {
+            if *t < EMPTY {
+                (color - t * behind[c]) / (1.0 - t)
+            } else {
+                *color
+            }
+        })
     };
     Ok((0..3).flat_map(solid).collect())
 }
 
-/// The hidden pixels of a view where nothing is left.
+/// Returns the hidden pixels of a view that are empty.
 fn gap(session: &mut Session, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
-    let frame = session.engine.render(session.view(camera), Channels::Color)?;
-    Ok(hidden.iter().zip(frame.channels(6, 7)).map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY).collect())
+    let frame = session
+        .engine
+        .render(session.view(camera), Channels::Color)?;
+    Ok(hidden
+        .iter()
+        .zip(frame.channels(6, 7))
+        .map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY)
+        .collect())
 }
 
-/// Makes Gaussians where nothing is left that was photographed, and adds them to the scene; returns how many.
+/// Fills the gaps of all views with Gaussians, and returns their number.
 fn fill(
     session: &mut Session,
     grid: &Grid,
@@ -205,25 +303,37 @@ fn fill(
     let work = run.work("gaps", order.len() as u64);
     for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
         work.advance()?;
-        // What is left of it when others are filled.
+        // Other views may have filled a part of this gap.
         let gap = gap(session, camera, hidden)?;
         let (n, width) = (gap.len(), camera.width as usize);
         if set(&gap) as f64 <= SMALL * n as f64 || set(&gap) == n {
             continue;
         }
         let depth = session.render_depth(camera)?;
-        let mut inverse: Vec<f32> = depth.iter().map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 }).collect();
+        let mut inverse: Vec<f32> = depth
+            .iter()
+            .map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 })
+            .collect();
         Membrane::span(&mut inverse, &gap, width);
         let mut colors = solid_colors(session, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
-        let ids = membrane::continued(&session.field_of_shown(camera)?.ids(grid).labels, &gap, width);
+        let ids = membrane::continued(
+            &session.field_of_shown(camera)?.ids(grid).labels,
+            &gap,
+            width,
+        );
         let to_world = camera.world_to_camera.inverse();
         let mut scene = session.gaussians.clone();
         for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {
             let depth = 1.0 / inverse[p];
             let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
             let place = to_world.transform_point3(camera.ray(pixel) * depth);
-            scene.push_sphere(place, RADIUS * depth / camera.fx, SOLID, std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)));
+            scene.push_sphere(
+                place,
+                RADIUS * depth / camera.fx,
+                SOLID,
+                std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)),
+            );
             let last = scene.len() - 1;
             (scene.object_ids[last], scene.features[last]) = (ids[p], grid.code_of(ids[p]));
         }

@@ -1,4 +1,4 @@
-//! One answer in one view: its report and its pictures.
+//! The answer to a query in one view, with its report and images.
 
 use super::ask::Ask;
 use super::pictures::{heatmap, mask_picture, overlay};
@@ -14,27 +14,29 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Objects that a report lists with their scores, chosen or not, unless more are asked for.
+/// Default number of objects that a report lists as candidates.
 pub const CANDIDATES: usize = 8;
-/// Pixels below which an answer is hardly seen.
+/// Number of pixels below which an answer counts as hardly visible in a view.
 const VISIBLE: usize = 30;
 
-/// What is asked, and how the answer is chosen.
+/// A query with the options of its answer.
 pub struct Question<'a> {
-    /// What is asked.
+    /// The query.
     pub ask: &'a Ask,
-    /// Texts that the object must not be nearer to.
+    /// Texts that must not fit an object better than the query.
     pub negatives: &'a [String],
-    /// What counts as found.
+    /// Options of object selection.
     pub config: QueryConfig,
-    /// Half width and height by which masks are widened.
+    /// Half width and half height of the dilation window in pixels; `None` leaves the mask
+    /// unchanged.
     pub dilate: Option<[u32; 2]>,
-    /// Objects that the report lists.
+    /// Number of objects that the report lists as candidates.
     pub candidates: usize,
 }
 
 impl Question<'_> {
-    /// Asks a rendered view; the answer and its report with milliseconds, to which the view's own are added.
+    /// Answers the query in a rendered view. Returns the answer and its report. `render_ms` is the
+    /// time that rendering `field` took, which the report adds to the total.
     ///
     /// # Errors
     /// A text or picture that cannot be embedded, or a point outside the view.
@@ -47,7 +49,12 @@ impl Question<'_> {
         render_ms: f64,
     ) -> Result<(Answer<'a>, Report)> {
         let mut clock = Instant::now();
-        let mut lap = || std::mem::replace(&mut clock, Instant::now()).elapsed().as_secs_f64() * 1e3;
+        let mut lap = || {
+            std::mem::replace(&mut clock, Instant::now())
+                .elapsed()
+                .as_secs_f64()
+                * 1e3
+        };
         let meaning = self.ask.meaning(session, self.negatives)?;
         let encode_ms = lap();
         let found = meaning.find(grid, field, camera, &self.config)?;
@@ -57,59 +64,80 @@ impl Question<'_> {
         if let Some(radius) = self.dilate {
             mask = metrics::dilate(&mask, camera.width, camera.height, radius);
         }
-        let answer = Answer { grid, field, found, mask, calibrated: meaning.is_calibrated() };
+        let answer = Answer {
+            grid,
+            field,
+            found,
+            mask,
+            calibrated: meaning.is_calibrated(),
+        };
         let total = encode_ms + render_ms + select_ms + restore_ms;
-        let ms = Milliseconds { encode: encode_ms, render: render_ms, select: select_ms, restore: restore_ms, total, gaussians: 0.0 };
+        let ms = Milliseconds {
+            encode: encode_ms,
+            render: render_ms,
+            select: select_ms,
+            restore: restore_ms,
+            total,
+            gaussians: 0.0,
+        };
         let report = answer.report(session, self.ask, camera, self.candidates, ms);
         Ok((answer, report))
     }
 }
 
-/// What is told of an answer.
+/// Report of an answer.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Report {
-    /// The text, the picture's name, or the point.
+    /// Text, picture name or pixels of the query.
     pub text: String,
     /// Name of the view.
     pub view: String,
-    /// Its size.
+    /// Size of the view, as `WIDTHxHEIGHT` in pixels.
     pub size: String,
-    /// Whether anything in the scene matches.
+    /// Whether an object was found.
     pub found: bool,
-    /// Score of the object that is most like what is asked, found or not: the share of absent names that score lower.
+    /// Largest score of all objects, found or not: the share of absent names that score lower.
     pub score: f32,
-    /// Whether that was measured with the scene's encoder; otherwise it follows from what is published about its kind.
+    /// Whether the encoder of the scene is calibrated. Otherwise scores use assumed constants for
+    /// this kind of encoder.
     pub calibrated: bool,
-    /// Whether the text is a name that the user has taught.
+    /// Whether the text is a taught name.
     pub taught: bool,
-    /// The objects that form the answer.
+    /// Targets: the objects of the answer.
     pub objects: Vec<ObjectReport>,
-    /// The best objects, chosen or not.
+    /// Objects of the highest ranks, targets or not.
     pub candidates: Vec<Hit>,
-    /// Pixels of the mask.
+    /// Number of pixels in the mask.
     pub pixels: usize,
-    /// The view that shows it best, where this one hardly does ([`Self::look_elsewhere`]).
+    /// View that shows the answer best, if this view hardly shows it; see [`Self::look_elsewhere`].
     pub seen_best: Option<String>,
-    /// File of the mask, where it was written.
+    /// File of the mask, if it was written.
     pub mask: Option<PathBuf>,
-    /// File of the heat map, where it was written.
+    /// File of the heat map, if it was written.
     pub heatmap: Option<PathBuf>,
-    /// Gaussians of the scene.
+    /// Number of Gaussians in the scene.
     pub gaussians: usize,
-    /// The device's name.
+    /// Name of the device.
     pub adapter: String,
-    /// Where the time went.
+    /// Duration of each step.
     pub ms: Milliseconds,
 }
 
 impl Report {
-    /// Names the view that shows the answer best, where this one hardly does.
+    /// Sets `seen_best` if this view shows fewer than 30 pixels of the answer.
     ///
     /// # Errors
-    /// When the device fails.
+    /// The device fails.
     pub fn look_elsewhere(&mut self, session: &mut Session, grid: &Grid) -> Result<()> {
-        // Without what widening adds to the mask.
-        if self.found && self.objects.iter().map(|object| object.pixels).sum::<usize>() < VISIBLE {
+        // Pixels that dilation adds do not count.
+        if self.found
+            && self
+                .objects
+                .iter()
+                .map(|object| object.pixels)
+                .sum::<usize>()
+                < VISIBLE
+        {
             let ids: Vec<u16> = self.objects.iter().map(|o| o.id).collect();
             self.seen_best = session.seen_best(grid, &ids)?;
         }
@@ -120,71 +148,97 @@ impl Report {
 /// One object of an answer.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ObjectReport {
-    /// Its number in the object table.
+    /// Object id.
     pub id: u16,
-    /// The object that it is a part of; 0 for none.
+    /// Id of the object that it is a part of; 0 for none.
     pub parent: u16,
-    /// How well the views' masks fit it, as their mean IoU.
+    /// Support: mean IoU with the best mask of each view, 0 to 1.
     pub support: f32,
-    /// Its score.
+    /// Score, 0 to 1.
     pub score: f32,
-    /// Left, top, right, bottom in pixels of the view, the last two excluded; nothing where the view does not show it.
+    /// Box in the view: left, top, right and bottom in pixels, the last two exclusive. `None` if
+    /// the view does not show the object.
     pub bbox2d: Option<[u32; 4]>,
-    /// Its box in the world, without stray Gaussians.
+    /// Box in world coordinates: minimum and maximum corner, without outliers.
     pub bbox3d: Option<[[f64; 3]; 2]>,
-    /// Its pixels in the view.
+    /// Number of its pixels in the view.
     pub pixels: usize,
-    /// Its Gaussians.
+    /// Number of its Gaussians.
     pub gaussians: usize,
 }
 
-/// Milliseconds of an answer.
+/// Duration of the steps of an answer, in milliseconds.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Milliseconds {
-    /// Embedding the question.
+    /// Embedding the query.
     pub encode: f64,
     /// Rendering the view.
     pub render: f64,
-    /// Choosing objects.
+    /// Selecting the targets.
     pub select: f64,
-    /// Making the mask.
+    /// Computing the mask.
     pub restore: f64,
-    /// All of it.
+    /// Sum of the steps above.
     pub total: f64,
-    /// Choosing the Gaussians of the answer, for boxes and exports, which a mask does not wait for.
+    /// Collecting the Gaussians of the answer, for boxes and exports. It is not part of the total.
     pub gaussians: f64,
 }
 
-/// Letters of a file's name that tell what was asked.
+/// Largest number of characters of a query in a file name.
 const NAME_LENGTH: usize = 60;
 
-/// A text as part of a file's name. Where more than spaces gets lost, a number that only this text has takes its place.
+/// Converts a text to a part of a file name. If characters other than spaces are lost, a hash of
+/// the text is appended.
 fn file_name(text: &str) -> String {
-    let safe: String = text.chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(NAME_LENGTH).collect();
-    let is_told = text.chars().count() <= NAME_LENGTH && text.chars().all(|c| c.is_alphanumeric() || c == ' ');
-    if is_told { safe } else { format!("{safe}_{}", text.bytes().fold(5381u32, |hash, byte| hash.wrapping_mul(33) ^ u32::from(byte))) }
+    let safe: String = text
+        .chars()
+        .map(|c| if c.is_alphanumeric() { c } else { '_' })
+        .take(NAME_LENGTH)
+        .collect();
+    let is_told = text.chars().count() <= NAME_LENGTH
+        && text.chars().all(|c| c.is_alphanumeric() || c == ' ');
+    if is_told {
+        safe
+    } else {
+        format!(
+            "{safe}_{}",
+            text.bytes()
+                .fold(5381u32, |hash, byte| hash.wrapping_mul(33)
+                    ^ u32::from(byte))
+        )
+    }
 }
 
-/// What was found, in a view.
+/// The answer to a query in one view.
 pub struct Answer<'a> {
     /// The object table.
     pub grid: &'a Grid,
-    /// What the view tells about objects.
+    /// Rendered object data of the view.
     pub field: &'a Field,
-    /// Objects by score, and those chosen.
+    /// Ranked objects and targets.
     pub found: Found,
-    /// Pixels of the answer.
+    /// Mask of the answer, row by row.
     pub mask: Vec<bool>,
     /// See [`Report::calibrated`].
     pub calibrated: bool,
 }
 
 impl Answer<'_> {
-    fn report(&self, session: &Session, ask: &Ask, camera: &Camera, candidates: usize, mut ms: Milliseconds) -> Report {
+    fn report(
+        &self,
+        session: &Session,
+        ask: &Ask,
+        camera: &Camera,
+        candidates: usize,
+        mut ms: Milliseconds,
+    ) -> Report {
         let Found { ranked, targets } = &self.found;
         let text = ask.name();
         let started = Instant::now();
-        let owned: Vec<Vec<usize>> = targets.iter().map(|t| selection::gaussians(&session.gaussians, self.grid, &[t.id])).collect();
+        let owned: Vec<Vec<usize>> = targets
+            .iter()
+            .map(|t| selection::gaussians(&session.gaussians, self.grid, &[t.id]))
+            .collect();
         ms.gaussians = started.elapsed().as_secs_f64() * 1e3;
         Report {
             view: camera.name.clone(),
@@ -194,7 +248,11 @@ impl Answer<'_> {
             calibrated: self.calibrated,
             taught: matches!(ask, Ask::Text(_)) && session.is_taught(&text),
             text,
-            objects: targets.iter().zip(&owned).map(|(t, own)| self.object(session, camera.width, t, own)).collect(),
+            objects: targets
+                .iter()
+                .zip(&owned)
+                .map(|(t, own)| self.object(session, camera.width, t, own))
+                .collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),
             seen_best: None,
@@ -206,7 +264,7 @@ impl Answer<'_> {
         }
     }
 
-    /// Box and size of one object in this view and in the world.
+    /// Measures one object: its boxes in this view and in the world, its pixels and its Gaussians.
     fn object(&self, session: &Session, width: u32, hit: &Hit, own: &[usize]) -> ObjectReport {
         let mut bounds: Option<[u32; 4]> = None;
         let mask = self.field.mask(self.grid, &[*hit]);
@@ -228,11 +286,18 @@ impl Answer<'_> {
         }
     }
 
-    /// Writes mask, overlay and, where wanted, heat map; names them in `report`, and returns the overlay.
+    /// Writes the mask, the overlay and, with `heat`, the heat map to `folder`. Records mask and
+    /// heat map in `report`, and returns the overlay.
     ///
     /// # Errors
-    /// The system's refusal.
-    pub fn write(&self, folder: &Path, frame: &Frame, heat: bool, report: &mut Report) -> Result<RgbImage> {
+    /// A file cannot be written.
+    pub fn write(
+        &self,
+        folder: &Path,
+        frame: &Frame,
+        heat: bool,
+        report: &mut Report,
+    ) -> Result<RgbImage> {
         let (w, h) = (frame.width, frame.height);
         let safe = file_name(&report.text);
         let view = report.view.clone();
@@ -240,7 +305,7 @@ impl Answer<'_> {
         let color = image_io::from_planar(frame.channels(0, 3), w, h);
         let lit = overlay(&color, &self.mask);
         if self.found.targets.is_empty() {
-            // A mask of an earlier run would contradict the answer.
+            // Without targets, mask and overlay of an earlier run would be wrong.
             for what in ["mask", "overlay"] {
                 let _ = std::fs::remove_file(path(what));
             }
@@ -250,7 +315,10 @@ impl Answer<'_> {
             report.mask = Some(path("mask"));
         }
         if heat {
-            image_io::save_png(&path("heatmap"), heatmap(&color, &self.field.relevancy(self.grid, &self.found.heat())))?;
+            image_io::save_png(
+                &path("heatmap"),
+                heatmap(&color, &self.field.relevancy(self.grid, &self.found.heat())),
+            )?;
             report.heatmap = Some(path("heatmap"));
         }
         Ok(lit)
@@ -263,9 +331,19 @@ mod tests {
 
     #[test]
     fn files_of_different_questions_have_different_names() {
-        assert_eq!([file_name("fox"), file_name("red cup"), file_name("Füchse 2")], ["fox", "red_cup", "Füchse_2"]);
+        assert_eq!(
+            [
+                file_name("fox"),
+                file_name("red cup"),
+                file_name("Füchse 2")
+            ],
+            ["fox", "red_cup", "Füchse_2"]
+        );
         let long = [file_name(&"1,2+".repeat(64)), file_name(&"1,3+".repeat(64))];
-        assert!(long[0] != long[1] && long.iter().all(|name| name.len() < 80), "{long:?}");
+        assert!(
+            long[0] != long[1] && long.iter().all(|name| name.len() < 80),
+            "{long:?}"
+        );
         assert_ne!(file_name("red-cup"), file_name("red_cup"));
     }
 }

@@ -1,4 +1,4 @@
-//! An opened, trained scene that renders and answers.
+//! An opened, trained scene, which renders views and answers queries.
 
 pub mod answer;
 pub mod ask;
@@ -33,39 +33,46 @@ pub use views::{ViewChoice, parse_size};
 pub struct Session {
     /// Its folder.
     pub folder: SceneFolder,
-    /// What made it.
+    /// Manifest of the scene.
     pub manifest: Manifest,
-    /// All views, sorted by name.
+    /// Cameras of all views, sorted by name.
     pub cameras: Vec<Camera>,
     /// The Gaussians.
     pub gaussians: Gaussians,
-    /// The device, holding the Gaussians.
+    /// Engine of the device, with the Gaussians loaded.
     pub engine: Box<dyn Engine>,
-    /// A CLIP text tower that is used instead of the one the scene remembers.
+    /// File of a CLIP text tower to use instead of the one that the manifest records.
     pub clip_text: Option<PathBuf>,
-    /// How it was trained.
+    /// Report of the training.
     pub trained: train::Report,
-    /// What cosines are worth, where that is not to be what is known of the scene's encoder.
+    /// Calibrations to use instead of those of the encoder.
     pub calibrations: Option<Calibrations>,
     texts: OnceCell<Texts>,
-    /// Whether names that the user taught are known.
+    /// Whether taught names are used.
     taught: bool,
-    /// The views that show objects best, as far as they were asked for.
+    /// Cache of the view that shows most of some objects, by object ids.
     seen_best: BTreeMap<Vec<u16>, Option<String>>,
 }
 
 impl Session {
-    /// Loads SCENE and puts it on the device.
+    /// Loads the scene in the folder `root`, and copies its Gaussians to the device.
+    ///
+    /// # Errors
+    /// A scene that is not trained, damaged files, or a device that fails.
     pub fn open(root: &Path, device: &str) -> Result<Self> {
         let folder = SceneFolder::open(root)?;
         let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
-        let Some(trained) = train::Report::of(&manifest, root)? else {
+        let Some(trained) = train::Report::from_manifest(&manifest, root)? else {
             let root = root.display();
-            bail!("{root}: its photos were preprocessed again after it was trained; run 'fastlgs train {root}' again");
+            bail!(
+                "{root}: the photos were preprocessed again after the training; run 'fastlgs train {root}' again"
+            );
         };
         if folder.is_compact() {
-            Grid::load(&folder).context("the object grid cannot be read; export the scene again")?.set_codes(&mut gaussians);
+            Grid::load(&folder)
+                .context("the object grid cannot be read; export the scene again")?
+                .set_codes(&mut gaussians);
         }
         let mut engine = fastlgs_raster::open_engine(device)?;
         engine.set_state(&State::of(&gaussians))?;
@@ -85,7 +92,7 @@ impl Session {
         })
     }
 
-    /// Puts other Gaussians in the place of the scene's.
+    /// Replaces the Gaussians of the scene, on the device as well.
     pub fn show(&mut self, gaussians: Gaussians) -> Result<()> {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
@@ -93,7 +100,8 @@ impl Session {
         Ok(())
     }
 
-    /// Renders once in passing: drivers compile kernels when they first run, which no query should wait for.
+    /// Renders a view of 16x16 pixels, so that the driver compiles the shaders before the first
+    /// query.
     pub fn warm_up(&mut self) -> Result<()> {
         match self.cameras.first().map(|c| c.resized(16, 16)) {
             Some(small) => self.field(&small, None).map(|_| ()),
@@ -101,21 +109,22 @@ impl Session {
         }
     }
 
-    /// The object table.
+    /// Loads the object table.
     ///
     /// # Errors
-    /// A damaged table, or Gaussians that another program saved without the objects that they belong to.
+    /// A damaged table, or a PLY file that another program saved without object ids.
     pub fn grid(&self) -> Result<Grid> {
-        if !self.folder.is_compact() && !ply::has_objects(&self.folder.ply_path())? {
+        if !self.folder.is_compact() && !ply::has_object_ids(&self.folder.ply_path())? {
             let (path, root) = (self.folder.ply_path(), self.folder.root.display());
             bail!(
-                "{}: another program saved it without the column object_id, so that it has no objects; \
-                 'fastlgs train {root} --init {} --iterations 0' finds them again and keeps the Gaussians",
+                "{}: another program saved this file without the column object_id, so the objects are lost; \
+                 run 'fastlgs train {root} --init {} --iterations 0' to find them again and keep the Gaussians",
                 path.display(),
                 path.display()
             );
         }
-        Grid::load(&self.folder).context("the object grid cannot be read; run 'fastlgs train' again")
+        Grid::load(&self.folder)
+            .context("the object grid cannot be read; run 'fastlgs train' again")
     }
 
     /// Renders colour and transmittance; features are 0.
@@ -128,25 +137,51 @@ impl Session {
         Ok(self.engine.render(self.view(camera), Channels::Feature)?)
     }
 
-    /// The frame of a camera, rendered in the way the scene was trained.
+    /// Returns the render settings of a camera, as in training.
     pub fn view(&self, camera: &Camera) -> View {
         self.trained.view(camera, &self.gaussians)
     }
 
-    /// Renders the expected depth (sum of w z / sum of w), infinite where nothing is.
+    /// Renders the expected depth of each pixel, in units of the scene: sum of w z / sum of w, with
+    /// blending weights w. Pixels with a transmittance of 0.999 or more are infinite.
     pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
-        let frame = self.engine.render(View { depth_as_feature: 1, ..self.view(camera) }, Channels::Feature)?;
-        let solid = |(z, t): (&f32, &f32)| if *t < 0.999 { z / (1.0 - t) } else { f32::INFINITY };
-        Ok(frame.channels(3, 4).iter().zip(frame.channels(6, 7)).map(solid).collect())
+        let frame = self.engine.render(
+            View {
+                depth_as_feature: 1,
+                ..self.view(camera)
+            },
+            Channels::Feature,
+        )?;
+        let solid = |(z, t): (&f32, &f32)| {
+            if *t < 0.999 {
+                z / (1.0 - t)
+            } else {
+                f32::INFINITY
+            }
+        };
+        Ok(frame
+            .channels(3, 4)
+            .iter()
+            .zip(frame.channels(6, 7))
+            .map(solid)
+            .collect())
     }
 
-    /// What a view tells about objects, in the way the scene was trained, unless `tau_ac` asks for the paper's.
+    /// Renders the object data of a view: id weights if features are lifted, codes if they are
+    /// trained. With `tau_ac`, codes are rendered in both cases (paper). Id weights include
+    /// transparent objects, drawn as solid.
     pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
         let solid = u32::from(self.trained.clear > 0);
-        self.field_of(View { solid, ..self.view(camera) }, tau_ac)
+        self.field_of(
+            View {
+                solid,
+                ..self.view(camera)
+            },
+            tau_ac,
+        )
     }
 
-    /// The same of what shows alone, as if nothing were seen through.
+    /// Renders the object data of a view without transparent objects.
     pub fn field_of_shown(&mut self, camera: &Camera) -> Result<Field> {
         self.field_of(self.view(camera), None)
     }
@@ -154,32 +189,58 @@ impl Session {
     fn field_of(&mut self, view: View, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
         if lifted && tau_ac.is_none() {
-            return Ok(Field::Shares(self.engine.render_ids(view, &self.gaussians.object_ids)?));
+            return Ok(Field::Shares(
+                self.engine.render_ids(view, &self.gaussians.object_ids)?,
+            ));
         }
-        let frame = self.engine.render(View { solid: 0, ..view }, Channels::Feature)?;
+        let frame = self
+            .engine
+            .render(View { solid: 0, ..view }, Channels::Feature)?;
         let (width, height) = (frame.width, frame.height);
-        // Codes that were trained make up for what passes through; those that were lifted do not.
-        let values = if lifted { covered(&frame).concat() } else { frame.channels(3, 6).to_vec() };
-        Ok(Field::Features { width, height, values, tau_ac })
+        // Trained codes compensate for the transmittance; lifted codes must be divided by the
+        // coverage.
+        let values = if lifted {
+            covered(&frame).concat()
+        } else {
+            frame.channels(3, 6).to_vec()
+        };
+        Ok(Field::Features {
+            width,
+            height,
+            values,
+            tau_ac,
+        })
     }
 
-    /// The view that shows most of some objects; nothing where none does.
+    /// Returns the name of the view that shows most pixels of some objects; `None` if no view shows
+    /// them.
     ///
     /// # Errors
-    /// When the device fails.
+    /// The device fails.
     pub fn seen_best(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
-        /// Longer side of the small pictures that are looked at.
+        /// Longer side of the rendered views, in pixels.
         const SIDE: u32 = 128;
         if let Some(known) = self.seen_best.get(ids) {
             return Ok(known.clone());
         }
-        let targets: Vec<Hit> = ids.iter().map(|id| Hit { id: *id, score: 1.0 }).collect();
+        let targets: Vec<Hit> = ids
+            .iter()
+            .map(|id| Hit {
+                id: *id,
+                score: 1.0,
+            })
+            .collect();
         let mut best = (0, None);
         for camera in self.cameras.clone() {
             let longer = camera.width.max(camera.height);
             let side = |v: u32| (v * SIDE.min(longer) / longer).max(1);
             let small = camera.resized(side(camera.width), side(camera.height));
-            let pixels = self.field(&small, None)?.mask(grid, &targets).iter().filter(|m| **m).count();
+            let pixels = self
+                .field(&small, None)?
+                .mask(grid, &targets)
+                .iter()
+                .filter(|m| **m)
+                .count();
             if pixels > best.0 {
                 best = (pixels, Some(camera.name));
             }
@@ -188,7 +249,7 @@ impl Session {
         Ok(best.1)
     }
 
-    /// The text tower of the encoder that made the scene's embeddings; the first call loads it.
+    /// Returns the text encoder of the scene; the first call loads it.
     fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
             let texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
@@ -197,7 +258,8 @@ impl Session {
         Ok(self.texts.get().expect("set above"))
     }
 
-    /// A text tower with this session's calibrations, and without names where these are not to count.
+    /// Applies the calibrations of this scene to a text encoder, and removes taught names if they
+    /// are not used.
     fn as_asked_here(&self, mut texts: Texts) -> Texts {
         texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
         if !self.taught {
@@ -206,23 +268,24 @@ impl Session {
         texts
     }
 
-    /// Prepares a text.
+    /// Embeds a text, or looks up a taught name.
     ///
     /// # Errors
-    /// As [`Texts::query`], and where the text tower cannot be loaded.
+    /// As [`Texts::query`], or a text encoder that cannot be loaded.
     pub fn text_query(&self, text: &str) -> Result<TextQuery> {
         self.texts()?.query(text)
     }
 
-    /// Prepares many texts at once.
+    /// Embeds many texts at once. A name that was taught only with another encoder is embedded as a
+    /// text.
     ///
     /// # Errors
-    /// As [`Self::text_query`], but names that were taught with another encoder are taken as words.
+    /// As [`Self::text_query`], except for such names.
     pub fn text_queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
         self.texts()?.queries(texts)
     }
 
-    /// Names that the user has taught with this scene's encoder.
+    /// Returns the names that were taught with the encoder of this scene.
     ///
     /// # Errors
     /// As [`Self::text_query`].
@@ -230,22 +293,22 @@ impl Session {
         Ok(self.texts()?.taught())
     }
 
-    /// Whether the user has taught a name.
+    /// Returns whether a text is a taught name; false if the text encoder cannot be loaded.
     pub fn is_taught(&self, text: &str) -> bool {
         self.texts().is_ok_and(|texts| texts.is_taught(text))
     }
 
-    /// Embeds texts by a tower of the caller's from now on, for scenes whose embeddings were imported.
+    /// Replaces the text encoder, for scenes with imported embeddings.
     ///
     /// # Errors
-    /// A tower whose embeddings have another length than the scene's.
+    /// An encoder whose embeddings have another length than those of the scene.
     pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
         let texts = Texts::of(encoder, &self.folder, &self.manifest)?;
         self.texts = OnceCell::from(self.as_asked_here(texts));
         Ok(())
     }
 
-    /// Takes all texts as words from now on, whatever the user taught: figures tell what the encoder knows by itself.
+    /// Ignores taught names from now on, so that an evaluation measures the encoder alone.
     pub fn forget_taught(&mut self) {
         self.taught = false;
         if let Some(texts) = self.texts.get_mut() {
@@ -253,26 +316,49 @@ impl Session {
         }
     }
 
-    /// Forgets the text tower, so that the next text is asked with the names as they are then.
+    /// Drops the text encoder. The next query loads it again, with the current taught names.
     pub fn forget_texts(&mut self) {
         self.texts = OnceCell::new();
     }
 
-    /// The image tower that made the scene's embeddings.
+    /// Loads the image encoder of the scene.
     pub fn image_encoder(&self) -> Result<Box<dyn Encoder>> {
         eyes::encoder_of(&self.folder, &self.manifest)
     }
 }
 
-/// The three features of each pixel as a mean over what covers it: blended ones over 1 - transmittance.
+/// Returns the mean feature of each pixel, one plane for each channel: the blended feature divided
+/// by 1 - transmittance. It is 0 at a transmittance of 0.999 or more.
 pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
     let over = |(v, t): (&f32, &f32)| if *t < 0.999 { v / (1.0 - t) } else { 0.0 };
-    [3, 4, 5].map(|k| frame.channels(k, k + 1).iter().zip(frame.channels(6, 7)).map(over).collect())
+    [3, 4, 5].map(|k| {
+        frame
+            .channels(k, k + 1)
+            .iter()
+            .zip(frame.channels(6, 7))
+            .map(over)
+            .collect()
+    })
 }
 
-/// Bytes of everything that a query needs.
+/// Returns the size of all files that a query needs, in bytes.
 pub fn bytes(root: &Path) -> u64 {
-    let model = if root.join("scene.ply").is_file() { "scene.ply" } else { "scene.safetensors" };
-    let files = [model, "grid.safetensors", "grid.json", "scene.json", "cameras/cameras.json", "cameras/trained.json"].into_iter();
-    files.filter_map(|f| std::fs::metadata(root.join(f)).ok()).map(|m| m.len()).sum()
+    let model = if root.join("scene.ply").is_file() {
+        "scene.ply"
+    } else {
+        "scene.safetensors"
+    };
+    let files = [
+        model,
+        "grid.safetensors",
+        "grid.json",
+        "scene.json",
+        "cameras/cameras.json",
+        "cameras/trained.json",
+    ]
+    .into_iter();
+    files
+        .filter_map(|f| std::fs::metadata(root.join(f)).ok())
+        .map(|m| m.len())
+        .sum()
 }

@@ -1,31 +1,38 @@
-//! Texts as they are compared: the same words typed, pasted or spoken of in another way are the same text.
+//! Normalises texts, so that different spellings of the same words are equal.
 
 use unicode_normalization::UnicodeNormalization;
 
-/// Words before a name that do not change what it means.
+/// Articles that are removed from the beginning of a text.
 const ARTICLES: [&str; 3] = ["a", "an", "the"];
 
-/// Characters that show nothing: a byte order mark, joiners, and marks of direction.
+/// Returns whether a character is invisible: soft hyphen, zero-width character, direction mark or
+/// byte order mark.
 fn is_invisible(c: char) -> bool {
     matches!(c, '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2060}'..='\u{2064}' | '\u{feff}')
 }
 
-/// Quotes, brackets, hyphens and other marks that separate words.
+/// Returns whether a character separates words: white space, control character, quote, bracket,
+/// hyphen, dash or underscore.
 fn separates(c: char) -> bool {
     c.is_whitespace()
         || c.is_control()
-        || "\"`\u{b4}\u{ab}\u{bb}()[]{}<>-_\u{2010}\u{2011}\u{2012}\u{2013}\u{2014}\u{2015}\u{2212}".contains(c)
+        || "\"`\u{b4}\u{ab}\u{bb}()[]{}<>-_\u{2010}\u{2011}\u{2012}\u{2013}\u{2014}\u{2015}\u{2212}"
+            .contains(c)
         || ('\u{2018}'..='\u{201f}').contains(&c)
 }
 
-/// A text without articles, quotes, brackets, hyphens and characters that show nothing, its letters composed (NFC), one space between words. A text of
-/// nothing else is empty.
+/// Normalises a text: composes letters (NFC), and separates words by one space. Quotes, brackets,
+/// hyphens, invisible characters, leading articles, and punctuation at both ends are removed. The
+/// result is empty if nothing remains.
 pub fn normalised(text: &str) -> String {
     let composed: String = text.nfc().filter(|c| !is_invisible(*c)).collect();
     let characters: Vec<char> = composed.chars().collect();
-    let letter = |at: Option<usize>| at.and_then(|k| characters.get(k)).is_some_and(|c| c.is_alphanumeric());
+    let letter = |at: Option<usize>| {
+        at.and_then(|k| characters.get(k))
+            .is_some_and(|c| c.is_alphanumeric())
+    };
     let plain = |(k, c): (usize, &char)| match c {
-        // Within a word it is an apostrophe.
+        // Between letters or digits it is an apostrophe.
         '\'' | '\u{2019}' if letter(k.checked_sub(1)) && letter(Some(k + 1)) => '\'',
         '\'' => ' ',
         c if separates(*c) => ' ',
@@ -40,7 +47,11 @@ pub fn normalised(text: &str) -> String {
         *last = last.trim_end_matches(|c: char| ".,;:!?".contains(c));
     }
     words.retain(|word| !word.is_empty());
-    while words.len() > 1 && ARTICLES.iter().any(|article| words[0].eq_ignore_ascii_case(article)) {
+    while words.len() > 1
+        && ARTICLES
+            .iter()
+            .any(|article| words[0].eq_ignore_ascii_case(article))
+    {
         words.remove(0);
     }
     words.join(" ")
@@ -73,7 +84,10 @@ mod tests {
         }
         assert_eq!(normalised("cafe\u{301}"), normalised("caf\u{e9}"));
         assert_eq!(normalised("the child\u{2019}s toy"), "child's toy");
-        assert_eq!(["a", "The", "A4 sheet", "3.5 inch disk"].map(normalised), ["a", "The", "A4 sheet", "3.5 inch disk"]);
+        assert_eq!(
+            ["a", "The", "A4 sheet", "3.5 inch disk"].map(normalised),
+            ["a", "The", "A4 sheet", "3.5 inch disk"]
+        );
         assert_eq!(["", "  ", "\u{200b}", "\"\"", "?"].map(normalised), [""; 5]);
     }
 }

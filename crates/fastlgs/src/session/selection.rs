@@ -1,4 +1,4 @@
-//! The three-dimensional side of an answer: which Gaussians belong to it.
+//! Selects the Gaussians of an answer, and exports them.
 
 use crate::Result;
 use crate::error::{Context, bail};
@@ -9,51 +9,67 @@ use fastlgs_grid::Grid;
 use glam::Vec3;
 use std::path::Path;
 
-/// Places of the Gaussians of some objects.
+/// Returns the indices of all Gaussians that belong to some objects.
 pub fn gaussians(scene: &Gaussians, grid: &Grid, objects: &[u16]) -> Vec<usize> {
     let members = grid.members(objects);
     let ids = scene.object_ids.iter().enumerate();
-    ids.filter(|(_, id)| members.get(usize::from(**id)) == Some(&true)).map(|(i, _)| i).collect()
+    ids.filter(|(_, id)| members.get(usize::from(**id)) == Some(&true))
+        .map(|(i, _)| i)
+        .collect()
 }
 
-/// Writes the selection (`keep`), or the scene without it, in the format of the file's ending.
+/// Writes the selected Gaussians (`keep`), or all others, in the format of the file extension.
 ///
 /// # Errors
-/// An empty rest, an unknown ending, or the system's refusal.
-pub fn export(path: &Path, scene: &Gaussians, world: &World, selected: &[usize], keep: bool) -> Result<()> {
+/// No Gaussians are left, the extension is unknown, or the file cannot be written.
+pub fn export(
+    path: &Path,
+    scene: &Gaussians,
+    world: &World,
+    selected: &[usize],
+    keep: bool,
+) -> Result<()> {
     let mut inside = vec![false; scene.len()];
     selected.iter().for_each(|&i| inside[i] = true);
     let places: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
     if places.is_empty() {
-        bail!("{}: nothing would be left to write", path.display());
+        bail!(
+            "{}: no Gaussians are left to write; change the selection",
+            path.display()
+        );
     }
     let selected = scene.select(&places);
     write(path, &selected, world).context("the selection cannot be written")
 }
 
-/// Files that Gaussians are written to, by their endings.
+/// File extensions of the formats to which Gaussians can be written.
 pub const ENDINGS: [&str; 4] = ["ply", "spz", "sog", "glb"];
 
-/// How a scene stands in the world.
+/// World frame and upward direction of a scene.
 pub struct World {
-    /// Its place and unit.
+    /// Origin and unit.
     pub frame: WorldFrame,
-    /// Its upward direction, a unit vector.
+    /// Upward direction in coordinates of the scene, a unit vector.
     pub up: Vec3,
 }
 
 impl World {
-    /// As the scene's manifest states it; up is that of the cameras.
+    /// Creates the world of a scene: the frame of its manifest, and the mean upward direction of
+    /// its cameras.
     pub fn of(manifest: &Manifest, cameras: &[Camera]) -> Self {
-        Self { frame: manifest.frame, up: mean_up(cameras) }
+        Self {
+            frame: manifest.frame,
+            up: mean_up(cameras),
+        }
     }
 }
 
-/// Writes Gaussians, in the coordinates of the world, as the file's ending says ([`ENDINGS`]). Formats of few bits hold the scene's
-/// own coordinates, and no Gaussians far outside, on which they would spend their range; the log says so.
+/// Writes Gaussians in world coordinates, in the format of the file extension ([`EXTENSIONS`]). SPZ
+/// and SOG have few bits for a coordinate: they hold scene coordinates, without distant outliers,
+/// and warnings report this.
 ///
 /// # Errors
-/// An unknown ending, or the system's refusal.
+/// An unknown extension, or a file that cannot be written.
 pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
     let frame = &world.frame;
     match path.extension().and_then(|e| e.to_str()) {
@@ -61,26 +77,36 @@ pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
         Some("spz") => spz::write(path, &of_few_bits(path, gaussians, frame))?,
         Some("sog") => sog::write(path, &of_few_bits(path, gaussians, frame))?,
         Some("glb") => glb::write(path, gaussians, world.up, frame)?,
-        _ => bail!("{}: name it .ply, .spz, .sog or .glb", path.display()),
+        _ => bail!(
+            "{}: the file extension is unknown; use .ply, .spz, .sog or .glb",
+            path.display()
+        ),
     }
     Ok(())
 }
 
-/// The scene as formats of few bits hold it: relative to the frame's origin, in the world's units, without far outliers.
+/// Removes distant outliers for a format with few bits. Warns about them, and about scene
+/// coordinates that are not world coordinates.
 fn of_few_bits(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> Gaussians {
     let (written, dropped) = gaussians.without_far_outliers();
     let path = path.display();
     if dropped > 0 {
-        tracing::warn!("{path}: {dropped} Gaussians far outside of the scene were left out, as the format's precision would suffer");
+        tracing::warn!(
+            "{path}: {dropped} Gaussians far outside the scene were left out, because they would reduce the precision of all others"
+        );
     }
     if !frame.is_identity() {
         let (origin, scale) = (frame.origin, frame.scale);
-        tracing::warn!("{path}: the format cannot hold the world's coordinates; they are origin + scale x those in it: {origin}, {scale}");
+        tracing::warn!(
+            "{path}: this format cannot hold world coordinates; compute them as origin + scale x coordinate, with origin {origin} and scale {scale}"
+        );
     }
     written
 }
 
-/// World box [min, max] between the 2nd and 98th percentile of the Gaussians' centres: a few floaters do not stretch it.
+/// Returns the minimum and maximum corner of the Gaussians `own`, in world coordinates; `None` if
+/// there are none. Corners are the 2nd and 98th percentiles of the centres, so that floaters do not
+/// enlarge the box.
 pub fn robust_box(scene: &Gaussians, frame: &WorldFrame, own: &[usize]) -> Option<[[f64; 3]; 2]> {
     if own.is_empty() {
         return None;
@@ -92,5 +118,5 @@ pub fn robust_box(scene: &Gaussians, frame: &WorldFrame, own: &[usize]) -> Optio
         out[0][k] = values[values.len() * 2 / 100];
         out[1][k] = values[(values.len() - 1) * 98 / 100];
     }
-    Some(out.map(|corner| frame.reported(corner)))
+    Some(out.map(|corner| frame.to_world_decimal(corner)))
 }

@@ -1,4 +1,4 @@
-//! A contact sheet: pictures in rows, each over its words.
+//! Contact sheets: rows of images, each with a title and a note below.
 
 use super::Session;
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
@@ -9,7 +9,7 @@ use fastlgs_raster::Frame;
 use image::imageops::{FilterType, overlay, resize};
 use image::{Rgb, RgbImage};
 
-/// A picture and what is said of it.
+/// An image with its title and note.
 pub struct Tile {
     picture: RgbImage,
     title: String,
@@ -17,60 +17,114 @@ pub struct Tile {
 }
 
 impl Tile {
-    /// A picture of any size, what it is, and what there is to know; may be empty.
+    /// Creates a tile from an image of any size. Title and note may be empty.
     pub fn new(picture: &RgbImage, title: impl Into<String>, note: impl Into<String>) -> Self {
-        Self { picture: fitted(picture), title: title.into(), note: note.into() }
+        Self {
+            picture: fitted(picture),
+            title: title.into(),
+            note: note.into(),
+        }
     }
 }
 
-/// What a view shows: its photo, where there is one, the render, and the objects.
-pub fn of_view(session: &Session, grid: &Grid, camera: &Camera, frame: &Frame, field: &Field) -> Vec<Tile> {
+/// Returns the tiles of a view: its photo if there is one, the render, and the object map.
+pub fn of_view(
+    session: &Session,
+    grid: &Grid,
+    camera: &Camera,
+    frame: &Frame,
+    field: &Field,
+) -> Vec<Tile> {
     let tile = |picture: RgbImage, title: &str| Tile::new(&picture, title, &camera.name);
     let owners = field.owners(grid);
-    let objects = RgbImage::from_fn(frame.width, frame.height, |x, y| Rgb(turbo::id_color(owners.at(x, y))));
+    let objects = RgbImage::from_fn(frame.width, frame.height, |x, y| {
+        Rgb(turbo::id_color(owners.at(x, y)))
+    });
     let render = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
-    let photo = session.folder.photo(&camera.name).ok().map(|photo| tile(photo, "photo"));
-    photo.into_iter().chain([tile(render, "render"), tile(objects, "objects")]).collect()
+    let photo = session
+        .folder
+        .photo(&camera.name)
+        .ok()
+        .map(|photo| tile(photo, "photo"));
+    photo
+        .into_iter()
+        .chain([tile(render, "render"), tile(objects, "objects")])
+        .collect()
 }
 
-/// Longer side of a picture on the sheet.
+/// Longer side of an image on the sheet, in pixels.
 const SIDE: u32 = 320;
-/// Room around a picture.
+/// Space between images, in pixels.
 const GAP: u32 = 10;
-/// Height of the letters of a title, and of a note.
+/// Font sizes of title and note, in pixels.
 const LETTERS: [f32; 2] = [19.0, 15.0];
-/// Room for the words under a picture.
+/// Height of the text below an image, in pixels.
 const WORDS: u32 = 48;
 const PAPER: Rgb<u8> = Rgb([255; 3]);
 const INK: [Rgb<u8>; 2] = [Rgb([20; 3]), Rgb([90; 3])];
 
-/// Puts tiles into rows of `columns`.
+/// Arranges tiles in rows of `columns` tiles.
 pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
     let columns = columns.clamp(1, tiles.len().max(1)) as u32;
-    let width = tiles.iter().map(|tile| tile.picture.width()).max().unwrap_or(SIDE) + GAP;
-    let height = tiles.iter().map(|tile| tile.picture.height()).max().unwrap_or(0) + WORDS + GAP;
+    let width = tiles
+        .iter()
+        .map(|tile| tile.picture.width())
+        .max()
+        .unwrap_or(SIDE)
+        + GAP;
+    let height = tiles
+        .iter()
+        .map(|tile| tile.picture.height())
+        .max()
+        .unwrap_or(0)
+        + WORDS
+        + GAP;
     let rows = (tiles.len() as u32).div_ceil(columns);
     let mut page = RgbImage::from_pixel(columns * width + GAP, rows * height + GAP, PAPER);
     for (place, tile @ Tile { picture, .. }) in (0..).zip(tiles) {
-        let (left, top) = (GAP + place % columns * width, GAP + place / columns * height);
+        let (left, top) = (
+            GAP + place % columns * width,
+            GAP + place / columns * height,
+        );
         overlay(&mut page, picture, i64::from(left), i64::from(top));
         let base = (top + picture.height()) as f32;
-        write(&mut page, &tile.title, [left as f32, base + LETTERS[0] + 2.0], width - GAP, LETTERS[0], INK[0]);
-        write(&mut page, &tile.note, [left as f32, base + LETTERS[0] + LETTERS[1] + 5.0], width - GAP, LETTERS[1], INK[1]);
+        write(
+            &mut page,
+            &tile.title,
+            [left as f32, base + LETTERS[0] + 2.0],
+            width - GAP,
+            LETTERS[0],
+            INK[0],
+        );
+        write(
+            &mut page,
+            &tile.note,
+            [left as f32, base + LETTERS[0] + LETTERS[1] + 5.0],
+            width - GAP,
+            LETTERS[1],
+            INK[1],
+        );
     }
     page
 }
 
-/// A picture whose longer side is [`SIDE`].
+/// Scales an image so that its longer side is [`SIDE`].
 fn fitted(picture: &RgbImage) -> RgbImage {
     let scale = SIDE as f32 / picture.width().max(picture.height()).max(1) as f32;
     let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
-    resize(picture, side(picture.width()), side(picture.height()), FilterType::Triangle)
+    resize(
+        picture,
+        side(picture.width()),
+        side(picture.height()),
+        FilterType::Triangle,
+    )
 }
 
-/// Writes a line whose letters stand on `base`; what does not fit is cut off.
+/// Draws a line of text with its baseline starting at `base` (x, y). Text beyond `room` pixels is
+/// cut off.
 fn write(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32, ink: Rgb<u8>) {
-    let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT).expect("the font is part of the program");
+    let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT)
+        .expect("the font is part of the program");
     let font = font.as_scaled(PxScale::from(size));
     let end = base[0] + room as f32;
     let mut pen = base[0];
@@ -84,11 +138,17 @@ fn write(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32,
         if let Some(outline) = font.outline_glyph(glyph) {
             let corner = outline.px_bounds().min;
             outline.draw(|x, y, cover| {
-                let (x, y) = (corner.x as i64 + i64::from(x), corner.y as i64 + i64::from(y));
-                let inside = x >= 0 && y >= 0 && x < i64::from(page.width()) && y < i64::from(page.height());
+                let (x, y) = (
+                    corner.x as i64 + i64::from(x),
+                    corner.y as i64 + i64::from(y),
+                );
+                let inside =
+                    x >= 0 && y >= 0 && x < i64::from(page.width()) && y < i64::from(page.height());
                 if inside {
                     let pixel = page.get_pixel_mut(x as u32, y as u32);
-                    *pixel = Rgb([0, 1, 2].map(|k| (f32::from(pixel[k]) * (1.0 - cover) + f32::from(ink[k]) * cover) as u8));
+                    *pixel = Rgb([0, 1, 2].map(|k| {
+                        (f32::from(pixel[k]) * (1.0 - cover) + f32::from(ink[k]) * cover) as u8
+                    }));
                 }
             });
         }
@@ -103,19 +163,40 @@ mod tests {
     #[test]
     fn pictures_stand_in_rows_over_their_words() {
         let note = "0.98, 120 pixels, and more than there is room for on one line of a sheet";
-        let tile = |color: [u8; 3], title: &str| Tile::new(&RgbImage::from_pixel(64, 32, Rgb(color)), title, note);
-        let page = sheet(&[tile([255, 0, 0], "photo"), tile([0, 255, 0], ""), tile([0, 0, 255], "Füchse")], 2);
-        assert_eq!(page.dimensions(), (2 * (SIDE + GAP) + GAP, 2 * (SIDE / 2 + WORDS + GAP) + GAP));
-        let [second_column, second_row] = [2 * GAP + SIDE, 2 * GAP + SIDE / 2 + WORDS].map(|v| v + 5);
+        let tile = |color: [u8; 3], title: &str| {
+            Tile::new(&RgbImage::from_pixel(64, 32, Rgb(color)), title, note)
+        };
+        let page = sheet(
+            &[
+                tile([255, 0, 0], "photo"),
+                tile([0, 255, 0], ""),
+                tile([0, 0, 255], "Füchse"),
+            ],
+            2,
+        );
+        assert_eq!(
+            page.dimensions(),
+            (2 * (SIDE + GAP) + GAP, 2 * (SIDE / 2 + WORDS + GAP) + GAP)
+        );
+        let [second_column, second_row] =
+            [2 * GAP + SIDE, 2 * GAP + SIDE / 2 + WORDS].map(|v| v + 5);
         assert_eq!(page.get_pixel(GAP + 5, GAP + 5), &Rgb([255, 0, 0]));
         assert_eq!(page.get_pixel(second_column, GAP + 5), &Rgb([0, 255, 0]));
         assert_eq!(page.get_pixel(GAP + 5, second_row), &Rgb([0, 0, 255]));
-        // Words are dark on white, under their picture and no further to the right.
+        // Text is dark on white, below its image and not wider than it.
         let dark = |x: std::ops::Range<u32>, y: std::ops::Range<u32>| {
-            x.flat_map(|x| y.clone().map(move |y| (x, y))).filter(|&(x, y)| page.get_pixel(x, y)[0] < 128).count()
+            x.flat_map(|x| y.clone().map(move |y| (x, y)))
+                .filter(|&(x, y)| page.get_pixel(x, y)[0] < 128)
+                .count()
         };
         let under = GAP + SIDE / 2..GAP + SIDE / 2 + 22;
         assert!(dark(GAP..GAP + SIDE, under.clone()) > 20);
-        assert_eq!((dark(GAP + SIDE..2 * GAP + SIDE, 0..page.height()), dark(second_column..page.width(), under)), (0, 0));
+        assert_eq!(
+            (
+                dark(GAP + SIDE..2 * GAP + SIDE, 0..page.height()),
+                dark(second_column..page.width(), under)
+            ),
+            (0, 0)
+        );
     }
 }

@@ -1,4 +1,4 @@
-//! The text tower of a scene's encoder, with what its scores are judged by and the names that were taught.
+//! The text encoder of a scene, with its calibrations and the taught names.
 
 use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
@@ -12,122 +12,200 @@ use fastlgs_grid::relevancy::{CANONICAL, TextQuery};
 use fastlgs_vision::TextEncoder;
 use std::path::Path;
 
-/// Fails where the objects' embeddings cannot be compared with those of texts or pictures, which have so many numbers.
-pub(super) fn check(manifest: &Manifest, grid: &Grid, folder: &SceneFolder, what: &str, length: usize) -> Result<()> {
+/// Checks that the embeddings of the objects can be compared with those of `what` (texts or
+/// pictures), which have `length` dimensions.
+///
+/// # Errors
+/// The object table has embeddings of another encoder or length.
+pub(super) fn check(
+    manifest: &Manifest,
+    grid: &Grid,
+    folder: &SceneFolder,
+    what: &str,
+    length: usize,
+) -> Result<()> {
     eyes::check_version(manifest, grid, folder)?;
-    let own = grid.objects.iter().flat_map(|o| &o.embeddings).map(Vec::len).next();
+    let own = grid
+        .objects
+        .iter()
+        .flat_map(|o| &o.embeddings)
+        .map(Vec::len)
+        .next();
     if let Some(own) = own.filter(|own| *own != length) {
         let root = folder.root.display();
         bail!(
-            "{root}: its embeddings have {own} numbers, those of {what} {length}; they are of another encoder: \
-             name the right tower with --clip-text, or run 'fastlgs train {root}' again"
+            "{root}: the embeddings of the scene have {own} dimensions, but those of {what} have {length}, so they are from different encoders; \
+             set clip_text to the text tower of the scene, or run 'fastlgs train {root}' again"
         );
     }
     Ok(())
 }
 
-/// A loaded text tower.
+/// A loaded text encoder.
 pub struct Texts {
     encoder: Box<dyn TextEncoder>,
     canonical: Vec<Vec<f32>>,
-    /// What cosines are worth.
+    /// Calibrations of the encoder.
     pub calibrations: Calibrations,
     names: Names,
     identity: String,
 }
 
 impl Texts {
-    /// The text tower of the encoder that made the scene's embeddings.
-    pub fn load(folder: &SceneFolder, manifest: &Manifest, clip_text: Option<&Path>) -> Result<Self> {
-        Self::of(eyes::text_encoder_of(manifest, clip_text)?, folder, manifest)
+    /// Loads the text encoder of the scene. `clip_text` replaces the CLIP text tower that the
+    /// manifest records.
+    pub fn load(
+        folder: &SceneFolder,
+        manifest: &Manifest,
+        clip_text: Option<&Path>,
+    ) -> Result<Self> {
+        Self::of(
+            eyes::text_encoder_of(manifest, clip_text)?,
+            folder,
+            manifest,
+        )
     }
 
-    /// A text tower of the caller's, which must belong to what made the scene's embeddings.
-    pub fn of(encoder: Box<dyn TextEncoder>, folder: &SceneFolder, manifest: &Manifest) -> Result<Self> {
-        let canonical = if manifest.encoder == calibrations::OFFLINE { Vec::new() } else { encoder.embed(&CANONICAL)? };
+    /// Uses a text encoder of the caller.
+    ///
+    /// # Errors
+    /// Its embeddings have another length than those of the scene, or the object table cannot be
+    /// read.
+    pub fn of(
+        encoder: Box<dyn TextEncoder>,
+        folder: &SceneFolder,
+        manifest: &Manifest,
+    ) -> Result<Self> {
+        let canonical = if manifest.encoder == calibrations::OFFLINE {
+            Vec::new()
+        } else {
+            encoder.embed(&CANONICAL)?
+        };
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
-        let grid = Grid::load(folder).context("the object grid cannot be read; run 'fastlgs train' again")?;
+        let grid = Grid::load(folder)
+            .context("the object grid cannot be read; run 'fastlgs train' again")?;
         check(manifest, &grid, folder, "texts", length)?;
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
-        Ok(Self { encoder, canonical, calibrations, names: Names::load()?, identity })
+        Ok(Self {
+            encoder,
+            canonical,
+            calibrations,
+            names: Names::load()?,
+            identity,
+        })
     }
 
-    /// Takes all texts as words from now on.
+    /// Ignores taught names from now on.
     pub fn forget_names(&mut self) {
         self.names = Names::default();
     }
 
-    /// Whether the user has taught this name.
+    /// Returns whether a text is a taught name.
     pub fn is_taught(&self, text: &str) -> bool {
         self.names.of(text).is_some()
     }
 
-    /// Prepares a text: the examples of a name that was taught, else its embedding.
+    /// Returns the query of a text: the examples of a taught name, or else the embedding of the
+    /// text.
     ///
     /// # Errors
-    /// An empty text, or a name that was taught with another encoder only.
+    /// An empty text, or a name that was taught only with another encoder.
     pub fn query(&self, text: &str) -> Result<TextQuery> {
-        // What was taught under a name that looks like a phrase is asked for by it.
+        // A taught name is looked up before the text is normalised.
         let plain = phrase::normalised(text);
-        let text = if self.is_taught(text) { text } else { plain.as_str() };
+        let text = if self.is_taught(text) {
+            text
+        } else {
+            plain.as_str()
+        };
         if text.trim().is_empty() {
-            bail!("the text is empty; say what to look for");
+            bail!("the text is empty; enter the name of an object");
         }
         if self.is_taught(text) {
             return self.of_examples(text).with_context(|| {
                 format!(
-                    "'{text}' was taught with another encoder than that of this scene, or an earlier version of it: teach it here as well, or forget \
-                     it: fastlgs names remove '{text}'"
+                    "'{text}' was taught with another encoder or encoder version than this scene has; teach it in this scene as well, \
+                     or remove it: fastlgs names remove '{text}'"
                 )
             });
         }
         Ok(self.worded(text, self.encoder.embed(&[text])?.remove(0)))
     }
 
-    /// Prepares many texts; a name that was taught with another encoder only is a text like others.
+    /// Returns the queries of many texts. A name that was taught only with another encoder is
+    /// embedded as a text.
     ///
     /// # Errors
-    /// When inference fails.
+    /// Inference fails.
     pub fn queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
-        let plain = |text: &String| if self.of_examples(text).is_some() { text.clone() } else { phrase::normalised(text) };
+        let plain = |text: &String| {
+            if self.of_examples(text).is_some() {
+                text.clone()
+            } else {
+                phrase::normalised(text)
+            }
+        };
         let texts: Vec<String> = texts.iter().map(plain).collect();
-        let embeddings = self.encoder.embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
-        let query = |(text, embedding): (&String, Vec<f32>)| self.of_examples(text).unwrap_or_else(|| self.worded(text, embedding));
+        let embeddings = self
+            .encoder
+            .embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
+        let query = |(text, embedding): (&String, Vec<f32>)| {
+            self.of_examples(text)
+                .unwrap_or_else(|| self.worded(text, embedding))
+        };
         Ok(texts.iter().zip(embeddings).map(query).collect())
     }
 
-    /// Names that were taught with this encoder.
+    /// Returns the names that were taught with this encoder.
     pub fn taught(&self) -> Vec<String> {
-        self.names.rows().into_iter().map(|row| row.name).filter(|name| self.of_examples(name).is_some()).collect()
+        self.names
+            .rows()
+            .into_iter()
+            .map(|row| row.name)
+            .filter(|name| self.of_examples(name).is_some())
+            .collect()
     }
 
-    /// Adds texts that the objects must not be nearer to.
+    /// Adds negative texts to a query. An object that fits one of them at least as well as the
+    /// query is never a target.
     ///
     /// # Errors
-    /// As [`Self::query`]; words where pictures are meant, and pictures where words are: their cosines cannot be compared.
+    /// As [`Self::query`]. A text and an example cannot be combined, because their cosines cannot
+    /// be compared.
     pub fn with_negatives(&self, mut query: TextQuery, negatives: &[String]) -> Result<TextQuery> {
         for text in negatives {
             let negative = self.query(text)?;
-            if negative.shown != query.shown {
-                let [meant, unwanted] = [query.shown, negative.shown].map(|shown| if shown { "a picture" } else { "words" });
-                bail!("--negative '{text}' is {unwanted}, what is looked for {meant}: how like they are to an object cannot be compared");
+            if negative.from_example != query.from_example {
+                let [meant, unwanted] = [query.from_example, negative.from_example]
+                    .map(|shown| if shown { "an example" } else { "a text" });
+                bail!(
+                    "the negative '{text}' is {unwanted}, but the query is {meant}; their cosines cannot be compared, so use a negative of the same kind"
+                );
             }
-            query.negatives.extend(negative.meant);
+            query.negatives.extend(negative.positive);
         }
         Ok(query)
     }
 
-    /// What was taught under a name with this encoder; nothing where nothing was.
+    /// Returns the query of the examples of a name; `None` if it was not taught with this encoder.
     fn of_examples(&self, name: &str) -> Option<TextQuery> {
-        let own = self.names.of(name)?.iter().filter(|e| e.encoder == self.identity);
+        let own = self
+            .names
+            .of(name)?
+            .iter()
+            .filter(|e| e.encoder == self.identity);
         let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
         (!meant.is_empty()).then(|| TextQuery::of_examples(meant, self.calibrations.pictures))
     }
 
-    /// A text with its embedding.
+    /// Returns the query of a text from its embedding.
     fn worded(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
         let calibration = self.calibrations.texts;
         let anything = calibration.anything + self.encoder.advantage(text);
-        TextQuery { canonical: self.canonical.clone(), anything, ..TextQuery::new(vec![embedding], calibration) }
+        TextQuery {
+            canonical: self.canonical.clone(),
+            min_canonical: anything,
+            ..TextQuery::new(vec![embedding], calibration)
+        }
     }
 }

@@ -136,11 +136,25 @@ impl Background {
     /// Any other text.
     pub fn parse(text: &str) -> Result<Self, String> {
         if text == "learn" {
-            return Ok(Self { color: [0.5; 3], learn: true });
+            return Ok(Self {
+                color: [0.5; 3],
+                learn: true,
+            });
         }
-        let values: Vec<f32> = text.split(',').filter_map(|v| v.trim().parse().ok()).filter(|v| (0.0..=1.0).contains(v)).collect();
-        let color = <[f32; 3]>::try_from(values).map_err(|_| format!("'{text}' is neither 'learn' nor three numbers from 0 to 1, separated by commas"))?;
-        Ok(Self { color, learn: false })
+        let values: Vec<f32> = text
+            .split(',')
+            .filter_map(|v| v.trim().parse().ok())
+            .filter(|v| (0.0..=1.0).contains(v))
+            .collect();
+        let color = <[f32; 3]>::try_from(values).map_err(|_| {
+            format!(
+                "'{text}' is neither 'learn' nor three numbers from 0 to 1, separated by commas"
+            )
+        })?;
+        Ok(Self {
+            color,
+            learn: false,
+        })
     }
 }
 
@@ -154,11 +168,11 @@ const FEATURE_WEIGHT: f32 = 0.2;
 
 /// Least number of training pixels per Gaussian of an automatic budget. A Gaussian has 14
 /// parameters and a pixel has three values. With fewer pixels, Gaussians overfit the photos.
-const PIXELS_A_GAUSSIAN: usize = 20;
+const MIN_PIXELS_PER_GAUSSIAN: usize = 20;
 
 /// Highest default SH degree for fewer than [`FEW_VIEWS`] training views. Only some of them show
 /// each Gaussian, so that higher degrees overfit.
-const DEGREE_OF_FEW: u32 = 1;
+const FEW_VIEWS_SH_DEGREE: u32 = 1;
 
 /// Number of Gaussians; `None` for `auto`.
 type BudgetChoice = Option<usize>;
@@ -169,7 +183,11 @@ fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
     if text == "auto" {
         return Ok(None);
     }
-    text.parse().ok().filter(|n| *n > 0).map(Some).ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
+    text.parse()
+        .ok()
+        .filter(|n| *n > 0)
+        .map(Some)
+        .ok_or_else(|| format!("'{text}' is neither 'auto' nor a number of Gaussians"))
 }
 
 /// Options of `train`.
@@ -218,7 +236,10 @@ pub struct Config {
     pub freeze: bool,
     /// Start from the Gaussians of a file instead of points: .ply (including compressed files of
     /// SuperSplat), .spz, .sog, .glb or .splat.
-    #[cfg_attr(feature = "clap", arg(long, value_name = "FILE", visible_alias = "init-ply"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(long, value_name = "FILE", visible_alias = "init-ply")
+    )]
     #[serde(alias = "init_ply")]
     pub init: Option<PathBuf>,
     /// How masks become objects.
@@ -239,7 +260,15 @@ pub struct Config {
     pub alpha: f32,
     /// Paper mapping: cues to compare in addition to embeddings, separated by commas (the ablation
     /// of the paper).
-    #[cfg_attr(feature = "clap", arg(long, value_enum, value_delimiter = ',', default_value = "keypoints,color"))]
+    #[cfg_attr(
+        feature = "clap",
+        arg(
+            long,
+            value_enum,
+            value_delimiter = ',',
+            default_value = "keypoints,color"
+        )
+    )]
     pub cues: Vec<Cue>,
     /// Global mapping: least support of an object, its mean IoU with the best mask of each view.
     #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
@@ -291,7 +320,11 @@ impl Config {
     /// Returns the options with those that the preset implies.
     pub(super) fn resolved(&self) -> Self {
         match self.preset {
-            Preset::LikePaper => Self { mapping: Mapping::Paper, feature_mode: FeatureMode::Train, ..self.clone() },
+            Preset::LikePaper => Self {
+                mapping: Mapping::Paper,
+                feature_mode: FeatureMode::Train,
+                ..self.clone()
+            },
             _ => self.clone(),
         }
     }
@@ -304,35 +337,61 @@ impl Config {
     /// Returns the default of the highest SH degree for a number of training views.
     pub(super) fn degree(&self, views: usize) -> u32 {
         let (_, degree, _) = self.preset.values();
-        if views < FEW_VIEWS && self.preset != Preset::LikePaper { degree.min(DEGREE_OF_FEW) } else { degree }
+        if views < FEW_VIEWS && self.preset != Preset::LikePaper {
+            degree.min(FEW_VIEWS_SH_DEGREE)
+        } else {
+            degree
+        }
     }
 
     /// Returns the budget of Gaussians. `pixels` is the number of pixels of all training views.
     pub(super) fn budget(&self, pixels: usize) -> Budget {
-        let most = self.preset.values().2.min(pixels / PIXELS_A_GAUSSIAN);
+        let most = self.preset.values().2.min(pixels / MIN_PIXELS_PER_GAUSSIAN);
         self.budget.map_or(Budget::Auto(most.max(1)), Budget::Fixed)
     }
 
     /// Returns the constants of Algorithm 1. `encoder` is its name in the manifest.
     pub(super) fn paper(&self, encoder: &str) -> PaperConfig {
-        let theta = if encoder == EncoderKind::Offline.name() { OFFLINE_THETA } else { PaperConfig::default().theta };
+        let theta = if encoder == EncoderKind::Offline.name() {
+            OFFLINE_THETA
+        } else {
+            PaperConfig::default().theta
+        };
         let theta = self.theta.unwrap_or(theta);
-        let alpha = if self.cues.contains(&Cue::Color) { self.alpha } else { 0.0 };
-        PaperConfig { tau: self.tau, theta, alpha, key_points: self.cues.contains(&Cue::Keypoints) }
+        let alpha = if self.cues.contains(&Cue::Color) {
+            self.alpha
+        } else {
+            0.0
+        };
+        PaperConfig {
+            tau: self.tau,
+            theta,
+            alpha,
+            key_points: self.cues.contains(&Cue::Keypoints),
+        }
     }
 
     /// Returns whether masks guide training. `segmenter` is its name in the manifest.
-    pub(super) fn masks_shape(&self, segmenter: &str) -> bool {
+    pub(super) fn masks_guide_training(&self, segmenter: &str) -> bool {
         let asked = match self.borders {
             Borders::Auto => segmenter != SegmenterKind::Offline.name(),
             Borders::On => true,
             Borders::Off => false,
         };
-        asked && self.mapping == Mapping::Global && self.feature_mode == FeatureMode::Lift && !self.freeze
+        asked
+            && self.mapping == Mapping::Global
+            && self.feature_mode == FeatureMode::Lift
+            && !self.freeze
     }
 
     /// Returns the constants of global mapping.
     pub(super) fn global(&self) -> objects::Config {
-        objects::Config { antialias: self.antialias, objects: chosen::Config { min_support: self.support, ..chosen::Config::default() } }
+        objects::Config {
+            antialias: self.antialias,
+            objects: chosen::Config {
+                min_support: self.support,
+                ..chosen::Config::default()
+            },
+        }
     }
 }

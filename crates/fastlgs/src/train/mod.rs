@@ -12,7 +12,9 @@ use crate::output::SceneLock;
 use crate::progress::{Message, TrainStep};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, checkpoints, clear, objects, preprocess};
-pub use config::{Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset};
+pub use config::{
+    Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset,
+};
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
@@ -26,7 +28,12 @@ use std::time::Instant;
 pub(crate) const MADE: &str = "made";
 
 /// Files of the scene that training replaces, besides the manifest and the object maps.
-const LEFT: [&str; 4] = ["grid.json", "grid.safetensors", "scene.ply", "cameras/trained.json"];
+const REPLACED: [&str; 4] = [
+    "grid.json",
+    "grid.safetensors",
+    "scene.ply",
+    "cameras/trained.json",
+];
 
 /// Trains the scene `config.scene`: writes its Gaussians, object table and object maps.
 ///
@@ -40,44 +47,72 @@ pub fn train(config: &Config, run: &Run) -> Result<Report> {
 /// Trains a scene that the caller has locked.
 pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
     if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
-        bail!("preset 'like-paper' finds objects by Algorithm 1 and cannot keep existing ones: omit mapping 'keep', or choose another preset");
+        bail!(
+            "preset 'like-paper' finds objects by Algorithm 1 and cannot keep existing ones: omit mapping 'keep', or choose another preset"
+        );
     }
     let config = &config.resolved();
-    let by_descent = config.feature_mode == FeatureMode::Train;
-    if by_descent && config.mapping == Mapping::Global {
+    let trains_features = config.feature_mode == FeatureMode::Train;
+    if trains_features && config.mapping == Mapping::Global {
         bail!(
             "--feature-mode train needs the objects before training: add --mapping paper, or keep those of a trained scene (--mapping keep)"
         );
     }
     let folder = SceneFolder::open(&config.scene)?;
     let mut manifest = folder.manifest()?;
-    let given = folder.given_cameras()?;
+    let given = folder.initial_cameras()?;
     // Gaussians of an earlier training belong to its cameras, which alignment may have moved.
-    let mut cameras = if config.init.is_some() { folder.cameras()? } else { given.clone() };
+    let mut cameras = if config.init.is_some() {
+        folder.cameras()?
+    } else {
+        given.clone()
+    };
     let mut training = manifest.training(&cameras);
-    let known = match config.mapping {
-        Mapping::Paper => Some(objects::by_algorithm_1(&folder, &training, &config.paper(&manifest.encoder), run)?),
+    let prior_objects = match config.mapping {
+        Mapping::Paper => Some(objects::by_algorithm_1(
+            &folder,
+            &training,
+            &config.paper(&manifest.encoder),
+            run,
+        )?),
         Mapping::Keep => Some(objects::kept(&folder, &training)?),
         Mapping::Global => None,
     };
-    let codes = known.as_ref().filter(|_| by_descent);
-    let light = preprocess::Brightness::of(&manifest)?;
-    let config = &start::as_before(config, &folder, &manifest)?;
+    let codes = prior_objects.as_ref().filter(|_| trains_features);
+    let light = preprocess::Brightness::from_manifest(&manifest)?;
+    let config = &start::with_earlier_settings(config, &folder, &manifest)?;
     let background = config.background.unwrap_or_default();
-    let targets = start::targets(&folder, &training, codes.map(start::codes).as_ref(), &background, |name| light.gain(name));
-    let held_out = start::targets(&folder, &manifest.held_out(&cameras), None, &background, |_| [1.0; 3]);
+    let targets = start::targets(
+        &folder,
+        &training,
+        codes.map(start::codes).as_ref(),
+        &background,
+        |name| light.gain(name),
+    );
+    let held_out = start::targets(
+        &folder,
+        &manifest.held_out(&cameras),
+        None,
+        &background,
+        |_| [1.0; 3],
+    );
     held_out.check()?;
     let mut first = start::gaussians(config, &folder, &targets, run)?;
     // Gaussians of transparent objects have no colour to train.
     clear::take(&mut first);
-    let kept_clear = if config.mapping == Mapping::Keep { clear::take(&mut folder.gaussians()?) } else { Gaussians::default() };
+    let kept_clear = if config.mapping == Mapping::Keep {
+        clear::take(&mut folder.gaussians()?)
+    } else {
+        Gaussians::default()
+    };
     let free = start::free_space(config, &folder, &training, &first)?;
-    if let Some(codes) = codes.filter(|_| config.init.is_none() || config.mapping != Mapping::Keep) {
+    if let Some(codes) = codes.filter(|_| config.init.is_none() || config.mapping != Mapping::Keep)
+    {
         // Start from the objects on which most views agree. From elsewhere, descent ends between
         // the codes of views that disagree.
         objects::lift(&mut first, &folder, &training, codes, config.antialias)?;
     }
-    if config.freeze && !by_descent {
+    if config.freeze && !trains_features {
         bail!(
             "freeze trains features only: set feature_mode to train, and mapping to paper or keep; to lift objects without training, set iterations to 0"
         );
@@ -87,13 +122,16 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let engine = fastlgs_raster::open_engine(&device.device)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
-    trainer.keep_free(free);
+    trainer.set_free_space(free);
     let checkpoint = checkpoints::path(&folder);
     if config.resume && !trainer.resume(&checkpoint)? {
-        run.warn(&format!("{}: there is no checkpoint to resume from; training starts from the beginning", checkpoint.display()));
+        run.warn(&format!(
+            "{}: there is no checkpoint to resume from; training starts from the beginning",
+            checkpoint.display()
+        ));
     }
     if trainer.is_coupled() {
-        borders::go_on(&mut trainer, &folder)?;
+        borders::resume_targets(&mut trainer, &folder)?;
     }
     run.progress.tell(Message::TrainingBegins(&first));
     let (mut curve, mut mapping_seconds) = (Vec::new(), 0.0);
@@ -106,15 +144,41 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         }
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
         let (iteration, seconds, psnr, gaussians) = (p.iteration, p.seconds, p.psnr, p.gaussians);
-        let mut step = TrainStep { iteration, seconds, loss, psnr, psnr_held_out: None, gaussians };
-        if config.curve.is_some_and(|every| iteration % every.next_multiple_of(20) == 0) {
+        let mut step = TrainStep {
+            iteration,
+            seconds,
+            loss,
+            psnr,
+            psnr_held_out: None,
+            gaussians,
+        };
+        if config
+            .curve
+            .is_some_and(|every| iteration % every.next_multiple_of(20) == 0)
+        {
             step.psnr_held_out = trainer.quality(&held_out, None)?;
-            tracing::info!(iteration, seconds, psnr_held_out = step.psnr_held_out, gaussians, "curve");
+            tracing::info!(
+                iteration,
+                seconds,
+                psnr_held_out = step.psnr_held_out,
+                gaussians,
+                "curve"
+            );
             curve.push(CurvePoint::from(step));
         }
-        run.progress.tell(Message::Trained { step, total: settings.iterations, scene: &|| Ok(trainer.gaussians()?) });
+        run.progress.tell(Message::Trained {
+            step,
+            total: settings.iterations,
+            scene: &|| Ok(trainer.gaussians()?),
+        });
         if iteration % 200 == 0 {
-            tracing::info!(iteration, loss, psnr, feature_l1 = p.losses.feature_l1, gaussians);
+            tracing::info!(
+                iteration,
+                loss,
+                psnr,
+                feature_l1 = p.losses.feature_l1,
+                gaussians
+            );
         }
         Ok::<_, crate::Error>(())
     })?;
@@ -122,7 +186,10 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
 
     training = trainer.cameras();
     for camera in &training {
-        cameras.iter_mut().filter(|c| c.name == camera.name).for_each(|c| *c = camera.clone());
+        cameras
+            .iter_mut()
+            .filter(|c| c.name == camera.name)
+            .for_each(|c| *c = camera.clone());
     }
     let aligned = cameras != given;
     let degree = trainer.needed_degree()?;
@@ -131,8 +198,8 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     run.progress.tell(Message::TrainingEnds(&scene));
     let started = Instant::now();
     let mut summary = None;
-    let grid = match known {
-        Some(found) if by_descent => {
+    let grid = match prior_objects {
+        Some(found) if trains_features => {
             if !found.overlaps.0.is_empty() {
                 run.warn("a trained feature keeps only the smallest of overlapping objects and the objects that contain it; set feature_mode to lift to keep them all");
             }
@@ -155,7 +222,9 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     mapping_seconds += started.elapsed().as_secs_f64();
     let staged = StagedOutput::new(&folder, "train")?;
     grid.save(&staged.folder)?;
-    staged.folder.save_trained_cameras(aligned.then_some(&cameras))?;
+    staged
+        .folder
+        .save_trained_cameras(aligned.then_some(&cameras))?;
     ply::write(&staged.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
     let report = Report {
@@ -189,7 +258,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     // The note of `make` is invalid now; `make` writes it again if it called this function.
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
-    staged.publish(&folder, &LEFT, [], &manifest)?;
+    staged.publish(&folder, &REPLACED, [], &manifest)?;
     objects::end_maps(&folder);
     // Only an interrupted run needs its checkpoints.
     checkpoints::forget(&folder);
@@ -200,5 +269,9 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
 /// to the origin get none: pixels outside of all masks are trained towards the origin.
 fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
     let codebook = Codebook::of(grid);
-    scene.object_ids = scene.features.iter().map(|feature| codebook.owner(*feature).0).collect();
+    scene.object_ids = scene
+        .features
+        .iter()
+        .map(|feature| codebook.owner(*feature).0)
+        .collect();
 }

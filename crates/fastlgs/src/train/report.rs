@@ -81,7 +81,12 @@ pub struct CurvePoint {
 
 impl From<TrainStep> for CurvePoint {
     fn from(step: TrainStep) -> Self {
-        Self { iteration: step.iteration, seconds: step.seconds, psnr: step.psnr_held_out, gaussians: step.gaussians }
+        Self {
+            iteration: step.iteration,
+            seconds: step.seconds,
+            psnr: step.psnr_held_out,
+            gaussians: step.gaussians,
+        }
     }
 }
 
@@ -94,8 +99,10 @@ impl Report {
     ///
     /// # Errors
     /// A note that cannot be read. Without it, background and filter of renders would be wrong.
-    pub fn of(manifest: &Manifest, root: &Path) -> Result<Option<Self>> {
-        let Some(note) = manifest.notes.get(NOTE) else { return Ok(None) };
+    pub fn from_manifest(manifest: &Manifest, root: &Path) -> Result<Option<Self>> {
+        let Some(note) = manifest.notes.get(NOTE) else {
+            return Ok(None);
+        };
         let read = serde_json::from_value(note.clone()).map_err(|error| {
             let root = root.display();
             Error::Invalid(format!(
@@ -115,7 +122,9 @@ impl Report {
 
     /// Stores the report in the manifest.
     pub(super) fn note(&self, manifest: &mut Manifest) -> Result<()> {
-        manifest.notes.insert(NOTE.to_owned(), serde_json::to_value(self)?);
+        manifest
+            .notes
+            .insert(NOTE.to_owned(), serde_json::to_value(self)?);
         Ok(())
     }
 }

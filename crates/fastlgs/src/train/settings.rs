@@ -2,8 +2,8 @@
 
 use super::borders;
 use super::config::{Align, Config, Exposures, FeatureMode};
-use crate::preprocess::Brightness;
 use crate::Result;
+use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_raster::{Alignment, Channels, Targets, TrainConfig};
@@ -12,7 +12,13 @@ use fastlgs_raster::{Alignment, Channels, Targets, TrainConfig};
 const VARYING: f32 = 0.15;
 
 /// Returns the trainer's configuration. The preset decides what no option sets.
-pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &Manifest, seed: u64) -> Result<TrainConfig> {
+pub fn settings(
+    config: &Config,
+    first: &Gaussians,
+    views: &Targets,
+    manifest: &Manifest,
+    seed: u64,
+) -> Result<TrainConfig> {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
     Ok(TrainConfig {
@@ -25,15 +31,21 @@ pub fn settings(config: &Config, first: &Gaussians, views: &Targets, manifest: &
             // As in the paper: features move Gaussians, too.
             (false, true) => Channels::Coupled,
         },
-        sh_degree: config.sh_degree.unwrap_or(if config.init.is_some() { first.sh_degree } else { config.degree(views.len()) }),
+        sh_degree: config.sh_degree.unwrap_or(if config.init.is_some() {
+            first.sh_degree
+        } else {
+            config.degree(views.len())
+        }),
         first_degree: first.sh_degree,
         feature_weight: config.feature_weight,
-        couples_at: config.masks_shape(&manifest.segmenter).then(|| borders::begin_at(config.iterations())),
+        couples_at: config
+            .masks_guide_training(&manifest.segmenter)
+            .then(|| borders::begin_at(config.iterations())),
         antialias: config.antialias,
         background: background.color,
         learn_background: background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => Brightness::of(manifest)?.spread_stops >= VARYING,
+            Exposures::Auto => Brightness::from_manifest(manifest)?.spread_stops >= VARYING,
             Exposures::On => true,
             Exposures::Off => false,
         },

@@ -9,33 +9,58 @@ use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, WorldFrame, image_io, splat_file};
 use fastlgs_grid::Grid;
 use fastlgs_raster::density::State;
-use fastlgs_raster::{Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, View, init, pack};
+use fastlgs_raster::{
+    Channels, FEW_VIEWS, FreeSpace, Target, TargetImage, Targets, View, init, pack,
+};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Least number of initial Gaussians. Random points are added if there are fewer.
-const ENOUGH: usize = 5000;
+const MIN_INITIAL_GAUSSIANS: usize = 5000;
 
 /// Returns the initial Gaussians: those of `config.init`, else one for each point of the scene. A
-/// backdrop is added if views are few, and random points if there are fewer than `ENOUGH`.
-pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &Run) -> Result<Gaussians> {
+/// backdrop is added if views are few, and random points if there are fewer than `MIN_INITIAL_GAUSSIANS`.
+pub fn gaussians(
+    config: &Config,
+    folder: &SceneFolder,
+    views: &Targets,
+    run: &Run,
+) -> Result<Gaussians> {
     if let Some(path) = &config.init {
         // The scene's own file is already in the scene's frame.
-        let frame = if is_own(folder, path) { WorldFrame::default() } else { folder.manifest()?.frame };
+        let frame = if is_own(folder, path) {
+            WorldFrame::default()
+        } else {
+            folder.manifest()?.frame
+        };
         let (first, warning) = splat_file::read(path, &frame)?;
         warning.into_iter().for_each(|warning| run.warn(&warning));
-        return if is_own(folder, path) { Ok(first) } else { with_axes_of_photos(first, path, views, config, run) };
+        return if is_own(folder, path) {
+            Ok(first)
+        } else {
+            with_matching_axes(first, path, views, config, run)
+        };
     }
     let mut rng = Rng::new(run.seed, "init");
     let mut points = folder.points()?;
     // Start with at most half of the budget, so that density control can add Gaussians.
-    let most = (config.budget(views.pixels()).most() / 2).max(1);
+    let most = (config.budget(views.pixels()).max_gaussians() / 2).max(1);
     // Photos with an alpha channel show a cut-out object, which needs no backdrop.
-    let cut_out = views.cameras.iter().any(|camera| folder.alpha_path(&camera.name).is_file());
-    let behind = if views.len() < FEW_VIEWS && !cut_out { init::backdrop(views, &points, most / 2)? } else { Gaussians::default() };
-    let missing = ENOUGH.saturating_sub(points.len() + behind.len());
+    let cut_out = views
+        .cameras
+        .iter()
+        .any(|camera| folder.alpha_path(&camera.name).is_file());
+    let behind = if views.len() < FEW_VIEWS && !cut_out {
+        init::backdrop(views, &points, most / 2)?
+    } else {
+        Gaussians::default()
+    };
+    let missing = MIN_INITIAL_GAUSSIANS.saturating_sub(points.len() + behind.len());
     if missing > 0 {
-        run.warn(&format!("the scene has only {} points; training starts from {missing} random ones in addition", points.len()));
+        run.warn(&format!(
+            "the scene has only {} points; training starts from {missing} random ones in addition",
+            points.len()
+        ));
         points.extend(init::random_points(views, missing, &mut rng)?);
     }
     rng.shuffle(&mut points);
@@ -48,11 +73,17 @@ pub fn gaussians(config: &Config, folder: &SceneFolder, views: &Targets, run: &R
 /// Number of training views that decide whether the axes of an imported file are flipped.
 const CHECKED_VIEWS: usize = 4;
 /// Factor by which flipped axes must lower the squared error.
-const PLAIN: f64 = 2.0;
+const MIN_ERROR_RATIO: f64 = 2.0;
 
 /// Flips y and z of Gaussians of another program if the photos then fit clearly better. Some
 /// programs write y and z with the opposite sign.
-fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &Config, run: &Run) -> Result<Gaussians> {
+fn with_matching_axes(
+    first: Gaussians,
+    path: &Path,
+    views: &Targets,
+    config: &Config,
+    run: &Run,
+) -> Result<Gaussians> {
     let background = config.background.unwrap_or_default();
     let mut engine = fastlgs_raster::open_engine("cpu")?;
     let mut error = |scene: &Gaussians| -> Result<f64> {
@@ -64,9 +95,17 @@ fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &
             view.background_color[..3].copy_from_slice(&background.color);
             let frame = engine.render(view, Channels::Color)?;
             let n = image.color.len();
-            let pixels = image.color.iter().enumerate().map(|(p, pixel)| (p, pixel.to_le_bytes())).filter(|(_, pixel)| pixel[3] == 255);
+            let pixels = image
+                .color
+                .iter()
+                .enumerate()
+                .map(|(p, pixel)| (p, pixel.to_le_bytes()))
+                .filter(|(_, pixel)| pixel[3] == 255);
             let difference = |(p, pixel): (usize, [u8; 4])| {
-                let shown = |c: usize| f64::from(frame.channels(0, 3)[c * n + p].clamp(0.0, 1.0)) - f64::from(pixel[c]) / 255.0;
+                let shown = |c: usize| {
+                    f64::from(frame.channels(0, 3)[c * n + p].clamp(0.0, 1.0))
+                        - f64::from(pixel[c]) / 255.0
+                };
                 (0..3).map(|c| shown(c).powi(2)).sum::<f64>()
             };
             sum += pixels.map(difference).sum::<f64>();
@@ -74,7 +113,7 @@ fn with_axes_of_photos(first: Gaussians, path: &Path, views: &Targets, config: &
         Ok(sum)
     };
     let turned = first.clone().with_y_and_z_flipped();
-    if error(&turned)? * PLAIN < error(&first)? {
+    if error(&turned)? * MIN_ERROR_RATIO < error(&first)? {
         run.warn(&format!("{}: y and z have the opposite sign of those of the photos' poses; the Gaussians were flipped", path.display()));
         return Ok(turned);
     }
@@ -89,16 +128,36 @@ fn is_own(folder: &SceneFolder, path: &Path) -> bool {
 
 /// Returns the options. If training starts from the scene's own Gaussians, their background and
 /// filter are the defaults.
-pub fn as_before(config: &Config, folder: &SceneFolder, manifest: &Manifest) -> Result<Config> {
+pub fn with_earlier_settings(
+    config: &Config,
+    folder: &SceneFolder,
+    manifest: &Manifest,
+) -> Result<Config> {
     let own = config.init.as_ref().filter(|path| is_own(folder, path));
-    let earlier = if own.is_some() { Report::of(manifest, &folder.root)?.unwrap_or_default() } else { Report::default() };
-    let background = config.background.unwrap_or(Background { color: earlier.background, learn: false });
-    Ok(Config { background: Some(background), antialias: config.antialias || earlier.antialias, ..config.clone() })
+    let earlier = if own.is_some() {
+        Report::from_manifest(manifest, &folder.root)?.unwrap_or_default()
+    } else {
+        Report::default()
+    };
+    let background = config.background.unwrap_or(Background {
+        color: earlier.background,
+        learn: false,
+    });
+    Ok(Config {
+        background: Some(background),
+        antialias: config.antialias || earlier.antialias,
+        ..config.clone()
+    })
 }
 
 /// Returns the space that the views show to be empty, in which density control removes floaters. It
 /// is empty with `FEW_VIEWS` or more views, or without iterations.
-pub fn free_space(config: &Config, folder: &SceneFolder, cameras: &[Camera], first: &Gaussians) -> Result<FreeSpace> {
+pub fn free_space(
+    config: &Config,
+    folder: &SceneFolder,
+    cameras: &[Camera],
+    first: &Gaussians,
+) -> Result<FreeSpace> {
     if cameras.len() >= FEW_VIEWS || config.iterations() == 0 {
         return Ok(FreeSpace::default());
     }
@@ -110,7 +169,15 @@ type Codes = Arc<Vec<[u8; 3]>>;
 
 /// Returns the codes of all objects as 8-bit RGB.
 pub fn codes(grid: &Grid) -> Codes {
-    Arc::new((0..=grid.highest()).map(|id| grid.code_of(id).to_array().map(|v| (v * 255.0).round() as u8)).collect())
+    Arc::new(
+        (0..=grid.highest())
+            .map(|id| {
+                grid.code_of(id)
+                    .to_array()
+                    .map(|v| (v * 255.0).round() as u8)
+            })
+            .collect(),
+    )
 }
 
 /// Returns the targets of `cameras`, whose images are read on demand. `gain` returns the brightness
@@ -123,9 +190,18 @@ pub fn targets(
     gain: impl Fn(&str) -> [f32; 3],
 ) -> Targets {
     let gains = cameras.iter().map(|c| gain(&c.name)).collect();
-    let (folder, views, codes, background) = (folder.clone(), cameras.to_vec(), codes.cloned(), *background);
-    let read = move |id: usize| target(&folder, &views[id], codes.as_ref(), &background).map(|target| target.image);
-    Targets::new(cameras.to_vec(), gains, move |id| read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error))))
+    let (folder, views, codes, background) = (
+        folder.clone(),
+        cameras.to_vec(),
+        codes.cloned(),
+        *background,
+    );
+    let read = move |id: usize| {
+        target(&folder, &views[id], codes.as_ref(), &background).map(|target| target.image)
+    };
+    Targets::new(cameras.to_vec(), gains, move |id| {
+        read(id).map_err(|error| fastlgs_raster::Error::Picture(Box::new(error)))
+    })
 }
 
 /// Loads the target image of a view: the photo and, with `codes`, the code map. Ignored pixels do
@@ -134,15 +210,33 @@ pub fn targets(
 /// # Errors
 /// A file that cannot be read, a photo whose size differs from its camera, or a transparent photo
 /// with a learned background.
-pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, background: &Background) -> Result<Target> {
+pub fn target(
+    folder: &SceneFolder,
+    camera: &Camera,
+    codes: Option<&Codes>,
+    background: &Background,
+) -> Result<Target> {
     let photo = folder.photo(&camera.name)?;
     if (photo.width(), photo.height()) != (camera.width, camera.height) {
-        bail!("{}: photo and camera differ in size; run 'fastlgs preprocess' again", folder.photo_path(&camera.name).display());
+        bail!(
+            "{}: photo and camera differ in size; run 'fastlgs preprocess' again",
+            folder.photo_path(&camera.name).display()
+        );
     }
-    let mask = |path: PathBuf| path.is_file().then(|| image_io::load_gray(&path)).transpose();
-    let (alpha, ignore) = (mask(folder.alpha_path(&camera.name))?, mask(folder.ignore_path(&camera.name))?);
+    let mask = |path: PathBuf| {
+        path.is_file()
+            .then(|| image_io::load_gray(&path))
+            .transpose()
+    };
+    let (alpha, ignore) = (
+        mask(folder.alpha_path(&camera.name))?,
+        mask(folder.ignore_path(&camera.name))?,
+    );
     if alpha.is_some() && background.learn {
-        bail!("the background cannot be learned, because the photo of '{}' is partly transparent; set background to a colour", camera.name);
+        bail!(
+            "the background cannot be learned, because the photo of '{}' is partly transparent; set background to a colour",
+            camera.name
+        );
     }
     let counts = |x: u32, y: u32| ignore.as_ref().is_none_or(|m| m.get_pixel(x, y)[0] >= 128);
     let color = photo.enumerate_pixels().map(|(x, y, p)| {
@@ -161,8 +255,18 @@ pub fn target(folder: &SceneFolder, camera: &Camera, codes: Option<&Codes>, back
         Some(codes) => {
             let map = folder.objects(&camera.name)?;
             let pixels = (0..map.height).flat_map(|y| (0..map.width).map(move |x| (x, y)));
-            pixels.map(|(x, y)| pack(code(codes, map.at(x, y)), counts(x, y))).collect()
+            pixels
+                .map(|(x, y)| pack(code(codes, map.at(x, y)), counts(x, y)))
+                .collect()
         }
     };
-    Ok(Target { camera: camera.clone(), image: TargetImage { size: [camera.width, camera.height], color, feature }, gain: [1.0; 3] })
+    Ok(Target {
+        camera: camera.clone(),
+        image: TargetImage {
+            size: [camera.width, camera.height],
+            color,
+            feature,
+        },
+        gain: [1.0; 3],
+    })
 }

@@ -1,4 +1,4 @@
-//! `fastlgs query SCENE -` on a terminal: texts and answers in turn.
+//! Interactive dialogue: `fastlgs query SCENE -` on a terminal.
 
 use super::{Asker, told};
 use crate::outcome::Outcome;
@@ -8,7 +8,7 @@ use fastlgs::session::ask::Ask;
 use std::io::{BufRead, Write};
 use std::path::PathBuf;
 
-/// A line of a dialogue.
+/// A parsed line of the dialogue.
 #[derive(Debug, PartialEq)]
 enum Said<'a> {
     Nothing,
@@ -37,15 +37,15 @@ impl<'a> Said<'a> {
     }
 }
 
-const HELP: &str = "a text asks for it; view NAME looks from there; views lists all; save writes the last answer's pictures; quit ends";
+const HELP: &str = "enter a text to find it; view NAME: change the view; views: list the views; save: write the pictures of the last answer; quit: end";
 
 impl Asker<'_> {
-    /// Questions and answers on a terminal.
+    /// Runs the dialogue until `quit` or the end of input.
     pub(super) fn converse(&mut self) -> Result<Outcome> {
         say!("{HELP}");
         let mut last = None;
         loop {
-            // Only what is saved makes a sheet.
+            // The contact sheet shows only the answer that is saved.
             self.tiles.clear();
             print!("{}> ", self.cameras[0].name);
             std::io::stdout().flush()?;
@@ -62,12 +62,19 @@ impl Asker<'_> {
                 Said::Quit => return Ok(Outcome::Done),
                 Said::Nothing => continue,
                 Said::Help => Ok(HELP.to_owned()),
-                Said::Views => Ok(self.scene.cameras.iter().map(|c| c.name.as_str()).collect::<Vec<_>>().join("  ")),
+                Said::Views => Ok(self
+                    .scene
+                    .cameras
+                    .iter()
+                    .map(|c| c.name.as_str())
+                    .collect::<Vec<_>>()
+                    .join("  ")),
                 Said::View(name) => self.look_from(name).map(|()| String::new()),
                 Said::Save => self.save(last.as_deref()),
                 Said::Text(text) => {
                     last = Some(text.to_owned());
-                    self.answer(&Ask::Text(text.to_owned()), 0).map(|report| told(&report))
+                    self.answer(&Ask::Text(text.to_owned()), 0)
+                        .map(|report| told(&report))
                 }
             };
             match said {
@@ -81,21 +88,37 @@ impl Asker<'_> {
     fn look_from(&mut self, name: &str) -> Result<()> {
         let index = self.scene.folder.view_index(&self.scene.cameras, name)?;
         let camera = self.scene.cameras[index].clone();
-        self.cameras = vec![self.args.views.size.map_or(camera.clone(), |(w, h)| camera.resized(w, h))];
+        self.cameras = vec![
+            self.args
+                .views
+                .size
+                .map_or(camera.clone(), |(w, h)| camera.resized(w, h)),
+        ];
         self.shown = None;
         Ok(())
     }
 
-    /// Writes the pictures of the last answer, to the folder `answers` unless another was named.
+    /// Writes the pictures of the last answer to the output folder, by default `answers`.
     fn save(&mut self, last: Option<&str>) -> Result<String> {
-        let Some(text) = last else { bail!("nothing was asked yet") };
-        let named = self.output.get_or_insert_with(|| PathBuf::from("answers")).clone();
+        let Some(text) = last else {
+            bail!("nothing was asked yet; enter a text first")
+        };
+        let named = self
+            .output
+            .get_or_insert_with(|| PathBuf::from("answers"))
+            .clone();
         self.shown = None;
-        let saved = self.answer(&Ask::Text(text.to_owned()), 0).and_then(|report| Ok((report, self.sheet()?.unwrap_or(named))));
-        // Also where it failed: further answers are written only if they were asked to be.
+        let saved = self
+            .answer(&Ask::Text(text.to_owned()), 0)
+            .and_then(|report| Ok((report, self.sheet()?.unwrap_or(named))));
+        // Also reset after an error: later answers are written only with --output.
         self.output.clone_from(&self.args.output);
         let (report, sheet) = saved?;
-        Ok(format!("{}\nall of it on one sheet: {}", told(&report), sheet.display()))
+        Ok(format!(
+            "{}\ncontact sheet: {}",
+            told(&report),
+            sheet.display()
+        ))
     }
 }
 
@@ -105,8 +128,30 @@ mod tests {
 
     #[test]
     fn a_line_of_a_dialogue_is_a_text_unless_it_is_a_command() {
-        let said = ["", "red cup", " view 003.png ", "view", "views", "save", "?", "exit"].map(Said::of);
+        let said = [
+            "",
+            "red cup",
+            " view 003.png ",
+            "view",
+            "views",
+            "save",
+            "?",
+            "exit",
+        ]
+        .map(Said::of);
         let view = Said::View("003.png");
-        assert_eq!(said, [Said::Nothing, Said::Text("red cup"), view, Said::Text("view"), Said::Views, Said::Save, Said::Help, Said::Quit]);
+        assert_eq!(
+            said,
+            [
+                Said::Nothing,
+                Said::Text("red cup"),
+                view,
+                Said::Text("view"),
+                Said::Views,
+                Said::Save,
+                Said::Help,
+                Said::Quit
+            ]
+        );
     }
 }
