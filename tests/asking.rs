@@ -9,7 +9,7 @@ mod run;
 
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::ply;
-use run::{coffee_iou, fails, fastlgs, fixture, json, text};
+use run::{assert_fails, coffee_iou, fastlgs, fixture, json, text};
 use serde_json::Value;
 use std::path::Path;
 use std::process::Command;
@@ -71,9 +71,9 @@ fn absent_things_are_not_found() {
 fn every_way_to_ask_ends_in_the_same_object() {
     let Some(f) = fixture() else { return };
     let file = |name: &str| f.dir.path().join("asked").join(name);
-    let ask =
+    let run_query =
         |args: &[&str]| json(&[&["query", text(&f.scene)], args, &["--view", "008"]].concat());
-    let cat = ask(&[
+    let cat = run_query(&[
         "cat",
         "--export-ply",
         text(&file("cat.ply")),
@@ -112,7 +112,7 @@ fn every_way_to_ask_ends_in_the_same_object() {
         .map(|x| (x, (middle[1] + middle[3]) / 2))
         .find(|(x, y)| mask.at(*x, *y) > 0)
         .expect("a pixel");
-    let point = ask(&["--point", &format!("{},{}", on_mask.0, on_mask.1)]);
+    let point = run_query(&["--point", &format!("{},{}", on_mask.0, on_mask.1)]);
     assert_eq!(point["objects"][0]["id"], id, "{point}");
     let pixels_of =
         (middle[1]..middle[3]).flat_map(|y| (middle[0]..middle[2]).map(move |x| (x, y)));
@@ -121,7 +121,7 @@ fn every_way_to_ask_ends_in_the_same_object() {
         .map(|k| all[k * all.len() / 6])
         .map(|(x, y)| format!("{x},{y}"))
         .collect();
-    let point = ask(&["--point", &several.join("+")]);
+    let point = run_query(&["--point", &several.join("+")]);
     assert_eq!(point["objects"][0]["id"], id, "{point}");
     let wrong = fastlgs(&["query", text(&f.scene), "--point", "1,2+", "--view", "008"]);
     assert!(
@@ -140,13 +140,13 @@ fn every_way_to_ask_ends_in_the_same_object() {
     )
     .to_image();
     fastlgs_core::image_io::save_png(&file("crop.png"), crop).expect("a temporary file");
-    let picture = ask(&["--image", text(&file("crop.png")), "--false-alarms", "1"]);
+    let picture = run_query(&["--image", text(&file("crop.png")), "--false-alarms", "1"]);
     // A part of the object may match the picture better.
     let found = &picture["objects"][0];
     assert!(found["id"] == id || found["parent"] == id, "{picture}");
 
     // Dilated masks, and a text that its negatives exclude.
-    let wide = ask(&["cat", "--dilate", "3x3", "--dilate-times", "2"]);
+    let wide = run_query(&["cat", "--dilate", "3x3", "--dilate-times", "2"]);
     let grown = wide["pixels"].as_u64().expect("a number");
     assert!(grown > pixels && grown < 2 * pixels, "{grown} of {pixels}");
     let ruled_out = fastlgs(&[
@@ -159,31 +159,31 @@ fn every_way_to_ask_ends_in_the_same_object() {
         "kitten",
     ]);
     assert_eq!(ruled_out.status.code(), Some(3));
-    fails(
+    assert_fails(
         &["query", text(&f.scene), "--point", "4000,1"],
         &["4000,1", "outside"],
     );
-    fails(
+    assert_fails(
         &["query", text(&f.scene), "--image", "nowhere.png"],
         &["nowhere.png"],
     );
-    fails(&["query", text(&f.scene), "-", "cat"], &["standard input"]);
-    fails(
+    assert_fails(&["query", text(&f.scene), "-", "cat"], &["standard input"]);
+    assert_fails(
         &["query", text(&f.scene), "cat", "--point", "1,1"],
         &["one way"],
     );
-    let said = fastlgs(&["query", text(&f.scene), "cat", "--view", "008"]);
-    let said = String::from_utf8_lossy(&said.stdout).into_owned();
+    let printed = fastlgs(&["query", text(&f.scene), "cat", "--view", "008"]);
+    let said = String::from_utf8_lossy(&printed.stdout).into_owned();
     assert!(
         said.starts_with("cat: found, confidence ") && said.contains(" pixels in 008.png"),
         "{said}"
     );
-    fails(
+    assert_fails(
         &["export", text(&f.scene), text(&file("cat.xyz"))],
         &["cat.xyz", ".spz"],
     );
     assert!(!file("cat.xyz").exists());
-    fails(&["query", text(&f.scene), " "], &["text is empty"]);
+    assert_fails(&["query", text(&f.scene), " "], &["text is empty"]);
 }
 
 #[test]
@@ -253,7 +253,7 @@ fn names_can_be_taught() {
             .is_some_and(|n| n.len() >= 2)
     );
     json(&["names", "remove", "kocur domowy"]);
-    fails(&["names", "remove", "kocur domowy"], &["never taught"]);
+    assert_fails(&["names", "remove", "kocur domowy"], &["never taught"]);
     let foreign = std::fs::read_to_string(&kept)
         .expect("a file")
         .replace("\"offline ", "\"another ");
@@ -263,12 +263,12 @@ fn names_can_be_taught() {
             .as_u64()
             .is_some_and(|n| n >= 2)
     );
-    fails(
+    assert_fails(
         &["query", text(&f.scene), "kocur domowy"],
         &["another encoder", "names remove"],
     );
     std::fs::write(&kept, "{}x").expect("a file");
-    fails(&["names", "import", text(&kept)], &["names.json"]);
+    assert_fails(&["names", "import", text(&kept)], &["names.json"]);
     for (args, words) in [
         (
             &["teach", "  ", text(&f.scene), "--object", "1"][..],
@@ -292,7 +292,7 @@ fn names_can_be_taught() {
             "nowhere",
         ),
     ] {
-        fails(args, &[words]);
+        assert_fails(args, &[words]);
     }
     json(&["names", "remove", "kocur domowy"]);
     json(&["names", "remove", "w srodku"]);
@@ -447,12 +447,12 @@ fn labels_of_every_layout_agree() {
     let wrong = at("wrong");
     std::fs::create_dir_all(&wrong).expect("a folder");
     std::fs::copy(at("cat/008.png"), wrong.join("009.png")).expect("a mask");
-    fails(
+    assert_fails(
         &["eval", text(&f.scene), "--labels", text(&wrong)],
         &["009.png", "trained on", "--holdout-labels"],
     );
     std::fs::rename(wrong.join("009.png"), wrong.join("none.png")).expect("a mask");
-    fails(
+    assert_fails(
         &["eval", text(&f.scene), "--labels", text(&wrong)],
         &["no view 'none'"],
     );
@@ -478,7 +478,7 @@ fn labels_of_every_layout_agree() {
         ),
         (Some(28), Some(4))
     );
-    fails(&["query", text(&scene), "cat"], &["never trained"]);
+    assert_fails(&["query", text(&scene), "cat"], &["never trained"]);
 }
 
 /// Returns the names of the instances of a generated scene.

@@ -27,7 +27,7 @@ fn bench(args: &[&str]) -> Value {
 fn table(folder: &Path) -> PathBuf {
     let (photos, scene) = (folder.join("photos"), folder.join("table"));
     let run = Run::silent("cpu", 0);
-    let kind = synth::Config {
+    let kind = synth::SynthConfig {
         kind: "table".into(),
         output: photos.clone(),
         views: Some(32),
@@ -35,14 +35,14 @@ fn table(folder: &Path) -> PathBuf {
         ..Default::default()
     };
     fastlgs::synth(&kind, &run).expect("generated photos");
-    let mut config = preprocess::Config {
+    let mut config = preprocess::PreprocessConfig {
         photos,
         output: scene.clone(),
         ..Default::default()
     };
     config.eyes.segmenter = SegmenterKind::Import;
     fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
-    let config = train::Config {
+    let config = train::TrainConfig {
         scene: scene.clone(),
         iterations: Some(1000),
         ..Default::default()

@@ -225,7 +225,7 @@ fn exports_keep_what_queries_need() {
         3 * bytes(&report) < report["bytes_before"].as_u64().expect("a number"),
         "{report}"
     );
-    let ask = |scene: &Path| {
+    let run_query = |scene: &Path| {
         json(&[
             "query",
             text(scene),
@@ -236,7 +236,7 @@ fn exports_keep_what_queries_need() {
             text(&at("out")),
         ])
     };
-    let (whole, compressed) = (ask(&f.scene), ask(&small));
+    let (whole, compressed) = (run_query(&f.scene), run_query(&small));
     assert_eq!(whole["objects"][0]["id"], compressed["objects"][0]["id"]);
     let pixels = |answer: &Value| answer["pixels"].as_f64().expect("a number");
     assert!(
@@ -250,8 +250,8 @@ fn exports_keep_what_queries_need() {
     let loss = |when: &str| report["psnr_held_out"][when].as_f64().expect("a number");
     assert!(loss("before") - loss("after") < 0.1, "{report}");
     let model = small.join("scene.safetensors");
-    let whole = std::fs::read(&model).expect("the model");
-    std::fs::write(&model, &whole[..whole.len() / 2]).expect("a file");
+    let original = std::fs::read(&model).expect("the model");
+    std::fs::write(&model, &original[..original.len() / 2]).expect("a file");
     fails(
         &["query", text(&small), "coffee"],
         &["scene.safetensors", "export the scene again"],
@@ -574,10 +574,10 @@ fn bad_input_is_named_and_nothing_is_damaged() {
         "--holdout",
         "0",
     ]);
-    let said = String::from_utf8_lossy(&output.stderr);
+    let printed = String::from_utf8_lossy(&output.stderr);
     assert!(
-        output.status.success() && said.contains("lost.png") && said.contains("001.png"),
-        "a warning names each of both files: {said}"
+        output.status.success() && printed.contains("lost.png") && printed.contains("001.png"),
+        "a warning names each of both files: {printed}"
     );
     fails(
         &["render", text(&out), "-o", text(&at("r"))],

@@ -32,7 +32,7 @@ struct Target {
 }
 
 /// Largest number of inputs in a corpus.
-const CORPUS: usize = 400;
+const MAX_INPUTS: usize = 400;
 /// Time limit for one input of a few kilobytes. A slower parser counts as hanging.
 const SLOW: Duration = Duration::from_secs(5);
 
@@ -393,7 +393,7 @@ fn parsers_survive_damaged_files() {
         earlier.sort();
         let mut corpus: Vec<Vec<u8>> = vec![target.seed.clone()];
         corpus.extend(earlier.iter().filter_map(|p| std::fs::read(p).ok()));
-        let mut said: BTreeSet<String> = corpus
+        let mut outcomes: BTreeSet<String> = corpus
             .iter()
             .filter_map(|data| Some(outcome(&parse(data).ok()?)))
             .collect();
@@ -403,14 +403,14 @@ fn parsers_survive_damaged_files() {
         let (started, mut runs) = (Instant::now(), 0);
         while started.elapsed().as_secs_f64() < seconds {
             let data = mutated(&corpus, &mut rng);
-            let began = Instant::now();
+            let input_started = Instant::now();
             let result = parse(&data);
             runs += 1;
             let new = match &result {
-                Ok(result) => said.insert(outcome(result)),
+                Ok(result) => outcomes.insert(outcome(result)),
                 Err(_) => false,
             };
-            if result.is_err() || began.elapsed() > SLOW {
+            if result.is_err() || input_started.elapsed() > SLOW {
                 let path = kept.join("failure");
                 std::fs::write(&path, &data).expect("the failure");
                 failures.push(format!(
@@ -428,7 +428,7 @@ fn parsers_survive_damaged_files() {
                     target.name
                 );
             }
-            if new && corpus.len() < CORPUS {
+            if new && corpus.len() < MAX_INPUTS {
                 std::fs::write(kept.join(format!("{:03}", corpus.len())), &data)
                     .expect("the corpus");
                 corpus.push(data);
@@ -437,7 +437,7 @@ fn parsers_survive_damaged_files() {
         println!(
             "fuzz {:20} {runs:6} inputs, {} different results, corpus {before} -> {}",
             target.name,
-            said.len(),
+            outcomes.len(),
             corpus.len()
         );
         total += runs;

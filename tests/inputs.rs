@@ -126,8 +126,8 @@ fn of_two_runs_the_second_says_who_holds_the_scene() {
         .filter(|output| !output.status.success())
         .collect();
     assert_eq!(refused.len(), 1, "{one:?} {two:?}");
-    let said = String::from_utf8_lossy(&refused[0].stderr);
-    assert!(said.contains("is writing this scene"), "{said}");
+    let printed = String::from_utf8_lossy(&refused[0].stderr);
+    assert!(printed.contains("is writing this scene"), "{printed}");
     SceneFolder::open(&scene)
         .and_then(|folder| folder.manifest())
         .expect("the scene of the first run");
@@ -232,7 +232,9 @@ fn masks_mean_the_same_however_they_are_saved() {
 
 /// Preprocesses and briefly trains a copy of the album with changed poses. Returns the messages,
 /// and the PSNR of held-out views in dB.
-fn with_poses(change: impl Fn(usize, DMat4) -> DMat4) -> Option<(String, f64, tempfile::TempDir)> {
+fn train_with_poses(
+    change: impl Fn(usize, DMat4) -> DMat4,
+) -> Option<(String, f64, tempfile::TempDir)> {
     let (dir, photos) = copy()?;
     let scene = dir.path().join("scene");
     let path = photos.join("transforms.json");
@@ -280,7 +282,7 @@ fn with_poses(change: impl Fn(usize, DMat4) -> DMat4) -> Option<(String, f64, te
 
 /// Smallest PSNR of a brief training with correct poses, in dB. Correct poses reach 26 to 27 dB,
 /// wrong poses 15 to 20.
-const RIGHT: f64 = 24.5;
+const CORRECT_POSES_PSNR: f64 = 24.5;
 
 #[test]
 fn poses_far_from_the_origin_keep_their_digits() {
@@ -289,10 +291,10 @@ fn poses_far_from_the_origin_keep_their_digits() {
         pose.w_axis += utm.extend(0.0);
         pose
     };
-    let Some((_, psnr, dir)) = with_poses(moved) else {
+    let Some((_, psnr, dir)) = train_with_poses(moved) else {
         return;
     };
-    assert!(psnr > RIGHT, "{psnr}");
+    assert!(psnr > CORRECT_POSES_PSNR, "{psnr}");
     let (scene, at) = (dir.path().join("scene"), |name: &str| dir.path().join(name));
     // Exports are in world coordinates, and can be imported again.
     json(&["export", text(&scene), text(&at("world.ply"))]);
@@ -364,10 +366,10 @@ fn units_and_one_wrong_pose_do_not_matter() {
             pose.w_axis = (unit * pose.w_axis.truncate()).extend(1.0);
             pose
         };
-        let Some((_, psnr, _)) = with_poses(scaled) else {
+        let Some((_, psnr, _)) = train_with_poses(scaled) else {
             return;
         };
-        assert!(psnr > RIGHT, "unit {unit}: {psnr}");
+        assert!(psnr > CORRECT_POSES_PSNR, "unit {unit}: {psnr}");
     }
     let wrong = |k: usize, mut pose: DMat4| {
         pose.w_axis += if k == 5 {
@@ -377,10 +379,13 @@ fn units_and_one_wrong_pose_do_not_matter() {
         };
         pose
     };
-    let Some((said, psnr, _)) = with_poses(wrong) else {
+    let Some((said, psnr, _)) = train_with_poses(wrong) else {
         return;
     };
-    assert!(said.contains("005.png") && psnr > RIGHT, "{psnr}: {said}");
+    assert!(
+        said.contains("005.png") && psnr > CORRECT_POSES_PSNR,
+        "{psnr}: {said}"
+    );
 }
 
 #[test]
@@ -393,11 +398,11 @@ fn the_photos_tell_the_convention_of_their_poses() {
         ("transposed", &|_, pose| pose.transpose()),
     ];
     for (name, write) in conventions {
-        let Some((said, psnr, _)) = with_poses(write) else {
+        let Some((said, psnr, _)) = train_with_poses(write) else {
             return;
         };
         assert!(
-            said.contains(name) && psnr > RIGHT,
+            said.contains(name) && psnr > CORRECT_POSES_PSNR,
             "{name}, {psnr}: {said}"
         );
     }
@@ -444,8 +449,8 @@ fn what_another_editor_saved_without_objects_is_said_to_have_none() {
         .expect("the column");
     std::fs::write(&path, [&data[..at], b"something", &data[at + 9..]].concat())
         .expect("the scene");
-    let mend = ["object_id", "--iterations 0"];
-    fails(&["query", text(&scene), "coffee"], &mend);
+    let remedy = ["object_id", "--iterations 0"];
+    fails(&["query", text(&scene), "coffee"], &remedy);
     fails(
         &[
             "remove",
@@ -455,13 +460,13 @@ fn what_another_editor_saved_without_objects_is_said_to_have_none() {
             "-o",
             text(&dir.path().join("rest")),
         ],
-        &mend,
+        &remedy,
     );
     // Texts with articles, typographic quotes and a byte order mark.
-    let ask = |words: &str| json(&["query", text(&room.scene), words, "--view", "008.png"]);
-    let plain = ask("coffee");
+    let run_query = |words: &str| json(&["query", text(&room.scene), words, "--view", "008.png"]);
+    let plain = run_query("coffee");
     for words in ["a coffee", "\u{201c}the coffee\u{201d}", "\u{feff}coffee"] {
-        let answer = ask(words);
+        let answer = run_query(words);
         assert_eq!(
             (&answer["found"], &answer["score"], &answer["objects"]),
             (&plain["found"], &plain["score"], &plain["objects"]),

@@ -4,7 +4,7 @@
 //! FASTLGS_REQUIRE_MODELS is set.
 
 use fastlgs::progress::{Message, Sink};
-use fastlgs::{Error, Run, Session, preprocess, synth, train};
+use fastlgs::{Error, Run, Scene, preprocess, synth, train};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, SceneFolder};
 use glam::{Mat4, Quat, Vec3};
@@ -12,17 +12,17 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// A progress sink that records stages. If `impatient` is set, it cancels once training has
+/// A progress sink that records stages. If `cancel_enabled` is set, it cancels once training has
 /// started.
 #[derive(Default)]
 struct Watcher {
-    heard: Mutex<Vec<String>>,
-    impatient: AtomicBool,
+    stages: Mutex<Vec<String>>,
+    cancel_enabled: AtomicBool,
     training: AtomicBool,
 }
 
 impl Sink for Watcher {
-    fn tell(&self, message: Message<'_>) {
+    fn on_message(&self, message: Message<'_>) {
         let line = match message {
             Message::Started { stage, .. } => format!("{stage} begins"),
             Message::Finished { stage } => format!("{stage} ends"),
@@ -34,11 +34,11 @@ impl Sink for Watcher {
             }
             _ => return,
         };
-        self.heard.lock().expect("no panic").push(line);
+        self.stages.lock().expect("no panic").push(line);
     }
 
     fn cancelled(&self) -> bool {
-        self.impatient.load(Ordering::Relaxed) && self.training.load(Ordering::Relaxed)
+        self.cancel_enabled.load(Ordering::Relaxed) && self.training.load(Ordering::Relaxed)
     }
 }
 
@@ -67,7 +67,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         progress: &watcher,
         ..Run::silent("cpu", 7)
     };
-    let made = synth::Config {
+    let made = synth::SynthConfig {
         kind: "table".into(),
         output: photos.clone(),
         views: Some(12),
@@ -81,7 +81,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         12
     );
 
-    let mut config = preprocess::Config {
+    let mut config = preprocess::PreprocessConfig {
         photos,
         output: scene.clone(),
         ..Default::default()
@@ -93,7 +93,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         (12, 10, "96x72")
     );
 
-    let quick = train::Config {
+    let quick = train::TrainConfig {
         scene: scene.clone(),
         iterations: Some(200),
         budget: Some(1500),
@@ -106,8 +106,8 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
     );
     // Reports survive serialisation.
     let text = serde_json::to_string(&report).expect("JSON");
-    let again: train::Report = serde_json::from_str(&text).expect("a report");
-    let counts = |r: &train::Report| {
+    let again: train::TrainReport = serde_json::from_str(&text).expect("a report");
+    let counts = |r: &train::TrainReport| {
         (
             r.gaussians,
             r.objects,
@@ -119,7 +119,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         )
     };
     assert_eq!(counts(&again), counts(&report));
-    let config: train::Config =
+    let config: train::TrainConfig =
         serde_json::from_str(r#"{"scene":"s","preset":"quick","mapping":"paper"}"#)
             .expect("a configuration");
     assert_eq!(
@@ -129,9 +129,9 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
 
     let file = |name: &str| std::fs::read(scene.join(name)).expect("a file of the scene");
     let before = [file("scene.ply"), file("grid.json"), file("scene.json")];
-    watcher.impatient.store(true, Ordering::Relaxed);
+    watcher.cancel_enabled.store(true, Ordering::Relaxed);
     watcher.training.store(false, Ordering::Relaxed);
-    let longer = train::Config {
+    let longer = train::TrainConfig {
         iterations: Some(5000),
         ..quick
     };
@@ -145,14 +145,14 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         "a cancelled run leaves the scene unchanged"
     );
     assert_eq!(
-        Session::open(&scene, "cpu")
+        Scene::open(&scene, "cpu")
             .expect("the scene")
             .gaussians
             .len(),
         report.gaussians
     );
 
-    let heard = watcher.heard.lock().expect("no panic");
+    let heard = watcher.stages.lock().expect("no panic");
     for stage in [
         "synth",
         "photos",
@@ -186,7 +186,7 @@ fn turns(cameras: &[Camera]) -> Vec<Quat> {
 
 /// Returns the mean difference of these rotations between two sets of cameras, in pixels of the
 /// picture.
-fn turned_by(a: &[Camera], b: &[Camera]) -> f32 {
+fn rotation_error(a: &[Camera], b: &[Camera]) -> f32 {
     let angles = turns(a)
         .into_iter()
         .zip(turns(b))
@@ -203,7 +203,7 @@ fn noise_on_poses_is_removed() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let photos = dir.path().join("photos");
     let run = Run::silent("cpu", 3);
-    let made = synth::Config {
+    let made = synth::SynthConfig {
         kind: "table".into(),
         output: photos.clone(),
         views: Some(30),
@@ -213,7 +213,7 @@ fn noise_on_poses_is_removed() {
     fastlgs::synth(&made, &run).expect("a generated scene");
     let preprocessed = |name: &str, poses: preprocess::Poses| {
         let scene = dir.path().join(name);
-        let mut config = preprocess::Config {
+        let mut config = preprocess::PreprocessConfig {
             photos: photos.clone(),
             output: scene.clone(),
             poses,
@@ -253,7 +253,10 @@ fn noise_on_poses_is_removed() {
         how.used && how.error_after < 0.9 * how.error_before && how.moved_median > 1.0,
         "{how:?}"
     );
-    let [before, after] = [turned_by(&kept, &truth), turned_by(&adjusted, &truth)];
+    let [before, after] = [
+        rotation_error(&kept, &truth),
+        rotation_error(&adjusted, &truth),
+    ];
     assert!(
         before > 5.0 && after < 0.1 * before,
         "{before} px before, {after} after"
@@ -270,7 +273,7 @@ fn moved_cameras_stay_with_their_gaussians() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     let run = Run::silent("cpu", 5);
-    let made = synth::Config {
+    let made = synth::SynthConfig {
         kind: "table".into(),
         output: photos.clone(),
         views: Some(10),
@@ -278,7 +281,7 @@ fn moved_cameras_stay_with_their_gaussians() {
         ..Default::default()
     };
     fastlgs::synth(&made, &run).expect("a generated scene");
-    let mut config = preprocess::Config {
+    let mut config = preprocess::PreprocessConfig {
         photos,
         output: scene.clone(),
         ..Default::default()
@@ -288,7 +291,7 @@ fn moved_cameras_stay_with_their_gaussians() {
     let cameras = || SceneFolder::new(&scene).cameras().expect("cameras");
     let given = cameras();
 
-    let moving = train::Config {
+    let moving = train::TrainConfig {
         scene: scene.clone(),
         iterations: Some(100),
         budget: Some(1500),
@@ -302,7 +305,7 @@ fn moved_cameras_stay_with_their_gaussians() {
     );
     let moved = cameras();
     assert_ne!(moved, given);
-    let lifting = train::Config {
+    let lifting = train::TrainConfig {
         iterations: Some(0),
         init: Some(scene.join("scene.ply")),
         align: train::Align::Auto,
@@ -318,7 +321,7 @@ fn moved_cameras_stay_with_their_gaussians() {
         moved,
         "objects are lifted with the cameras that the Gaussians were trained with"
     );
-    let anew = train::Config {
+    let anew = train::TrainConfig {
         align: train::Align::Auto,
         ..moving
     };
@@ -333,7 +336,7 @@ fn moved_cameras_stay_with_their_gaussians() {
 #[test]
 fn errors_name_the_file_and_the_mend() {
     let missing = Path::new("/nowhere/photos");
-    let config = preprocess::Config {
+    let config = preprocess::PreprocessConfig {
         photos: missing.into(),
         output: "/nowhere/scene".into(),
         ..Default::default()
@@ -344,7 +347,7 @@ fn errors_name_the_file_and_the_mend() {
         "{error}"
     );
     let error = fastlgs::train(
-        &train::Config {
+        &train::TrainConfig {
             scene: missing.into(),
             ..Default::default()
         },

@@ -16,7 +16,7 @@ use fastlgs_core::image_io;
 use image::RgbImage;
 use run::{copy_folder, json, text};
 use serde_json::Value;
-use served::{Served, room};
+use served::{Server, room};
 use std::collections::BTreeSet;
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -74,14 +74,14 @@ fn type_text(browser: &Browser, what: &str) -> String {
     browser.keys("/");
     browser.run("document.getElementById('text').value = '';");
     browser.keys(&format!("{what}\u{e007}"));
-    let said = "document.getElementById('answer').textContent";
+    let message = "document.getElementById('answer').textContent";
     browser.wait_for(&format!(
-        "{said}.includes('\"{what}\"') && {said}.includes(' ms)')"
+        "{message}.includes('\"{what}\"') && {message}.includes(' ms)')"
     ));
     // Escape moves the focus from the text field to the picture.
     browser.keys("\u{e00c}");
     browser
-        .run(&format!("return {said};"))
+        .run(&format!("return {message};"))
         .as_str()
         .expect("text")
         .to_owned()
@@ -110,15 +110,24 @@ const WEBGPU: [&str; 5] = [
 
 /// Tests the page of a scene with one renderer. The query `word` highlights the pixels of its mask,
 /// `absent` is not found, keys and mouse work.
-fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &str) -> Browser {
+fn page_works(
+    served: &Server,
+    renderer_name: &str,
+    flags: &[&str],
+    word: &str,
+    absent: &str,
+) -> Browser {
     let browser = Browser::open(window().0, window().1, flags);
-    browser.go(&format!("{}/?renderer={way}", served.url));
+    browser.go(&format!("{}/?renderer={renderer_name}", served.url));
     browser.wait_for("document.body.dataset.ready");
-    assert_eq!(browser.run("return fastlgs.stage.renderer.name;"), way);
+    assert_eq!(
+        browser.run("return fastlgs.stage.renderer.name;"),
+        renderer_name
+    );
     let plain = snapshot(&browser);
     let camera = browser
         .run("return fastlgs.stage.camera.asJson(fastlgs.stage.width, fastlgs.stage.height);");
-    let rendered = served.ask(
+    let rendered = served.request(
         "/api/render",
         Some(&serde_json::json!({ "camera": camera }).to_string()),
     );
@@ -126,10 +135,14 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
         &plain,
         &image_io::decode_rgb("render", &rendered.1).expect("a PNG"),
     );
-    let least = if way == "pictures" { 25.0 } else { 32.0 };
+    let least = if renderer_name == "pictures" {
+        25.0
+    } else {
+        32.0
+    };
     assert!(
         same > least,
-        "{way}: the PSNR of the browser's and the server's picture is only {same} dB"
+        "{renderer_name}: the PSNR of the browser's and the server's picture is only {same} dB"
     );
 
     let said = type_text(&browser, word);
@@ -146,11 +159,11 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     let mask = image_io::decode_rgb("mask", &Browser::decode(&answer["mask"])).expect("a PNG");
     let iou = lit_iou(&plain, &marked, &mask);
     println!(
-        "{way}: {same:.1} dB to the server's picture; highlighted pixels and mask of \"{word}\" have an IoU of {iou:.3}"
+        "{renderer_name}: {same:.1} dB to the server's picture; highlighted pixels and mask of \"{word}\" have an IoU of {iou:.3}"
     );
     assert!(
         iou > 0.8,
-        "{way}: highlighted pixels and mask have an IoU of {iou}"
+        "{renderer_name}: highlighted pixels and mask have an IoU of {iou}"
     );
 
     // A click on the object selects it, one of its parts, or an object that contains it.
@@ -159,7 +172,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
         .map(|p| [p % mask.width(), p / mask.width()])
         .filter(at)
         .collect();
-    let place_of = |p: [u32; 2]| {
+    let page_position = |p: [u32; 2]| {
         let place = browser.run(&format!(
             "const box = fastlgs.stage.elements.canvas.getBoundingClientRect(); return [box.x + {} / fastlgs.stage.ratio, box.y + {} / fastlgs.stage.ratio];",
             p[0], p[1]
@@ -169,7 +182,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     // A pixel may belong to no object: at the border of two objects, or behind a stray Gaussian.
     let selects = |p: [u32; 2]| {
         browser.keys("\u{e00c}");
-        browser.drag(place_of(p), place_of(p));
+        browser.drag(page_position(p), page_position(p));
         let selected = || {
             browser.run("await fastlgs.stage.settle(); return fastlgs.state.selected.size;") == 1
         };
@@ -180,7 +193,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     };
     assert!(
         (8..16).any(|k| selects(own[own.len() * k / 16])),
-        "{way}: no click on the object selects anything"
+        "{renderer_name}: no click on the object selects anything"
     );
 
     // Keys hide, show and isolate objects.
@@ -189,11 +202,14 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     let hidden = psnr(&snapshot(&browser), &plain);
     browser.keys("a");
     let back = psnr(&snapshot(&browser), &plain);
-    assert!(back > 45.0, "{way}: the hidden object is shown again");
+    assert!(
+        back > 45.0,
+        "{renderer_name}: the hidden object is shown again"
+    );
     // A small object changes few pixels.
     assert!(
         hidden < back - 5.0,
-        "{way}: hiding must change the picture: {hidden:.1} dB hidden, {back:.1} dB shown again"
+        "{renderer_name}: hiding must change the picture: {hidden:.1} dB hidden, {back:.1} dB shown again"
     );
     let objects = served.json("/api/objects", None);
     let outermost = objects
@@ -212,7 +228,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
 
     // Clicks with Shift held select one object together.
     browser.keys("\u{e00c}");
-    let places = [4, 8, 12].map(|k| place_of(own[own.len() * k / 16]));
+    let places = [4, 8, 12].map(|k| page_position(own[own.len() * k / 16]));
     browser.holding("\u{e008}", || {
         places
             .iter()
@@ -234,9 +250,9 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     let first = eye();
     browser.keys("\u{e012}\u{e013}");
     let turned = eye();
-    assert_ne!(first, turned, "{way}: arrow keys turn");
+    assert_ne!(first, turned, "{renderer_name}: arrow keys turn");
     browser.drag([300, 300], [360, 330]);
-    assert_ne!(turned, eye(), "{way}: the mouse turns");
+    assert_ne!(turned, eye(), "{renderer_name}: the mouse turns");
     let distance = || {
         browser
             .run("return fastlgs.stage.camera.distance;")
@@ -247,13 +263,13 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     browser.pinch([300, 300], 40, 120);
     assert!(
         distance() < 0.6 * before,
-        "{way}: spreading two fingers moves the camera closer"
+        "{renderer_name}: spreading two fingers moves the camera closer"
     );
     browser.keys("][");
     assert_eq!(
         first,
         eye(),
-        "{way}: keys step through the photos and return to the first view"
+        "{renderer_name}: keys step through the photos and return to the first view"
     );
     browser.keys("pc3");
     browser.wait_for(
@@ -269,7 +285,7 @@ fn page_works(served: &Served, way: &str, flags: &[&str], word: &str, absent: &s
     assert_eq!(
         browser.errors(),
         Vec::<String>::new(),
-        "{way}: the console has no errors"
+        "{renderer_name}: the console has no errors"
     );
     browser
 }
@@ -280,7 +296,7 @@ fn a_text_lights_up_its_object_in_the_browser() {
         return;
     }
     let Some(scene) = room() else { return };
-    let served = Served::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
+    let served = Server::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
     page_works(&served, "webgpu", &WEBGPU, "cat", "pizza");
     page_works(&served, "pictures", &[], "cat", "pizza");
     let browser = page_works(
@@ -312,7 +328,7 @@ fn what_one_sees_is_named_measured_and_passed_on() {
     }
     let Some(scene) = room() else { return };
     let names = tempfile::tempdir().expect("a temporary folder");
-    let served = Served::start_knowing(
+    let served = Server::start_with_names(
         names.path(),
         &["serve", text(scene), "--bind", "0", "--device", "cpu"],
     );
@@ -507,7 +523,7 @@ fn a_large_scene_is_seen_soon() {
     let room = folder.gaussians().expect("the room");
     let many = room.select(&(0..GAUSSIANS).map(|i| i % room.len()).collect::<Vec<_>>());
     fastlgs_core::ply::write(&folder.ply_path(), &many).expect("a file");
-    let served = Served::start(&["serve", text(&large), "--bind", "0", "--device", "cpu"]);
+    let served = Server::start(&["serve", text(&large), "--bind", "0", "--device", "cpu"]);
     for (way, flags) in [
         ("pictures", &[][..]),
         ("webgl2", &["--enable-unsafe-swiftshader"][..]),
@@ -685,12 +701,12 @@ fn the_fox_lights_up_in_the_browser() {
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let scene = dir.path().join("fox");
-    let few = dir.path().join("few");
+    let half = dir.path().join("few");
     // The short run uses every second photo.
     let photos = if run::all() {
         photos
     } else {
-        every_second(&photos, &few)
+        every_second(&photos, &half)
     };
     json(&[
         "preprocess",
@@ -710,7 +726,7 @@ fn the_fox_lights_up_in_the_browser() {
         "--device",
         "cpu",
     ]);
-    let served = Served::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
+    let served = Server::start(&["serve", text(&scene), "--bind", "0", "--device", "cpu"]);
     page_works(
         &served,
         "webgl2",

@@ -18,13 +18,13 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Returns an empty folder for scenes. `None` without models or device.
-fn workshop() -> Option<tempfile::TempDir> {
+fn scene_dir() -> Option<tempfile::TempDir> {
     run::ready().then(|| tempfile::tempdir().expect("a temporary folder"))
 }
 
 #[test]
 fn transparent_and_masked_pixels_do_not_count() {
-    let Some(dir) = workshop() else { return };
+    let Some(dir) = scene_dir() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&[
         "synth",
@@ -143,7 +143,7 @@ fn transparent_and_masked_pixels_do_not_count() {
 /// Lens distortion that no input file reports is estimated and removed.
 #[test]
 fn an_untold_bend_of_the_lens_is_found_and_removed() {
-    let Some(dir) = workshop() else { return };
+    let Some(dir) = scene_dir() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&[
         "synth",
@@ -183,9 +183,9 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
                 photo.file_name().expect("a name").to_string_lossy()
             ));
             let map = LabelMap::load(&path).expect("masks");
-            let bent = map.undistorted(&camera, &lens);
-            bent.save(&path).expect("masks");
-            [map, bent]
+            let distorted = map.undistorted(&camera, &lens);
+            distorted.save(&path).expect("masks");
+            [map, distorted]
         })
         .collect();
     for finer in ["part", "subpart"] {
@@ -225,15 +225,18 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
             / straight.len() as f64
     };
     let bent = mean(&|path| load_rgb(path).expect("a photo"));
-    let mended = mean(&|path| {
+    let corrected = mean(&|path| {
         folder
             .photo(&path.file_name().expect("a name").to_string_lossy())
             .expect("a photo")
     });
     println!(
-        "k1 {found:.3}, truth {K1}; PSNR against undistorted photos {bent:.1} dB before, {mended:.1} dB after"
+        "k1 {found:.3}, truth {K1}; PSNR against undistorted photos {bent:.1} dB before, {corrected:.1} dB after"
     );
-    assert!(mended > bent + 2.0, "{bent} dB before, {mended} dB after");
+    assert!(
+        corrected > bent + 2.0,
+        "{bent} dB before, {corrected} dB after"
+    );
 
     // Finds the best IoU for each object of 400 to 20,000 pixels, in the distorted and in the
     // corrected masks.
@@ -272,7 +275,7 @@ fn an_untold_bend_of_the_lens_is_found_and_removed() {
 
 #[test]
 fn preprocessing_does_again_only_what_changed() {
-    let Some(dir) = workshop() else { return };
+    let Some(dir) = scene_dir() else { return };
     let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
     json(&[
         "synth",
@@ -319,13 +322,13 @@ fn preprocessing_does_again_only_what_changed() {
         // Key points may be two pixels outside.
         (-2.0..162.0).contains(&pixel.x) && (-2.0..122.0).contains(&pixel.y)
     };
-    let sights = |p: &SfmPoint| {
+    let observations = |p: &SfmPoint| {
         p.seen_by
             .iter()
             .map(|view| inside(&training[*view as usize], p.position))
             .collect::<Vec<bool>>()
     };
-    let seen: Vec<bool> = points.iter().flat_map(sights).collect();
+    let seen: Vec<bool> = points.iter().flat_map(observations).collect();
     assert!(
         seen.len() > 100 && seen.iter().all(|inside| *inside),
         "{} observations of {} points",
@@ -353,7 +356,7 @@ fn preprocessing_does_again_only_what_changed() {
 /// Without the exact poses, structure from motion must recover them up to a similarity transform.
 #[test]
 fn photos_without_poses_are_placed() {
-    let Some(dir) = workshop() else { return };
+    let Some(dir) = scene_dir() else { return };
     let (photos, exact, scene) = (
         dir.path().join("photos"),
         dir.path().join("exact"),
@@ -438,27 +441,27 @@ fn photos_without_poses_are_placed() {
         let mean = far.iter().sum::<f32>() / far.len() as f32;
         far.iter().map(|d| d / mean).collect()
     };
-    let mut off: Vec<f32> = pairs(&exact)
+    let mut errors: Vec<f32> = pairs(&exact)
         .iter()
         .zip(pairs(&found))
         .map(|(a, b)| (a - b).abs())
         .collect();
-    off.sort_by(f32::total_cmp);
-    let (median, worst) = (off[off.len() / 2], off[off.len() - 1]);
+    errors.sort_by(f32::total_cmp);
+    let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
     println!(
         "{} of 24 photos placed; distances between centres differ by {median:.4} of their mean, at most {worst:.4}",
         found.len()
     );
     // The table's plain surfaces give only about 36 points per photo, so single photos may be
     // wrong.
-    assert!(median < 0.02 && worst < 0.3, "{off:?}");
+    assert!(median < 0.02 && worst < 0.3, "{errors:?}");
 }
 
 /// Two fifths of the poses are wrong but consistent with each other, as when a room has two similar
 /// sides. They are estimated again.
 #[test]
 fn poses_of_which_many_are_wrong_are_found_anew() {
-    let Some(dir) = workshop() else { return };
+    let Some(dir) = scene_dir() else { return };
     let fox = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !fox.is_dir() {
         println!("SKIPPED: {} is absent", fox.display());

@@ -95,7 +95,7 @@ fn grid(parents: &[u16]) -> Grid {
     }
 }
 
-fn through<T>(write: impl FnOnce(&Path), read: impl FnOnce(&Path) -> T) -> T {
+fn round_trip<T>(write: impl FnOnce(&Path), read: impl FnOnce(&Path) -> T) -> T {
     let dir = tempfile::tempdir().expect("a folder");
     let path = dir.path().join("file");
     write(&path);
@@ -105,13 +105,13 @@ fn through<T>(write: impl FnOnce(&Path), read: impl FnOnce(&Path) -> T) -> T {
 proptest! {
     #[test]
     fn ply_keeps_every_bit(scene in scene()) {
-        let back = through(|p| ply::write(p, &scene).expect("written"), |p| ply::read(p).expect("read"));
+        let back = round_trip(|p| ply::write(p, &scene).expect("written"), |p| ply::read(p).expect("read"));
         prop_assert_eq!(back, scene);
     }
 
     #[test]
     fn compact_files_keep_what_their_bytes_can(scene in scene()) {
-        let back = through(|p| compact::write(p, &scene, &Precision::default()).expect("written"), |p| compact::read(p).expect("read"));
+        let back = round_trip(|p| compact::write(p, &scene, &Precision::default()).expect("written"), |p| compact::read(p).expect("read"));
         prop_assert_eq!(&back.object_ids, &scene.object_ids);
         // Positions have three bytes over at most 100 units. Other values have two bytes over their
         // range.
@@ -125,7 +125,7 @@ proptest! {
 
     #[test]
     fn spz_keeps_what_eyes_see(scene in scene()) {
-        let back = through(|p| spz::write(p, &scene).expect("written"), |p| spz::read(p).expect("read"));
+        let back = round_trip(|p| spz::write(p, &scene).expect("written"), |p| spz::read(p).expect("read"));
         prop_assert_eq!(back.len(), scene.len());
         for i in 0..scene.len() {
             prop_assert!((back.means[i] - scene.means[i]).abs().max_element() <= 1.0 / 4096.0);
@@ -137,7 +137,7 @@ proptest! {
 
     #[test]
     fn sog_keeps_what_eyes_see(scene in scene()) {
-        let back = through(|p| sog::write(p, &scene).expect("written"), |p| sog::read(p).expect("read"));
+        let back = round_trip(|p| sog::write(p, &scene).expect("written"), |p| sog::read(p).expect("read"));
         prop_assert_eq!(back.len(), scene.len());
         // SOG reorders the Gaussians.
         for (mean, i) in back.means.iter().zip(0..) {
@@ -153,7 +153,7 @@ proptest! {
         (Just(a.clone()), labels.prop_map(move |labels| LabelMap { labels, ..a }))
     })) {
         let (a, b) = pair;
-        let back = through(|p| a.save(&p.with_extension("png")).expect("written"), |p| LabelMap::load(&p.with_extension("png")).expect("read"));
+        let back = round_trip(|p| a.save(&p.with_extension("png")).expect("written"), |p| LabelMap::load(&p.with_extension("png")).expect("read"));
         prop_assert_eq!(&back.labels, &a.labels);
         let (dense, names) = a.dense();
         let undone: Vec<u16> = dense.labels.iter().map(|l| names[usize::from(*l)]).collect();
@@ -222,16 +222,16 @@ proptest! {
         grid.save(&folder).expect("it can be written");
         prop_assert_eq!(&Grid::load(&folder).expect("it can be read"), &grid);
 
-        let own = pick % count + 1;
-        let (members, related) = (grid.members(&[own]), grid.related(own));
+        let picked_id = pick % count + 1;
+        let (members, related) = (grid.members(&[picked_id]), grid.related(picked_id));
         for (id, list) in ids.iter().zip(&lists) {
-            prop_assert_eq!(members[usize::from(*id)], list.contains(&own));
+            prop_assert_eq!(members[usize::from(*id)], list.contains(&picked_id));
         }
         for other in 1..=count {
-            prop_assert_eq!(related[usize::from(other) - 1], grid.related(other)[usize::from(own) - 1], "{} and {}", own, other);
+            prop_assert_eq!(related[usize::from(other) - 1], grid.related(other)[usize::from(picked_id) - 1], "{} and {}", picked_id, other);
         }
-        let gone = grid.parts(&[own]);
-        let (left, new) = grid.without(&[own]);
+        let gone = grid.parts(&[picked_id]);
+        let (left, new) = grid.without(&[picked_id]);
         let stay: Vec<u16> = (1..=count).filter(|id| !gone[usize::from(*id) - 1]).collect();
         for (id, list) in ids.iter().zip(&lists) {
             let after: Vec<u16> = left.chain(new[usize::from(*id)]).map(|id| stay[usize::from(id) - 1]).collect();
@@ -257,7 +257,7 @@ proptest! {
         prop_assume!(eye.length() > 0.5 && eye.normalize().y.abs() < 0.99);
         let camera = Camera::look_at("a.png", eye, Vec3::ZERO, Vec3::Y, size.0, size.1, fov);
         let text = serde_json::to_vec(&camera).expect("JSON");
-        let back = through(|p| std::fs::write(p, &text).expect("written"), |p| Camera::load(p, &fastlgs_core::WorldFrame::default()).expect("read"));
+        let back = round_trip(|p| std::fs::write(p, &text).expect("written"), |p| Camera::load(p, &fastlgs_core::WorldFrame::default()).expect("read"));
         prop_assert_eq!(&back, &camera);
         prop_assert!((camera.centre() - eye).length() < 1e-3);
         let seen = camera.to_pixel(camera.world_to_camera.transform_point3(Vec3::ZERO));

@@ -82,8 +82,8 @@ fn training_survives_kills() {
     let mut rng = Rng::new(20, "kills");
     let (mut kills, mut resumed, mut finished) = (0, 0, 0);
     // Later runs find a checkpoint more often, because resumed runs start in the middle.
-    let wanted = if run::all() { 20 } else { 5 };
-    while kills < wanted {
+    let target_kills = if run::all() { 20 } else { 5 };
+    while kills < target_kills {
         resumed += usize::from(scene.join("checkpoints/train.json").is_file());
         let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
             .args([&["train", text(&scene), "--resume", "-q"], &TRAINING[..]].concat())
@@ -112,7 +112,7 @@ fn training_survives_kills() {
         "kills: {kills}, runs with a checkpoint: {resumed}, runs that finished before their kill: {finished}"
     );
     assert!(
-        resumed > wanted / 7,
+        resumed > target_kills / 7,
         "too few runs found a checkpoint: {resumed}"
     );
     assert!(
@@ -282,7 +282,7 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
     }
     // Kills runs while or after they move their output into the scene. If the manifest is missing,
     // the next run must restore the earlier scene.
-    let mut moving = 0;
+    let mut killed_while_moving = 0;
     for _ in 0..3 {
         std::fs::remove_dir_all(&scene).expect("a scene");
         copy_folder(&f.trained, &scene);
@@ -290,7 +290,7 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
         while manifest(&scene) == before.1 && run.try_wait().expect("a child").is_none() {}
         end(run);
         if manifest(&scene).is_none() {
-            moving += 1;
+            killed_while_moving += 1;
             let run = begin().expect("the binary starts");
             let started = Instant::now();
             while manifest(&scene).is_none() {
@@ -312,7 +312,7 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
         }
     }
     println!(
-        "preprocess: {kills} kills before and {moving} of 3 during the final moves, no scene is mixed"
+        "preprocess: {kills} kills before and {killed_while_moving} of 3 during the final moves, no scene is mixed"
     );
     json(&smaller);
     assert!(kills > 0 && made(&scene) == after && !scene.join("preprocess.partial").exists());

@@ -22,7 +22,7 @@ fn coffee(f: &Fixture) -> u16 {
 
 /// Returns the label on whose surface Gaussian `i` lies, by a vote of all photos with exact depth
 /// and masks. A photo votes if its depth agrees within 3 %. `None` without votes.
-fn thing_of(scene: &Gaussians, i: usize, photos: &[(Camera, Vec<f32>, LabelMap)]) -> Option<u16> {
+fn label_of(scene: &Gaussians, i: usize, photos: &[(Camera, Vec<f32>, LabelMap)]) -> Option<u16> {
     let mut votes = std::collections::BTreeMap::new();
     for (camera, depth, things) in photos {
         let there = camera.world_to_camera.transform_point3(scene.means[i]);
@@ -73,7 +73,7 @@ fn the_gaussians_of_an_answer_are_the_things() {
         .collect();
     let (mut both, mut found, mut there) = (0, 0, 0);
     for i in 0..scene.len() {
-        let Some(thing) = thing_of(&scene, i, &photos) else {
+        let Some(thing) = label_of(&scene, i, &photos) else {
             continue;
         };
         let (is_selected, is_coffee) = (selected.binary_search(&i).is_ok(), thing == COFFEE);
@@ -96,7 +96,7 @@ fn the_gaussians_of_an_answer_are_the_things() {
 fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
     let Some(f) = fixture() else { return };
     let at = |name: &str| f.dir.path().join("removal").join(name);
-    let (truth, tidy) = (at("truth"), at("tidy"));
+    let (truth, removed_scene) = (at("truth"), at("tidy"));
     let made = json(&[
         "synth",
         "room",
@@ -116,7 +116,14 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         "{made}"
     );
     let id = coffee(f).to_string();
-    let report = json(&["remove", text(&f.scene), "--object", &id, "-o", text(&tidy)]);
+    let report = json(&[
+        "remove",
+        text(&f.scene),
+        "--object",
+        &id,
+        "-o",
+        text(&removed_scene),
+    ]);
     assert!(
         report["removed"].as_u64().is_some_and(|n| n > 50),
         "{report}"
@@ -139,7 +146,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
             let wanted = image_io::to_planar(
                 &image_io::load_rgb(&truth.join("images").join(view)).expect("the truth"),
             );
-            let shown = image_io::to_planar(
+            let rendered = image_io::to_planar(
                 &image_io::load_rgb(&out.join(format!("{view}.color.png"))).expect("a picture"),
             );
             let mask = LabelMap::load(&f.photos.join("masks").join(format!("{view}.png")))
@@ -155,7 +162,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
                         .map(|(_, v)| *v)
                         .collect()
                 };
-                metrics::psnr(&pick(&shown), &pick(&wanted))
+                metrics::psnr(&pick(&rendered), &pick(&wanted))
             };
             if mask.iter().filter(|m| **m).count() > 50 {
                 inside.push(psnr(&|p| mask[p]));
@@ -165,7 +172,10 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
         [mean(&inside), mean(&outside)]
     };
-    let (before, after) = (quality(&f.scene, "before"), quality(&tidy, "after"));
+    let (before, after) = (
+        quality(&f.scene, "before"),
+        quality(&removed_scene, "after"),
+    );
     println!(
         "PSNR in the coffee's mask: {:.1} dB before, {:.1} dB after removal; elsewhere {:.2} and {:.2} dB",
         before[0], after[0], before[1], after[1]
@@ -176,7 +186,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
     );
 
     // The new scene works like any other, and does not find the object.
-    let asked = fastlgs(&["query", text(&tidy), "coffee", "--view", "008"]);
+    let asked = fastlgs(&["query", text(&removed_scene), "coffee", "--view", "008"]);
     assert_eq!(
         asked.status.code(),
         Some(3),
@@ -189,9 +199,9 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
             .objects
             .len()
     };
-    assert!(objects(&tidy) < objects(&f.scene));
-    json(&["eval", text(&tidy)]);
-    json(&["export", text(&tidy), text(&at("tidy.spz"))]);
+    assert!(objects(&removed_scene) < objects(&f.scene));
+    json(&["eval", text(&removed_scene)]);
+    json(&["export", text(&removed_scene), text(&at("tidy.spz"))]);
     let small = at("small/");
     json(&["export", text(&f.scene), text(&small)]);
     fails(
@@ -206,7 +216,14 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         &["photos are not there"],
     );
     fails(
-        &["remove", text(&f.scene), "--object", &id, "-o", text(&tidy)],
+        &[
+            "remove",
+            text(&f.scene),
+            "--object",
+            &id,
+            "-o",
+            text(&removed_scene),
+        ],
         &["tidy", "already"],
     );
     fails(

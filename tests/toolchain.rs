@@ -115,10 +115,10 @@ fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
             .expect("a time")
     };
     let before = stamp();
-    let said = String::from_utf8(fastlgs(&args).stdout).expect("words");
+    let printed = String::from_utf8(fastlgs(&args).stdout).expect("words");
     assert!(
-        said.contains("is up to date") && said.contains("fastlgs serve '"),
-        "{said}"
+        printed.contains("is up to date") && printed.contains("fastlgs serve '"),
+        "{printed}"
     );
     assert_eq!(before, stamp());
     // Replaces the first photo by another one.
@@ -333,7 +333,7 @@ fn selections_and_camera_paths_go_out_and_in() {
     let Some(l) = library() else { return };
     let room = l.scenes.join("room");
     let out = l.dir.path().join("exchange");
-    for ending in fastlgs::session::selection::ENDINGS {
+    for ending in fastlgs::session::selection::EXTENSIONS {
         let file = out.join(format!("cat.{ending}"));
         let answer = json(&[
             "query",
@@ -430,17 +430,20 @@ fn selections_and_camera_paths_go_out_and_in() {
         fastlgs_core::image_io::load_rgb(&pictures.join("001.png.color.png")).expect("a picture");
     let by_path = fastlgs_core::image_io::load_rgb(&pictures.join("frame_00001.color.png"))
         .expect("a picture");
-    let far = own
+    let differing = own
         .as_raw()
         .iter()
         .zip(by_path.as_raw())
         .filter(|(a, b)| a.abs_diff(**b) > 2)
         .count();
-    assert!(far * 1000 < own.as_raw().len(), "{far} values differ");
+    assert!(
+        differing * 1000 < own.as_raw().len(),
+        "{differing} values differ"
+    );
 }
 
 /// Installs programs of others by npm once, and returns their folder. `None` without npm.
-fn others() -> Option<PathBuf> {
+fn other_programs() -> Option<PathBuf> {
     let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("npm");
     let npm = |args: &[&str]| Command::new("npm").args(args).current_dir(&root).output();
     std::fs::create_dir_all(&root).expect("a folder");
@@ -473,7 +476,7 @@ fn others() -> Option<PathBuf> {
 
 #[test]
 fn programs_of_others_read_what_is_exported() {
-    let (Some(l), Some(others)) = (library(), others()) else {
+    let (Some(l), Some(others)) = (library(), other_programs()) else {
         return;
     };
     let room = l.scenes.join("room");
@@ -521,7 +524,7 @@ fn programs_of_others_read_what_is_exported() {
             g.select(&places)
         };
         let (ours, theirs) = (sorted(ours), sorted(theirs));
-        let off = (0..ours.len()).filter(|&i| {
+        let mismatches = (0..ours.len()).filter(|&i| {
             let apart = |a: [f32; 3], b: [f32; 3]| {
                 a.iter()
                     .zip(b)
@@ -546,7 +549,7 @@ fn programs_of_others_read_what_is_exported() {
                 || ours.rotation(i).dot(theirs.rotation(i)).abs() < 1.0 - close
         });
         // Gaussians with the same position may be sorted in any order.
-        let off = off.count();
+        let off = mismatches.count();
         assert!(
             off * 100 <= ours.len(),
             "{off} of {} Gaussians differ",

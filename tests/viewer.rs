@@ -191,10 +191,10 @@ fn the_interface_answers_as_the_query_command_does() {
         ),
         ("/api/scene", "{}", 405, "openapi"),
     ] {
-        let said = served.refusal(path, Some(body), status);
+        let message = served.refusal(path, Some(body), status);
         assert!(
-            said.to_lowercase().contains(&word.to_lowercase()),
-            "{path}: '{said}' lacks '{word}'"
+            message.to_lowercase().contains(&word.to_lowercase()),
+            "{path}: '{message}' lacks '{word}'"
         );
     }
     assert!(

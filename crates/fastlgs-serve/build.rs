@@ -16,9 +16,9 @@ const SHARED: &str = "../../shaders/shared";
 
 fn main() {
     let out = env::var("OUT_DIR").expect("cargo sets OUT_DIR");
-    valid("web/present.wgsl", &read("web/present.wgsl"));
-    let source = assembled();
-    let (module, info) = valid(SOURCE, &source);
+    parse_and_validate("web/present.wgsl", &read("web/present.wgsl"));
+    let source = resolve_imports();
+    let (module, info) = parse_and_validate(SOURCE, &source);
     fs::write(Path::new(&out).join("splat.wgsl"), &source).expect("writable OUT_DIR");
     let options = glsl::Options {
         version: glsl::Version::Embedded {
@@ -61,7 +61,7 @@ fn read(path: &str) -> String {
 
 /// Returns the drawing shader with its imports replaced by the shared files. Imports inside the
 /// shared files are removed, so the shader itself must import those files.
-fn assembled() -> String {
+fn resolve_imports() -> String {
     let line = |line: &str| match line.strip_prefix("#import ") {
         Some(name) => read(&format!("{SHARED}/{name}.wgsl"))
             .lines()
@@ -73,7 +73,7 @@ fn assembled() -> String {
     read(SOURCE).lines().map(line).collect()
 }
 
-fn valid(path: &str, source: &str) -> (Module, ModuleInfo) {
+fn parse_and_validate(path: &str, source: &str) -> (Module, ModuleInfo) {
     let module = naga::front::wgsl::parse_str(source)
         .unwrap_or_else(|e| panic!("{path}:\n{}", e.emit_to_string(source)));
     let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(&module);

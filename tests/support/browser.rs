@@ -10,7 +10,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// Limit of every wait. Even software rendering on a busy machine is faster.
-const PATIENCE: Duration = Duration::from_secs(180);
+const TIMEOUT: Duration = Duration::from_secs(180);
 
 /// A browser with one page. It ends with this value.
 pub struct Browser {
@@ -56,7 +56,7 @@ impl Browser {
             port.expect("chromedriver prints its port")
         );
         let agent = ureq::Agent::config_builder()
-            .timeout_global(Some(2 * PATIENCE))
+            .timeout_global(Some(2 * TIMEOUT))
             .http_status_as_error(false)
             .build()
             .into();
@@ -70,7 +70,7 @@ impl Browser {
         ];
         args.extend(flags);
         let options = json!({ "args": args });
-        let timeouts = json!({ "script": PATIENCE.as_millis() as u64 });
+        let timeouts = json!({ "script": TIMEOUT.as_millis() as u64 });
         let logs = json!({ "browser": "ALL" });
         let always = json!({ "browserName": "chrome", "timeouts": timeouts, "goog:chromeOptions": options, "goog:loggingPrefs": logs });
         let mut browser = Self {
@@ -126,7 +126,7 @@ impl Browser {
         while self.run(&format!("return Boolean({expression});")) != true {
             let problem = self.run("return document.getElementById('problem')?.textContent ?? '';");
             assert!(
-                began.elapsed() < PATIENCE,
+                began.elapsed() < TIMEOUT,
                 "'{expression}' did not become true; message on the page: {problem}"
             );
             std::thread::sleep(Duration::from_millis(200));
@@ -152,16 +152,16 @@ impl Browser {
 
     /// Runs `work` while a key is held.
     pub fn holding<T>(&self, key: &str, work: impl FnOnce() -> T) -> T {
-        let turn = |kind: &str| {
+        let send_key = |kind: &str| {
             let action = json!({ "type": kind, "value": key });
             self.post(
                 "/actions",
                 &json!({ "actions": [{ "type": "key", "id": "keyboard", "actions": [action] }] }),
             );
         };
-        turn("keyDown");
+        send_key("keyDown");
         let done = work();
-        turn("keyUp");
+        send_key("keyUp");
         done
     }
 

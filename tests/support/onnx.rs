@@ -93,13 +93,13 @@ impl Graph {
         bytes(&mut self.outputs, 12, &value_info(name, kind, shape));
     }
 
-    fn fresh(&mut self) -> String {
+    fn new_name(&mut self) -> String {
         self.names += 1;
         format!("v{}", self.names)
     }
 
     fn constant(&mut self, kind: Kind, shape: &[i64], raw: &[u8]) -> String {
-        let name = self.fresh();
+        let name = self.new_name();
         let mut tensor = Vec::new();
         shape.iter().for_each(|d| number(&mut tensor, 1, *d));
         number(&mut tensor, 2, kind as i64);
@@ -135,7 +135,7 @@ impl Graph {
 
     /// Adds a node and returns the name of its result.
     pub fn op(&mut self, kind: &str, inputs: &[&str], attributes: &[Attribute]) -> String {
-        let name = self.fresh();
+        let name = self.new_name();
         self.node(kind, inputs, attributes, &name);
         name
     }

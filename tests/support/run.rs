@@ -41,8 +41,8 @@ pub fn fastlgs(args: &[&str]) -> Output {
         .expect("the binary starts")
 }
 
-/// Returns whether the full tests run (`./test.sh --all`). Otherwise slow tests are shortened.
-pub fn all() -> bool {
+/// Returns whether the full tests run (`./test.sh --full_tests`). Otherwise slow tests are shortened.
+pub fn full_tests() -> bool {
     std::env::var_os("FASTLGS_TEST_ALL").is_some()
 }
 
@@ -57,7 +57,7 @@ pub struct Room {
 pub fn room() -> Option<&'static Room> {
     static ROOM: OnceLock<Option<Room>> = OnceLock::new();
     let make = || {
-        if !ready() {
+        if !requirements_met() {
             return None;
         }
         let program = std::fs::metadata(PROGRAM).expect("the binary");
@@ -168,20 +168,20 @@ pub fn json(args: &[&str]) -> Value {
 }
 
 /// Asserts exit code 1, and returns the line with the error message.
-pub fn complaint(args: &[&str], output: &Output) -> String {
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(1), "{args:?}: {said}");
-    assert!(!said.contains("panicked"), "{said}");
-    let line = said
+pub fn error_line(args: &[&str], output: &Output) -> String {
+    let printed = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(1), "{args:?}: {printed}");
+    assert!(!printed.contains("panicked"), "{printed}");
+    let line = printed
         .lines()
         .find(|l| l.starts_with("error: "))
-        .unwrap_or_else(|| panic!("{args:?} prints no error message: {said}"));
+        .unwrap_or_else(|| panic!("{args:?} prints no error message: {printed}"));
     line.to_owned()
 }
 
 /// Asserts that a command fails with exit code 1 and one line that contains all `words`.
-pub fn fails(args: &[&str], words: &[&str]) {
-    let line = complaint(args, &fastlgs(args));
+pub fn assert_fails(args: &[&str], words: &[&str]) {
+    let line = error_line(args, &fastlgs(args));
     assert!(
         words.iter().all(|w| line.contains(w)),
         "{args:?}: '{line}' lacks one of {words:?}"
@@ -194,7 +194,7 @@ pub fn text(path: &Path) -> &str {
 
 /// Returns whether models and device exist. If not, prints a message, or fails if
 /// FASTLGS_REQUIRE_GPU is set.
-pub fn ready() -> bool {
+pub fn requirements_met() -> bool {
     let ready = json(&["info"]);
     let complete = ready["offline_models"] == true
         && ready["adapters"].as_array().is_some_and(|a| !a.is_empty());

@@ -14,20 +14,20 @@ pub fn room() -> Option<&'static Path> {
 }
 
 /// A running `fastlgs serve` or `train --serve`. It ends with this value.
-pub struct Served {
+pub struct Server {
     pub process: Child,
     /// URL of the server without a path.
     pub url: String,
     pub token: Option<String>,
 }
 
-impl Served {
+impl Server {
     pub fn start(args: &[&str]) -> Self {
-        Self::start_knowing(&super::run::data(), args)
+        Self::start_with_names(&super::run::data(), args)
     }
 
     /// Starts the program with the taught names of the folder `names`.
-    pub fn start_knowing(names: &Path, args: &[&str]) -> Self {
+    pub fn start_with_names(names: &Path, args: &[&str]) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_fastlgs"));
         let command = command
             .args(args)
@@ -61,7 +61,7 @@ impl Served {
     }
 
     /// Sends a request and returns status and body. A given body is posted as JSON.
-    pub fn ask(&self, path: &str, body: Option<&str>) -> (u16, Vec<u8>) {
+    pub fn request(&self, path: &str, body: Option<&str>) -> (u16, Vec<u8>) {
         let url = format!("{}{path}", self.url);
         let agent: ureq::Agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
@@ -88,7 +88,7 @@ impl Served {
     }
 
     pub fn json(&self, path: &str, body: Option<Value>) -> Value {
-        let (status, data) = self.ask(path, body.map(|b| b.to_string()).as_deref());
+        let (status, data) = self.request(path, body.map(|b| b.to_string()).as_deref());
         let value = serde_json::from_slice(&data)
             .unwrap_or_else(|e| panic!("{path}: {e}: {}", String::from_utf8_lossy(&data)));
         assert_eq!(status, 200, "{path}: {value}");
@@ -97,7 +97,7 @@ impl Served {
 
     /// Asserts the status `expected`, and returns the error message.
     pub fn refusal(&self, path: &str, body: Option<&str>, expected: u16) -> String {
-        let (status, data) = self.ask(path, body);
+        let (status, data) = self.request(path, body);
         let value: Value = serde_json::from_slice(&data)
             .unwrap_or_else(|e| panic!("{path}: {e}: {}", String::from_utf8_lossy(&data)));
         assert_eq!(status, expected, "{path} {body:?}: {value}");
@@ -108,7 +108,7 @@ impl Served {
     }
 }
 
-impl Drop for Served {
+impl Drop for Server {
     fn drop(&mut self) {
         let _ = self.process.kill();
         let _ = self.process.wait();

@@ -30,13 +30,13 @@ impl SamExport {
 }
 
 /// Width and height of embeddings and masks, in pixels.
-const SIDE: i64 = 256;
+const EMBEDDING_SIDE: i64 = 256;
 /// Squared colour distances, in standard deviations, of the masks for subpart, part and whole. A
 /// mask holds the pixels whose distance to the prompted colour is smaller.
-pub const REACH: [f32; 3] = [0.02, 0.4, 1.6];
+pub const COLOUR_TOLERANCES: [f32; 3] = [0.02, 0.4, 1.6];
 
 /// Writes an encoder and a decoder. The embedding is the scaled-down photo. The masks are the
-/// pixels of the prompted colour, with three tolerances (`REACH`).
+/// pixels of the prompted colour, with three tolerances (`COLOUR_TOLERANCES`).
 pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     let mut g = Graph::default();
     let (input, shape) = match export {
@@ -62,7 +62,7 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     };
     let photo = g.input(input, kind, &shape);
     let photo = cast(&mut g, &photo, Kind::Float);
-    let sizes = g.ints(&[1, 3, SIDE, SIDE]);
+    let sizes = g.ints(&[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE]);
     let small = g.op(
         "Resize",
         &[&photo, "", "", &sizes],
@@ -74,21 +74,25 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     } else {
         "image_embeddings"
     };
-    g.output_as(&small, main, kind, &[1, 3, SIDE, SIDE]);
+    g.output_as(&small, main, kind, &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE]);
     if export == SamExport::Second {
         for name in ["high_res_feats_0", "high_res_feats_1"] {
             let same = g.op("Identity", &[&small], &[]);
-            g.output(&same, name, &[1, 3, SIDE, SIDE]);
+            g.output(&same, name, &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE]);
         }
     }
     if export == SamExport::Transformers {
         let nothing = g.op("Sub", &[&small, &small], &[]);
-        g.output(&nothing, "image_positional_embeddings", &[1, 3, SIDE, SIDE]);
+        g.output(
+            &nothing,
+            "image_positional_embeddings",
+            &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE],
+        );
     }
     g.save(encoder);
 
     let mut g = Graph::default();
-    let embedding = g.input(main, kind, &[1, 3, SIDE, SIDE]);
+    let embedding = g.input(main, kind, &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE]);
     let embedding = cast(&mut g, &embedding, Kind::Float);
     // Converts points to cells of the embedding.
     let points = match export {
@@ -105,18 +109,24 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
             let points = g.input("point_coords", Kind::Float, &[n, -1, 2]);
             g.input("point_labels", Kind::Float, &[n, -1]);
             if export != SamExport::Edge {
-                g.input("mask_input", Kind::Float, &[1, 1, SIDE, SIDE]);
+                g.input(
+                    "mask_input",
+                    Kind::Float,
+                    &[1, 1, EMBEDDING_SIDE, EMBEDDING_SIDE],
+                );
                 g.input("has_mask_input", Kind::Float, &[1]);
                 g.input("orig_im_size", Kind::Float, &[2]);
             }
             if export == SamExport::Second {
                 ["high_res_feats_0", "high_res_feats_1"]
                     .iter()
-                    .for_each(|name| drop(g.input(name, Kind::Float, &[1, 3, SIDE, SIDE])));
+                    .for_each(|name| {
+                        drop(g.input(name, Kind::Float, &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE]))
+                    });
             }
             let first = g.ints(&[0]);
             let point = g.op("Gather", &[&points, &first], &[Attribute::Int("axis", 1)]);
-            let ratio = g.floats(&[1], &[SIDE as f32 / 1024.0]);
+            let ratio = g.floats(&[1], &[EMBEDDING_SIDE as f32 / 1024.0]);
             g.op("Mul", &[&point, &ratio], &[])
         }
         SamExport::Efficient => {
@@ -131,7 +141,7 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
                 &[Attribute::Int("to", Kind::Float as i64)],
             );
             let share = g.op("Div", &[&points, &size], &[]);
-            let side = g.floats(&[1], &[SIDE as f32]);
+            let side = g.floats(&[1], &[EMBEDDING_SIDE as f32]);
             g.op("Mul", &[&share, &side], &[])
         }
         SamExport::Transformers => {
@@ -140,21 +150,21 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
             g.input(
                 "image_positional_embeddings",
                 Kind::Float,
-                &[1, 3, SIDE, SIDE],
+                &[1, 3, EMBEDDING_SIDE, EMBEDDING_SIDE],
             );
-            let ratio = g.floats(&[1], &[SIDE as f32 / 1024.0]);
+            let ratio = g.floats(&[1], &[EMBEDDING_SIDE as f32 / 1024.0]);
             g.op("Mul", &[&points, &ratio], &[])
         }
     };
     let rows = g.ints(&[-1, 2]);
     let points = g.op("Reshape", &[&points, &rows], &[]);
     let cells = g.op("Floor", &[&points], &[]);
-    let strides = g.floats(&[2, 1], &[1.0, SIDE as f32]);
+    let strides = g.floats(&[2, 1], &[1.0, EMBEDDING_SIDE as f32]);
     let flat = g.op("MatMul", &[&cells, &strides], &[]);
     let one = g.ints(&[-1]);
     let flat = g.op("Reshape", &[&flat, &one], &[]);
     let flat = g.op("Cast", &[&flat], &[Attribute::Int("to", Kind::Int as i64)]);
-    let plane = g.ints(&[3, SIDE * SIDE]);
+    let plane = g.ints(&[3, EMBEDDING_SIDE * EMBEDDING_SIDE]);
     let colors = g.op("Reshape", &[&embedding, &plane], &[]);
     let color = g.op("Gather", &[&colors, &flat], &[Attribute::Int("axis", 1)]);
     let color = g.op("Transpose", &[&color], &[Attribute::Ints("perm", &[1, 0])]);
@@ -176,18 +186,18 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
     } else {
         1.0
     };
-    let mut reach = REACH.map(|r| unit * r).to_vec();
+    let mut tolerances = COLOUR_TOLERANCES.map(|r| unit * r).to_vec();
     if matches!(
         export,
         SamExport::Official { .. } | SamExport::Edge | SamExport::Half
     ) {
-        reach.insert(0, 1e6);
+        tolerances.insert(0, 1e6);
     }
     if export == SamExport::Single {
-        reach = vec![REACH[2]];
+        tolerances = vec![COLOUR_TOLERANCES[2]];
     }
-    let m = reach.len() as i64;
-    let reach = g.floats(&[1, m, 1, 1], &reach);
+    let m = tolerances.len() as i64;
+    let reach = g.floats(&[1, m, 1, 1], &tolerances);
     let inside = g.op("Sub", &[&reach, &distance], &[]);
     let steep = g.floats(&[1], &[1e4]);
     let logits = g.op("Mul", &[&inside, &steep], &[]);
@@ -219,7 +229,7 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
             } else {
                 ("low_res_masks", "iou_predictions")
             };
-            g.output(&logits, masks, &[-1, m, SIDE, SIDE]);
+            g.output(&logits, masks, &[-1, m, EMBEDDING_SIDE, EMBEDDING_SIDE]);
             g.output(&scores, ious, &[-1, m]);
         }
         _ => {
@@ -228,11 +238,11 @@ pub fn sam(export: SamExport, encoder: &Path, decoder: &Path) {
             } else {
                 ("pred_masks", "iou_scores")
             };
-            let shape = g.ints(&[1, -1, m, SIDE, SIDE]);
+            let shape = g.ints(&[1, -1, m, EMBEDDING_SIDE, EMBEDDING_SIDE]);
             let logits = g.op("Reshape", &[&logits, &shape], &[]);
             let shape = g.ints(&[1, -1, m]);
             let scores = g.op("Reshape", &[&scores, &shape], &[]);
-            g.output(&logits, masks, &[1, -1, m, SIDE, SIDE]);
+            g.output(&logits, masks, &[1, -1, m, EMBEDDING_SIDE, EMBEDDING_SIDE]);
             g.output(&scores, ious, &[1, -1, m]);
         }
     }

@@ -9,7 +9,7 @@ const ENCODER: [usize; 3] = [128, 32, 3];
 const DECODER: [usize; 2] = [32, 128];
 const EPOCHS: usize = 300;
 const BATCH: usize = 64;
-const RATE: f32 = 2e-3;
+const LEARNING_RATE: f32 = 2e-3;
 
 /// A linear layer with the moments of Adam.
 struct Layer {
@@ -18,7 +18,7 @@ struct Layer {
     moments: [Array2<f32>; 2],
     bias_moments: [Array1<f32>; 2],
     /// Whether a ReLU follows.
-    cut: bool,
+    relu: bool,
 }
 
 impl Layer {
@@ -34,13 +34,13 @@ impl Layer {
             bias,
             moments: [zeros.clone(), zeros],
             bias_moments: [bias_zeros.clone(), bias_zeros],
-            cut,
+            relu: cut,
         }
     }
 
     fn forward(&self, x: ArrayView2<f32>) -> Array2<f32> {
         let out = x.dot(&self.weights) + &self.bias;
-        if self.cut {
+        if self.relu {
             out.mapv_into(|v| v.max(0.0))
         } else {
             out
@@ -56,14 +56,14 @@ impl Layer {
         mut gradient: Array2<f32>,
         step: i32,
     ) -> Array2<f32> {
-        if self.cut {
+        if self.relu {
             Zip::from(&mut gradient)
                 .and(out)
                 .for_each(|g, o| *g *= f32::from(u8::from(*o > 0.0)));
         }
         let before = gradient.dot(&self.weights.t());
         let (of_weights, of_bias) = (x.t().dot(&gradient), gradient.sum_axis(Axis(0)));
-        let rate = RATE * (1.0 - 0.999f32.powi(step)).sqrt() / (1.0 - 0.9f32.powi(step));
+        let rate = LEARNING_RATE * (1.0 - 0.999f32.powi(step)).sqrt() / (1.0 - 0.9f32.powi(step));
         let adam = |value: &mut f32, m: &mut f32, v: &mut f32, g: &f32| {
             *m = 0.9 * *m + 0.1 * g;
             *v = 0.999 * *v + 0.001 * g * g;
@@ -106,7 +106,7 @@ impl Autoencoder {
                 rng,
             )
         };
-        let mut own = Self {
+        let mut model = Self {
             layers: (0..=last).map(|k| layer(k, &mut rng)).collect(),
         };
         let mut order: Vec<usize> = (0..embeddings.nrows()).collect();
@@ -115,10 +115,10 @@ impl Autoencoder {
             rng.shuffle(&mut order);
             for batch in order.chunks(BATCH) {
                 step += 1;
-                own.step(embeddings.select(Axis(0), batch), step);
+                model.step(embeddings.select(Axis(0), batch), step);
             }
         }
-        own
+        model
     }
 
     fn step(&mut self, x: Array2<f32>, step: i32) {

@@ -5,11 +5,11 @@
 
 use crate::autoencoder::Autoencoder;
 use anyhow::{Context, Result, bail};
-use fastlgs::session::covered;
-use fastlgs::{Run, Session, eval, eyes};
+use fastlgs::session::mean_features;
+use fastlgs::{Run, Scene, eval, eyes};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::shares::{Shares, pack, unpack};
+use fastlgs_core::shares::{IdWeights, pack, unpack};
 use fastlgs_core::{Camera, LabelMap, Level, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -41,19 +41,19 @@ pub struct Args {
 }
 
 /// Largest size of the vectors of all Gaussians, in bytes.
-const MOST_BYTES: usize = 4 << 30;
+const MAX_VECTOR_BYTES: usize = 4 << 30;
 
 /// Relevancy threshold. From 0.5 on, a pixel is closer to the text than to every canonical phrase.
-const NEARER: f32 = 0.5;
+const RELEVANCY_THRESHOLD: f32 = 0.5;
 
 /// Sides of LERF's tiles, as fractions of the photo's shorter side.
-const TILES: [f32; 3] = [0.5, 0.25, 0.125];
+const TILE_SIDES: [f32; 3] = [0.5, 0.25, 0.125];
 
 /// One row per Gaussian, pixel or object.
 type Vectors = Array2<f32>;
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    let mut scene = Session::open(&args.scene, run.device)?;
+    let mut scene = Scene::open(&args.scene, run.device)?;
     let grid = scene.grid()?;
     let views = labels::load(&Path::new(&scene.manifest.photos).join("labels"), None)?;
     let started = Instant::now();
@@ -64,7 +64,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         code => PerPixel::of_codes(
             &scene,
             &grid,
-            lattice(
+            lattice_codes(
                 grid.objects.len(),
                 code[4..].parse().context("a dimension")?,
                 run.seed,
@@ -84,7 +84,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             .map(|v| rendered(&mut scene, &camera, v))
             .collect::<Result<Vec<_>>>()?;
         milliseconds.push(started.elapsed().as_secs_f64() * 1e3);
-        wrong.extend(field.wrong(&mut scene, &grid, &camera, &pictures[0])?);
+        wrong.extend(field.wrong_pixel_share(&mut scene, &grid, &camera, &pictures[0])?);
         for score in field.score(&scene, &grid, view, &camera, pictures)? {
             oracle.push(score[0]);
             text.push(score[1]);
@@ -113,7 +113,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 }
 
 /// What a rendered vector stands for.
-enum Meaning {
+enum Representation {
     /// An embedding.
     Embedding,
     /// The autoencoder's code of an embedding.
@@ -126,11 +126,11 @@ enum Meaning {
 struct PerPixel {
     /// Vectors of all Gaussians, one array for each scale or level.
     layers: Vec<Vectors>,
-    meaning: Meaning,
+    meaning: Representation,
 }
 
 impl PerPixel {
-    fn raw(scene: &Session, run: &Run) -> Result<Self> {
+    fn raw(scene: &Scene, run: &Run) -> Result<Self> {
         let masks = fastlgs::masks::training_descriptors(
             &scene.folder,
             &scene.manifest.training(&scene.cameras),
@@ -152,15 +152,15 @@ impl PerPixel {
         })?;
         Ok(Self {
             layers: vec![lifted],
-            meaning: Meaning::Embedding,
+            meaning: Representation::Embedding,
         })
     }
 
-    fn lerf(scene: &Session, run: &Run) -> Result<Self> {
+    fn lerf(scene: &Scene, run: &Run) -> Result<Self> {
         let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
         let progress = run.work(
             "tiles",
-            (TILES.len() * scene.manifest.training(&scene.cameras).len()) as u64,
+            (TILE_SIDES.len() * scene.manifest.training(&scene.cameras).len()) as u64,
         );
         let of_scale = |share: &f32| {
             lifted(scene, |_, camera| {
@@ -178,14 +178,14 @@ impl PerPixel {
                 embedded(scene, encoder.as_ref(), camera, map)
             })
         };
-        let layers = TILES.iter().map(of_scale).collect::<Result<_>>()?;
+        let layers = TILE_SIDES.iter().map(of_scale).collect::<Result<_>>()?;
         Ok(Self {
             layers,
-            meaning: Meaning::Embedding,
+            meaning: Representation::Embedding,
         })
     }
 
-    fn langsplat(scene: &Session, run: &Run) -> Result<Self> {
+    fn langsplat(scene: &Scene, run: &Run) -> Result<Self> {
         let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
         let training = scene.manifest.training(&scene.cameras);
         let progress = run.work("embeddings", 2 * training.len() as u64);
@@ -232,13 +232,13 @@ impl PerPixel {
         });
         Ok(Self {
             layers: layers.collect::<Result<_>>()?,
-            meaning: Meaning::Encoded(coder),
+            meaning: Representation::Encoded(coder),
         })
     }
 
     /// Gives each Gaussian the code of its object. Gaussians without an object get the origin,
     /// which is not a code.
-    fn of_codes(scene: &Session, grid: &Grid, codes: Vectors) -> Self {
+    fn of_codes(scene: &Scene, grid: &Grid, codes: Vectors) -> Self {
         let own = |g: usize, axis: usize| {
             grid.chain(scene.gaussians.object_ids[g])
                 .next()
@@ -249,21 +249,21 @@ impl PerPixel {
         });
         Self {
             layers: vec![layer],
-            meaning: Meaning::Object(codes),
+            meaning: Representation::Object(codes),
         }
     }
 
     /// Returns the fraction of a view's pixels that are classified as an object that is not there.
     /// An object is there if it is one of the pixel's blended ids or contains one. A blend of two
     /// codes can come near a third code, which causes such errors. `None` for fields without codes.
-    fn wrong(
+    fn wrong_pixel_share(
         &self,
-        scene: &mut Session,
+        scene: &mut Scene,
         grid: &Grid,
         camera: &Camera,
         picture: &Vectors,
     ) -> Result<Option<f64>> {
-        let (Meaning::Object(codes), Field::Shares(shares)) =
+        let (Representation::Object(codes), Field::Shares(shares)) =
             (&self.meaning, scene.field(camera, None)?)
         else {
             return Ok(None);
@@ -286,7 +286,7 @@ impl PerPixel {
     /// Returns for each label: oracle IoU, IoU of the text's mask, and 1 or 0 for the localisation.
     fn score(
         &self,
-        scene: &Session,
+        scene: &Scene,
         grid: &Grid,
         view: &LabelledView,
         camera: &Camera,
@@ -301,13 +301,13 @@ impl PerPixel {
                 &view.boxes(label, w, h),
             )))
         };
-        if let Meaning::Object(codes) = &self.meaning {
+        if let Representation::Object(codes) = &self.meaning {
             let pixels = pictures[0]
                 .rows()
                 .into_iter()
                 .map(|p| [pack(nearest(&p.to_vec(), codes), 1.0), 0, 0, 0])
                 .collect();
-            let field = Field::Shares(Shares {
+            let field = Field::Shares(IdWeights {
                 width: w,
                 height: h,
                 pixels,
@@ -329,7 +329,7 @@ impl PerPixel {
             return view.labels.iter().map(score).collect();
         }
         let decoded = pictures.into_iter().map(|picture| match &self.meaning {
-            Meaning::Encoded(coder) => coder.decode(picture),
+            Representation::Encoded(coder) => coder.decode(picture),
             _ => picture,
         });
         let embeddings: Vec<Vectors> = decoded.map(normalised).collect();
@@ -351,7 +351,7 @@ impl PerPixel {
                     .into_iter()
                     .map(above)
                     .fold(0.0, f64::max),
-                above(NEARER),
+                above(RELEVANCY_THRESHOLD),
                 localised(&relevancy, label),
             ])
         };
@@ -361,7 +361,7 @@ impl PerPixel {
 
 /// Returns `count` codes on a lattice with spacing K^(-1/d) in d dimensions (paper, semantic
 /// feature grid). K is the number of objects. Their order is random.
-fn lattice(count: usize, dimension: u32, seed: u64) -> Vectors {
+fn lattice_codes(count: usize, dimension: u32, seed: u64) -> Vectors {
     let side = (1usize..).find(|s| s.pow(dimension) >= count).unwrap_or(1);
     let mut cells: Vec<usize> = (0..side.pow(dimension)).collect();
     Rng::new(seed, "codes of any dimension").shuffle(&mut cells);
@@ -375,7 +375,7 @@ type Labelled = (LabelMap, Vec<(u16, Vec<f32>)>);
 
 /// Embeds the masks of a label map. Labels whose embedding is zero are left out.
 fn embedded(
-    scene: &Session,
+    scene: &Scene,
     encoder: &dyn Encoder,
     camera: &Camera,
     map: LabelMap,
@@ -401,24 +401,27 @@ fn rows(vectors: &[&Vec<f32>]) -> Result<Vectors> {
 }
 
 /// Returns the mean vector of each Gaussian over all training views, weighted by blending weights.
-/// `shown` returns the label map of a view and the vectors of its labels.
+/// `labelled_view` returns the label map of a view and the vectors of its labels.
 ///
 /// # Errors
 /// The vectors need more than 4 GiB.
-fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -> Result<Vectors> {
+fn lifted(
+    scene: &Scene,
+    labelled_view: impl Fn(usize, &Camera) -> Result<Labelled>,
+) -> Result<Vectors> {
     let mut sums = Vectors::zeros((0, 0));
     let mut weights = vec![0.0f32; scene.gaussians.len()];
     for (view, camera) in scene.manifest.training(&scene.cameras).iter().enumerate() {
-        let (map, vectors) = shown(view, camera)?;
+        let (map, vectors) = labelled_view(view, camera)?;
         let width = vectors.first().map_or(sums.ncols(), |v| v.1.len());
         if sums.is_empty() {
             let bytes = 4 * width * scene.gaussians.len();
-            if bytes > MOST_BYTES {
+            if bytes > MAX_VECTOR_BYTES {
                 bail!(
                     "vectors of {width} numbers for {} Gaussians need {} MB, but the limit is {} MB; use a smaller scene",
                     scene.gaussians.len(),
                     bytes >> 20,
-                    MOST_BYTES >> 20
+                    MAX_VECTOR_BYTES >> 20
                 );
             }
             sums = Vectors::zeros((scene.gaussians.len(), width));
@@ -448,7 +451,7 @@ fn lifted(scene: &Session, shown: impl Fn(usize, &Camera) -> Result<Labelled>) -
 }
 
 /// Renders the vectors into a view, three numbers per pass. Returns one row per pixel.
-fn rendered(scene: &mut Session, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
+fn rendered(scene: &mut Scene, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
     let (pixels, width) = ((camera.width * camera.height) as usize, vectors.ncols());
     let mut out = Vectors::zeros((pixels, width));
     let before = scene.gaussians.features.clone();
@@ -462,7 +465,11 @@ fn rendered(scene: &mut Session, camera: &Camera, vectors: &Vectors) -> Result<V
             .collect();
         scene.engine.set_state(&State::of(&scene.gaussians))?;
         let frame = scene.engine.render(scene.view(camera), Channels::Feature)?;
-        for (k, channel) in covered(&frame).into_iter().enumerate().take(width - first) {
+        for (k, channel) in mean_features(&frame)
+            .into_iter()
+            .enumerate()
+            .take(width - first)
+        {
             out.column_mut(first + k)
                 .iter_mut()
                 .zip(channel)

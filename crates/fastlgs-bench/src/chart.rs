@@ -1,10 +1,10 @@
 //! `fastlgs-bench chart`: accuracy against time, for several methods of making a language field
 //! from masks.
 
-use crate::plot::{self, Axes, Scatter, Spot};
+use crate::plot::{self, Axes, Point, Scatter};
 use crate::table::{self, number};
 use crate::trial::{self, Trial};
-use crate::ways::{How, Way, wanted};
+use crate::ways::{How, Method, selected_ways};
 use anyhow::Result;
 use fastlgs::Run;
 use fastlgs_core::SceneFolder;
@@ -31,103 +31,103 @@ pub struct Args {
     output: PathBuf,
 }
 
-const WAYS: [Way; 20] = [
-    Way {
+const WAYS: [Method; 20] = [
+    Method {
         name: "embeddings",
         how: How::Remap(&["--mapping", "paper", "--cues", "none"]),
         cost: 0,
     },
-    Way {
+    Method {
         name: "+ key points",
         how: How::Remap(&["--mapping", "paper", "--cues", "keypoints"]),
         cost: 0,
     },
-    Way {
+    Method {
         name: "+ colour (paper)",
         how: How::Remap(&["--mapping", "paper"]),
         cost: 0,
     },
-    Way {
+    Method {
         name: "global",
         how: How::Remap(&[]),
         cost: 0,
     },
-    Way {
+    Method {
         name: "code of 1 number",
         how: How::Baseline("code1"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "code of 2 numbers",
         how: How::Baseline("code2"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "code of 3 numbers",
         how: How::Baseline("code3"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "code of 4 numbers",
         how: How::Baseline("code4"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "no grid",
         how: How::Baseline("raw"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "like LangSplat",
         how: How::Baseline("langsplat"),
         cost: 1,
     },
-    Way {
+    Method {
         name: "like LERF",
         how: How::Baseline("lerf"),
         cost: 1,
     },
-    Way {
+    Method {
         name: "paper 300 steps",
         how: How::Descent("300"),
         cost: 0,
     },
-    Way {
+    Method {
         name: "paper 1000 steps",
         how: How::Descent("1000"),
         cost: 1,
     },
-    Way {
+    Method {
         name: "paper 3000 steps",
         how: How::Descent("3000"),
         cost: 1,
     },
-    Way {
+    Method {
         name: "paper 7000 steps",
         how: How::Descent("7000"),
         cost: 2,
     },
-    Way {
+    Method {
         name: "paper 30000 steps",
         how: How::Descent("30000"),
         cost: 2,
     },
-    Way {
+    Method {
         name: "preset quick",
         how: How::Train(&["--preset", "quick"]),
         cost: 2,
     },
-    Way {
+    Method {
         name: "preset standard",
         how: How::Train(&["--preset", "standard"]),
         cost: 2,
     },
-    Way {
+    Method {
         name: "preset paper",
         how: How::Train(&["--preset", "paper"]),
         cost: 2,
     },
-    Way {
+    Method {
         name: "preset like-paper",
         how: How::Train(&["--preset", "like-paper"]),
         cost: 2,
@@ -136,11 +136,11 @@ const WAYS: [Way; 20] = [
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let most = if args.long { 2 } else { u8::from(!args.quick) };
-    let ways: Vec<&Way> = wanted(&WAYS, &args.ways)?
+    let ways: Vec<&Method> = selected_ways(&WAYS, &args.ways)?
         .into_iter()
         .filter(|w| w.cost <= most)
         .collect();
-    let work = trial::workshop(&args.output)?;
+    let work = trial::trials_folder(&args.output)?;
     let scenes = trial::or_generated(&args.scenes, &work, run)?;
     let progress = run.work("ways", (scenes.len() * ways.len()) as u64);
     let mut rows = Vec::new();
@@ -177,7 +177,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             "milliseconds",
         ),
     ] {
-        let spots: Vec<Spot> = rows.iter().map(|row| spot(row, x)).collect();
+        let spots: Vec<Point> = rows.iter().map(|row| spot(row, x)).collect();
         let axes = Axes {
             title,
             x: label,
@@ -198,7 +198,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 /// Marks the Pareto-optimal rows of each scene: no other row is at least as fast and as accurate,
 /// and better in one of the two.
 fn mark_front(rows: &mut [Value]) {
-    let beaten = |row: &Value, rows: &[Value]| {
+    let is_dominated = |row: &Value, rows: &[Value]| {
         rows.iter().any(|other| {
             let [faster, better] = [
                 number(other, "seconds") <= number(row, "seconds"),
@@ -209,7 +209,7 @@ fn mark_front(rows: &mut [Value]) {
             other["scene"] == row["scene"] && faster && better && !same
         })
     };
-    let front: Vec<bool> = rows.iter().map(|row| !beaten(row, rows)).collect();
+    let front: Vec<bool> = rows.iter().map(|row| !is_dominated(row, rows)).collect();
     rows.iter_mut()
         .zip(front)
         .for_each(|(row, front)| row["pareto"] = json!(front));
@@ -232,11 +232,11 @@ const COLUMNS: [&str; 14] = [
     "command",
 ];
 
-fn spot(row: &Value, x: &str) -> Spot {
+fn spot(row: &Value, x: &str) -> Point {
     let name = row["way"].as_str().unwrap_or_default().to_owned();
     let series = row["scene"].as_str().unwrap_or_default().to_owned();
     // The Pareto front is computed for the column `seconds` only.
-    Spot {
+    Point {
         series,
         name,
         x: number(row, x),

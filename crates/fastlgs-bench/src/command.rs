@@ -12,11 +12,11 @@ use serde_json::Value;
 #[derive(Parser)]
 #[command(name = "fastlgs", no_binary_name = true)]
 enum Command {
-    Synth(synth::Config),
-    Preprocess(preprocess::Config),
-    Train(train::Config),
-    Eval(eval::Config),
-    Export(export::Config),
+    Synth(synth::SynthConfig),
+    Preprocess(preprocess::PreprocessConfig),
+    Train(train::TrainConfig),
+    Eval(eval::EvalConfig),
+    Export(export::ExportConfig),
     #[command(subcommand)]
     Bench(Bench),
 }
@@ -28,10 +28,10 @@ enum Bench {
 
 /// A muted progress sink, so that the bars of a trial do not hide those of the bench. It passes on
 /// cancellation only.
-struct Quiet<'a>(&'a dyn Sink);
+struct MutedSink<'a>(&'a dyn Sink);
 
-impl Sink for Quiet<'_> {
-    fn tell(&self, message: Message<'_>) {
+impl Sink for MutedSink<'_> {
+    fn on_message(&self, message: Message<'_>) {
         if let Message::Warning(text) = message {
             tracing::debug!("{text}");
         }
@@ -43,7 +43,7 @@ impl Sink for Quiet<'_> {
 }
 
 /// Runs `fastlgs COMMAND ARGS` on the device of `run` with `seed`, and returns the report.
-pub fn call(run: &Run, seed: u64, command: &str, args: &[&str]) -> Result<Value> {
+pub fn run_command(run: &Run, seed: u64, command: &str, args: &[&str]) -> Result<Value> {
     let words = std::iter::once(&command).chain(args);
     let Ok(parsed) = Command::try_parse_from(words) else {
         bail!(
@@ -51,7 +51,7 @@ pub fn call(run: &Run, seed: u64, command: &str, args: &[&str]) -> Result<Value>
             args.join(" ")
         )
     };
-    let quiet = Quiet(run.progress);
+    let quiet = MutedSink(run.progress);
     let run = &Run {
         seed,
         progress: &quiet,

@@ -19,7 +19,7 @@ use std::path::Path;
 /// A change of photos or poses. Labelled views keep their photo and pose, because accuracy is
 /// measured on them.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Photos {
+pub enum PhotoChange {
     /// No change: the reference.
     Unchanged,
     /// A random rotation of each camera, with this mean shift of the image in pixels.
@@ -42,7 +42,7 @@ pub enum Photos {
 
 /// A change of the masks of all levels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Masks {
+pub enum MaskChange {
     /// Erosion by this many pixels.
     Eroded(u32),
     /// A random fraction of the masks is split in two along a line.
@@ -135,16 +135,16 @@ impl Album {
 
     /// Writes a dataset with the changed photos into `to`: `images/`, `transforms.json`, `masks/`,
     /// `ignore/`, and `labels/` in the layout of 3D-OVS.
-    pub fn write(&self, to: &Path, change: Photos, seed: u64) -> Result<()> {
+    pub fn write(&self, to: &Path, change: PhotoChange, seed: u64) -> Result<()> {
         let mut rng = Rng::new(seed, "disturbed photos");
         let missing = match change {
-            Photos::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| {
+            PhotoChange::Missing(share) => some_of(self.shots.len(), share, &mut rng, |k| {
                 !self.shots[k].labelled
             }),
             _ => BTreeSet::new(),
         };
         let mut places: Vec<usize> = (0..self.shots.len()).collect();
-        if change == Photos::Shuffled {
+        if change == PhotoChange::Shuffled {
             rng.shuffle(&mut places);
         }
         let mut frames = Vec::new();
@@ -210,36 +210,36 @@ impl Album {
     }
 }
 
-/// Returns a random `share` (0 to 1) of the indices below `count` that `may` accepts.
+/// Returns a random `share` (0 to 1) of the indices below `count` that `is_candidate` accepts.
 fn some_of(
     count: usize,
     share: f32,
     rng: &mut Rng,
-    may: impl Fn(usize) -> bool,
+    is_candidate: impl Fn(usize) -> bool,
 ) -> BTreeSet<usize> {
-    let mut all: Vec<usize> = (0..count).filter(|k| may(*k)).collect();
+    let mut all: Vec<usize> = (0..count).filter(|k| is_candidate(*k)).collect();
     rng.shuffle(&mut all);
     all.truncate((share * all.len() as f32).round() as usize);
     all.into_iter().collect()
 }
 
 impl Shot {
-    fn changed(&self, change: Photos, rng: &mut Rng) -> Result<(Camera, RgbImage)> {
+    fn changed(&self, change: PhotoChange, rng: &mut Rng) -> Result<(Camera, RgbImage)> {
         let (mut camera, mut pixels) = (self.camera.clone(), self.pixels.clone());
         match change {
-            Photos::Unchanged | Photos::Missing(_) | Photos::Shuffled => {}
-            Photos::Pose(moved) => {
+            PhotoChange::Unchanged | PhotoChange::Missing(_) | PhotoChange::Shuffled => {}
+            PhotoChange::Pose(moved) => {
                 // A vector of two standard normal numbers has the mean length sqrt(pi / 2).
                 let deviation = moved / (camera.fx * std::f32::consts::FRAC_PI_2.sqrt());
                 let axis = Vec3::new(rng.normal(), rng.normal(), 0.0) * deviation;
                 camera.world_to_camera =
                     Mat4::from_quat(Quat::from_scaled_axis(axis)) * camera.world_to_camera;
             }
-            Photos::Exposure(stops) => {
+            PhotoChange::Exposure(stops) => {
                 let gain = (stops * rng.normal()).exp2();
                 scale_channels(&mut pixels, [gain; 3]);
             }
-            Photos::WhiteBalance(deviation) => {
+            PhotoChange::WhiteBalance(deviation) => {
                 let gains = [
                     1.0 + deviation * rng.normal(),
                     1.0,
@@ -247,14 +247,14 @@ impl Shot {
                 ];
                 scale_channels(&mut pixels, gains);
             }
-            Photos::Blur(sigma) => pixels = imageops::blur(&pixels, sigma),
-            Photos::Jpeg(quality) => {
+            PhotoChange::Blur(sigma) => pixels = imageops::blur(&pixels, sigma),
+            PhotoChange::Jpeg(quality) => {
                 let mut file = Vec::new();
                 JpegEncoder::new_with_quality(Cursor::new(&mut file), quality)
                     .encode_image(&pixels)?;
                 pixels = image::load_from_memory(&file)?.into_rgb8();
             }
-            Photos::Focal(share) => {
+            PhotoChange::Focal(share) => {
                 (camera.fx, camera.fy) = (camera.fx * (1.0 + share), camera.fy * (1.0 + share))
             }
         }
@@ -271,7 +271,7 @@ fn scale_channels(pixels: &mut RgbImage, gains: [f32; 3]) {
 }
 
 /// Changes the masks of all training views of a scene in place.
-pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
+pub fn masks(scene: &SceneFolder, change: MaskChange, seed: u64) -> Result<()> {
     let mut rng = Rng::new(seed, "disturbed masks");
     for camera in scene.manifest()?.training(&scene.cameras()?) {
         changed_masks(&scene.masks(&camera)?, change, &mut rng)
@@ -281,7 +281,7 @@ pub fn masks(scene: &SceneFolder, change: Masks, seed: u64) -> Result<()> {
 }
 
 /// Returns the changed masks. They may overlap, as the given ones. Empty masks are removed.
-fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
+fn changed_masks(list: &MaskList, change: MaskChange, rng: &mut Rng) -> MaskList {
     let (w, h) = (list.width as usize, list.height as usize);
     let drawn = |runs: &RunLengths| {
         let mut inside = vec![false; w * h];
@@ -297,15 +297,15 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
     let some = |share: f32, rng: &mut Rng| some_of(list.masks.len(), share, rng, |_| true);
     let mut out = list.clone();
     match change {
-        Masks::Eroded(pixels) => out.masks.iter_mut().for_each(|mask| {
+        MaskChange::Eroded(pixels) => out.masks.iter_mut().for_each(|mask| {
             let inside = drawn(&mask.runs);
             mask.runs = runs(
                 &(0..w * h)
-                    .map(|p| reach(p, w, h, pixels as isize).all(|q| inside[q]))
+                    .map(|p| neighbours(p, w, h, pixels as isize).all(|q| inside[q]))
                     .collect::<Vec<_>>(),
             );
         }),
-        Masks::Dropped(share) => {
+        MaskChange::Dropped(share) => {
             let dropped = some(share, rng);
             out.masks = out
                 .masks
@@ -315,11 +315,11 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
                 .map(|m| m.1)
                 .collect();
         }
-        Masks::Merged(share) => {
+        MaskChange::Merged(share) => {
             for own in some(share, rng) {
                 let mut inside = drawn(&out.masks[own].runs);
                 let around: Vec<bool> = (0..w * h)
-                    .map(|p| reach(p, w, h, 1).any(|q| inside[q]))
+                    .map(|p| neighbours(p, w, h, 1).any(|q| inside[q]))
                     .collect();
                 let lies_beside = |other: &&Mask| {
                     let both = other.runs.places(list.width, list.height);
@@ -343,7 +343,7 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
                 }
             }
         }
-        Masks::Split(share) => {
+        MaskChange::Split(share) => {
             for own in some(share, rng) {
                 let inside = drawn(&list.masks[own].runs);
                 let place = |p: usize| Vec2::new((p % w) as f32, (p / w) as f32);
@@ -378,7 +378,7 @@ fn changed_masks(list: &MaskList, change: Masks, rng: &mut Rng) -> MaskList {
 
 /// Returns the indices of the pixels in the same row or column, up to `pixels` away. At the image
 /// border, indices are clamped.
-fn reach(place: usize, w: usize, h: usize, pixels: isize) -> impl Iterator<Item = usize> {
+fn neighbours(place: usize, w: usize, h: usize, pixels: isize) -> impl Iterator<Item = usize> {
     let (x, y) = ((place % w) as isize, (place / w) as isize);
     let at = move |x: isize, y: isize| {
         y.clamp(0, h as isize - 1) as usize * w + x.clamp(0, w as isize - 1) as usize
@@ -432,7 +432,7 @@ mod tests {
         }
     }
 
-    fn areas(change: Masks) -> Vec<usize> {
+    fn areas(change: MaskChange) -> Vec<usize> {
         changed_masks(&list(), change, &mut Rng::new(0, "test"))
             .masks
             .iter()
@@ -443,14 +443,14 @@ mod tests {
     #[test]
     fn masks_are_changed_as_their_names_say() {
         assert_eq!(
-            areas(Masks::Eroded(1)),
+            areas(MaskChange::Eroded(1)),
             [4, 8],
             "the image border protects the last mask, and the wide mask keeps its middle columns"
         );
-        assert_eq!(areas(Masks::Dropped(0.5)).len(), 2);
-        let split = areas(Masks::Split(1.0));
+        assert_eq!(areas(MaskChange::Dropped(0.5)).len(), 2);
+        let split = areas(MaskChange::Split(1.0));
         assert_eq!((split.len(), split.iter().sum::<usize>()), (8, 40));
-        let merged = areas(Masks::Merged(1.0));
+        let merged = areas(MaskChange::Merged(1.0));
         assert_eq!(
             merged,
             [24, 16],

@@ -34,13 +34,13 @@ use std::process::ExitCode;
 )]
 struct Cli {
     #[command(subcommand)]
-    what: What,
+    selected: Bench,
     #[command(flatten)]
     common: ui::Common,
 }
 
 #[derive(clap::Subcommand)]
-enum What {
+enum Bench {
     /// Time every pass, rendering and training.
     Speed(speed::Args),
     /// Evaluate another kind of language field on the same Gaussians and masks.
@@ -59,21 +59,21 @@ enum What {
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
-    fastlgs_cli::start(&cli.common);
+    fastlgs_cli::init_process(&cli.common);
     let console = Console::new(&cli.common);
-    let figures = bench(&cli.what, &cli.common.run(&console));
-    fastlgs_cli::end(figures.and_then(|figures| report::give(&cli.common, &figures)))
+    let figures = bench(&cli.selected, &cli.common.run(&console));
+    fastlgs_cli::exit_code(figures.and_then(|figures| report::write_fields(&cli.common, &figures)))
 }
 
 /// Runs a bench and returns its figures.
-fn bench(what: &What, run: &Run) -> Result<Value> {
+fn bench(what: &Bench, run: &Run) -> Result<Value> {
     match what {
-        What::Speed(args) => speed::run(args, run),
-        What::Baseline(args) => baseline::run(args, run),
-        What::Chart(args) => chart::run(args, run),
-        What::Size(args) => size::run(args, run),
-        What::Stability(args) => stability::run(args, run),
-        What::Paper(args) => paper::run(args, run),
-        What::Names(args) => names::run(args, run),
+        Bench::Speed(args) => speed::run(args, run),
+        Bench::Baseline(args) => baseline::run(args, run),
+        Bench::Chart(args) => chart::run(args, run),
+        Bench::Size(args) => size::run(args, run),
+        Bench::Stability(args) => stability::run(args, run),
+        Bench::Paper(args) => paper::run(args, run),
+        Bench::Names(args) => names::run(args, run),
     }
 }

@@ -8,7 +8,7 @@ use crate::table;
 use crate::trial::name;
 use anyhow::{Context, Result, bail};
 use fastlgs::calibrations::Calibrations;
-use fastlgs::{Run, Session, calibrate, eval};
+use fastlgs::{Run, Scene, calibrate, eval};
 use fastlgs_core::{labels, metrics};
 use fastlgs_grid::calibration::{Calibration, Samples};
 use serde_json::{Value, json};
@@ -35,7 +35,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut samples = Vec::new();
     for (root, folder) in &scenes {
         samples.push(calibrate::samples_of(
-            &mut Session::open(root, run.device)?,
+            &mut Scene::open(root, run.device)?,
             &labels::load(folder, None)?,
         )?);
         work.advance()?;
@@ -43,30 +43,30 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut rows = Vec::new();
     let (mut present, mut absent) = (Vec::new(), Vec::new());
     for (place, (root, folder)) in scenes.iter().copied().enumerate() {
-        let others = |left_out: Option<usize>| {
+        let samples_without = |left_out: Option<usize>| {
             samples
                 .iter()
                 .enumerate()
                 .filter(move |(k, _)| Some(*k) != left_out)
                 .map(|s| s.1)
         };
-        let judged = |left_out: Option<usize>| -> Result<(Calibration, eval::Report)> {
-            let mut scene = Session::open(root, run.device)?;
+        let evaluated = |left_out: Option<usize>| -> Result<(Calibration, eval::EvalReport)> {
+            let mut scene = Scene::open(root, run.device)?;
             let own = Calibrations::of(&scene.manifest);
-            let measured = measured(others(left_out), own.texts.anything);
+            let measured = calibration_of(samples_without(left_out), own.texts.anything);
             let texts = measured.with_context(|| format!("{}: the labels of the other scenes are too few or do not separate objects; add scenes", root.display()))?;
             scene.calibrations = Some(Calibrations { texts, ..own });
-            let config = eval::Config {
+            let config = eval::EvalConfig {
                 scene: root.into(),
                 labels: Some(folder.into()),
-                ..eval::Config::default()
+                ..eval::EvalConfig::default()
             };
             let report = eval::eval_session(scene, &config)?;
             work.advance()?;
             Ok((texts, report))
         };
-        let (texts, left_out) = judged(Some(place))?;
-        let (of_all, seen) = judged(None)?;
+        let (texts, left_out) = evaluated(Some(place))?;
+        let (of_all, seen) = evaluated(None)?;
         present.extend(left_out.present_scores.values());
         absent.extend(left_out.absent_scores.values());
         rows.push(json!({
@@ -127,12 +127,15 @@ const COLUMNS: [&str; 9] = [
     "auroc",
 ];
 
-fn rejected(report: &eval::Report) -> f64 {
+fn rejected(report: &eval::EvalReport) -> f64 {
     report.absent_rejected as f64 / report.absent_texts.max(1) as f64
 }
 
 /// Measures a calibration on the samples of all given scenes. `None` if they are too few.
-fn measured<'a>(scenes: impl Iterator<Item = &'a Samples>, anything: f32) -> Option<Calibration> {
+fn calibration_of<'a>(
+    scenes: impl Iterator<Item = &'a Samples>,
+    anything: f32,
+) -> Option<Calibration> {
     let mut all = Samples::default();
     scenes.for_each(|scene| all.extend(scene));
     Calibration::measured(&all, anything)

@@ -2,9 +2,9 @@
 
 use crate::table;
 use crate::trial::{self, Trial};
-use crate::ways::{How, Way, wanted};
+use crate::ways::{How, Method, selected_ways};
 use anyhow::Result;
-use fastlgs::{Run, Session};
+use fastlgs::{Run, Scene};
 use fastlgs_grid::query::Hit;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -27,32 +27,32 @@ pub struct Args {
 }
 
 /// Image size of the last row of the paper's speed table, in pixels.
-const SIZE: (u32, u32) = (1440, 1080);
+const LARGE_VIEW: (u32, u32) = (1440, 1080);
 
 /// The rows of the paper's ablation tables. Rows for matching, field and codes keep the Gaussians
 /// of the scene.
-const WAYS: [Way; 11] = [
-    Way::new(
+const WAYS: [Method; 11] = [
+    Method::new(
         "matching: embeddings",
         How::Remap(&["--mapping", "paper", "--cues", "none"]),
     ),
-    Way::new(
+    Method::new(
         "matching: + key points",
         How::Remap(&["--mapping", "paper", "--cues", "keypoints"]),
     ),
-    Way::new("matching: + colour", How::Remap(&["--mapping", "paper"])),
-    Way::new("field: embeddings", How::Baseline("raw")),
-    Way::new("field: codes of embeddings", How::Baseline("langsplat")),
-    Way::new("codes: 1 number", How::Baseline("code1")),
-    Way::new("codes: 2 numbers", How::Baseline("code2")),
-    Way::new("codes: 3 numbers", How::Baseline("code3")),
-    Way::new("codes: 4 numbers", How::Baseline("code4")),
-    Way::new("all: as the paper", How::Train(&["--preset", "like-paper"])),
-    Way::new("all: by default", How::Train(&[])),
+    Method::new("matching: + colour", How::Remap(&["--mapping", "paper"])),
+    Method::new("field: embeddings", How::Baseline("raw")),
+    Method::new("field: codes of embeddings", How::Baseline("langsplat")),
+    Method::new("codes: 1 number", How::Baseline("code1")),
+    Method::new("codes: 2 numbers", How::Baseline("code2")),
+    Method::new("codes: 3 numbers", How::Baseline("code3")),
+    Method::new("codes: 4 numbers", How::Baseline("code4")),
+    Method::new("all: as the paper", How::Train(&["--preset", "like-paper"])),
+    Method::new("all: by default", How::Train(&[])),
 ];
 
 /// The paper's own figures, measured on a TITAN RTX.
-const SAID: &str = "
+const PAPER_FIGURES: &str = "
 Figures of the paper, on other scenes (SPIn-NeRF's and its own), with CLIP, SAM and a TITAN RTX:
 
 | | mIoU | mAcc | seconds a query | MB |
@@ -67,8 +67,8 @@ Figures of the paper, on other scenes (SPIn-NeRF's and its own), with CLIP, SAM 
 ";
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    let ways = wanted(&WAYS, &args.ways)?;
-    let work = trial::workshop(&args.output)?;
+    let ways = selected_ways(&WAYS, &args.ways)?;
+    let work = trial::trials_folder(&args.output)?;
     let scenes = trial::or_generated(&args.scenes, &work, run)?;
     let progress = run.work("ways", (scenes.len() * ways.len()) as u64);
     let iterations = args.iterations.to_string();
@@ -82,20 +82,20 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             }
             let mut row = way.row(&trial, &command, scene, run)?;
             if !matches!(way.how, How::Baseline(_)) {
-                row["large_ms"] = json!(large_query(&trial.scene().root, run)?);
+                row["large_ms"] = json!(large_query_ms(&trial.scene().root, run)?);
             }
             rows.push(row);
             progress.advance()?;
         }
     }
     std::fs::remove_dir_all(&work)?;
-    table::write(&args.output, "paper", &COLUMNS, &rows, SAID)
+    table::write(&args.output, "paper", &COLUMNS, &rows, PAPER_FIGURES)
 }
 
 /// Returns the milliseconds for the mask of one object in a new view of 1440x1080. The object is
 /// the one that most views show.
-fn large_query(scene: &Path, run: &Run) -> Result<f64> {
-    let mut session = Session::open(scene, run.device)?;
+fn large_query_ms(scene: &Path, run: &Run) -> Result<f64> {
+    let mut session = Scene::open(scene, run.device)?;
     session.warm_up()?;
     let grid = session.grid()?;
     let target: Vec<Hit> = grid
@@ -108,7 +108,7 @@ fn large_query(scene: &Path, run: &Run) -> Result<f64> {
         })
         .into_iter()
         .collect();
-    let camera = session.cameras[0].resized(SIZE.0, SIZE.1);
+    let camera = session.cameras[0].resized(LARGE_VIEW.0, LARGE_VIEW.1);
     let started = Instant::now();
     session.field(&camera, None)?.mask(&grid, &target);
     Ok(started.elapsed().as_secs_f64() * 1e3)

@@ -167,7 +167,7 @@ impl Drawing for Lines<'_> {
 
 /// A point of a scatter chart.
 #[derive(Clone)]
-pub struct Spot {
+pub struct Point {
     /// Points of one series share a colour.
     pub series: String,
     pub name: String,
@@ -180,7 +180,7 @@ pub struct Spot {
 /// A scatter chart with names and a logarithmic x axis.
 pub struct Scatter<'a> {
     pub axes: Axes<'a>,
-    pub spots: &'a [Spot],
+    pub spots: &'a [Point],
 }
 
 impl Drawing for Scatter<'_> {
@@ -189,7 +189,7 @@ impl Drawing for Scatter<'_> {
         DB::ErrorType: 'static,
     {
         let spots = || self.spots.iter().filter(|s| s.x > 0.0 && s.y.is_finite());
-        let span = |of: fn(&Spot) -> f64| {
+        let span = |of: fn(&Point) -> f64| {
             spots()
                 .map(of)
                 .fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| {
@@ -218,7 +218,7 @@ impl Drawing for Scatter<'_> {
         let series: BTreeSet<&String> = spots().map(|s| &s.series).collect();
         for (k, name) in series.into_iter().enumerate() {
             let color = Palette99::pick(k).to_rgba();
-            let own: Vec<&Spot> = spots().filter(|s| s.series == *name).collect();
+            let own: Vec<&Point> = spots().filter(|s| s.series == *name).collect();
             let mut front: Vec<(f64, f64)> =
                 own.iter().filter(|s| s.front).map(|s| (s.x, s.y)).collect();
             front.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -255,21 +255,21 @@ pub struct Cell {
 }
 
 /// A table with coloured cells.
-pub struct Heat<'a> {
+pub struct HeatMap<'a> {
     pub title: &'a str,
     pub columns: &'a [&'a str],
     /// Name and cells of each row.
     pub rows: &'a [(String, Vec<Cell>)],
 }
 
-impl Heat<'_> {
+impl HeatMap<'_> {
     const ROW: i32 = 20;
     const NAME: i32 = 250;
     const COLUMN: i32 = 92;
     const HEAD: i32 = 64;
 }
 
-impl Drawing for Heat<'_> {
+impl Drawing for HeatMap<'_> {
     fn size(&self) -> (u32, u32) {
         let width = Self::NAME + Self::COLUMN * self.columns.len() as i32 + 16;
         (
@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn charts_are_written_in_both_forms() {
         let folder = tempfile::tempdir().expect("a folder");
-        let spot = |x, y| Spot {
+        let spot = |x, y| Point {
             series: "s".to_owned(),
             name: "spot".to_owned(),
             x,
@@ -367,7 +367,7 @@ mod tests {
         save(
             folder.path(),
             "heat",
-            &Heat {
+            &HeatMap {
                 title: "heat",
                 columns: &["a"],
                 rows: &rows,
@@ -378,7 +378,7 @@ mod tests {
         assert!(svg.contains("row") && svg.contains("heat"));
         let picture = image_io::load_rgb(&folder.path().join("heat.png")).expect("the PNG");
         let red = picture
-            .get_pixel(Heat::NAME as u32 + 80, Heat::HEAD as u32 + 10)
+            .get_pixel(HeatMap::NAME as u32 + 80, HeatMap::HEAD as u32 + 10)
             .0;
         assert!(red[0] > 200 && red[1] < 100, "{red:?}");
         assert!(

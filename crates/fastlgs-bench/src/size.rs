@@ -1,7 +1,7 @@
 //! `fastlgs-bench size`: accuracy and PSNR against model size, and a check of `--budget auto`.
 
-use crate::command::call;
-use crate::plot::{self, Axes, Scatter, Spot};
+use crate::command::run_command;
+use crate::plot::{self, Axes, Point, Scatter};
 use crate::table::{self, number};
 use crate::trial::{self, Trial, text};
 use anyhow::Result;
@@ -51,7 +51,7 @@ const COLUMNS: [&str; 8] = [
 ];
 
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
-    let work = trial::workshop(&args.output)?;
+    let work = trial::trials_folder(&args.output)?;
     let mut scenes = args.scenes.clone();
     if scenes.is_empty() {
         let (views, size) = trial::QUICK;
@@ -103,17 +103,20 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             0.0,
         )?;
         let folder = trial.scene();
-        let whole = folder.gaussians()?;
-        for degree in (0..whole.sh_degree).rev() {
-            ply::write(&folder.ply_path(), &whole.clone().with_sh_degree(degree))?;
+        let full_model = folder.gaussians()?;
+        for degree in (0..full_model.sh_degree).rev() {
+            ply::write(
+                &folder.ply_path(),
+                &full_model.clone().with_sh_degree(degree),
+            )?;
             add(format!("degree {degree}"), &trial.eval(&[])?, 0.0)?;
         }
-        let order = by_change(&folder, &whole)?;
+        let order = importance_order(&folder, &full_model)?;
         for share in &kept {
-            let most = (share * whole.len() as f64).round() as usize;
+            let most = (share * full_model.len() as f64).round() as usize;
             let mut keep = order[..most].to_vec();
             keep.sort_unstable();
-            ply::write(&folder.ply_path(), &whole.select(&keep))?;
+            ply::write(&folder.ply_path(), &full_model.select(&keep))?;
             add(
                 format!("{:.0} % kept", 100.0 * share),
                 &trial.eval(&[])?,
@@ -143,7 +146,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
             "Accuracy against size: filled points are --budget auto",
         ),
     ] {
-        let spots: Vec<Spot> = rows.iter().map(|row| spot(row, what)).collect();
+        let spots: Vec<Point> = rows.iter().map(|row| spot(row, what)).collect();
         let axes = Axes {
             title,
             x: "megabytes of all files that a query needs",
@@ -166,10 +169,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 
 /// Returns the indices of all Gaussians, sorted in descending order by the change of the training
 /// views without them.
-fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
+fn importance_order(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
     let trained =
-        fastlgs::train::Report::from_manifest(&manifest, &folder.root)?.unwrap_or_default();
+        fastlgs::train::TrainReport::from_manifest(&manifest, &folder.root)?.unwrap_or_default();
     let mut changes = Changes::of(scene);
     manifest
         .training(&folder.cameras()?)
@@ -188,7 +191,7 @@ fn by_change(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
 fn compact(run: &Run, work: &Path, trial: &Trial) -> Result<Value> {
     let folder = tempfile::tempdir_in(work)?;
     let (scene, small) = (trial.scene(), folder.path().join("small"));
-    call(run, run.seed, "export", &[text(&scene.root), text(&small)])?;
+    run_command(run, run.seed, "export", &[text(&scene.root), text(&small)])?;
     // The export has no photos. PSNR needs the held-out ones.
     for camera in scene.manifest()?.held_out(&scene.cameras()?) {
         let photo = SceneFolder::new(&small).photo_path(&camera.name);
@@ -198,10 +201,10 @@ fn compact(run: &Run, work: &Path, trial: &Trial) -> Result<Value> {
     trial.eval_of(&small)
 }
 
-fn spot(row: &Value, what: &str) -> Spot {
+fn spot(row: &Value, what: &str) -> Point {
     let model = row["model"].as_str().unwrap_or_default().to_owned();
     let front = model.starts_with("auto");
-    Spot {
+    Point {
         series: row["scene"].as_str().unwrap_or_default().to_owned(),
         name: model,
         x: number(row, "scene_bytes") / 1e6,

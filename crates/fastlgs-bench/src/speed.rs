@@ -98,7 +98,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
                 settings.push(Setting {
                     gaussians: count,
                     size: (w, h),
-                    row: setting(engine.as_mut(), &views, args.steps)?,
+                    row: measure_setting(engine.as_mut(), &views, args.steps)?,
                 });
             }
         }
@@ -203,7 +203,7 @@ pub fn peak_process_bytes() -> Option<u64> {
 }
 
 /// Measures one number of Gaussians at one image size.
-fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
+fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
     let pixels = views[0].pixels();
     let zero = [0.0; BASE_CHANNELS + 1];
     let degree = views[0].sh_degree;
@@ -223,11 +223,11 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value>
         feature: vec![pack([128; 3], true); pixels],
     };
     (0..views.len()).try_for_each(|id| engine.set_target(id, target.clone()))?;
-    let (mut pairs, mut walked) = (0.0, 0.0);
+    let (mut pairs, mut splats_per_pixel) = (0.0, 0.0);
     for (id, view) in views.iter().enumerate() {
         let frame = engine.render(*view, Channels::Both)?;
         pairs += f64::from(frame.pairs) / views.len() as f64;
-        walked += frame
+        splats_per_pixel += frame
             .channels(7, 8)
             .iter()
             .map(|w| f64::from(*w))
@@ -287,12 +287,12 @@ fn setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value>
     let memory = engine.memory();
     // Time of the blend pass. The whole frame where the device cannot profile passes.
     let blend_seconds = passes.get("blend").map_or(render_seconds, |ms| ms / 1e3);
-    let evaluated = walked * pixels as f64 / blend_seconds;
+    let evaluated = splats_per_pixel * pixels as f64 / blend_seconds;
     Ok(json!({
         "gaussians": engine.len(),
         "size": format!("{}x{}", views[0].size[0], views[0].size[1]),
         "pairs": pairs,
-        "evaluated_per_pixel": walked,
+        "evaluated_per_pixel": splats_per_pixel,
         "evaluated_per_second": evaluated,
         "memory": memory,
         "train_iterations_per_second": 1.0 / full_seconds,

@@ -1,9 +1,9 @@
 //! `fastlgs-bench stability`: how accuracy changes when the input is disturbed, and on difficult
 //! generated scenes.
 
-use crate::command::call;
-use crate::disturb::{self, Album, Masks, Photos};
-use crate::plot::{self, Cell, Heat};
+use crate::command::run_command;
+use crate::disturb::{self, Album, MaskChange, PhotoChange};
+use crate::plot::{self, Cell, HeatMap};
 use crate::table::{self, number};
 use crate::trial::{self, Trial, text};
 use anyhow::{Context, Result, bail};
@@ -52,11 +52,11 @@ pub struct Args {
 #[derive(Clone)]
 enum Change {
     /// All stages, from disturbed photos.
-    Photos(Photos),
+    Photos(PhotoChange),
     /// Training with other seeds, on the same prepared scene.
     Seed,
     /// Disturbed masks, mapped to the same Gaussians.
-    Masks(Masks),
+    Masks(MaskChange),
     /// Noise on the objects' embeddings. The value is its length.
     Embeddings(f32),
     /// Other mapping options, on the same Gaussians.
@@ -109,59 +109,101 @@ fn cases() -> Vec<Case> {
         case(disturbance, strength, Change::Map(args), 10.0, quick)
     };
     vec![
-        photos("photos shuffled", "", Photos::Shuffled, 3.0, true),
-        photos("pose noise", "1 px", Photos::Pose(1.0), 1.0, false),
-        photos("pose noise", "2 px", Photos::Pose(2.0), 3.0, true),
-        photos("pose noise", "4 px", Photos::Pose(4.0), 8.0, false),
-        photos("views missing", "25 %", Photos::Missing(0.25), 1.0, false),
-        photos("views missing", "50 %", Photos::Missing(0.5), 2.0, true),
-        photos("views missing", "75 %", Photos::Missing(0.75), 10.0, false),
-        photos("exposure", "0.25 stops", Photos::Exposure(0.25), 5.0, false),
-        photos("exposure", "0.5 stops", Photos::Exposure(0.5), 2.0, true),
-        photos("exposure", "1 stop", Photos::Exposure(1.0), 8.0, false),
+        photos("photos shuffled", "", PhotoChange::Shuffled, 3.0, true),
+        photos("pose noise", "1 px", PhotoChange::Pose(1.0), 1.0, false),
+        photos("pose noise", "2 px", PhotoChange::Pose(2.0), 3.0, true),
+        photos("pose noise", "4 px", PhotoChange::Pose(4.0), 8.0, false),
+        photos(
+            "views missing",
+            "25 %",
+            PhotoChange::Missing(0.25),
+            1.0,
+            false,
+        ),
+        photos(
+            "views missing",
+            "50 %",
+            PhotoChange::Missing(0.5),
+            2.0,
+            true,
+        ),
+        photos(
+            "views missing",
+            "75 %",
+            PhotoChange::Missing(0.75),
+            10.0,
+            false,
+        ),
+        photos(
+            "exposure",
+            "0.25 stops",
+            PhotoChange::Exposure(0.25),
+            5.0,
+            false,
+        ),
+        photos(
+            "exposure",
+            "0.5 stops",
+            PhotoChange::Exposure(0.5),
+            2.0,
+            true,
+        ),
+        photos("exposure", "1 stop", PhotoChange::Exposure(1.0), 8.0, false),
         photos(
             "white balance",
             "5 %",
-            Photos::WhiteBalance(0.05),
+            PhotoChange::WhiteBalance(0.05),
             5.0,
             false,
         ),
         photos(
             "white balance",
             "10 %",
-            Photos::WhiteBalance(0.1),
+            PhotoChange::WhiteBalance(0.1),
             5.0,
             true,
         ),
         photos(
             "white balance",
             "20 %",
-            Photos::WhiteBalance(0.2),
+            PhotoChange::WhiteBalance(0.2),
             15.0,
             false,
         ),
-        photos("blur", "0.5 px", Photos::Blur(0.5), 5.0, false),
-        photos("blur", "1 px", Photos::Blur(1.0), 5.0, true),
-        photos("blur", "2 px", Photos::Blur(2.0), 3.0, false),
-        photos("JPEG", "quality 70", Photos::Jpeg(70), 5.0, false),
-        photos("JPEG", "quality 40", Photos::Jpeg(40), 5.0, true),
-        photos("JPEG", "quality 15", Photos::Jpeg(15), 15.0, false),
-        photos("focal length", "1 %", Photos::Focal(0.01), 5.0, false),
-        photos("focal length", "3 %", Photos::Focal(0.03), 3.0, true),
-        photos("focal length", "10 %", Photos::Focal(0.1), 10.0, false),
+        photos("blur", "0.5 px", PhotoChange::Blur(0.5), 5.0, false),
+        photos("blur", "1 px", PhotoChange::Blur(1.0), 5.0, true),
+        photos("blur", "2 px", PhotoChange::Blur(2.0), 3.0, false),
+        photos("JPEG", "quality 70", PhotoChange::Jpeg(70), 5.0, false),
+        photos("JPEG", "quality 40", PhotoChange::Jpeg(40), 5.0, true),
+        photos("JPEG", "quality 15", PhotoChange::Jpeg(15), 15.0, false),
+        photos("focal length", "1 %", PhotoChange::Focal(0.01), 5.0, false),
+        photos("focal length", "3 %", PhotoChange::Focal(0.03), 3.0, true),
+        photos("focal length", "10 %", PhotoChange::Focal(0.1), 10.0, false),
         case("seed", "spread", Change::Seed, 1.0, true),
-        masks("masks eroded", "1 px", Masks::Eroded(1), 5.0, false),
-        masks("masks eroded", "2 px", Masks::Eroded(2), 5.0, true),
-        masks("masks eroded", "4 px", Masks::Eroded(4), 15.0, false),
-        masks("masks split", "10 %", Masks::Split(0.1), 5.0, false),
-        masks("masks split", "20 %", Masks::Split(0.2), 5.0, true),
-        masks("masks split", "40 %", Masks::Split(0.4), 15.0, false),
-        masks("masks merged", "10 %", Masks::Merged(0.1), 5.0, false),
-        masks("masks merged", "20 %", Masks::Merged(0.2), 5.0, true),
-        masks("masks merged", "40 %", Masks::Merged(0.4), 15.0, false),
-        masks("masks dropped", "10 %", Masks::Dropped(0.1), 5.0, false),
-        masks("masks dropped", "20 %", Masks::Dropped(0.2), 5.0, true),
-        masks("masks dropped", "40 %", Masks::Dropped(0.4), 15.0, false),
+        masks("masks eroded", "1 px", MaskChange::Eroded(1), 5.0, false),
+        masks("masks eroded", "2 px", MaskChange::Eroded(2), 5.0, true),
+        masks("masks eroded", "4 px", MaskChange::Eroded(4), 15.0, false),
+        masks("masks split", "10 %", MaskChange::Split(0.1), 5.0, false),
+        masks("masks split", "20 %", MaskChange::Split(0.2), 5.0, true),
+        masks("masks split", "40 %", MaskChange::Split(0.4), 15.0, false),
+        masks("masks merged", "10 %", MaskChange::Merged(0.1), 5.0, false),
+        masks("masks merged", "20 %", MaskChange::Merged(0.2), 5.0, true),
+        masks("masks merged", "40 %", MaskChange::Merged(0.4), 15.0, false),
+        masks(
+            "masks dropped",
+            "10 %",
+            MaskChange::Dropped(0.1),
+            5.0,
+            false,
+        ),
+        masks("masks dropped", "20 %", MaskChange::Dropped(0.2), 5.0, true),
+        masks(
+            "masks dropped",
+            "40 %",
+            MaskChange::Dropped(0.4),
+            15.0,
+            false,
+        ),
         text(
             "embedding noise",
             "25 %",
@@ -321,8 +363,8 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         })
         .collect::<Result<_>>()?;
     let kinds: Vec<Kind> = if args.quick { vec![Kind::Twins] } else { kinds };
-    let work = trial::workshop(&args.output)?;
-    let bench = Bench {
+    let work = trial::trials_folder(&args.output)?;
+    let bench = Suite {
         args,
         run,
         work: &work,
@@ -357,17 +399,17 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     }
     for scene in &scenes {
         let name = trial::name(scene);
-        let own = bench.disturb(scene, &name, &cases, &progress)?;
+        let scene_rows = bench.disturb(scene, &name, &cases, &progress)?;
         plot::save(
             &args.output,
             &format!("stability-{name}"),
-            &Heat {
+            &HeatMap {
                 title: &format!("Stability: {name}"),
                 columns: &HEAT,
-                rows: &heat(&own),
+                rows: &heat(&scene_rows),
             },
         )?;
-        rows.extend(own);
+        rows.extend(scene_rows);
     }
     for kind in kinds {
         rows.push(bench.kind(kind)?);
@@ -381,14 +423,14 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
-struct Bench<'a> {
+struct Suite<'a> {
     args: &'a Args,
     run: &'a Run<'a>,
     work: &'a Path,
     iterations: u32,
 }
 
-impl Bench<'_> {
+impl Suite<'_> {
     /// Generates and preprocesses a scene. Returns its folder.
     fn generated(&self, kind: Kind, name: &str) -> Result<PathBuf> {
         let (views, size) = if self.args.quick {
@@ -423,11 +465,11 @@ impl Bench<'_> {
 
     /// Runs all stages, from changed photos to the evaluation. Returns the report of `eval`, with
     /// the seconds of all stages.
-    fn whole(
+    fn run_all_stages(
         &self,
         album: &Album,
-        like: &Manifest,
-        change: Photos,
+        scene_manifest: &Manifest,
+        change: PhotoChange,
         seed: u64,
         photos: &Path,
         scene: &Path,
@@ -441,18 +483,24 @@ impl Bench<'_> {
             "--holdout-labels",
             text(&labels),
         ];
-        args.extend(["--segmenter", &like.segmenter, "--encoder", &like.encoder]);
-        like.models
+        args.extend([
+            "--segmenter",
+            &scene_manifest.segmenter,
+            "--encoder",
+            &scene_manifest.encoder,
+        ]);
+        scene_manifest
+            .models
             .iter()
             .for_each(|(role, file)| args.extend([option_of(role), text(&file.path)]));
-        let before = call(self.run, seed, "preprocess", &args)?;
-        let trained = call(
+        let before = run_command(self.run, seed, "preprocess", &args)?;
+        let trained = run_command(
             self.run,
             seed,
             "train",
             &[text(scene), "--iterations", &iterations],
         )?;
-        let mut scored = call(
+        let mut scored = run_command(
             self.run,
             seed,
             "eval",
@@ -486,7 +534,14 @@ impl Bench<'_> {
         let seed = self.run.seed;
         // The reference runs through the same stages as the disturbed photos.
         let [base, photos] = ["base", "undisturbed"].map(|n| self.work.join(name).join(n));
-        let undisturbed = self.whole(&album, &manifest, Photos::Unchanged, seed, &photos, &base)?;
+        let undisturbed = self.run_all_stages(
+            &album,
+            &manifest,
+            PhotoChange::Unchanged,
+            seed,
+            &photos,
+            &base,
+        )?;
         const REMAP: [&str; 4] = ["--init-ply", "SCENE/scene.ply", "--iterations", "0"];
         let paper = Trial::new(&base, self.work, self.run)?;
         let [_, paper_scored] =
@@ -525,7 +580,7 @@ impl Bench<'_> {
                         // Starts from a copy of the base scene, so that unchanged results come from
                         // its cache.
                         let (trial, photos) = (same_gaussians()?, tempfile::tempdir_in(self.work)?);
-                        self.whole(
+                        self.run_all_stages(
                             &album,
                             &manifest,
                             *change,
@@ -694,7 +749,7 @@ mod tests {
                 &runs.iter().map(|r| run(*r)).collect::<Vec<_>>(),
             )
         };
-        let blurred = of(Change::Photos(Photos::Blur(1.0)), 5.0, &[0.88, 0.84]);
+        let blurred = of(Change::Photos(PhotoChange::Blur(1.0)), 5.0, &[0.88, 0.84]);
         assert!(
             (number(&blurred, "change") + 4.0).abs() < 1e-9
                 && (number(&blurred, "worst") + 6.0).abs() < 1e-9

@@ -26,24 +26,24 @@ pub fn write(
     Ok(value)
 }
 
-/// Returns the rows as Markdown (`framed`) or CSV.
-fn text(rows: &[Value], columns: &[&str], framed: bool) -> String {
+/// Returns the rows as Markdown (`markdown`) or CSV.
+fn text(rows: &[Value], columns: &[&str], markdown: bool) -> String {
     let line = |cells: Vec<String>| {
-        if framed {
+        if markdown {
             format!("| {} |\n", cells.join(" | "))
         } else {
             format!("{}\n", cells.join(","))
         }
     };
     let cell = |row: &Value, name: &str| match &row[name] {
-        Value::String(text) if framed => text.clone(),
+        Value::String(text) if markdown => text.clone(),
         Value::String(text) => format!("\"{}\"", text.replace('"', "\"\"")),
         Value::Number(n) if n.is_f64() => format!("{:.3}", n.as_f64().unwrap_or(f64::NAN)),
         Value::Null => String::new(),
         other => other.to_string(),
     };
     let mut out = line(columns.iter().map(|c| (*c).to_owned()).collect());
-    if framed {
+    if markdown {
         out += &line(columns.iter().map(|_| "---".to_owned()).collect());
     }
     rows.iter()

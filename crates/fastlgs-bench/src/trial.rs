@@ -1,6 +1,6 @@
 //! Trials: commands of `fastlgs` on copies of scenes. Each figure can thus be reproduced by hand.
 
-use crate::command::call;
+use crate::command::run_command;
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
 use fastlgs_core::SceneFolder;
@@ -16,7 +16,7 @@ pub fn text(path: &Path) -> &str {
 ///
 /// # Errors
 /// The folder cannot be created.
-pub fn workshop(output: &Path) -> Result<PathBuf> {
+pub fn trials_folder(output: &Path) -> Result<PathBuf> {
     let work = output.join(".trials");
     let _ = std::fs::remove_dir_all(&work);
     std::fs::create_dir_all(&work).with_context(|| work.display().to_string())?;
@@ -31,7 +31,7 @@ pub const QUICK: (usize, &str) = (32, "240x180");
 pub fn generated(run: &Run, work: &Path, kind: &str, views: usize, size: &str) -> Result<PathBuf> {
     let (photos, scene) = (work.join(kind).join("photos"), work.join(kind).join(kind));
     if !scene.is_dir() {
-        call(
+        run_command(
             run,
             run.seed,
             "synth",
@@ -45,7 +45,7 @@ pub fn generated(run: &Run, work: &Path, kind: &str, views: usize, size: &str) -
                 &views.to_string(),
             ],
         )?;
-        call(
+        run_command(
             run,
             run.seed,
             "preprocess",
@@ -62,7 +62,7 @@ pub fn or_generated(scenes: &[PathBuf], work: &Path, run: &Run) -> Result<Vec<Pa
     }
     let (views, size) = QUICK;
     let scene = generated(run, work, "table", views, size)?;
-    call(
+    run_command(
         run,
         run.seed,
         "train",
@@ -104,13 +104,13 @@ impl<'a> Trial<'a> {
                 scene.display()
             );
         }
-        let beside = scene.canonicalize()?;
+        let source = scene.canonicalize()?;
         let folder = tempfile::tempdir_in(work).with_context(|| work.display().to_string())?;
-        link_all(&beside, &folder.path().join("scene"))
+        link_all(&source, &folder.path().join("scene"))
             .with_context(|| format!("copying {} failed", scene.display()))?;
         Ok(Self {
             folder,
-            start: beside.join("scene.ply"),
+            start: source.join("scene.ply"),
             labels,
             run: *run,
         })
@@ -136,19 +136,19 @@ impl<'a> Trial<'a> {
         let all: Vec<&str> = std::iter::once(text(&scene.root))
             .chain(args.iter().map(String::as_str))
             .collect();
-        call(&self.run, seed, "train", &all)
+        run_command(&self.run, seed, "train", &all)
     }
 
     /// Evaluates the copy against the labels, and returns the report.
     pub fn eval(&self, args: &[&str]) -> Result<Value> {
         let scene = self.scene();
         let first = [text(&scene.root), "--labels", text(&self.labels)];
-        call(&self.run, self.run.seed, "eval", &[&first, args].concat())
+        run_command(&self.run, self.run.seed, "eval", &[&first, args].concat())
     }
 
     /// Evaluates another folder of the same scene against the labels, and returns the report.
     pub fn eval_of(&self, scene: &Path) -> Result<Value> {
-        call(
+        run_command(
             &self.run,
             self.run.seed,
             "eval",

@@ -1,6 +1,6 @@
 //! Methods of making a language field from masks: their commands, cost and accuracy.
 
-use crate::command::call;
+use crate::command::run_command;
 use crate::table::number;
 use crate::trial::{self, Trial};
 use anyhow::{Result, bail};
@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 /// A method of making a language field from masks.
-pub struct Way {
+pub struct Method {
     pub name: &'static str,
     pub how: How,
     /// Cost class: 0 takes seconds, 1 minutes, 2 much longer.
@@ -56,7 +56,7 @@ impl How {
 ///
 /// # Errors
 /// A name is unknown.
-pub fn wanted<'a>(ways: &'a [Way], names: &[String]) -> Result<Vec<&'a Way>> {
+pub fn selected_ways<'a>(ways: &'a [Method], names: &[String]) -> Result<Vec<&'a Method>> {
     if let Some(unknown) = names
         .iter()
         .find(|name| !ways.iter().any(|way| way.name == **name))
@@ -75,7 +75,7 @@ pub fn wanted<'a>(ways: &'a [Way], names: &[String]) -> Result<Vec<&'a Way>> {
         .collect())
 }
 
-impl Way {
+impl Method {
     pub const fn new(name: &'static str, how: How) -> Self {
         Self { name, how, cost: 0 }
     }
@@ -134,7 +134,7 @@ fn baseline(trial: &Trial, command: &[&str], run: &Run) -> Result<Value> {
             }
         })
         .collect();
-    let mut found = call(run, run.seed, command[0], &args)?;
+    let mut found = run_command(run, run.seed, command[0], &args)?;
     (found["query_ms"], found["bytes"]) =
         (found["render_ms"].clone(), found["field_bytes"].clone());
     if !found["wrong_pixels"].is_null() {

@@ -30,7 +30,7 @@ struct Stage {
     bar: ProgressBar,
     started: Instant,
     /// Time of the last printed line, and the number of steps done by then.
-    told: (Instant, u64),
+    last_line: (Instant, u64),
 }
 
 impl Console {
@@ -68,12 +68,12 @@ impl Console {
             Stage {
                 bar,
                 started: now,
-                told: (now, 0),
+                last_line: (now, 0),
             },
         );
     }
 
-    /// Shows that `done` of `total` steps are done. `facts` is additional text.
+    /// Shows that `done` of `total` steps are done. `details` is additional text.
     fn advance(&self, name: &'static str, done: u64, total: u64, facts: &str) {
         let mut stages = self.stages();
         let Some(stage) = stages.get_mut(name) else {
@@ -89,9 +89,10 @@ impl Console {
                 }
             }
             Medium::Lines => {
-                if stage.told.0.elapsed() >= LINE_EVERY && is_tenth_more(stage.told.1, done, total)
+                if stage.last_line.0.elapsed() >= LINE_EVERY
+                    && is_tenth_more(stage.last_line.1, done, total)
                 {
-                    stage.told = (Instant::now(), done);
+                    stage.last_line = (Instant::now(), done);
                     eprintln!(
                         "{}",
                         line(name, done, total, facts, stage.started.elapsed())
@@ -109,7 +110,7 @@ impl Console {
 }
 
 impl Sink for Console {
-    fn tell(&self, message: Message<'_>) {
+    fn on_message(&self, message: Message<'_>) {
         match message {
             Message::Started { stage, total } => self.start(stage, total),
             Message::Advanced {
@@ -119,13 +120,18 @@ impl Sink for Console {
                 note,
             } => self.advance(stage, done, total, note),
             Message::Trained { step, total, .. } => {
-                let facts = format!(
+                let details = format!(
                     "loss {:.4}, {:.1} dB, {}k Gaussians",
                     step.loss,
                     step.psnr,
                     step.gaussians / 1000
                 );
-                self.advance("train", u64::from(step.iteration), u64::from(total), &facts);
+                self.advance(
+                    "train",
+                    u64::from(step.iteration),
+                    u64::from(total),
+                    &details,
+                );
             }
             Message::Finished { stage } => self.finish(stage),
             Message::Warning(text) => {

@@ -30,36 +30,36 @@ enum Command {
         after_help = "Example: fastlgs make photos/fox -o scenes/fox --max-side 480\n\n\
 Run again, it keeps a finished scene and continues an interrupted run. It rebuilds the scene if photos or options have changed."
     )]
-    Make(fastlgs::make::Config),
+    Make(fastlgs::make::MakeConfig),
     /// Prepare a scene from photos, with or without poses: cameras, masks, key points and initial
     /// points.
     #[command(after_help = "Example: fastlgs preprocess photos/fox -o scenes/fox --max-side 480")]
-    Preprocess(fastlgs::preprocess::Config),
+    Preprocess(fastlgs::preprocess::PreprocessConfig),
     /// Train Gaussians, then find the objects among them.
     Train(commands::train::Args),
     /// Render views: colour, depth, feature and object images.
     #[command(
         after_help = "Example: fastlgs render scenes/fox --view 0027.jpg --what color,depth,feature,objects -o pictures"
     )]
-    Render(fastlgs::render::Config),
+    Render(fastlgs::render::RenderConfig),
     /// Find the objects that a text, a picture or a pixel names; write masks, heat maps and
     /// Gaussians.
     Query(commands::query::Args),
     /// Remove an object from a scene and fill the area behind it.
     #[command(after_help = "Example: fastlgs remove scenes/room \"coffee mug\" -o scenes/tidy")]
-    Remove(fastlgs::remove::Config),
+    Remove(fastlgs::remove::RemoveConfig),
     /// Teach a name by an example; all scenes with the same encoder then know it.
     #[command(
         after_help = "Example: fastlgs teach \"my mug\" scenes/desk --view 0003.jpg --point 210,144"
     )]
-    Teach(fastlgs::teach::Lesson),
+    Teach(fastlgs::teach::TeachConfig),
     /// List, remove, export or import taught names.
     Names(commands::names::Args),
     /// Show a scene in the browser, with an HTTP interface.
     Serve(commands::serve::Args),
     /// Measure accuracy on held-out views against labels.
     #[command(after_help = "Example: fastlgs eval scenes/fox --labels photos/fox/labels --json -")]
-    Eval(fastlgs::eval::Config),
+    Eval(fastlgs::eval::EvalConfig),
     /// Print how to run fastlgs-bench, which has the benchmarks.
     #[command(hide = true)]
     Bench {
@@ -77,7 +77,7 @@ Run again, it keeps a finished scene and continues an interrupted run. It rebuil
     #[command(
         after_help = "Example: fastlgs synth table -o photos/table --views 40 --size 320x240"
     )]
-    Synth(fastlgs::synth::Config),
+    Synth(fastlgs::synth::SynthConfig),
     /// List, install, download or calibrate encoders and segmenters.
     Models(commands::models::Args),
     /// Show the devices of this machine, or the contents of a scene.
@@ -91,12 +91,12 @@ Run again, it keeps a finished scene and continues an interrupted run. It rebuil
 /// Runs the command line with the arguments of this process.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    start(&cli.common);
-    end(run(cli.command, &cli.common))
+    init_process(&cli.common);
+    exit_code(run(cli.command, &cli.common))
 }
 
 /// Starts logging and sets the environment variables of graphics drivers.
-pub fn start(common: &ui::Common) {
+pub fn init_process(common: &ui::Common) {
     // SAFETY: no other thread runs yet, so none can read the environment.
     // Mesa's device selection layer contacts the desktop session and prints errors without one.
     unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
@@ -104,7 +104,7 @@ pub fn start(common: &ui::Common) {
 }
 
 /// Converts the result of a command to an exit code. Prints an error as one sentence.
-pub fn end(result: anyhow::Result<Outcome>) -> ExitCode {
+pub fn exit_code(result: anyhow::Result<Outcome>) -> ExitCode {
     match result {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::NotFound) => ExitCode::from(3),
@@ -120,25 +120,27 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
     let run = &common.run(&console);
     match command {
         Command::Make(config) => commands::make::run(&config, common, run),
-        Command::Preprocess(config) => report::tell(
+        Command::Preprocess(config) => report::write_summary(
             common,
             &fastlgs::preprocess(&config, run)?,
             words::preprocess,
         ),
         Command::Train(args) => commands::train::run(&args, common, &console),
         Command::Render(config) => {
-            report::tell(common, &fastlgs::render(&config, run)?, words::render)
+            report::write_summary(common, &fastlgs::render(&config, run)?, words::render)
         }
         Command::Query(args) => commands::query::run(&args, common, run),
         Command::Remove(config) => {
-            report::tell(common, &fastlgs::remove(&config, run)?, words::remove)
+            report::write_summary(common, &fastlgs::remove(&config, run)?, words::remove)
         }
         Command::Teach(lesson) => {
-            report::tell(common, &fastlgs::teach::teach(&lesson, run)?, words::teach)
+            report::write_summary(common, &fastlgs::teach::teach(&lesson, run)?, words::teach)
         }
         Command::Names(args) => commands::names::run(&args, common),
         Command::Serve(args) => commands::serve::run(&args, common),
-        Command::Eval(config) => report::tell(common, &fastlgs::eval(&config, run)?, words::eval),
+        Command::Eval(config) => {
+            report::write_summary(common, &fastlgs::eval(&config, run)?, words::eval)
+        }
         Command::Bench { arguments } => {
             let arguments = arguments.join(" ");
             anyhow::bail!(
@@ -147,7 +149,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         }
         Command::Export(args) => commands::export::run(&args, common, run),
         Command::Synth(config) => {
-            report::tell(common, &fastlgs::synth(&config, run)?, words::synth)
+            report::write_summary(common, &fastlgs::synth(&config, run)?, words::synth)
         }
         Command::Models(args) => commands::models::run(&args, common, run),
         Command::Info(args) => commands::info::run(&args, common),

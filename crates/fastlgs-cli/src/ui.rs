@@ -66,7 +66,7 @@ pub fn start_logging(common: &Common) {
 ///
 /// # Errors
 /// Any other I/O error, such as a full disk.
-pub fn line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
+pub fn write_line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
     use std::io::Write;
     match writeln!(std::io::stdout(), "{words}") {
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
@@ -75,9 +75,9 @@ pub fn line(words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
 }
 
 /// Prints a line to standard output and ignores errors.
-macro_rules! say {
+macro_rules! print_line {
     ($($words:tt)*) => {
-        drop($crate::ui::line(format_args!($($words)*)))
+        drop($crate::ui::write_line(format_args!($($words)*)))
     };
 }
-pub(crate) use say;
+pub(crate) use print_line;

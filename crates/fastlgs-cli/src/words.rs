@@ -5,9 +5,9 @@ use fastlgs_serve::share;
 
 /// Formats rows of (name, text) as an aligned table. Rows with empty text are left out.
 pub fn table(lines: &[(&str, String)]) -> String {
-    let said = || lines.iter().filter(|(_, words)| !words.is_empty());
-    let width = said().map(|(name, _)| name.len()).max().unwrap_or(0);
-    said()
+    let rows = || lines.iter().filter(|(_, words)| !words.is_empty());
+    let width = rows().map(|(name, _)| name.len()).max().unwrap_or(0);
+    rows()
         .map(|(name, words)| format!("{name:width$}  {words}"))
         .collect::<Vec<_>>()
         .join("\n")
@@ -34,7 +34,7 @@ fn decibels(psnr: Option<f64>) -> String {
     psnr.map(|psnr| format!("{psnr:.2} dB")).unwrap_or_default()
 }
 
-pub fn preprocess(r: &fastlgs::preprocess::Report) -> String {
+pub fn preprocess(r: &fastlgs::preprocess::PreprocessReport) -> String {
     let adjusted = r.adjusted.as_ref().map(|a| {
         let verdict = if a.used {
             "bundle adjustment moved all cameras"
@@ -46,9 +46,9 @@ pub fn preprocess(r: &fastlgs::preprocess::Report) -> String {
             a.error_before, a.error_after
         )
     });
-    let there: usize = r.cached.values().map(|c| c[0]).sum();
-    let reused = if there > 0 {
-        format!(", {} cached results were reused", thousands(there))
+    let reused_results: usize = r.cached.values().map(|c| c[0]).sum();
+    let reused = if reused_results > 0 {
+        format!(", {} cached results were reused", thousands(reused_results))
     } else {
         String::new()
     };
@@ -94,7 +94,7 @@ pub fn preprocess(r: &fastlgs::preprocess::Report) -> String {
     ])
 }
 
-pub fn remove(r: &fastlgs::remove::Report) -> String {
+pub fn remove(r: &fastlgs::remove::RemoveReport) -> String {
     table(&[
         (
             "scene",
@@ -116,14 +116,14 @@ pub fn remove(r: &fastlgs::remove::Report) -> String {
     ])
 }
 
-pub fn train(r: &fastlgs::train::Report) -> String {
+pub fn train(r: &fastlgs::train::TrainReport) -> String {
     let held_out = decibels(r.psnr_held_out);
     let colour = if held_out.is_empty() {
         "not measured: no photos are held out".to_owned()
     } else {
         format!("{held_out} on held-out photos")
     };
-    let dropped = r.mapping_summary.as_ref().map(|s| {
+    let rejected = r.mapping_summary.as_ref().map(|s| {
         let left_out = s.few_views + s.unsupported + s.same;
         format!(
             " from {} masks; {left_out} proposals were rejected",
@@ -151,7 +151,7 @@ pub fn train(r: &fastlgs::train::Report) -> String {
             format!(
                 "{} objects and parts{}",
                 thousands(r.objects),
-                dropped.unwrap_or_default()
+                rejected.unwrap_or_default()
             ),
         ),
         (
@@ -174,7 +174,7 @@ pub fn train(r: &fastlgs::train::Report) -> String {
     ])
 }
 
-pub fn render(r: &fastlgs::render::Report) -> String {
+pub fn render(r: &fastlgs::render::RenderReport) -> String {
     let mean = r.render_ms.iter().sum::<f64>() / r.render_ms.len().max(1) as f64;
     let mut lines: Vec<String> = r
         .files
@@ -191,12 +191,12 @@ pub fn render(r: &fastlgs::render::Report) -> String {
     lines.join("\n")
 }
 
-pub fn export(r: &fastlgs::export::Report) -> String {
+pub fn export(r: &fastlgs::export::ExportReport) -> String {
     let r = match r {
-        fastlgs::export::Report::Path { output, frames, .. } => {
+        fastlgs::export::ExportReport::Path { output, frames, .. } => {
             return format!("{}: a camera path of {frames} views", output.display());
         }
-        fastlgs::export::Report::Scene(scene) => scene,
+        fastlgs::export::ExportReport::Scene(scene) => scene,
     };
     let quality = match (r.psnr_held_out.before, r.psnr_held_out.after) {
         (Some(before), Some(after)) => {
@@ -228,7 +228,7 @@ pub fn export(r: &fastlgs::export::Report) -> String {
     ])
 }
 
-pub fn share(r: &share::Report) -> String {
+pub fn share(r: &share::ShareReport) -> String {
     let folder = r.output.display();
     let said = table(&[
         (
@@ -248,7 +248,7 @@ pub fn share(r: &share::Report) -> String {
     format!("{said}\n\ntry it:  python3 -m http.server -d {folder}")
 }
 
-pub fn synth(r: &fastlgs::synth::Report) -> String {
+pub fn synth(r: &fastlgs::synth::SynthReport) -> String {
     let photos = r.photos.display();
     format!(
         "{photos}: {} photos at {} of '{}', with exact poses, depths, masks and labels\nobjects: {}",
@@ -259,7 +259,7 @@ pub fn synth(r: &fastlgs::synth::Report) -> String {
     )
 }
 
-pub fn teach(r: &fastlgs::teach::Report) -> String {
+pub fn teach(r: &fastlgs::teach::TeachReport) -> String {
     let shown = r
         .object
         .map_or_else(|| "the picture".to_owned(), |id| format!("object {id}"));
@@ -272,8 +272,9 @@ pub fn teach(r: &fastlgs::teach::Report) -> String {
     )
 }
 
-pub fn eval(r: &fastlgs::eval::Report) -> String {
-    let two = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
+pub fn eval(r: &fastlgs::eval::EvalReport) -> String {
+    let two_decimals =
+        |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |v| format!("{v:.2}"));
     let aligned = r
         .psnr_aligned
         .map(|p| format!(", {p:.2} dB with aligned poses"))
@@ -286,7 +287,7 @@ pub fn eval(r: &fastlgs::eval::Report) -> String {
         )
     });
     let labelled = r.labels_scored > 0;
-    let only = |words: String| if labelled { words } else { String::new() };
+    let if_labelled = |words: String| if labelled { words } else { String::new() };
     let outcomes = r.outcomes.iter().map(|(outcome, count)| {
         let words = match outcome {
             Outcome::Right => "correct",
@@ -315,28 +316,28 @@ pub fn eval(r: &fastlgs::eval::Report) -> String {
         ("colour", colour.unwrap_or_default()),
         (
             "objects",
-            only(format!(
+            if_labelled(format!(
                 "oracle mIoU {} over {} labels in {} views",
-                two(r.oracle_miou),
+                two_decimals(r.oracle_miou),
                 r.labels_scored,
                 r.views_scored
             )),
         ),
         (
             "texts",
-            only(format!(
+            if_labelled(format!(
                 "mIoU {}: {}",
-                two(r.miou),
+                two_decimals(r.miou),
                 outcomes.collect::<Vec<_>>().join(", ")
             )),
         ),
         (
             "absent",
-            only(format!(
+            if_labelled(format!(
                 "{} of {} absent names are rejected{coloured}; AUROC {}",
                 r.absent_rejected,
                 r.absent_texts,
-                two(r.absent_auroc)
+                two_decimals(r.absent_auroc)
             )),
         ),
         (
@@ -359,7 +360,7 @@ pub fn eval(r: &fastlgs::eval::Report) -> String {
         .max()
         .unwrap_or(0);
     for (name, oracle) in &r.oracle_by_label {
-        let asked = two(r.miou_by_label.get(name).copied().flatten());
+        let asked = two_decimals(r.miou_by_label.get(name).copied().flatten());
         let place = r
             .oracle_rank_by_label
             .get(name)
@@ -367,7 +368,7 @@ pub fn eval(r: &fastlgs::eval::Report) -> String {
             .unwrap_or_default();
         text += &format!(
             "\n  {name:width$}  text IoU {asked}, oracle IoU {}{place}",
-            two(*oracle)
+            two_decimals(*oracle)
         );
     }
     text
@@ -379,7 +380,7 @@ mod tests {
 
     #[test]
     fn reports_are_short_tables() {
-        let made = fastlgs::train::Report {
+        let made = fastlgs::train::TrainReport {
             gaussians: 28782,
             objects: 596,
             seconds: 87.2,
@@ -387,7 +388,7 @@ mod tests {
             size: "270x480".into(),
             ..Default::default()
         };
-        let said = train(&fastlgs::train::Report {
+        let said = train(&fastlgs::train::TrainReport {
             psnr_held_out: Some(31.932),
             ..made.clone()
         });
@@ -399,7 +400,7 @@ mod tests {
         );
         assert!(train(&made).contains("no photos are held out"));
         let some = |v: f64| Some(v);
-        let plain = fastlgs::eval::Report {
+        let plain = fastlgs::eval::EvalReport {
             gaussians: 12,
             objects: 3,
             ..Default::default()
@@ -410,7 +411,7 @@ mod tests {
             "values that were not measured are left out: {}",
             eval(&plain)
         );
-        let labelled = fastlgs::eval::Report {
+        let labelled = fastlgs::eval::EvalReport {
             labels_scored: 2,
             views_scored: 1,
             miou: some(0.4),

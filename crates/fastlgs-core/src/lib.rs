@@ -47,5 +47,5 @@ pub use gaussians::Gaussians;
 pub use label_map::LabelMap;
 pub use mask_list::{Level, MaskList};
 pub use scene_folder::SceneFolder;
-pub use shares::Shares;
+pub use shares::IdWeights;
 pub use world_frame::WorldFrame;

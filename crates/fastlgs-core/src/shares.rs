@@ -9,7 +9,7 @@ pub const IDS_PER_PIXEL: usize = 4;
 /// Blending weights (alpha x transmittance) of a view, summed by object id. Each pixel keeps the
 /// [`IDS_PER_PIXEL`] largest.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shares {
+pub struct IdWeights {
     /// Width in pixels.
     pub width: u32,
     /// Height in pixels.
@@ -29,7 +29,7 @@ pub fn unpack(share: u32) -> (u16, u32) {
     ((share >> 16) as u16, share & 0xffff)
 }
 
-impl Shares {
+impl IdWeights {
     /// Returns a mask of the pixels whose weight belongs mostly to the ids with `member[id]`. Ids
     /// beyond the list are not members.
     pub fn mask(&self, member: &[bool]) -> Vec<bool> {
@@ -100,7 +100,7 @@ mod tests {
             shares(&[(3, 0.2)]),
             shares(&[(0, 0.5), (7, 0.5)]),
         ];
-        let shares = Shares {
+        let shares = IdWeights {
             width: 3,
             height: 1,
             pixels,
@@ -128,7 +128,7 @@ mod tests {
             shares(&[(1, 0.4)]),
             shares(&[(9, 1.0)]),
         ];
-        let shares = Shares {
+        let shares = IdWeights {
             width: 6,
             height: 1,
             pixels,

@@ -12,7 +12,7 @@
 //! As in MaskClustering (arXiv 2401.07745), whole masks of all views decide, not the borders of
 //! two. There, however, each mask belongs to one object only.
 
-use crate::sightings::{Fit, MIN_PIXELS, MaskId, Scratch, Sightings};
+use crate::sightings::{Fit, MIN_PIXELS, MaskId, Observations, Scratch};
 use rayon::prelude::*;
 
 /// A set of Gaussians on which masks of several views agree.
@@ -30,7 +30,7 @@ const ROUNDS: usize = 8;
 const BATCH: usize = 256;
 
 /// Returns the distinct proposals of all masks. At least `min_views` views show each of them.
-pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
+pub fn proposals(sightings: &Observations, min_views: usize) -> Vec<Proposal> {
     // Tracks come first, then single masks in scattered order, so that a batch rarely contains the
     // same object twice.
     let mut seeds: Vec<Vec<MaskId>> = sightings.tracks();
@@ -73,7 +73,7 @@ pub fn proposals(sightings: &Sightings, min_views: usize) -> Vec<Proposal> {
 /// Refines the Gaussians of the seed masks until their masks do not change, in at most [`ROUNDS`]
 /// rounds. Returns `None` if fewer than `min_views` views show the set.
 fn refine(
-    sightings: &Sightings,
+    sightings: &Observations,
     seed: &[MaskId],
     min_views: usize,
     scratch: &mut Scratch,
@@ -99,7 +99,7 @@ fn refine(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Sighting;
+    use crate::sightings::Observation;
     use fastlgs_core::mask_list::{AtomTable, Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 
@@ -126,10 +126,10 @@ mod tests {
         let seen = atoms.iter().enumerate().map(|(view, a)| {
             let shown = (0..12).filter(|g| shows(view, *g));
             shown
-                .map(|g| Sighting::new(g, a.map.at(g, 0), 50.0))
+                .map(|g| Observation::new(g, a.map.at(g, 0), 50.0))
                 .collect()
         });
-        let mut sets: Vec<Vec<u32>> = proposals(&Sightings::new(12, seen.collect(), &tables), 3)
+        let mut sets: Vec<Vec<u32>> = proposals(&Observations::new(12, seen.collect(), &tables), 3)
             .into_iter()
             .map(|p| p.set)
             .collect();

@@ -5,11 +5,11 @@ use crate::grid::Grid;
 use crate::overlaps::representative_id;
 use crate::query::Hit;
 use fastlgs_core::shares::{IDS_PER_PIXEL, unpack};
-use fastlgs_core::{LabelMap, Shares};
+use fastlgs_core::{IdWeights, LabelMap};
 
 /// Returns for each pixel the id that represents its objects. `lists`: the objects of each id,
 /// smallest first.
-pub fn ids(shares: &Shares, lists: &[Vec<u16>]) -> LabelMap {
+pub fn ids(shares: &IdWeights, lists: &[Vec<u16>]) -> LabelMap {
     let found = |pixel: &[u32; IDS_PER_PIXEL]| {
         pixel
             .map(unpack)
@@ -32,7 +32,7 @@ pub fn ids(shares: &Shares, lists: &[Vec<u16>]) -> LabelMap {
 /// The rendered object data of a view.
 pub enum Field {
     /// Id weights, for scenes with lifted object ids.
-    Shares(Shares),
+    Shares(IdWeights),
     /// Rendered codes, for scenes with trained features (paper).
     Features {
         /// Pixels along x.
@@ -170,7 +170,7 @@ mod tests {
             [pack(2, 0.9), 0, 0, 0],
             [pack(3, 1.0), 0, 0, 0],
         ];
-        let field = Field::Shares(Shares {
+        let field = Field::Shares(IdWeights {
             width: 3,
             height: 1,
             pixels,

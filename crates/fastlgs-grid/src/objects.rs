@@ -3,13 +3,13 @@
 use crate::consensus::Proposal;
 use crate::grid::PART;
 use crate::overlaps::{self, Overlaps};
-use crate::sightings::Sightings;
+use crate::sightings::Observations;
 use crate::support::Support;
 use std::collections::BTreeSet;
 
 /// Conditions for a set to be an object.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Config {
+pub struct SelectionConfig {
     /// Smallest number of views that show it, each with at least
     /// [`MIN_PIXELS`](crate::sightings::MIN_PIXELS). Distant glimpses do not count.
     pub min_views: usize,
@@ -19,7 +19,7 @@ pub struct Config {
     pub same: f32,
 }
 
-impl Default for Config {
+impl Default for SelectionConfig {
     fn default() -> Self {
         Self {
             min_views: 3,
@@ -82,11 +82,11 @@ impl Chosen {
 ///
 /// `pixels`: mean number of pixels of a view.
 pub fn choose(
-    sightings: &Sightings,
+    sightings: &Observations,
     sets: Vec<Proposal>,
     support: Vec<Support>,
     pixels: usize,
-    config: &Config,
+    config: &SelectionConfig,
 ) -> Chosen {
     let mut chosen = Chosen::default();
     let mut left: Vec<(Proposal, Support)> = Vec::new();
@@ -203,12 +203,12 @@ impl SetsByGaussian {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Sighting;
+    use crate::sightings::Observation;
 
     /// Returns the objects of sets of 20 Gaussians with these supports. Each Gaussian covers 100
     /// pixels in each of four views of 10,000.
-    fn chosen(sets: &[(std::ops::Range<u32>, f32)], config: &Config) -> Chosen {
-        let seen = (0..20).map(|g| Sighting::new(g, 0, 400.0)).collect();
+    fn chosen(sets: &[(std::ops::Range<u32>, f32)], config: &SelectionConfig) -> Chosen {
+        let seen = (0..20).map(|g| Observation::new(g, 0, 400.0)).collect();
         let table = fastlgs_core::MaskList::new(1, 1).atoms().table;
         let proposals = sets
             .iter()
@@ -222,7 +222,7 @@ mod tests {
             areas: (0..4).map(|v| (100 * set.len() as u32, v)).collect(),
         };
         choose(
-            &Sightings::new(20, vec![seen], &[table]),
+            &Observations::new(20, vec![seen], &[table]),
             proposals,
             sets.iter().map(support).collect(),
             10_000,
@@ -236,7 +236,7 @@ mod tests {
         // that overlaps the object.
         let found = chosen(
             &[(1..5, 0.9), (2..12, 0.8), (6..9, 0.2), (10..16, 1.0)],
-            &Config::default(),
+            &SelectionConfig::default(),
         );
         assert_eq!(
             (found.parents.as_slice(), found.dropped),
@@ -270,9 +270,9 @@ mod tests {
         assert_eq!(
             chosen(
                 &[(0..5, 0.9)],
-                &Config {
+                &SelectionConfig {
                     min_views: 5,
-                    ..Config::default()
+                    ..SelectionConfig::default()
                 }
             )
             .dropped,
@@ -284,7 +284,7 @@ mod tests {
     fn of_two_that_are_nearly_the_same_the_better_one_stays() {
         let found = chosen(
             &[(0..8, 0.6), (0..19, 0.9), (0..20, 0.8)],
-            &Config::default(),
+            &SelectionConfig::default(),
         );
         assert_eq!(
             (

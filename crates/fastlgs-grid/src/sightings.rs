@@ -21,13 +21,13 @@ impl Weight {
 
 /// Blending weight of one Gaussian on one atom of a view.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Sighting {
+pub struct Observation {
     gaussian: u32,
     atom: u16,
     weight: Weight,
 }
 
-impl Sighting {
+impl Observation {
     /// `weight`: sum of blending weights in pixels.
     pub fn new(gaussian: u32, atom: u16, weight: f32) -> Self {
         Self {
@@ -64,7 +64,7 @@ struct ViewMasks {
 }
 
 impl ViewMasks {
-    fn new(mut seen: Vec<Sighting>, table: &AtomTable, first: MaskId) -> Self {
+    fn new(mut seen: Vec<Observation>, table: &AtomTable, first: MaskId) -> Self {
         seen.sort_by_key(|s| (s.atom, s.gaussian));
         let mut atoms = vec![Vec::new(); table.areas.len()];
         for atom in 0..table.count() {
@@ -96,7 +96,7 @@ impl ViewMasks {
 }
 
 /// All observations, by Gaussian and by mask.
-pub struct Sightings<'a> {
+pub struct Observations<'a> {
     /// Observations sorted by Gaussian, then by view.
     votes: Vec<Vote>,
     /// For each Gaussian: index of its first vote, with a final end index.
@@ -141,10 +141,10 @@ pub struct Scratch {
 /// Smallest weight in pixels for a view to show a set, or for a mask to be used.
 pub const MIN_PIXELS: f32 = 30.0;
 
-impl<'a> Sightings<'a> {
+impl<'a> Observations<'a> {
     /// Indexes the observations of each view. `gaussians`: number of Gaussians; `tables`: mask
     /// tables of all views.
-    pub fn new(gaussians: usize, views: Vec<Vec<Sighting>>, tables: &'a [AtomTable]) -> Self {
+    pub fn new(gaussians: usize, views: Vec<Vec<Observation>>, tables: &'a [AtomTable]) -> Self {
         let mut begin = vec![0usize; gaussians + 1];
         views
             .iter()
@@ -161,7 +161,7 @@ impl<'a> Sightings<'a> {
             begin[gaussians]
         ];
         for (view, seen) in views.iter().enumerate() {
-            for Sighting {
+            for Observation {
                 gaussian,
                 atom,
                 weight,
@@ -415,11 +415,11 @@ mod tests {
             .iter()
             .map(|a| {
                 (0..10)
-                    .map(|g| Sighting::new(g, a.map.at(g, 0), 40.0))
+                    .map(|g| Observation::new(g, a.map.at(g, 0), 40.0))
                     .collect()
             })
             .collect();
-        let sightings = Sightings::new(10, seen, &tables);
+        let sightings = Observations::new(10, seen, &tables);
         assert_eq!(
             (
                 sightings.pixels.as_slice(),

@@ -1,7 +1,7 @@
 //! Global mapping, step 3: IoU of each elected set with the masks of each view.
 
 use crate::consensus::Proposal;
-use crate::sightings::Sightings;
+use crate::sightings::Observations;
 use rayon::prelude::*;
 
 /// Support of a set of Gaussians by masks.
@@ -15,7 +15,7 @@ pub struct Support {
 }
 
 /// Computes the support of each set.
-pub fn support(sightings: &Sightings, sets: &[Proposal]) -> Vec<Support> {
+pub fn support(sightings: &Observations, sets: &[Proposal]) -> Vec<Support> {
     let of = |scratch: &mut _, set: &Proposal| {
         let shown = sightings.view_fits(&set.set, scratch);
         let (pixels, common) = shown.iter().fold((0.0, 0.0), |(pixels, common), s| {
@@ -41,7 +41,7 @@ pub fn support(sightings: &Sightings, sets: &[Proposal]) -> Vec<Support> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Sighting;
+    use crate::sightings::Observation;
     use fastlgs_core::mask_list::{Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 
@@ -56,11 +56,11 @@ mod tests {
         .atoms();
         let seen = |_| {
             (0..5)
-                .map(|g| Sighting::new(g, atoms.map.at(g, 0), 100.0))
+                .map(|g| Observation::new(g, atoms.map.at(g, 0), 100.0))
                 .collect()
         };
         let tables = [(); 3].map(|()| atoms.table.clone());
-        let sightings = Sightings::new(5, [(); 3].map(seen).to_vec(), &tables);
+        let sightings = Observations::new(5, [(); 3].map(seen).to_vec(), &tables);
         let sets = [0..2, 1..2, 0..4, 4..5, 0..5].map(|set| Proposal {
             set: set.collect(),
             masks: Vec::new(),

@@ -1,7 +1,7 @@
 //! The Python class `Answer`.
 
 use crate::options::to_python;
-use fastlgs::session::answer::Report;
+use fastlgs::session::answer::AnswerReport;
 use numpy::PyArray2;
 use pyo3::prelude::*;
 
@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 #[pyclass(frozen, module = "fastlgs")]
 pub struct Answer {
     /// Report of the answer.
-    pub report: Report,
+    pub report: AnswerReport,
     /// Mask of the answer, `(height, width)`.
     pub mask: Py<PyArray2<bool>>,
     /// Confidence of the object at each pixel, 0 to 1, `(height, width)`.
@@ -77,7 +77,7 @@ impl Answer {
     }
 
     fn __repr__(&self) -> String {
-        let Report {
+        let AnswerReport {
             text,
             found,
             score,

@@ -19,7 +19,7 @@ pub struct Camera {
 
 impl Camera {
     /// Converts a camera of a scene to world coordinates.
-    pub fn of(camera: fastlgs_core::Camera, frame: &WorldFrame) -> Self {
+    pub fn from_scene(camera: fastlgs_core::Camera, frame: &WorldFrame) -> Self {
         let pose = match frame.is_identity() {
             true => camera.world_to_camera.as_dmat4(),
             false => frame.world_pose(&camera.world_to_camera).inverse(),
@@ -28,7 +28,7 @@ impl Camera {
     }
 
     /// Converts the camera to the coordinates of a scene.
-    pub fn within(&self, frame: &WorldFrame) -> fastlgs_core::Camera {
+    pub fn to_scene(&self, frame: &WorldFrame) -> fastlgs_core::Camera {
         fastlgs_core::Camera {
             world_to_camera: frame.local_pose(&Pose::WorldToCamera(self.pose)),
             ..self.camera.clone()
@@ -83,13 +83,13 @@ impl Camera {
         cy: Option<f32>,
         name: &str,
     ) -> PyResult<Self> {
-        let fits = (1..=16384).contains(&width)
+        let is_valid = (1..=16384).contains(&width)
             && (1..=16384).contains(&height)
             && fx > 0.0
             && fy > 0.0
             && fx.is_finite()
             && fy.is_finite();
-        if !fits {
+        if !is_valid {
             return Err(Error::new_err(format!(
                 "a camera cannot have {width}x{height} pixels and focal lengths {fx} and {fy}; sides must be 1 to 16384 pixels, focal lengths positive"
             )));
@@ -129,7 +129,7 @@ impl Camera {
         name: &str,
     ) -> PyResult<Self> {
         let flip = DMat4::from_diagonal(DVec4::new(1.0, -1.0, -1.0, 1.0));
-        let rows = by_rows(
+        let rows = to_numpy(
             camera_to_world.py(),
             (matrix(camera_to_world)? * flip).inverse(),
         )?;
@@ -162,7 +162,7 @@ impl Camera {
     /// World-to-camera matrix, (4, 4).
     #[getter]
     fn world_to_camera<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        by_rows(py, self.pose)
+        to_numpy(py, self.pose)
     }
 
     /// Returns the same view at another size. The field of view stays the same along each axis.
@@ -187,7 +187,7 @@ impl Camera {
 }
 
 /// Converts a matrix to a NumPy array, (4, 4).
-fn by_rows<'py>(py: Python<'py>, matrix: DMat4) -> PyResult<Bound<'py, PyAny>> {
+fn to_numpy<'py>(py: Python<'py>, matrix: DMat4) -> PyResult<Bound<'py, PyAny>> {
     let rows = matrix.transpose().to_cols_array().to_vec();
     Ok(numpy::PyArray1::from_vec(py, rows)
         .reshape([4, 4])?

@@ -24,7 +24,7 @@ create_exception!(
 );
 
 /// Converts an error of the pipeline to a Python exception.
-fn raised(error: impl Into<fastlgs::Error>) -> PyErr {
+fn to_py_error(error: impl Into<fastlgs::Error>) -> PyErr {
     Error::new_err(fastlgs::one_sentence(&error.into()))
 }
 
@@ -43,18 +43,18 @@ fn make<'py>(
     effort: Option<&str>,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::preprocess::Config {
+    let defaults = fastlgs::preprocess::PreprocessConfig {
         photos,
         output,
         ..Default::default()
     };
-    let usual = fastlgs::make::Config::default();
+    let usual = fastlgs::make::MakeConfig::default();
     let effort = effort
         .map(|effort| options::value_of("effort", effort))
         .transpose()?
         .unwrap_or(usual.effort);
-    let config = fastlgs::make::Config {
-        preprocess: options::with(&known, options)?,
+    let config = fastlgs::make::MakeConfig {
+        preprocess: options::with_options(&defaults, options)?,
         effort,
     };
     let made = stage::run(py, progress, device, seed, move |run| {
@@ -75,7 +75,7 @@ fn preprocess<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::preprocess::Config {
+    let known = fastlgs::preprocess::PreprocessConfig {
         photos,
         output,
         ..Default::default()
@@ -102,7 +102,7 @@ fn train<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::train::Config {
+    let known = fastlgs::train::TrainConfig {
         scene,
         ..Default::default()
     };
@@ -121,7 +121,7 @@ fn synth<'py>(
     seed: u64,
     options: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let known = fastlgs::synth::Config {
+    let known = fastlgs::synth::SynthConfig {
         kind,
         output,
         ..Default::default()

@@ -8,12 +8,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-fn refused(error: impl std::fmt::Display) -> PyErr {
+fn to_error(error: impl std::fmt::Display) -> PyErr {
     Error::new_err(error.to_string())
 }
 
 /// Converts an option that is not JSON: NumPy numbers and arrays, and paths.
-fn plain<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+fn to_json_type<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
     if value.hasattr("tolist")? {
         return value.call_method0("tolist");
     }
@@ -25,26 +25,26 @@ fn plain<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
 ///
 /// # Errors
 /// An unknown option, or a value of the wrong type.
-pub fn with<T: Serialize + DeserializeOwned>(
+pub fn with_options<T: Serialize + DeserializeOwned>(
     known: &T,
     options: Option<&Bound<'_, PyDict>>,
 ) -> PyResult<T> {
-    let mut all = serde_json::to_value(known).map_err(refused)?;
+    let mut all = serde_json::to_value(known).map_err(to_error)?;
     let Some(options) = options else {
-        return serde_json::from_value(all).map_err(refused);
+        return serde_json::from_value(all).map_err(to_error);
     };
     let py = options.py();
     let default = PyCFunction::new_closure(py, None, None, |arguments, _| {
-        plain(&arguments.get_item(0)?).map(Bound::unbind)
+        to_json_type(&arguments.get_item(0)?).map(Bound::unbind)
     })?;
-    let how = [("default", default)].into_py_dict(py)?;
+    let keywords = [("default", default)].into_py_dict(py)?;
     let dumped = py
         .import("json")?
-        .call_method("dumps", (options,), Some(&how));
+        .call_method("dumps", (options,), Some(&keywords));
     let plain =
         dumped.map_err(|error| Error::new_err(format!("an option is not valid: {error}")))?;
     let given: serde_json::Map<String, Value> =
-        serde_json::from_str(&plain.extract::<String>()?).map_err(refused)?;
+        serde_json::from_str(&plain.extract::<String>()?).map_err(to_error)?;
     for (name, value) in given {
         // `init_ply` is an alias of `init`.
         let name = if name == "init_ply" {
@@ -72,7 +72,7 @@ pub fn with<T: Serialize + DeserializeOwned>(
             )));
         }
     }
-    serde_json::from_value(all).map_err(refused)
+    serde_json::from_value(all).map_err(to_error)
 }
 
 /// Returns a value of an option by its name, such as `quick`.
@@ -89,6 +89,6 @@ pub fn value_of<T: DeserializeOwned>(option: &str, name: &str) -> PyResult<T> {
 /// # Errors
 /// None for the reports of this crate.
 pub fn to_python<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, PyAny>> {
-    let text = serde_json::to_string(value).map_err(refused)?;
+    let text = serde_json::to_string(value).map_err(to_error)?;
     py.import("json")?.call_method1("loads", (text,))
 }

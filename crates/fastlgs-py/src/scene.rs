@@ -5,10 +5,9 @@ use crate::camera::Camera;
 use crate::fork;
 use crate::options::to_python;
 use crate::texts::Texts;
-use crate::{Error, raised};
-use fastlgs::Session;
-use fastlgs::session::answer::{CANDIDATES, Question};
-use fastlgs::session::ask::Ask;
+use crate::{Error, to_py_error};
+use fastlgs::session::answer::{CANDIDATES, QueryRequest};
+use fastlgs::session::ask::ObjectQuery;
 use fastlgs::session::{Pixels, selection};
 use fastlgs_core::gaussians::rest_len;
 use fastlgs_grid::Grid;
@@ -27,12 +26,12 @@ use std::time::Instant;
 
 /// One pixel, or several pixels of one object.
 #[derive(FromPyObject)]
-enum Pointed {
+enum PointArgument {
     One([u32; 2]),
     Several(Vec<[u32; 2]>),
 }
 
-impl Pointed {
+impl PointArgument {
     fn pixels(self) -> PyResult<Pixels> {
         let pixels = match self {
             Self::One(pixel) => vec![pixel],
@@ -49,21 +48,21 @@ pub struct Scene {
 }
 
 struct Opened {
-    session: Session,
+    session: fastlgs::Scene,
     grid: Grid,
     /// Camera and field of the view that was rendered last.
-    shown: Option<(fastlgs_core::Camera, Field)>,
+    last_field: Option<(fastlgs_core::Camera, Field)>,
 }
 
 /// The view of a query or picture.
 #[derive(Clone)]
-enum Which {
+enum ViewArgument {
     First,
     Named(String),
     Given(Box<Camera>),
 }
 
-impl Which {
+impl ViewArgument {
     /// Reads the name of a view or a `Camera`; `None` means the first view.
     fn of(view: Option<&Bound<'_, PyAny>>) -> PyResult<Self> {
         let Some(view) = view else {
@@ -90,17 +89,19 @@ impl Scene {
     ) -> PyResult<T> {
         fork::check()?;
         py.detach(|| work(&mut self.opened.lock().unwrap_or_else(PoisonError::into_inner)))
-            .map_err(raised)
+            .map_err(to_py_error)
     }
 }
 
 impl Opened {
-    fn camera(&self, which: &Which) -> fastlgs::Result<fastlgs_core::Camera> {
+    fn camera(&self, which: &ViewArgument) -> fastlgs::Result<fastlgs_core::Camera> {
         let cameras = &self.session.cameras;
         Ok(match which {
-            Which::Given(camera) => camera.within(&self.session.manifest.frame),
-            Which::Named(name) => cameras[self.session.folder.view_index(cameras, name)?].clone(),
-            Which::First => {
+            ViewArgument::Given(camera) => camera.to_scene(&self.session.manifest.frame),
+            ViewArgument::Named(name) => {
+                cameras[self.session.folder.view_index(cameras, name)?].clone()
+            }
+            ViewArgument::First => {
                 let first = cameras.first().cloned();
                 first.ok_or_else(|| fastlgs::Error::Invalid("the scene has no views".to_owned()))?
             }
@@ -108,17 +109,21 @@ impl Opened {
     }
 
     /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
-    fn look(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<f64> {
+    fn render_field(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<f64> {
         let started = Instant::now();
-        if self.shown.as_ref().is_none_or(|(shown, _)| shown != camera) {
-            self.shown = Some((camera.clone(), self.session.field(camera, None)?));
+        if self
+            .last_field
+            .as_ref()
+            .is_none_or(|(shown, _)| shown != camera)
+        {
+            self.last_field = Some((camera.clone(), self.session.field(camera, None)?));
         }
         Ok(started.elapsed().as_secs_f64() * 1e3)
     }
 }
 
 /// Converts values in row-major order to a NumPy array of this shape.
-fn table<'py, T: numpy::Element>(
+fn to_numpy<'py, T: numpy::Element>(
     py: Python<'py>,
     values: Vec<T>,
     shape: &[usize],
@@ -143,7 +148,7 @@ impl Scene {
     ) -> PyResult<Self> {
         fork::check()?;
         let open = || -> fastlgs::Result<Opened> {
-            let mut session = Session::open(&path, device)?;
+            let mut session = fastlgs::Scene::open(&path, device)?;
             session.clip_text = clip_text;
             if let Some(embed) = embed_text {
                 session.use_text_encoder(Box::new(Texts(embed)))?;
@@ -152,11 +157,11 @@ impl Scene {
             Ok(Opened {
                 session,
                 grid,
-                shown: None,
+                last_field: None,
             })
         };
         Ok(Self {
-            opened: Mutex::new(py.detach(open).map_err(raised)?),
+            opened: Mutex::new(py.detach(open).map_err(to_py_error)?),
         })
     }
 
@@ -200,9 +205,9 @@ impl Scene {
 
     /// Returns the camera of a view.
     fn camera(&self, py: Python<'_>, view: &Bound<'_, PyAny>) -> PyResult<Camera> {
-        let which = Which::of(Some(view))?;
+        let which = ViewArgument::of(Some(view))?;
         self.with(py, |opened| {
-            Ok(Camera::of(
+            Ok(Camera::from_scene(
                 opened.camera(&which)?,
                 &opened.session.manifest.frame,
             ))
@@ -219,16 +224,16 @@ impl Scene {
         py: Python<'_>,
         text: Option<String>,
         view: Option<&Bound<'_, PyAny>>,
-        point: Option<Pointed>,
+        point: Option<PointArgument>,
         image: Option<PyReadonlyArray3<'_, u8>>,
         negatives: Vec<String>,
         false_alarms: Option<f32>,
         top_k: Option<usize>,
     ) -> PyResult<Answer> {
         let ask = match (text, point, image) {
-            (Some(text), None, None) => Ask::Text(text),
-            (None, Some(point), None) => Ask::Point(point.pixels()?),
-            (None, None, Some(image)) => Ask::Image("image".to_owned(), picture(&image)?),
+            (Some(text), None, None) => ObjectQuery::Text(text),
+            (None, Some(point), None) => ObjectQuery::Point(point.pixels()?),
+            (None, None, Some(image)) => ObjectQuery::Image("image".to_owned(), picture(&image)?),
             _ => {
                 return Err(Error::new_err(
                     "query in one way: give a text, a point or an image",
@@ -245,29 +250,29 @@ impl Scene {
                 "false_alarms must be a number from 0 to 1, and top_k at least 1",
             ));
         }
-        let which = Which::of(view)?;
+        let which = ViewArgument::of(view)?;
         let (camera, report, mask, relevancy) = self.with(py, |opened| {
             let camera = opened.camera(&which)?;
-            let render_ms = opened.look(&camera)?;
+            let render_ms = opened.render_field(&camera)?;
             let Opened {
                 session,
                 grid,
-                shown,
+                last_field,
             } = opened;
-            let Some((_, field)) = shown else {
+            let Some((_, field)) = last_field else {
                 unreachable!("rendered above")
             };
-            let question = Question {
+            let question = QueryRequest {
                 ask: &ask,
                 negatives: &negatives,
                 config,
                 dilate: None,
                 candidates: CANDIDATES,
             };
-            let (answer, mut report) = question.put(session, grid, field, &camera, render_ms)?;
+            let (answer, mut report) = question.answer(session, grid, field, &camera, render_ms)?;
             let relevancy = field.relevancy(grid, &answer.found.heat());
             let mask = answer.mask;
-            report.look_elsewhere(session, grid)?;
+            report.find_best_view(session, grid)?;
             Ok((camera, report, mask, relevancy))
         })?;
         let shape = [camera.height as usize, camera.width as usize];
@@ -286,11 +291,16 @@ impl Scene {
     #[getter]
     fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let area = |areas: &[f32]| areas.iter().fold(0.0f32, |most, area| most.max(*area));
-        let told = |o: &Object| json!({ "id": o.id, "parent": o.parent, "support": o.support, "views": o.views, "area": area(&o.areas), "code": o.code.to_array() });
+        let description = |o: &Object| json!({ "id": o.id, "parent": o.parent, "support": o.support, "views": o.views, "area": area(&o.areas), "code": o.code.to_array() });
         to_python(
             py,
             &self.with(py, |opened| {
-                Ok(opened.grid.objects.iter().map(told).collect::<Vec<_>>())
+                Ok(opened
+                    .grid
+                    .objects
+                    .iter()
+                    .map(description)
+                    .collect::<Vec<_>>())
             })?,
         )
     }
@@ -310,7 +320,7 @@ impl Scene {
             Ok(object.ok_or_else(unknown)?.embeddings.clone())
         })?;
         let columns = embeddings.first().map_or(0, Vec::len);
-        table(py, embeddings.concat(), &[embeddings.len(), columns])
+        to_numpy(py, embeddings.concat(), &[embeddings.len(), columns])
     }
 
     /// Renders a view: `color` uint8 (h, w, 3), `depth` float32 (h, w) in world units, `feature`
@@ -322,7 +332,7 @@ impl Scene {
         view: Option<&Bound<'py, PyAny>>,
         what: &str,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let which = Which::of(view)?;
+        let which = ViewArgument::of(view)?;
         let size = |camera: &fastlgs_core::Camera| [camera.height as usize, camera.width as usize];
         let planes = |color: bool| {
             self.with(py, |opened| {
@@ -352,11 +362,11 @@ impl Scene {
                     .into_iter()
                     .map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8)
                     .collect();
-                table(py, bytes, &[h, w, 3])
+                to_numpy(py, bytes, &[h, w, 3])
             }
             "feature" => {
                 let ([h, w], values) = planes(false)?;
-                table(py, values, &[h, w, 3])
+                to_numpy(py, values, &[h, w, 3])
             }
             "depth" => {
                 let (size, values) = self.with(py, |opened| {
@@ -372,19 +382,19 @@ impl Scene {
                             .collect(),
                     ))
                 })?;
-                table(py, values, &size)
+                to_numpy(py, values, &size)
             }
             "objects" => {
                 let (size, owners) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
-                    opened.look(&camera)?;
+                    opened.render_field(&camera)?;
                     let owners = opened
-                        .shown
+                        .last_field
                         .as_ref()
                         .map(|(_, field)| field.owners(&opened.grid).labels);
                     Ok((size(&camera), owners.unwrap_or_default()))
                 })?;
-                table(py, owners, &size)
+                to_numpy(py, owners, &size)
             }
             other => Err(Error::new_err(format!(
                 "what: '{other}' is unknown; use color, depth, feature or objects"
@@ -442,8 +452,8 @@ impl Scene {
         let arrays = PyDict::new(py);
         // Double precision: single precision would lose digits far from the origin.
         let means = match frame.is_identity() {
-            true => table(py, rows(&scene.means), &[n, 3])?,
-            false => table(
+            true => to_numpy(py, rows(&scene.means), &[n, 3])?,
+            false => to_numpy(
                 py,
                 scene
                     .means
@@ -454,22 +464,22 @@ impl Scene {
             )?,
         };
         arrays.set_item("means", means)?;
-        arrays.set_item("scales", table(py, scales, &[n, 3])?)?;
+        arrays.set_item("scales", to_numpy(py, scales, &[n, 3])?)?;
         arrays.set_item(
             "rotations",
-            table(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?,
+            to_numpy(py, scene.rotations.iter().flat_map(unit).collect(), &[n, 4])?,
         )?;
-        arrays.set_item("opacities", table(py, opacities, &[n])?)?;
+        arrays.set_item("opacities", to_numpy(py, opacities, &[n])?)?;
         arrays.set_item(
             "sh",
-            table(
+            to_numpy(
                 py,
                 sh.flat_map(|c| c.to_array()).collect(),
                 &[n, 1 + rest, 3],
             )?,
         )?;
-        arrays.set_item("features", table(py, rows(&scene.features), &[n, 3])?)?;
-        arrays.set_item("object_ids", table(py, scene.object_ids, &[n])?)?;
+        arrays.set_item("features", to_numpy(py, rows(&scene.features), &[n, 3])?)?;
+        arrays.set_item("object_ids", to_numpy(py, scene.object_ids, &[n])?)?;
         Ok(arrays)
     }
 
@@ -505,7 +515,7 @@ impl Scene {
             py,
             |Opened {
                  session:
-                     Session {
+                     fastlgs::Scene {
                          gaussians,
                          cameras,
                          manifest,

@@ -1,6 +1,6 @@
 //! Runs a stage on its own thread, while Python's main thread receives progress and Ctrl-C.
 
-use crate::{fork, options, raised};
+use crate::{fork, options, to_py_error};
 use fastlgs::Run;
 use fastlgs::progress::{Message, Sink};
 use pyo3::prelude::*;
@@ -12,7 +12,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::time::Duration;
 
 /// Longest time until Ctrl-C is noticed.
-const PATIENCE: Duration = Duration::from_millis(50);
+const SIGNAL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// A progress message that is passed to Python.
 enum Event {
@@ -59,13 +59,13 @@ impl Event {
 }
 
 /// Progress sink that sends events to the main thread, and cancels the stage on request.
-struct Listener<'a> {
+struct EventSink<'a> {
     events: std::sync::Mutex<Sender<Event>>,
     cancelled: &'a AtomicBool,
 }
 
-impl Sink for Listener<'_> {
-    fn tell(&self, message: Message<'_>) {
+impl Sink for EventSink<'_> {
+    fn on_message(&self, message: Message<'_>) {
         let event = match message {
             Message::Started { stage, total } => Event::Stage {
                 stage,
@@ -103,7 +103,7 @@ impl Sink for Listener<'_> {
 
 /// Waits for the next event. A receiver is not `Sync`; `&mut` makes the borrow `Send`.
 fn wait(heard: &mut Receiver<Event>) -> Result<Event, RecvTimeoutError> {
-    heard.recv_timeout(PATIENCE)
+    heard.recv_timeout(SIGNAL_INTERVAL)
 }
 
 /// Runs `work` with the GIL released. `progress` is called with a dictionary for each event.
@@ -124,7 +124,7 @@ pub fn run<T: Send>(
         let (events, mut heard) = channel();
         let cancelled = &cancelled;
         let thread = scope.spawn(move || {
-            let listener = Listener {
+            let listener = EventSink {
                 events: std::sync::Mutex::new(events),
                 cancelled,
             };
@@ -137,7 +137,7 @@ pub fn run<T: Send>(
         let mut interruption = None;
         loop {
             let event = py.detach(|| wait(&mut heard));
-            let told = match &event {
+            let called = match &event {
                 Ok(event) => progress
                     .as_ref()
                     .map_or(Ok(()), |f| f.call1(py, (event.to_python(py)?,)).map(drop)),
@@ -145,7 +145,7 @@ pub fn run<T: Send>(
                 Err(RecvTimeoutError::Disconnected) => break,
             };
             // The first interruption cancels the stage. Later ones are ignored until it has ended.
-            if let (Err(error), None) = (told.and_then(|()| py.check_signals()), &interruption) {
+            if let (Err(error), None) = (called.and_then(|()| py.check_signals()), &interruption) {
                 interruption = Some(error);
                 cancelled.store(true, Ordering::Relaxed);
             }
@@ -153,7 +153,7 @@ pub fn run<T: Send>(
         let result = py.detach(|| thread.join());
         match (interruption, result) {
             (Some(error), _) => Err(error),
-            (None, Ok(result)) => result.map_err(raised),
+            (None, Ok(result)) => result.map_err(to_py_error),
             (None, Err(panic)) => std::panic::resume_unwind(panic),
         }
     })
@@ -172,7 +172,7 @@ pub fn with_options<'py, C: Serialize + DeserializeOwned + Send, R: Serialize + 
     seed: u64,
     stage: fn(&C, &Run) -> fastlgs::Result<R>,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let config = options::with(known, options)?;
+    let config = options::with_options(known, options)?;
     options::to_python(
         py,
         &run(py, progress, device, seed, move |run| stage(&config, run))?,

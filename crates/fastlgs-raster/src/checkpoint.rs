@@ -7,7 +7,7 @@ use crate::Result;
 use crate::budget::Removal;
 use crate::density::State;
 use crate::exposure::{Learned, LearnedExposure};
-use crate::schedule::TrainConfig;
+use crate::schedule::TrainerConfig;
 use fastlgs_core::fs;
 use fastlgs_core::gaussians::channels;
 use fastlgs_core::rng::Rng;
@@ -18,8 +18,8 @@ use std::path::{Path, PathBuf};
 
 /// The state of a training run, except its tensors.
 #[derive(Clone, Serialize, Deserialize)]
-pub(crate) struct Course {
-    pub config: TrainConfig,
+pub(crate) struct TrainingState {
+    pub config: TrainerConfig,
     pub iteration: u32,
     pub gaussians: usize,
     pub order: Vec<usize>,
@@ -47,7 +47,12 @@ fn tensors_path(path: &Path, iteration: u32) -> PathBuf {
 }
 
 /// Writes `path.json` and the tensor file that it names, then removes older tensor files.
-pub(crate) fn save(path: &Path, course: &Course, state: &State, stats: &[f32]) -> Result<()> {
+pub(crate) fn save(
+    path: &Path,
+    course: &TrainingState,
+    state: &State,
+    stats: &[f32],
+) -> Result<()> {
     let n = state.len();
     let shape = vec![channels(state.sh_degree), n];
     let tensors = [
@@ -93,12 +98,12 @@ pub fn remove(path: &Path) {
 }
 
 /// Reads a checkpoint. Returns `None` if there is none.
-pub(crate) fn load(path: &Path) -> Result<Option<(Course, State, Vec<f32>)>> {
+pub(crate) fn load(path: &Path) -> Result<Option<(TrainingState, State, Vec<f32>)>> {
     let header = path.with_extension("json");
     if !header.is_file() {
         return Ok(None);
     }
-    let course: Course = fs::read_json(&header)?;
+    let course: TrainingState = fs::read_json(&header)?;
     let tensors_path = tensors_path(path, course.iteration);
     let mut tensors = load_tensors(&tensors_path)?;
     let mut take = |name: &str, rows: usize| {

@@ -23,7 +23,7 @@ pub struct State {
 
 /// Thresholds of 3DGS.
 #[derive(Clone, Copy, Debug)]
-pub struct Config {
+pub struct DensityConfig {
     /// Mean gradient of the projected centre (in half-image units) above which a Gaussian is cloned
     /// or split.
     pub gradient: f32,
@@ -38,7 +38,7 @@ pub struct Config {
     pub budget: usize,
 }
 
-impl Default for Config {
+impl Default for DensityConfig {
     fn default() -> Self {
         Self {
             gradient: 2e-4,
@@ -201,7 +201,7 @@ pub fn refine(
     state: &mut State,
     stats: &[f32],
     extent: f32,
-    config: &Config,
+    config: &DensityConfig,
     rng: &mut Rng,
 ) -> Counts {
     let n = state.len();
@@ -279,7 +279,7 @@ mod tests {
             &mut s,
             &stats,
             1.0,
-            &Config::default(),
+            &DensityConfig::default(),
             &mut Rng::new(1, "test"),
         );
         assert_eq!(
@@ -309,9 +309,9 @@ mod tests {
         let mut scene = Gaussians::default();
         (0..10).for_each(|i| scene.push_sphere(Vec3::splat(i as f32), 0.5, 0.5, [0.5; 3]));
         let mut s = state(&scene);
-        let config = Config {
+        let config = DensityConfig {
             budget: 13,
-            ..Config::default()
+            ..DensityConfig::default()
         };
         refine(&mut s, &[1.0; 20], 1.0, &config, &mut Rng::new(1, "test"));
         assert_eq!(s.len(), 13);
@@ -331,7 +331,7 @@ mod tests {
                 &mut s,
                 &[0.0; 8],
                 1.0,
-                &Config::default(),
+                &DensityConfig::default(),
                 &mut Rng::new(1, "test")
             )
             .pruned,

@@ -5,7 +5,7 @@ use crate::cpu::ROWS_PER_INVOCATION;
 use crate::density::State;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
-use fastlgs_core::Shares;
+use fastlgs_core::IdWeights;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -210,7 +210,7 @@ pub trait Engine: Send {
     ///
     /// # Errors
     /// As [`Self::render`], and when the number of ids is wrong.
-    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares>;
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<IdWeights>;
     /// Runs one training step towards target `id`: forward, loss, backward, Adam. With
     /// [`Channels::Feature`], geometry must not have changed since the last [`Self::set_state`].
     ///

@@ -47,10 +47,10 @@ pub use gpu_engine::GpuEngine;
 pub use native::CpuEngine;
 pub use open::{Choice, choice, open_engine};
 
-pub use schedule::{Alignment, Budget, TrainConfig};
+pub use schedule::{Alignment, Budget, TrainerConfig};
 pub use shape::Shape;
 pub use target::{Target, Targets};
-pub use trainer::{Progress, TrainReport, Trainer};
+pub use trainer::{Progress, Trainer, TrainerReport};
 pub use view::{Rates, Step, View};
 
 /// Errors of the rasteriser.

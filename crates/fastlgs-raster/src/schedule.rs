@@ -36,7 +36,7 @@ pub enum Alignment {
 
 /// Configuration of a training run; part of every checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct TrainConfig {
+pub struct TrainerConfig {
     /// Optimiser steps.
     pub iterations: u32,
     /// Seed of view order, splitting and left-out Gaussians.
@@ -73,7 +73,7 @@ pub struct TrainConfig {
     pub couples_at: Option<u32>,
 }
 
-impl Default for TrainConfig {
+impl Default for TrainerConfig {
     fn default() -> Self {
         Self {
             iterations: 3000,
@@ -121,7 +121,7 @@ const MEAN_OPACITY_WEIGHT: f32 = 0.04;
 /// Share of the Gaussians that the last step drops if photos are few (DropGaussian).
 const MAX_DROPOUT: f32 = 0.2;
 
-impl TrainConfig {
+impl TrainerConfig {
     /// Returns the share of the run that is done at a step.
     pub(crate) fn progress(&self, iteration: u32) -> f32 {
         iteration as f32 / self.iterations.max(1) as f32
@@ -245,11 +245,11 @@ mod tests {
 
     #[test]
     fn the_schedule_of_a_run() {
-        let config = TrainConfig {
+        let config = TrainerConfig {
             iterations: 8000,
             sh_degree: 3,
             budget: Budget::Auto(1000),
-            ..TrainConfig::default()
+            ..TrainerConfig::default()
         };
         assert_eq!(
             [0, 999, 1000, 2500, 7999].map(|i| config.degree(i)),
@@ -263,7 +263,7 @@ mod tests {
                 && !config.refines(3300)
         );
         let rounds = |iterations: u32| {
-            let config = TrainConfig {
+            let config = TrainerConfig {
                 iterations,
                 ..config.clone()
             };
@@ -275,7 +275,7 @@ mod tests {
             [few(24, 0), few(24, 4000), few(24, 8000), few(25, 8000)],
             [0.0, 0.1, 0.2, 0.0]
         );
-        let frozen = TrainConfig {
+        let frozen = TrainerConfig {
             channels: crate::Channels::Feature,
             ..config.clone()
         };
@@ -286,14 +286,14 @@ mod tests {
         );
         assert_ne!(
             config.step_seed(5),
-            TrainConfig {
+            TrainerConfig {
                 seed: 1,
                 ..config.clone()
             }
             .step_seed(5)
         );
         assert!(!config.resets_opacity(3000), "too late to recover");
-        let long = TrainConfig {
+        let long = TrainerConfig {
             iterations: 30_000,
             ..config.clone()
         };
@@ -307,7 +307,7 @@ mod tests {
             [3599, 3600].map(|i| config.opacity_weight(i, 1, 0.5)),
             [0.5 * MEAN_OPACITY_WEIGHT, 0.0]
         );
-        let continued = TrainConfig {
+        let continued = TrainerConfig {
             first_degree: 2,
             ..config.clone()
         };
@@ -316,7 +316,7 @@ mod tests {
             [2, 2, 3],
             "training continues at the degree of the scene"
         );
-        let frozen = TrainConfig {
+        let frozen = TrainerConfig {
             channels: crate::Channels::Feature,
             ..config
         };

@@ -1,9 +1,9 @@
 //! Handlers of the HTTP interface. `web/openapi.json` describes it for programs.
 
-use crate::desk::{Choice, Desk};
+use crate::desk::{SceneWorker, VisibleObjects};
 use crate::failure::Failure;
 use crate::guard::LARGEST_BODY;
-use crate::shared::Shared;
+use crate::shared::AppState;
 use axum::Json;
 use axum::body::Bytes;
 use axum::extract::rejection::{JsonRejection, PathRejection, QueryRejection};
@@ -12,12 +12,12 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
 use fastlgs::session::Pixels;
-use fastlgs::session::answer::{CANDIDATES, Question};
-use fastlgs::session::ask::Ask;
+use fastlgs::session::answer::{CANDIDATES, QueryRequest};
+use fastlgs::session::ask::ObjectQuery;
 use fastlgs::session::pictures::{heatmap, mask_picture, overlay};
 use fastlgs::session::selection::World;
 use fastlgs::session::{parse_size, selection};
-use fastlgs::teach::learn;
+use fastlgs::teach::teach_object;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::query::{self, QueryConfig};
@@ -34,7 +34,7 @@ const LONGEST_TEXT: usize = 300;
 const MOST_NEGATIVES: usize = 8;
 
 type Answer<T = Json<Value>> = Result<T, Failure>;
-type App = State<Arc<Shared>>;
+type App = State<Arc<AppState>>;
 
 /// `GET /api/scene`: describes the scene, its views and the limits of requests.
 pub async fn scene(State(app): App) -> Answer {
@@ -50,7 +50,7 @@ pub async fn scene(State(app): App) -> Answer {
             let live = app.live.as_ref().ok_or_else(Failure::busy)?;
             json!({ "stage": "training", "antialias": live.antialias, "background": live.background, "objects": 0 })
         }
-        Some(bell) => bell.ask(|desk| Ok(desk.about())).await?,
+        Some(bell) => bell.ask(|desk| Ok(desk.description())).await?,
     };
     if let (Value::Object(all), Value::Object(more)) = (&mut value, more) {
         all.extend(more);
@@ -111,7 +111,7 @@ pub async fn best_view(State(app): App, id: Result<Path<u16>, PathRejection>) ->
 /// Body of `POST /api/names`.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Naming {
+pub struct NameRequest {
     name: String,
     object: u16,
 }
@@ -124,20 +124,20 @@ pub async fn names(State(app): App) -> Answer {
 }
 
 /// `POST /api/names`: teaches the name of an object. Later text queries find it.
-pub async fn name(State(app): App, request: Result<Json<Naming>, JsonRejection>) -> Answer {
+pub async fn name(State(app): App, request: Result<Json<NameRequest>, JsonRejection>) -> Answer {
     let Json(naming) = request?;
     let name = checked_text(&naming.name)?.to_owned();
-    let work = move |desk: &mut Desk| {
-        let known = usize::from(naming.object)
+    let work = move |desk: &mut SceneWorker| {
+        let is_object = usize::from(naming.object)
             .checked_sub(1)
             .is_some_and(|k| k < desk.grid.objects.len());
-        if !known {
+        if !is_object {
             return Err(Failure::new(
                 StatusCode::NOT_FOUND,
                 format!("the scene has no object {}", naming.object),
             ));
         }
-        let learned = learn(&desk.scene, &desk.grid, &name, naming.object)?;
+        let learned = teach_object(&desk.scene, &desk.grid, &name, naming.object)?;
         desk.scene.forget_texts();
         Ok(Json(
             json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples }),
@@ -175,35 +175,37 @@ pub async fn photo(State(app): App, view: Result<Path<String>, PathRejection>) -
 /// Status 400 for both a view and a camera, an unknown view, an invalid camera or size, or too many
 /// pixels.
 fn camera_of(
-    app: &Shared,
+    app: &AppState,
     view: Option<&str>,
     camera: Option<Camera>,
     size: Option<&str>,
 ) -> Answer<Camera> {
     let mut camera = match (view, camera) {
-        (Some(_), Some(_)) => return Err(Failure::bad("give a view or a camera, not both")),
+        (Some(_), Some(_)) => {
+            return Err(Failure::bad_request("give a view or a camera, not both"));
+        }
         (None, Some(camera)) => camera,
         (Some(view), None) => {
             let cameras = app.cameras();
             let index = app
                 .folder
                 .view_index(&cameras, view)
-                .map_err(|e| Failure::bad(e.to_string()))?;
+                .map_err(|e| Failure::bad_request(e.to_string()))?;
             cameras[index].clone()
         }
         (None, None) => app
             .cameras()
             .first()
             .cloned()
-            .ok_or_else(|| Failure::bad("the scene has no views"))?,
+            .ok_or_else(|| Failure::bad_request("the scene has no views"))?,
     };
     if let Some(size) = size {
-        let (w, h) = parse_size(size).map_err(Failure::bad)?;
+        let (w, h) = parse_size(size).map_err(Failure::bad_request)?;
         camera = camera.resized(w, h);
     }
-    camera.check().map_err(Failure::bad)?;
+    camera.check().map_err(Failure::bad_request)?;
     if camera.width.saturating_mul(camera.height) > MOST_PIXELS {
-        return Err(Failure::bad(format!(
+        return Err(Failure::bad_request(format!(
             "{}x{} is too large: at most {} million pixels",
             camera.width,
             camera.height,
@@ -216,8 +218,8 @@ fn camera_of(
 fn checked_text(text: &str) -> Answer<&str> {
     let text = text.trim();
     match text.chars().count() {
-        0 => Err(Failure::bad("the text is empty")),
-        n if n > LONGEST_TEXT => Err(Failure::bad(format!(
+        0 => Err(Failure::bad_request("the text is empty")),
+        n if n > LONGEST_TEXT => Err(Failure::bad_request(format!(
             "the text has {n} characters; at most {LONGEST_TEXT} are allowed"
         ))),
         _ => Ok(text),
@@ -227,7 +229,7 @@ fn checked_text(text: &str) -> Answer<&str> {
 /// Body of `POST /api/query`; exactly one of `text`, `point` and `image` is required.
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
-pub struct Asked {
+pub struct QueryBody {
     text: Option<String>,
     point: Option<Pixels>,
     /// A PNG or JPEG in base64.
@@ -250,7 +252,7 @@ pub struct Asked {
 }
 
 /// `POST /api/query`: answers a query with the fields of `fastlgs query --json`.
-pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>) -> Answer {
+pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejection>) -> Answer {
     let Json(asked) = request?;
     let camera = camera_of(
         &app,
@@ -259,11 +261,11 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         asked.size.as_deref(),
     )?;
     let ask = match (&asked.text, &asked.point, &asked.image) {
-        (Some(text), None, None) => Ask::Text(checked_text(text)?.to_owned()),
+        (Some(text), None, None) => ObjectQuery::Text(checked_text(text)?.to_owned()),
         (None, Some(pixels), None) => match pixels.outside(&camera) {
-            None => Ask::Point(pixels.clone()),
+            None => ObjectQuery::Point(pixels.clone()),
             Some((x, y)) => {
-                return Err(Failure::bad(format!(
+                return Err(Failure::bad_request(format!(
                     "the point {x},{y} lies outside the view of {}x{}",
                     camera.width, camera.height
                 )));
@@ -272,28 +274,32 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         (None, None, Some(data)) => {
             let data = base64::engine::general_purpose::STANDARD
                 .decode(data)
-                .map_err(|e| Failure::bad(format!("image: {e}")))?;
+                .map_err(|e| Failure::bad_request(format!("image: {e}")))?;
             // Decoded on a blocking thread, so that other requests are not delayed.
             let decoded =
                 tokio::task::spawn_blocking(move || image_io::decode_rgb("image", &data)).await;
             let decoded = decoded.map_err(|e| anyhow::anyhow!("image: {e}"))?;
-            Ask::Image(
+            ObjectQuery::Image(
                 "image".into(),
-                decoded.map_err(|e| Failure::bad(e.to_string()))?,
+                decoded.map_err(|e| Failure::bad_request(e.to_string()))?,
             )
         }
-        _ => return Err(Failure::bad("give exactly one of text, point and image")),
+        _ => {
+            return Err(Failure::bad_request(
+                "give exactly one of text, point and image",
+            ));
+        }
     };
     if asked
         .false_alarms
         .is_some_and(|share| !(share > 0.0 && share < 1.0))
     {
-        return Err(Failure::bad(
+        return Err(Failure::bad_request(
             "false_alarms: give a number between 0 and 1, such as 0.05",
         ));
     }
     if asked.negative.len() > MOST_NEGATIVES {
-        return Err(Failure::bad(format!(
+        return Err(Failure::bad_request(format!(
             "negative: at most {MOST_NEGATIVES} texts are allowed"
         )));
     }
@@ -303,35 +309,40 @@ pub async fn query(State(app): App, request: Result<Json<Asked>, JsonRejection>)
         .map(|n| checked_text(n).map(str::to_owned))
         .collect::<Answer<Vec<_>>>()?;
     let (want_mask, want_heat) = (asked.mask, asked.heatmap);
-    let choice = Choice {
+    let choice = VisibleObjects {
         hidden: asked.hidden,
         only: asked.only,
     };
-    let work = move |desk: &mut Desk| {
+    let work = move |desk: &mut SceneWorker| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
             false_alarms: asked.false_alarms.unwrap_or(defaults.false_alarms),
             top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
         };
         let candidates = asked.candidates.unwrap_or(CANDIDATES);
-        let Some(render_ms) = desk.look(&camera, &choice)? else {
-            return Err(Failure::bad(
+        let Some(render_ms) = desk.render_field(&camera, &choice)? else {
+            return Err(Failure::bad_request(
                 "nothing would be left to query; hide fewer objects",
             ));
         };
-        let question = Question {
+        let question = QueryRequest {
             ask: &ask,
             negatives: &negatives,
             config,
             dilate: None,
             candidates,
         };
-        let (answer, mut report) =
-            question.put(&desk.scene, &desk.grid, desk.seen()?, &camera, render_ms)?;
+        let (answer, mut report) = question.answer(
+            &desk.scene,
+            &desk.grid,
+            desk.last_field()?,
+            &camera,
+            render_ms,
+        )?;
         let mask = (want_mask && report.found)
             .then(|| mask_picture(&answer.mask, camera.width, camera.height));
         let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.heat()));
-        report.look_elsewhere(&mut desk.scene, &desk.grid)?;
+        report.find_best_view(&mut desk.scene, &desk.grid)?;
         let mut value = serde_json::to_value(&report).map_err(anyhow::Error::from)?;
         if let Some(mask) = mask {
             value["mask"] = data_url(mask)?;
@@ -354,7 +365,7 @@ fn data_url(picture: impl Into<DynamicImage>) -> Answer<Value> {
 /// Body of `POST /api/render`.
 #[derive(Deserialize, Default)]
 #[serde(deny_unknown_fields, default)]
-pub struct Wanted {
+pub struct RenderRequest {
     view: Option<String>,
     camera: Option<Camera>,
     size: Option<String>,
@@ -372,7 +383,7 @@ pub struct Wanted {
 /// `POST /api/render`: renders a view as PNG.
 pub async fn render(
     State(app): App,
-    request: Result<Json<Wanted>, JsonRejection>,
+    request: Result<Json<RenderRequest>, JsonRejection>,
 ) -> Answer<Response> {
     let Json(wanted) = request?;
     let camera = camera_of(
@@ -389,22 +400,22 @@ pub async fn render(
         .transpose()?
         .map(str::to_owned);
     if !["color", "objects", "heatmap"].contains(&what.as_str()) {
-        return Err(Failure::bad(format!(
+        return Err(Failure::bad_request(format!(
             "what: '{what}' is unknown; use color, objects or heatmap"
         )));
     }
     if (what == "heatmap") != text.is_some() {
-        return Err(Failure::bad(
+        return Err(Failure::bad_request(
             "text: required for a heatmap, and allowed only there",
         ));
     }
-    let choice = Choice {
+    let choice = VisibleObjects {
         hidden: wanted.hidden,
         only: wanted.only,
     };
-    let work = move |desk: &mut Desk| {
-        if !desk.choose(&choice)? {
-            return Err(Failure::bad(
+    let work = move |desk: &mut SceneWorker| {
+        if !desk.set_visible(&choice)? {
+            return Err(Failure::bad_request(
                 "nothing would be left to show; hide fewer objects",
             ));
         }
@@ -417,7 +428,7 @@ pub async fn render(
             })
         } else if let Some(text) = &text {
             let field = desk.scene.field(&camera, None)?;
-            let meaning = Ask::Text(text.clone()).meaning(&desk.scene, &[])?;
+            let meaning = ObjectQuery::Text(text.clone()).embed(&desk.scene, &[])?;
             let found = meaning.find(&desk.grid, &field, &camera, &QueryConfig::default())?;
             heatmap(&color, &field.relevancy(&desk.grid, &found.heat()))
         } else if wanted.selected.is_empty() {
@@ -473,12 +484,12 @@ pub async fn export(
         .split(',')
         .map(|id| id.trim().parse().ok())
         .collect();
-    let ids = ids.ok_or_else(|| Failure::bad("objects: give ids like 3,17"))?;
+    let ids = ids.ok_or_else(|| Failure::bad_request("objects: give ids like 3,17"))?;
     let ending = wanted.format;
-    if !selection::ENDINGS.contains(&ending.as_str()) {
-        return Err(Failure::bad(format!(
+    if !selection::EXTENSIONS.contains(&ending.as_str()) {
+        return Err(Failure::bad_request(format!(
             "format: '{ending}' is unknown; use one of {}",
-            selection::ENDINGS.join(", ")
+            selection::EXTENSIONS.join(", ")
         )));
     }
     let name = format!(
@@ -486,11 +497,11 @@ pub async fn export(
         app.name,
         if wanted.keep { "selection" } else { "rest" }
     );
-    let work = move |desk: &mut Desk| {
-        desk.choose(&Choice::default())?;
+    let work = move |desk: &mut SceneWorker| {
+        desk.set_visible(&VisibleObjects::default())?;
         let selected = selection::gaussians(&desk.scene.gaussians, &desk.grid, &ids);
         if selected.is_empty() || (!wanted.keep && selected.len() == desk.scene.gaussians.len()) {
-            return Err(Failure::bad(
+            return Err(Failure::bad_request(
                 "there is nothing to write: the selection has no Gaussians",
             ));
         }
@@ -503,7 +514,7 @@ pub async fn export(
     };
     let data: Vec<u8> = app.ready()?.ask(work).await?;
     let mut headers = HeaderMap::new();
-    let safe: String = name
+    let file_name: String = name
         .chars()
         .map(|c| {
             if c.is_ascii_alphanumeric() || "-_.".contains(c) {
@@ -513,7 +524,7 @@ pub async fn export(
             }
         })
         .collect();
-    let disposition = format!("attachment; filename=\"{safe}\"");
+    let disposition = format!("attachment; filename=\"{file_name}\"");
     headers.insert(
         header::CONTENT_DISPOSITION,
         disposition

@@ -6,7 +6,7 @@ use crate::thumbnails::Thumbnails;
 use anyhow::{Context, Result, anyhow};
 use axum::body::Bytes;
 use axum::http::StatusCode;
-use fastlgs::Session;
+use fastlgs::Scene;
 use fastlgs::session::selection;
 use fastlgs_core::{Camera, Gaussians, WorldFrame, turbo};
 use fastlgs_grid::Grid;
@@ -20,21 +20,21 @@ use std::time::Instant;
 use tokio::sync::{mpsc, oneshot};
 
 /// Largest number of waiting requests; further ones get status 503.
-const WAITING: usize = 32;
+const MAX_WAITING: usize = 32;
 
 /// The opened scene, and the state that is kept between requests.
-pub struct Desk {
+pub struct SceneWorker {
     /// The scene.
-    pub scene: Session,
+    pub scene: Scene,
     /// Object table of the scene.
     pub grid: Grid,
     /// Cached pictures of objects.
     thumbnails: Thumbnails,
     /// Camera and visible objects of the last query, and the field rendered for them.
-    seen: Option<(Camera, Choice, Field)>,
+    seen: Option<(Camera, VisibleObjects, Field)>,
     /// Visible objects, whose Gaussians are on the device. `all` has all Gaussians while some are
     /// hidden.
-    choice: Choice,
+    visible: VisibleObjects,
     all: Option<Gaussians>,
     /// Gaussians packed for browsers, after the first request for them.
     splats: Option<Bytes>,
@@ -42,23 +42,23 @@ pub struct Desk {
 
 /// Visible objects; each includes its parts.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Choice {
+pub struct VisibleObjects {
     /// Ids of objects to leave out.
     pub hidden: Vec<u16>,
     /// Ids of the only objects to show; all if empty.
     pub only: Vec<u16>,
 }
 
-type Work = Box<dyn FnOnce(&mut Desk) + Send>;
+type Work = Box<dyn FnOnce(&mut SceneWorker) + Send>;
 
 /// Handle of the scene worker, to which requests send their work.
 #[derive(Clone)]
-pub struct Bell(mpsc::Sender<Work>);
+pub struct SceneHandle(mpsc::Sender<Work>);
 
-impl Desk {
+impl SceneWorker {
     /// Opens a scene on a device. `clip_text` replaces the CLIP text tower that the scene names.
     pub fn new(root: &Path, device: &str, clip_text: Option<PathBuf>) -> Result<Self> {
-        let mut scene = Session::open(root, device)?;
+        let mut scene = Scene::open(root, device)?;
         scene.clip_text = clip_text;
         let grid = scene.grid()?;
         Ok(Self {
@@ -66,16 +66,16 @@ impl Desk {
             grid,
             thumbnails: Thumbnails::default(),
             seen: None,
-            choice: Choice::default(),
+            visible: VisibleObjects::default(),
             all: None,
             splats: None,
         })
     }
 
     /// Opens a scene on a new thread. Returns when it can answer queries.
-    pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<Bell> {
-        let (bell, mut work) = mpsc::channel::<Work>(WAITING);
-        let (opened, wait) = std::sync::mpsc::channel();
+    pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<SceneHandle> {
+        let (bell, mut work) = mpsc::channel::<Work>(MAX_WAITING);
+        let (open_result, wait) = std::sync::mpsc::channel();
         std::thread::Builder::new()
             .name("scene".into())
             .spawn(move || {
@@ -91,26 +91,30 @@ impl Desk {
                 };
                 match open() {
                     Ok(mut desk) => {
-                        let _ = opened.send(Ok(()));
+                        let _ = open_result.send(Ok(()));
                         while let Some(work) = work.blocking_recv() {
                             work(&mut desk);
                         }
                     }
                     Err(error) => {
-                        let _ = opened.send(Err(error));
+                        let _ = open_result.send(Err(error));
                     }
                 }
             })?;
         wait.recv()
             .map_err(|_| anyhow!("the scene worker stopped before the scene was opened"))??;
-        Ok(Bell(bell))
+        Ok(SceneHandle(bell))
     }
 
     /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
     ///
     /// Returns `None` and changes nothing if no Gaussian would be visible.
-    pub fn look(&mut self, camera: &Camera, choice: &Choice) -> Result<Option<f64>> {
-        if !self.choose(choice)? {
+    pub fn render_field(
+        &mut self,
+        camera: &Camera,
+        choice: &VisibleObjects,
+    ) -> Result<Option<f64>> {
+        if !self.set_visible(choice)? {
             return Ok(None);
         }
         if self
@@ -126,11 +130,11 @@ impl Desk {
         Ok(Some(started.elapsed().as_secs_f64() * 1e3))
     }
 
-    /// Returns the field that [`Self::look`] rendered last.
+    /// Returns the field that [`Self::render_field`] rendered last.
     ///
     /// # Errors
     /// No view was rendered yet.
-    pub fn seen(&self) -> Result<&Field> {
+    pub fn last_field(&self) -> Result<&Field> {
         self.seen
             .as_ref()
             .map(|seen| &seen.2)
@@ -140,13 +144,13 @@ impl Desk {
     /// Sets the visible objects of later renderings.
     ///
     /// Returns `false` and changes nothing if no Gaussian would be visible.
-    pub fn choose(&mut self, choice: &Choice) -> Result<bool> {
-        if self.choice == *choice {
+    pub fn set_visible(&mut self, choice: &VisibleObjects) -> Result<bool> {
+        if self.visible == *choice {
             return Ok(true);
         }
         let all = &*self.all.get_or_insert_with(|| self.scene.gaussians.clone());
-        if *choice == Choice::default() {
-            self.scene.show(all.clone())?;
+        if *choice == VisibleObjects::default() {
+            self.scene.set_gaussians(all.clone())?;
             self.all = None;
         } else {
             let (hidden, only) = (
@@ -162,14 +166,14 @@ impl Desk {
             if places.is_empty() {
                 return Ok(false);
             }
-            self.scene.show(all.select(&places))?;
+            self.scene.set_gaussians(all.select(&places))?;
         }
-        self.choice = choice.clone();
+        self.visible = choice.clone();
         Ok(true)
     }
 
     /// Describes the opened scene for the page.
-    pub fn about(&self) -> Value {
+    pub fn description(&self) -> Value {
         json!({
             "stage": "ready",
             "antialias": self.scene.trained.antialias,
@@ -189,7 +193,7 @@ impl Desk {
 
     /// Lists all objects and parts in order of their ids.
     pub fn objects(&mut self) -> Result<Value> {
-        self.choose(&Choice::default())?;
+        self.set_visible(&VisibleObjects::default())?;
         // One pass over all Gaussians. Those of an object include those of its parts.
         let mut own: Vec<Vec<usize>> = vec![Vec::new(); self.grid.objects.len() + 1];
         for (i, id) in self.scene.gaussians.object_ids.iter().enumerate() {
@@ -216,20 +220,20 @@ impl Desk {
 
     /// Returns the picture of an object, or `None` if no searched view shows it.
     pub fn picture(&mut self, id: u16) -> Result<Option<RgbImage>> {
-        self.choose(&Choice::default())?;
+        self.set_visible(&VisibleObjects::default())?;
         self.thumbnails.picture(&mut self.scene, &self.grid, id)
     }
 
     /// Returns the picture of an object as PNG, or `None` if no searched view shows it.
     pub fn thumbnail(&mut self, id: u16) -> Result<Option<Vec<u8>>> {
-        self.choose(&Choice::default())?;
+        self.set_visible(&VisibleObjects::default())?;
         self.thumbnails.png(&mut self.scene, &self.grid, id)
     }
 
     /// Returns the name of the view that shows most of an object, or `None` if no searched view
     /// does.
     pub fn best_view(&mut self, id: u16) -> Result<Option<String>> {
-        self.choose(&Choice::default())?;
+        self.set_visible(&VisibleObjects::default())?;
         self.thumbnails.view(&mut self.scene, &self.grid, id)
     }
 
@@ -247,7 +251,7 @@ impl Desk {
     }
 }
 
-impl Bell {
+impl SceneHandle {
     /// Sends work to the scene worker and waits for its result. Work of a cancelled request is not
     /// started.
     ///
@@ -255,7 +259,7 @@ impl Bell {
     /// Errors of `work`, status 500 if it panics, and 503 if too many requests are waiting.
     pub async fn ask<T: Send + 'static>(
         &self,
-        work: impl FnOnce(&mut Desk) -> Result<T, Failure> + Send + 'static,
+        work: impl FnOnce(&mut SceneWorker) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
         let (reply, answer) = oneshot::channel();
         let work: Work = Box::new(move |desk| {

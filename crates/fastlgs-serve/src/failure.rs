@@ -31,7 +31,7 @@ impl Failure {
     }
 
     /// Returns status 400: the request is invalid.
-    pub fn bad(reason: impl Into<String>) -> Self {
+    pub fn bad_request(reason: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, reason)
     }
 }
@@ -79,7 +79,7 @@ impl From<QueryRejection> for Failure {
 impl From<fastlgs::Error> for Failure {
     fn from(error: fastlgs::Error) -> Self {
         if let fastlgs::Error::Invalid(reason) = &error {
-            return Self::bad(reason.clone());
+            return Self::bad_request(reason.clone());
         }
         anyhow::Error::from(error).into()
     }

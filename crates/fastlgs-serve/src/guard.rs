@@ -17,14 +17,14 @@ use std::time::Duration;
 use tokio::sync::Semaphore;
 
 /// Largest number of simultaneous requests to `/api/`; further ones get status 503.
-const AT_ONCE: usize = 64;
+const MAX_CONCURRENT: usize = 64;
 /// Largest body of a request, in bytes.
 pub const LARGEST_BODY: usize = 8 << 20;
 /// Number of bytes that are read from a body that is too large. A client that sends more may not
 /// receive the response.
-const PATIENCE: usize = 64 << 20;
+const MAX_DISCARDED_BODY: usize = 64 << 20;
 /// Longest time for reading a body.
-const PATIENT_FOR: Duration = Duration::from_secs(60);
+const BODY_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Access rules and limits that every request is checked against.
 pub struct Guard {
@@ -33,7 +33,7 @@ pub struct Guard {
     hosts: Vec<String>,
     /// Token that requests must contain: 32 hexadecimal digits. `None` on a loopback address.
     pub token: Option<String>,
-    places: Semaphore,
+    permits: Semaphore,
 }
 
 impl Guard {
@@ -54,7 +54,7 @@ impl Guard {
             loopback,
             hosts: hosts.to_vec(),
             token,
-            places: Semaphore::new(AT_ONCE),
+            permits: Semaphore::new(MAX_CONCURRENT),
         })
     }
 
@@ -149,21 +149,21 @@ fn is_api(request: &Parts) -> bool {
 ///
 /// # Errors
 /// Status 413 if the body is too large, 408 if it does not arrive completely or in time.
-async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
+async fn read_body(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
     let (mut kept, mut arrived) = (Vec::new(), 0);
-    let listen = async {
+    let read = async {
         while let Some(frame) = body.frame().await {
             let data = frame.ok()?.into_data().unwrap_or_default();
             arrived += data.len();
             if arrived <= most {
                 kept.extend_from_slice(&data);
-            } else if arrived > PATIENCE {
+            } else if arrived > MAX_DISCARDED_BODY {
                 break;
             }
         }
         Some(())
     };
-    match tokio::time::timeout(PATIENT_FOR, listen).await {
+    match tokio::time::timeout(BODY_TIMEOUT, read).await {
         Ok(Some(())) if arrived <= most => Ok(kept),
         Ok(Some(())) => Err(Failure::new(
             StatusCode::PAYLOAD_TOO_LARGE,
@@ -183,25 +183,25 @@ async fn receive(mut body: Body, most: usize) -> Result<Vec<u8>, Failure> {
 pub async fn check(State(guard): State<Arc<Guard>>, request: Request, next: Next) -> Response {
     let (parts, body) = request.into_parts();
     // Refused requests and files of the page do not count towards the limit.
-    let place = match guard.refusal(&parts) {
+    let permit = match guard.refusal(&parts) {
         Some(refusal) => Err(refusal),
         None if !is_api(&parts) => Ok(None),
         None => guard
-            .places
+            .permits
             .try_acquire()
             .map(Some)
             .map_err(|_| Failure::busy()),
     };
-    let body = receive(
+    let body = read_body(
         body,
-        if matches!(place, Ok(Some(_))) {
+        if matches!(permit, Ok(Some(_))) {
             LARGEST_BODY
         } else {
             0
         },
     )
     .await;
-    let mut response = match (place, body) {
+    let mut response = match (permit, body) {
         (Err(refusal), _) | (Ok(_), Err(refusal)) => refusal.into_response(),
         (Ok(_place), Ok(body)) => next.run(Request::from_parts(parts, body.into())).await,
     };

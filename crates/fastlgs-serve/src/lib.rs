@@ -16,13 +16,13 @@ use anyhow::{Context, Result};
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 use axum::{Router, middleware};
-use desk::Desk;
+use desk::SceneWorker;
 use fastlgs::progress::{Message, Sink};
 use fastlgs_core::{Camera, SceneFolder};
 use glam::Vec3;
 use guard::Guard;
 pub use live::Live;
-use shared::Shared;
+use shared::AppState;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock, PoisonError, RwLock};
@@ -32,7 +32,7 @@ use tokio::runtime::Runtime;
 /// A running server.
 pub struct Server {
     runtime: Runtime,
-    shared: Arc<Shared>,
+    shared: Arc<AppState>,
     /// Address of the page, with the token if there is one.
     pub url: String,
 }
@@ -68,7 +68,7 @@ impl Server {
             .root
             .canonicalize()
             .unwrap_or_else(|_| folder.root.clone());
-        let shared = Arc::new(Shared {
+        let shared = Arc::new(AppState {
             name: root
                 .file_name()
                 .unwrap_or_default()
@@ -100,7 +100,7 @@ impl Server {
             self.shared
                 .cameras()
                 .iter()
-                .map(|c| focus(means, c))
+                .map(|c| subject_distance(means, c))
                 .collect(),
         );
     }
@@ -116,7 +116,7 @@ impl Server {
             .cameras
             .write()
             .unwrap_or_else(PoisonError::into_inner) = Arc::new(self.shared.folder.cameras()?);
-        let bell = Desk::open(
+        let bell = SceneWorker::open(
             self.shared.folder.root.clone(),
             device.to_owned(),
             clip_text,
@@ -147,17 +147,17 @@ impl Server {
 
 /// Shows a running training on the page.
 impl Sink for Server {
-    fn tell(&self, message: Message<'_>) {
+    fn on_message(&self, message: Message<'_>) {
         let Some(live) = &self.shared.live else {
             return;
         };
         match message {
             Message::TrainingBegins(first) => {
                 self.set_focus(&first.means);
-                live.picture(first);
+                live.set_snapshot(first);
             }
             Message::Trained { step, total, scene } if live.report(step, total) => match scene() {
-                Ok(scene) => live.picture(&scene),
+                Ok(scene) => live.set_snapshot(&scene),
                 Err(error) => tracing::warn!("cannot show the scene during training: {error}"),
             },
             Message::TrainingEnds(scene) => live.finish(scene),
@@ -166,7 +166,7 @@ impl Sink for Server {
     }
 }
 
-fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
+fn router(guard: Arc<Guard>, shared: Arc<AppState>) -> Router {
     page::routes()
         .route("/api/scene", get(api::scene))
         .route("/api/training", get(api::training))
@@ -189,7 +189,7 @@ fn router(guard: Arc<Guard>, shared: Arc<Shared>) -> Router {
 
 /// Returns the distance from a camera to its subject: the median depth of the Gaussians in the
 /// central 40 % of the image along each axis. Returns 1 if there are none.
-fn focus(means: &[Vec3], camera: &Camera) -> f32 {
+fn subject_distance(means: &[Vec3], camera: &Camera) -> f32 {
     const SAMPLES: usize = 4_000;
     let middle = |m: &Vec3| {
         let p = camera.world_to_camera.transform_point3(*m);

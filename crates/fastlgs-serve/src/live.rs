@@ -9,9 +9,9 @@ use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// Shortest time between two snapshots of the Gaussians.
-const PICTURE_EVERY: Duration = Duration::from_secs(2);
+const SNAPSHOT_INTERVAL: Duration = Duration::from_secs(2);
 /// No snapshots are taken if no page has polled for this time.
-const WATCHED: Duration = Duration::from_secs(10);
+const WATCH_TIMEOUT: Duration = Duration::from_secs(10);
 /// Largest number of points of the curves. Above it, every second point is dropped.
 const POINTS: usize = 600;
 
@@ -34,15 +34,15 @@ pub struct Live {
     pub antialias: bool,
     /// Background colour, each channel 0 to 1.
     pub background: [f32; 3],
-    state: Mutex<Watched>,
+    state: Mutex<State>,
 }
 
 #[derive(Default)]
-struct Watched {
+struct State {
     progress: Progress,
     splats: Bytes,
-    pictured: Option<Instant>,
-    asked: Option<Instant>,
+    last_snapshot: Option<Instant>,
+    last_poll: Option<Instant>,
 }
 
 impl Live {
@@ -52,10 +52,10 @@ impl Live {
             iterations,
             ..Progress::default()
         };
-        let first = Watched {
+        let first = State {
             progress,
             splats: Bytes::from(splats::pack(&Gaussians::default())),
-            ..Watched::default()
+            ..State::default()
         };
         Self {
             antialias,
@@ -64,7 +64,7 @@ impl Live {
         }
     }
 
-    fn state(&self) -> std::sync::MutexGuard<'_, Watched> {
+    fn state(&self) -> std::sync::MutexGuard<'_, State> {
         self.state
             .lock()
             .unwrap_or_else(std::sync::PoisonError::into_inner)
@@ -85,29 +85,32 @@ impl Live {
                 number % 2 == 0 || p.psnr_held_out.is_some()
             });
         }
-        let watched = state.asked.is_some_and(|t| t.elapsed() < WATCHED);
-        watched && state.pictured.is_none_or(|t| t.elapsed() >= PICTURE_EVERY)
+        let watched = state.last_poll.is_some_and(|t| t.elapsed() < WATCH_TIMEOUT);
+        watched
+            && state
+                .last_snapshot
+                .is_none_or(|t| t.elapsed() >= SNAPSHOT_INTERVAL)
     }
 
     /// Stores a snapshot of the Gaussians.
-    pub fn picture(&self, scene: &Gaussians) {
+    pub fn set_snapshot(&self, scene: &Gaussians) {
         let splats = Bytes::from(splats::pack(scene));
         let mut state = self.state();
         state.splats = splats;
         state.progress.revision += 1;
-        state.pictured = Some(Instant::now());
+        state.last_snapshot = Some(Instant::now());
     }
 
     /// Stores the final Gaussians. All iterations are done, and objects follow.
     pub fn finish(&self, scene: &Gaussians) {
-        self.picture(scene);
+        self.set_snapshot(scene);
         self.state().progress.finished = true;
     }
 
     /// Returns the progress, and notes that a page is watching.
     pub fn progress(&self) -> Progress {
         let mut state = self.state();
-        state.asked = Some(Instant::now());
+        state.last_poll = Some(Instant::now());
         state.progress.clone()
     }
 
@@ -132,12 +135,12 @@ mod tests {
             psnr_held_out: None,
             gaussians: 1,
         };
-        live.picture(&Gaussians::default());
-        live.state().pictured = None;
+        live.set_snapshot(&Gaussians::default());
+        live.state().last_snapshot = None;
         assert!(!live.report(point(20), 30_000), "no one watches");
         assert_eq!(live.progress().revision, 1);
         assert!(live.report(point(40), 30_000));
-        live.picture(&Gaussians::default());
+        live.set_snapshot(&Gaussians::default());
         assert!(!live.report(point(60), 30_000), "the last picture is fresh");
         for k in 4..5_000 {
             live.report(

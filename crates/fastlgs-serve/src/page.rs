@@ -1,6 +1,6 @@
 //! The files of the page, which are embedded in the binary.
 
-use crate::shared::Shared;
+use crate::shared::AppState;
 use axum::Router;
 use axum::http::header;
 use axum::routing::get;
@@ -61,7 +61,7 @@ const TEXT: &str = "text/plain; charset=utf-8";
 /// Returns names and contents of the files of a static folder. In it, `files.js` takes the place of
 /// `server.js`.
 pub fn files() -> impl Iterator<Item = (&'static str, &'static str)> {
-    let of = |(address, _, content): (&'static str, &str, &'static str)| match address {
+    let static_file = |(address, _, content): (&'static str, &str, &'static str)| match address {
         "/" => Some(("index.html", content)),
         "/server.js" => Some(("server.js", include_str!("../web/files.js"))),
         _ => address
@@ -69,11 +69,11 @@ pub fn files() -> impl Iterator<Item = (&'static str, &'static str)> {
             .filter(|name| !name.contains('/'))
             .map(|name| (name, content)),
     };
-    FILES.into_iter().filter_map(of)
+    FILES.into_iter().filter_map(static_file)
 }
 
 /// Returns a router with one route per file.
-pub fn routes() -> Router<Arc<Shared>> {
+pub fn routes() -> Router<Arc<AppState>> {
     FILES
         .into_iter()
         .fold(Router::new(), |router, (address, kind, content)| {

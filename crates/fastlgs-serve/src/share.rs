@@ -1,9 +1,9 @@
 //! Exports a scene as a static folder for any web server: the page, the Gaussians, and answers for
 //! common words.
 
-use crate::desk::Desk;
+use crate::desk::SceneWorker;
 use crate::shared::views;
-use crate::{focus, page, splats};
+use crate::{page, splats, subject_distance};
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
 use fastlgs::session::phrase::normalised;
@@ -22,7 +22,7 @@ use std::io::Write;
 use std::path::{Component, Path, PathBuf};
 
 /// Default number of common words.
-pub const WORDS: usize = 20_000;
+pub const DEFAULT_WORDS: usize = 20_000;
 /// Number of words that are embedded together.
 const BATCH: usize = 256;
 /// Number of objects that are stored for each word. `web/files.js` must have the same number.
@@ -32,7 +32,7 @@ const JPEG_QUALITY: u8 = 80;
 
 /// Options of [`share`].
 #[derive(Clone, Debug)]
-pub struct Config {
+pub struct ShareConfig {
     /// Trained scene folder.
     pub scene: PathBuf,
     /// Output folder.
@@ -47,7 +47,7 @@ pub struct Config {
 
 /// Report of [`share`].
 #[derive(Clone, Debug, Serialize)]
-pub struct Report {
+pub struct ShareReport {
     /// Scene folder.
     pub scene: PathBuf,
     /// Output folder.
@@ -67,12 +67,12 @@ pub struct Report {
 ///
 /// # Errors
 /// The scene cannot be queried, the folder holds something else, or a file cannot be written.
-pub fn share(config: &Config, run: &Run) -> Result<Report> {
+pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
     let root = &config.output;
-    let listed = listed(root);
-    let ours = !listed.is_empty();
+    let listed = exported_files(root);
+    let is_export = !listed.is_empty();
     if root.exists()
-        && !ours
+        && !is_export
         && root
             .read_dir()
             .map_or(true, |mut entries| entries.next().is_some())
@@ -82,14 +82,14 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
             root.display()
         );
     }
-    let mut desk = Desk::new(&config.scene, run.device, config.clip_text.clone())?;
+    let mut desk = SceneWorker::new(&config.scene, run.device, config.clip_text.clone())?;
     if let Some(degree) = config.sh_degree {
         let lower = desk
             .scene
             .gaussians
             .clone()
             .with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
-        desk.scene.show(lower)?;
+        desk.scene.set_gaussians(lower)?;
     }
     let parent = std::path::absolute(root)?
         .parent()
@@ -101,9 +101,9 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
         .prefix(".share-")
         .tempdir_in(&parent)
         .with_context(|| parent.display().to_string())?;
-    let (words, found) = fill(partial.path(), &mut desk, config, run)?;
+    let (words, found) = write_files(partial.path(), &mut desk, config, run)?;
     let size = bytes(partial.path());
-    if ours {
+    if is_export {
         // Replaces only files of an earlier export: the folder may be a repository.
         let made = files_below(partial.path(), Path::new(""))?;
         if let Some(foreign) = made
@@ -128,10 +128,10 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
         }
     } else {
         let partial = partial.keep();
-        readable(&partial)?;
+        make_readable(&partial)?;
         std::fs::rename(&partial, root).with_context(|| root.display().to_string())?;
     }
-    Ok(Report {
+    Ok(ShareReport {
         scene: config.scene.clone(),
         output: root.clone(),
         bytes: size,
@@ -142,16 +142,16 @@ pub fn share(config: &Config, run: &Run) -> Result<Report> {
 }
 
 /// First line of `files.txt`. It identifies a folder as an export.
-const SHARED: &str = "A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.";
+const MARKER: &str = "A scene of FastLGS. Any web server can give out this folder; opened as a file, browsers do not load it.";
 
 /// Returns the files of an earlier export, or nothing if the folder is not an export.
-fn listed(root: &Path) -> BTreeSet<PathBuf> {
+fn exported_files(root: &Path) -> BTreeSet<PathBuf> {
     let text = std::fs::read_to_string(root.join("files.txt")).unwrap_or_default();
     let is_below = |file: &PathBuf| {
         file.components()
             .all(|part| matches!(part, Component::Normal(_)))
     };
-    match text.strip_prefix(SHARED) {
+    match text.strip_prefix(MARKER) {
         Some(list) => list
             .lines()
             .filter(|line| !line.is_empty())
@@ -178,7 +178,7 @@ fn files_below(root: &Path, folder: &Path) -> Result<BTreeSet<PathBuf>> {
 }
 
 /// Makes a folder readable for the web server. Temporary folders are private to their owner.
-fn readable(folder: &Path) -> Result<()> {
+fn make_readable(folder: &Path) -> Result<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
@@ -189,7 +189,12 @@ fn readable(folder: &Path) -> Result<()> {
 }
 
 /// Writes all files. Returns the number of words, and the number of those that name an object.
-fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usize, usize)> {
+fn write_files(
+    root: &Path,
+    desk: &mut SceneWorker,
+    config: &ShareConfig,
+    run: &Run,
+) -> Result<(usize, usize)> {
     let data = root.join("data");
     let (words, rows, found) = words(desk, config.words, run)?;
     write_json(&data.join("words.json"), &words)?;
@@ -198,7 +203,7 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
     let cameras = &desk.scene.cameras;
     let focus: Vec<f32> = cameras
         .iter()
-        .map(|camera| focus(&desk.scene.gaussians.means, camera))
+        .map(|camera| subject_distance(&desk.scene.gaussians.means, camera))
         .collect();
     let mut views = views(&desk.scene.folder, cameras, &focus)?;
     // Photos are not exported.
@@ -209,7 +214,7 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
         .scene
         .canonicalize()
         .unwrap_or_else(|_| config.scene.clone());
-    let mut about = desk.about();
+    let mut about = desk.description();
     about["name"] = json!(scene.file_name().unwrap_or_default().to_string_lossy());
     about["up"] = json!(mean_up(cameras).to_array());
     about["views"] = json!(views);
@@ -241,7 +246,7 @@ fn fill(root: &Path, desk: &mut Desk, config: &Config, run: &Run) -> Result<(usi
         .iter()
         .map(|file| format!("{}\n", file.display()))
         .collect();
-    write(&list, format!("{SHARED}\n{files}").as_bytes())?;
+    write(&list, format!("{MARKER}\n{files}").as_bytes())?;
     Ok((words.len(), found))
 }
 
@@ -269,7 +274,7 @@ fn write(path: &Path, content: &[u8]) -> Result<()> {
 }
 
 /// Returns the words, one [`Row`] for each, and the number of words that name an object.
-fn words(desk: &Desk, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
+fn words(desk: &SceneWorker, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
     let taught = desk
         .scene
         .taught_names()?
@@ -308,15 +313,18 @@ type Row = [u8; 2 + 3 * CANDIDATES];
 
 fn row(grid: &Grid, query: &TextQuery, config: &QueryConfig) -> Row {
     let ranked = query::rank(grid, query);
-    let meant = query::select(grid, &ranked, query, config);
+    let targets = query::select(grid, &ranked, query, config);
     let byte = |score: f32| (score.clamp(0.0, 1.0) * 255.0).round() as u8;
     let mut row = [0; 2 + 3 * CANDIDATES];
     row[0] = byte(query::best_score(&ranked));
-    row[1] = meant.len().min(CANDIDATES) as u8;
+    row[1] = targets.len().min(CANDIDATES) as u8;
     let others = ranked
         .iter()
-        .filter(|hit| !meant.iter().any(|m| m.id == hit.id));
-    for (place, Hit { id, score }) in row[2..].chunks_exact_mut(3).zip(meant.iter().chain(others)) {
+        .filter(|hit| !targets.iter().any(|m| m.id == hit.id));
+    for (place, Hit { id, score }) in row[2..]
+        .chunks_exact_mut(3)
+        .zip(targets.iter().chain(others))
+    {
         place[..2].copy_from_slice(&id.to_le_bytes());
         place[2] = byte(*score);
     }

@@ -1,6 +1,6 @@
 //! State that all requests share.
 
-use crate::desk::Bell;
+use crate::desk::SceneHandle;
 use crate::failure::Failure;
 use crate::live::Live;
 use anyhow::Result;
@@ -10,19 +10,19 @@ use serde_json::{Value, json};
 use std::sync::{Arc, OnceLock, PoisonError, RwLock};
 
 /// State that all requests share.
-pub struct Shared {
+pub struct AppState {
     pub name: String,
     pub folder: SceneFolder,
     /// Current cameras; training may move them.
     pub cameras: RwLock<Arc<Vec<Camera>>>,
     pub live: Option<Arc<Live>>,
-    pub bell: OnceLock<Bell>,
+    pub bell: OnceLock<SceneHandle>,
     pub focus: OnceLock<Vec<f32>>,
 }
 
-impl Shared {
+impl AppState {
     /// Returns the handle of the scene worker, or `None` during training.
-    pub fn bell(&self) -> Option<Bell> {
+    pub fn bell(&self) -> Option<SceneHandle> {
         self.bell.get().cloned()
     }
 
@@ -30,7 +30,7 @@ impl Shared {
     ///
     /// # Errors
     /// Status 409 during training.
-    pub fn ready(&self) -> Result<Bell, Failure> {
+    pub fn ready(&self) -> Result<SceneHandle, Failure> {
         self.bell().ok_or_else(|| {
             Failure::new(
                 StatusCode::CONFLICT,

@@ -44,12 +44,12 @@ pub fn pack(scene: &Gaussians) -> Vec<u8> {
         let scale = (scene.log_scales[i] - LOG_SCALE_LOW) / LOG_SCALE_RANGE;
         let (low, high) = pack_rotation(scene.rotations[i]);
         words.extend(scene.means[i].to_array().map(f32::to_bits));
-        words.push(two(scale.x, scale.y));
-        words.push(two(scale.z, sigmoid(scene.opacity_logits[i])));
-        words.push(ten_bits(scene.sh_dc[i] / color_range));
+        words.push(pack_two_16(scale.x, scale.y));
+        words.push(pack_two_16(scale.z, sigmoid(scene.opacity_logits[i])));
+        words.push(pack_three_10(scene.sh_dc[i] / color_range));
         words.push(low);
         words.push(u32::from(scene.object_ids[i]) << 16 | high);
-        words.extend(scene.rest(i).iter().map(|c| ten_bits(*c / sh_range)));
+        words.extend(scene.rest(i).iter().map(|c| pack_three_10(*c / sh_range)));
         words.resize(words.len().next_multiple_of(4), 0);
     }
     words.iter().flat_map(|w| w.to_le_bytes()).collect()
@@ -61,12 +61,12 @@ fn fixed(value: f32, bits: u32) -> u32 {
     (value.clamp(0.0, 1.0) * most).round() as u32
 }
 
-fn two(low: f32, high: f32) -> u32 {
+fn pack_two_16(low: f32, high: f32) -> u32 {
     fixed(low, 16) | fixed(high, 16) << 16
 }
 
 /// Packs three values from -1 to 1 with ten bits each.
-fn ten_bits(v: Vec3) -> u32 {
+fn pack_three_10(v: Vec3) -> u32 {
     let v = v * 0.5 + 0.5;
     fixed(v.x, 10) | fixed(v.y, 10) << 10 | fixed(v.z, 10) << 20
 }
@@ -84,7 +84,7 @@ fn pack_rotation(q: [f32; 4]) -> (u32, u32) {
         .map(|k| q[k] / sign * std::f32::consts::FRAC_1_SQRT_2 + 0.5);
     let mut next = || rest.next().expect("three of four are left");
     let (a, b, c) = (next(), next(), next());
-    (two(a, b), fixed(c, 14) | (largest as u32) << 14)
+    (pack_two_16(a, b), fixed(c, 14) | (largest as u32) << 14)
 }
 
 #[cfg(test)]

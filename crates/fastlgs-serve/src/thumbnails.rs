@@ -1,7 +1,7 @@
 //! Small pictures of objects. Each is cut from the searched view that shows most of the object.
 
 use anyhow::Result;
-use fastlgs::Session;
+use fastlgs::Scene;
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
 use image::RgbImage;
@@ -13,7 +13,7 @@ const VIEWS: usize = 16;
 /// Longer side of these views, in pixels.
 const VIEW_SIDE: u32 = 400;
 /// Longer side of a thumbnail, in pixels.
-const SIDE: u32 = 96;
+const THUMBNAIL_SIDE: u32 = 96;
 /// Margin around the box of an object, relative to the longer side of the box.
 const MARGIN: f32 = 0.15;
 
@@ -35,13 +35,13 @@ struct Best {
 }
 
 /// Returns the step between searched views.
-fn step(scene: &Session) -> usize {
+fn step(scene: &Scene) -> usize {
     scene.cameras.len().div_ceil(VIEWS).max(1)
 }
 
 impl Thumbnails {
     /// Returns the thumbnail of an object as PNG, or `None` if no searched view shows it.
-    pub fn png(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
+    pub fn png(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<Vec<u8>>> {
         if !self.made.contains_key(&id) {
             let Some(picture) = self.picture(scene, grid, id)? else {
                 return Ok(None);
@@ -52,12 +52,7 @@ impl Thumbnails {
     }
 
     /// Returns the thumbnail of an object, or `None` if no searched view shows it.
-    pub fn picture(
-        &mut self,
-        scene: &mut Session,
-        grid: &Grid,
-        id: u16,
-    ) -> Result<Option<RgbImage>> {
+    pub fn picture(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<RgbImage>> {
         let Some(Best {
             view,
             bounds: [left, top, right, bottom],
@@ -74,7 +69,7 @@ impl Thumbnails {
             (bottom + margin).min(picture.height()),
         );
         let (w, h) = (right - left, bottom - top);
-        let scale = SIDE as f32 / w.max(h) as f32;
+        let scale = THUMBNAIL_SIDE as f32 / w.max(h) as f32;
         let size = |n: u32| ((n as f32 * scale).round() as u32).max(1);
         Ok(Some(resize(
             &*crop_imm(picture, left, top, w, h),
@@ -85,12 +80,12 @@ impl Thumbnails {
     }
 
     /// Returns the name of the searched view that shows most of an object, or `None` if none does.
-    pub fn view(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<String>> {
+    pub fn view(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<String>> {
         let best = self.best(scene, grid, id)?;
         Ok(best.map(|best| scene.cameras[best.view * step(scene)].name.clone()))
     }
 
-    fn best(&mut self, scene: &mut Session, grid: &Grid, id: u16) -> Result<Option<Best>> {
+    fn best(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<Best>> {
         if self.best.is_empty() {
             self.search(scene, grid)?;
         }
@@ -98,7 +93,7 @@ impl Thumbnails {
     }
 
     /// Renders the searched views, and finds for each object the one with most of its pixels.
-    fn search(&mut self, scene: &mut Session, grid: &Grid) -> Result<()> {
+    fn search(&mut self, scene: &mut Scene, grid: &Grid) -> Result<()> {
         let cameras: Vec<Camera> = scene
             .cameras
             .iter()
@@ -108,13 +103,13 @@ impl Thumbnails {
         let mut best: Vec<Option<Best>> = vec![None; grid.objects.len() + 1];
         let mut views = Vec::new();
         for (view, camera) in cameras.iter().enumerate() {
-            let mut here: BTreeMap<u16, Best> = BTreeMap::new();
+            let mut in_view: BTreeMap<u16, Best> = BTreeMap::new();
             let mut pixels =
                 (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x, y)));
             scene.field(camera, None)?.for_each_pixel(grid, |objects| {
                 let (x, y) = pixels.next().unwrap_or_default();
                 for id in objects {
-                    let own = here.entry(*id).or_insert(Best {
+                    let own = in_view.entry(*id).or_insert(Best {
                         view,
                         pixels: 0,
                         bounds: [x, y, x, y],
@@ -124,7 +119,7 @@ impl Thumbnails {
                     own.bounds = [b[0].min(x), b[1].min(y), b[2].max(x + 1), b[3].max(y + 1)];
                 }
             });
-            for (id, own) in here {
+            for (id, own) in in_view {
                 let known = &mut best[usize::from(id)];
                 if known.is_none_or(|known| known.pixels < own.pixels) {
                     *known = Some(own);

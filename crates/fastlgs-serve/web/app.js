@@ -14,7 +14,7 @@ const LISTED = 24; // objects listed before "more"
 const ASKED_SIDE = 640; // longer side of the view that is queried, in pixels
 
 let scene, stage, objects, recent;
-const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, wish: null, listed: LISTED };
+const state = { selected: new Set(), hidden: new Set(), only: new Set(), scores: new Map(), ranked: null, text: null, linkText: null, listed: LISTED };
 
 function failed(error) {
   $("problem").textContent = readable(error.message);
@@ -24,7 +24,7 @@ function failed(error) {
 }
 
 // Wraps an event handler: errors are shown on the page, not thrown.
-const guarded = (work) => async (...args) => {
+const withErrors = (work) => async (...args) => {
   try {
     await work(...args);
   } catch (error) {
@@ -94,13 +94,13 @@ const bestView = async (id) => (await getJson(`/api/objects/${id}/view`)).view;
 const lookFrom = (name) => name && stage.lookFrom(scene.views.findIndex((view) => view.name === name));
 
 // Number of queries that were started or cancelled. Answers to earlier queries are ignored.
-let questions = 0;
+let queryNumber = 0;
 
-const find = guarded(async (text) => {
+const find = withErrors(async (text) => {
   if (!objects) return;
   if (!text.trim()) return clear();
-  const number = ++questions;
-  const isLate = () => number !== questions;
+  const number = ++queryNumber;
+  const isLate = () => number !== queryNumber;
   say(`searching for "${text}" ...`);
   try {
     const found = await answered(text, isLate);
@@ -141,7 +141,7 @@ function show(text, { answer, best }) {
   select(answer.objects.map((o) => o.id));
 }
 
-const nameIt = guarded(async (name) => {
+const nameIt = withErrors(async (name) => {
   const [object] = state.selected;
   const taught = await postJson("/api/names", { name, object });
   $("its-name").value = "";
@@ -151,7 +151,7 @@ const nameIt = guarded(async (name) => {
 
 function clear() {
   if (!objects) return;
-  questions += 1;
+  queryNumber += 1;
   stage.clicks = [];
   Object.assign(state, { selected: new Set(), scores: new Map(), ranked: null, text: null, listed: LISTED });
   say("");
@@ -176,7 +176,7 @@ function setCompare(value) {
   stage.draw();
 }
 
-const exported = guarded(async (keep) => {
+const exported = withErrors(async (keep) => {
   const format = $("format").value;
   const ids = [...state.selected].join(",");
   save(await getBlob(`/api/export?objects=${ids}&format=${format}&keep=${keep}`), `${scene.name}-${keep ? "selection" : "rest"}.${format}`);
@@ -196,22 +196,22 @@ function measured() {
   $("known").hidden = !length;
 }
 
-const link = guarded(async () => {
+const link = withErrors(async () => {
   history.replaceState(null, "", linkOf(stage.camera, { text: state.text, mode: stage.mode }));
   // Browsers allow access to the clipboard only on localhost and over HTTPS.
   const copied = await navigator.clipboard?.writeText(location.href).then(() => true, () => false);
   say(copied ? "the link to this view was copied" : "the link to this view is in the address bar");
 });
 
-const followed = guarded(async () => {
+const followed = withErrors(async () => {
   const { text, mode } = followLink(location.hash, stage);
   if (mode) setMode(mode);
   state.wish = text;
-  if (objects) await fulfil();
+  if (objects) await queryLinkText();
 });
 
 // Queries the text of the link.
-async function fulfil() {
+async function queryLinkText() {
   const text = state.wish;
   state.wish = null;
   if (!text) return;
@@ -234,7 +234,7 @@ const actions = {
     update();
   },
   clear,
-  best: guarded(async () => lookFrom(await bestView([...state.selected][0]))),
+  best: withErrors(async () => lookFrom(await bestView([...state.selected][0]))),
   measure: () => measure(),
   link,
   export: () => exported(true),
@@ -245,7 +245,7 @@ const actions = {
   },
   previous: () => step(-1),
   next: () => step(1),
-  save: guarded(async () => save(await stage.snapshot(), `${scene.name}.png`)),
+  save: withErrors(async () => save(await stage.snapshot(), `${scene.name}.png`)),
 };
 
 const cameras = () => {
@@ -321,11 +321,11 @@ function listen() {
   for (const [id, action] of Object.entries(actions)) $(id).addEventListener("click", action);
   document.addEventListener("keydown", pressed);
   stage.measured = measured;
-  stage.pickedTogether = (rays) => objects && together(rays);
+  stage.pickedTogether = (rays) => objects && pickTogether(rays);
   stage.looked = (index) => { $("views").selectedIndex = index; };
   stage.picked = (id) => {
     if (!objects) return;
-    questions += 1;
+    queryNumber += 1;
     if (id === 0) return select([]);
     const [only] = state.selected;
     select([state.selected.size === 1 ? objects.below(id, only) : objects.meant(id)]);
@@ -333,13 +333,13 @@ function listen() {
 }
 
 // Selects the object that several rays of the camera hit.
-const together = guarded(async (rays) => {
-  const number = ++questions;
+const pickTogether = withErrors(async (rays) => {
+  const number = ++queryNumber;
   const camera = stage.camera.asJson(stage.width, stage.height, ASKED_SIDE);
   const at = ([x, y]) => [Math.floor(x * camera.fx + camera.cx), Math.floor(y * camera.fy + camera.cy)];
   const point = rays.map(at).filter(([x, y]) => x >= 0 && y >= 0 && x < camera.width && y < camera.height);
   const answer = await postJson("/api/query", { point, camera, hidden: [...state.hidden], only: [...state.only] });
-  if (number !== questions) return;
+  if (number !== queryNumber) return;
   const ids = answer.objects.map((o) => o.id);
   say(`${rays.length} clicks on one object: ${ids.map((id) => `#${id}`).join(", ") || "no object is there"}`);
   select(ids);
@@ -378,7 +378,7 @@ async function main() {
   // The Gaussians are loaded first; the page can show objects later.
   await stage.load();
   await ready();
-  await fulfil();
+  await queryLinkText();
   if (scene.trained_here) await recall(training);
   // For programs that control this page, such as tests.
   window.fastlgs = { stage, state, find };

@@ -7,7 +7,7 @@ const scaled = (a, s) => [a[0] * s, a[1] * s, a[2] * s];
 const unit = (a) => scaled(a, 1 / Math.hypot(...a));
 
 // Smallest distance for overlays and for zooming, relative to the distance of the view's subject.
-const NEAREST = 0.002;
+const MIN_DISTANCE = 0.002;
 
 // Rotates v about a unit axis by an angle in radians (Rodrigues).
 function turned(v, axis, angle) {
@@ -62,11 +62,11 @@ export class Camera {
   turn(yaw, pitch) {
     const target = this.target();
     const both = (v) => turned(turned(v, this.right, pitch), this.up, yaw);
-    const steep = (v) => Math.abs(dot(unit(v), this.up));
-    const tilted = steep(turned(this.forward, this.right, pitch));
+    const polarCosine = (v) => Math.abs(dot(unit(v), this.up));
+    const tilted = polarCosine(turned(this.forward, this.right, pitch));
     // Beyond the pole the picture would be upside down. A view that starts closer to the pole may
     // still turn away.
-    if (pitch !== 0 && tilted > Math.max(0.985, steep(this.forward))) return this.turn(yaw, 0);
+    if (pitch !== 0 && tilted > Math.max(0.985, polarCosine(this.forward))) return this.turn(yaw, 0);
     [this.forward, this.down] = [unit(both(this.forward)), unit(both(this.down))];
     this.right = unit(cross(this.down, this.forward));
     this.down = unit(cross(this.forward, this.right));
@@ -83,7 +83,7 @@ export class Camera {
 
   zoom(factor) {
     const target = this.target();
-    this.distance = Math.max(this.distance * factor, NEAREST * this.view.focus);
+    this.distance = Math.max(this.distance * factor, MIN_DISTANCE * this.view.focus);
     this.eye = add(target, this.forward, -this.distance);
     this.moved = true;
   }
@@ -124,7 +124,7 @@ export class Camera {
   project(point, lens) {
     const v = add(point, this.eye, -1);
     const z = dot(v, this.forward);
-    return z > NEAREST * this.view.focus ? [lens.fx * dot(v, this.right) / z + lens.cx, lens.fy * dot(v, this.down) / z + lens.cy] : null;
+    return z > MIN_DISTANCE * this.view.focus ? [lens.fx * dot(v, this.right) / z + lens.cx, lens.fy * dot(v, this.down) / z + lens.cy] : null;
   }
 }
 

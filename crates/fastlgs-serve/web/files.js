@@ -5,7 +5,7 @@
 const CANDIDATES = 8;
 const ROW = 2 + 3 * CANDIDATES;
 // Number of suggestions for an unknown text.
-const NEAR = 5;
+const SUGGESTIONS = 5;
 
 async function file(path) {
   const response = await fetch(path).catch(() => null);
@@ -50,7 +50,7 @@ function near(text, list) {
   const inside = text.split(/\s+/).filter((word) => word !== text && list.has(word));
   const written = [...list.keys()].filter((word) => Math.abs(word.length - text.length) < 4).map((word) => [distance(text, word), word]);
   written.sort((a, b) => a[0] - b[0]);
-  return [...new Set([...inside.reverse(), ...written.map(([, word]) => word)])].slice(0, NEAR);
+  return [...new Set([...inside.reverse(), ...written.map(([, word]) => word)])].slice(0, SUGGESTIONS);
 }
 
 // Answers a text from the table, in the format of the server.
@@ -62,8 +62,8 @@ export async function postJson(path, { text }) {
     throw error;
   });
   const { list, rows } = await table;
-  const said = text.trim().toLowerCase().replace(/\s+/g, " ");
-  const plain = list.has(said) ? said : phrase(text);
+  const typed = text.trim().toLowerCase().replace(/\s+/g, " ");
+  const plain = list.has(typed) ? typed : phrase(text);
   const place = list.get(plain);
   if (place === undefined) {
     const known = `${list.size.toLocaleString("en")} words`;

@@ -1,6 +1,6 @@
 // Links to the state of the page: the part of an address after #, with view, camera, text and mode.
 
-const SHOWN = ["relevancy", "objects"];
+const MODES = ["relevancy", "objects"];
 
 export function linkOf(camera, { text, mode }) {
   const parts = new URLSearchParams({ view: camera.view.name });
@@ -22,5 +22,5 @@ export function follow(hash, stage) {
   const pose = parts.get("camera")?.split("_").map(Number);
   if (pose && !stage.camera.stand(pose)) throw new Error("the camera of the link is invalid; its view is shown instead");
   stage.changed();
-  return { text: parts.get("text"), mode: SHOWN.find((mode) => mode === parts.get("show")) ?? "color" };
+  return { text: parts.get("text"), mode: MODES.find((mode) => mode === parts.get("show")) ?? "color" };
 }

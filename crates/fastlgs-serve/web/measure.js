@@ -3,7 +3,7 @@
 // Range of log-scales, as in src/splats.rs.
 const LOG_SCALE_LOW = -20, LOG_SCALE_RANGE = 30;
 // The surface is where the transmittance falls below this value.
-const SOLID = 0.5;
+const SURFACE_TRANSMITTANCE = 0.5;
 const NEAR = 0.5; // least depth of a drawn Gaussian relative to its size, as in splat.wgsl
 const FAINT = 1 / 255; // least alpha of a drawn Gaussian: one grey level
 
@@ -57,7 +57,7 @@ export function pointAt(splats, camera, lens, x, y, shown) {
   let light = 1;
   for (const { depth, alpha } of crossings) {
     light *= 1 - alpha;
-    if (light < SOLID) return camera.eye.map((v, k) => v + depth * direction[k]);
+    if (light < SURFACE_TRANSMITTANCE) return camera.eye.map((v, k) => v + depth * direction[k]);
   }
   return null;
 }

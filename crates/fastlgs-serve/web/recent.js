@@ -1,6 +1,6 @@
 // Suggestions for the text field: earlier texts, newest first, then taught names.
 
-const MOST = 40;
+const MAX_TEXTS = 40;
 
 export class Recent {
   // `list` is the datalist of the text field. The browser stores the texts of each scene.
@@ -17,7 +17,7 @@ export class Recent {
   }
 
   asked(text) {
-    this.texts = [text, ...this.texts.filter((known) => known !== text)].slice(0, MOST);
+    this.texts = [text, ...this.texts.filter((known) => known !== text)].slice(0, MAX_TEXTS);
     try {
       localStorage.setItem(this.key, JSON.stringify(this.texts));
     } catch {

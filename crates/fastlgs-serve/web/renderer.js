@@ -4,7 +4,7 @@ import { openWebGpu } from "./webgpu.js";
 import { openWebGl2 } from "./webgl2.js";
 import { openPictures } from "./pictures.js";
 
-const WAYS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openPictures]];
+const RENDERERS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openPictures]];
 
 // Opens the renderer named `wish`, or the first that works in this browser.
 //
@@ -12,7 +12,7 @@ const WAYS = [["webgpu", openWebGpu], ["webgl2", openWebGl2], ["pictures", openP
 // another renderer. With `alone`, no server renders pictures.
 export async function openRenderer(canvas, wish, alone) {
   const reasons = [];
-  for (const [name, open] of WAYS) {
+  for (const [name, open] of RENDERERS) {
     if ((wish && wish !== name) || (alone && name === "pictures")) continue;
     try {
       return Object.assign(await open(canvas, alone || Boolean(wish)), { name, reasons });

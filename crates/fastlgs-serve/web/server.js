@@ -4,15 +4,15 @@ const address = new URL(location.href);
 const given = address.searchParams.get("token");
 // Removes the token from the visible address. Session storage keeps it for reloads.
 if (given) {
-  remembered((place) => place.setItem("token", given));
+  withStorage((place) => place.setItem("token", given));
   address.searchParams.delete("token");
   history.replaceState(null, "", address);
 }
 
-const token = given ?? remembered((place) => place.getItem("token"));
+const token = given ?? withStorage((place) => place.getItem("token"));
 
 // Uses the session storage; returns null if the browser has none.
-function remembered(use) {
+function withStorage(use) {
   try {
     return use(sessionStorage);
   } catch {

@@ -46,7 +46,7 @@ fn texel(plane_index: u32) -> vec4<u32> {
     return textureLoad(splats, vec2<i32>(i32(plane_index % ROW), i32(plane_index / ROW)), 0);
 }
 
-fn unit10(bits: u32) -> vec3<f32> {
+fn unpack_ten_bits(bits: u32) -> vec3<f32> {
     return vec3<f32>(vec3<u32>(bits, bits >> 10u, bits >> 20u) & vec3<u32>(1023u)) / 511.5 - 1.0;
 }
 
@@ -65,10 +65,10 @@ fn unpack_rotation(low: u32, high: u32) -> vec4<f32> {
 }
 
 fn color_of(first: u32, packed: u32, direction: vec3<f32>) -> vec3<f32> {
-    var color = vec3<f32>(0.5) + SH_C0 * frame.size.z * unit10(packed);
+    var color = vec3<f32>(0.5) + SH_C0 * frame.size.z * unpack_ten_bits(packed);
     var b = basis(direction);
     for (var k = 0u; k < rest_of(frame.mode.y); k++) {
-        color += b[k] * frame.size.w * unit10(texel(first + 2u + k / 4u)[k % 4u]);
+        color += b[k] * frame.size.w * unpack_ten_bits(texel(first + 2u + k / 4u)[k % 4u]);
     }
     return max(color, vec3<f32>(0.0));
 }
@@ -138,18 +138,18 @@ fn corner(@builtin(vertex_index) plane_index: u32, @location(0) gaussian: u32) -
         return out;
     }
     // Semi-axes of the ellipse on which alpha equals ALPHA_MIN.
-    let middle = 0.5 * (cov.x + cov.z);
+    let mean_variance = 0.5 * (cov.x + cov.z);
     let spread = length(vec2<f32>(0.5 * (cov.x - cov.z), cov.y));
     var axis = vec2<f32>(1.0, 0.0);
     if abs(cov.y) > 1e-6 {
-        axis = normalize(vec2<f32>(cov.y, middle + spread - cov.x));
+        axis = normalize(vec2<f32>(cov.y, mean_variance + spread - cov.x));
     } else if cov.z > cov.x {
         axis = vec2<f32>(0.0, 1.0);
     }
-    let reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
-    out.place = reach * (vec2<f32>(f32(plane_index & 1u), f32(plane_index >> 1u)) * 2.0 - 1.0);
-    let long = sqrt(middle + spread) * out.place.x * axis;
-    let short = sqrt(max(middle - spread, 0.01)) * out.place.y * vec2<f32>(-axis.y, axis.x);
+    let radius = sqrt(2.0 * log(opacity / ALPHA_MIN));
+    out.place = radius * (vec2<f32>(f32(plane_index & 1u), f32(plane_index >> 1u)) * 2.0 - 1.0);
+    let long = sqrt(mean_variance + spread) * out.place.x * axis;
+    let short = sqrt(max(mean_variance - spread, 0.01)) * out.place.y * vec2<f32>(-axis.y, axis.x);
     let pixel = view.focal * t.xy / t.z + view.centre + long + short;
     out.position = vec4<f32>(pixel / frame.size.xy * vec2<f32>(2.0, -2.0) + vec2<f32>(-1.0, 1.0), 0.0, 1.0);
     let color = color_of(first, b.y, normalize(mean - frame.camera.xyz));

@@ -262,7 +262,7 @@ export class Stage {
     const { canvas } = this.elements;
     const pointers = new Map();
     // Movements up to this share of the image height still count as a click.
-    const STILL = 0.01;
+    const CLICK_TOLERANCE = 0.01;
     let dragging = false;
     const place = (event) => [event.offsetX * this.ratio, event.offsetY * this.ratio];
     const spread = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]);
@@ -276,7 +276,7 @@ export class Stage {
       if (!before) return;
       const now = place(event);
       const [dx, dy] = [(now[0] - before[0]) / this.height, (now[1] - before[1]) / this.height];
-      if (!dragging && Math.abs(dx) + Math.abs(dy) < STILL) return;
+      if (!dragging && Math.abs(dx) + Math.abs(dy) < CLICK_TOLERANCE) return;
       dragging = true;
       if (pointers.size === 2) {
         const old = spread([...pointers.values()]);

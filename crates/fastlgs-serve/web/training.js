@@ -2,10 +2,10 @@
 
 import { getJson } from "./server.js";
 
-const EVERY_MS = 1000;
+const POLL_INTERVAL_MS = 1000;
 
 // Polls a run until the scene answers queries. Calls `grown` when there are new Gaussians.
-export async function follow(elements, grown) {
+export async function follow(elements, onSplats) {
   elements.training.hidden = false;
   let revision = 0;
   for (;;) {
@@ -13,7 +13,7 @@ export async function follow(elements, grown) {
       const progress = await getJson("/api/training");
       show(elements, progress, "training is done, objects are being found");
       if (progress.revision !== revision) {
-        await grown();
+        await onSplats();
         revision = progress.revision;
       }
       if ((await getJson("/api/scene")).stage === "ready") return;
@@ -21,7 +21,7 @@ export async function follow(elements, grown) {
       // After an error, such as a busy server, the next poll tries again.
       elements.text.textContent = `${error.message}; trying again`;
     }
-    await new Promise((done) => setTimeout(done, EVERY_MS));
+    await new Promise((done) => setTimeout(done, POLL_INTERVAL_MS));
   }
 }
 

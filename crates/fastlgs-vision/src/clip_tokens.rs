@@ -18,7 +18,7 @@ const MERGES: usize = 49_152 - 256 - 2;
 const START: &str = "<|startoftext|>";
 const END: &str = "<|endoftext|>";
 /// Pattern of one word: special tokens, English clitics, letters, single digits, other characters.
-const WORDS: &str =
+const WORD_PATTERN: &str =
     r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+";
 
 /// Converts texts to token ids.
@@ -42,9 +42,9 @@ impl Tokens {
     /// # Errors
     /// Both files are missing, or the one that is used is damaged.
     pub fn beside(model: &Path) -> Result<Self> {
-        match described(model) {
+        match tokenizer_path(model) {
             Some(path) => Self::of_clip(
-                Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?,
+                Tokenizer::from_file(&path).map_err(|e| damaged(&path, e))?,
                 &path,
             ),
             None => Self::published(&places::offline_dir().join(places::CLIP_MERGES)),
@@ -65,8 +65,8 @@ impl Tokens {
                 model.display()
             ))
         };
-        let path = described(model).ok_or_else(missing)?;
-        let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| bad(&path, e))?;
+        let path = tokenizer_path(model).ok_or_else(missing)?;
+        let mut tokenizer = Tokenizer::from_file(&path).map_err(|e| damaged(&path, e))?;
         let configuration = path.with_file_name("tokenizer_config.json");
         let configuration: serde_json::Value = if configuration.is_file() {
             fs::read_json(&configuration)?
@@ -80,15 +80,15 @@ impl Tokens {
                 .or_else(|| token["content"].as_str())
                 .and_then(|token| tokenizer.token_to_id(token))
         };
-        let told = tokenizer
+        let configured = tokenizer
             .get_padding()
             .map(|padding| padding.pad_id)
             .or_else(named);
-        plain(&mut tokenizer, &path)?;
+        disable_padding(&mut tokenizer, &path)?;
         let ended = || Some(*tokenizer.encode("", true).ok()?.get_ids().last()?);
-        let padding = told
+        let padding = configured
             .or_else(ended)
-            .ok_or_else(|| bad(&path, "it has no padding token and no end token"))?;
+            .ok_or_else(|| damaged(&path, "it has no padding token and no end token"))?;
         Ok(Self {
             kind: Kind::Siglip { padding },
             tokenizer,
@@ -109,10 +109,10 @@ impl Tokens {
         let mut text = String::new();
         GzDecoder::new(fs::read(path)?.as_slice())
             .read_to_string(&mut text)
-            .map_err(|e| bad(path, e))?;
+            .map_err(|e| damaged(path, e))?;
         let merges: Vec<&str> = text.lines().skip(1).take(MERGES).collect();
         if merges.len() < MERGES {
-            return Err(bad(
+            return Err(damaged(
                 path,
                 format!("it has {} merges instead of {MERGES}", merges.len()),
             ));
@@ -142,7 +142,7 @@ impl Tokens {
                 { "type": "Lowercase" },
             ] },
             "pre_tokenizer": { "type": "Sequence", "pretokenizers": [
-                { "type": "Split", "pattern": { "Regex": WORDS }, "behavior": "Removed", "invert": true },
+                { "type": "Split", "pattern": { "Regex": WORD_PATTERN }, "behavior": "Removed", "invert": true },
                 { "type": "ByteLevel", "add_prefix_space": false, "trim_offsets": true, "use_regex": false },
             ] },
             "model": {
@@ -151,17 +151,20 @@ impl Tokens {
             },
         });
         Self::of_clip(
-            description.to_string().parse().map_err(|e| bad(path, e))?,
+            description
+                .to_string()
+                .parse()
+                .map_err(|e| damaged(path, e))?,
             path,
         )
     }
 
     fn of_clip(mut tokenizer: Tokenizer, path: &Path) -> Result<Self> {
-        plain(&mut tokenizer, path)?;
+        disable_padding(&mut tokenizer, path)?;
         let id = |token: &str| {
             tokenizer
                 .token_to_id(token)
-                .ok_or_else(|| bad(path, format!("it has no token {token}")))
+                .ok_or_else(|| damaged(path, format!("it has no token {token}")))
         };
         Ok(Self {
             kind: Kind::Clip {
@@ -222,7 +225,7 @@ impl Tokens {
 }
 
 /// Returns the path of `tokenizer.json` in the folder of a model or the one above.
-fn described(model: &Path) -> Option<PathBuf> {
+fn tokenizer_path(model: &Path) -> Option<PathBuf> {
     model
         .ancestors()
         .skip(1)
@@ -232,13 +235,15 @@ fn described(model: &Path) -> Option<PathBuf> {
 }
 
 /// Turns off padding and truncation of the tokenizer; both are done here.
-fn plain(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
+fn disable_padding(tokenizer: &mut Tokenizer, path: &Path) -> Result<()> {
     tokenizer.with_padding(None);
-    tokenizer.with_truncation(None).map_err(|e| bad(path, e))?;
+    tokenizer
+        .with_truncation(None)
+        .map_err(|e| damaged(path, e))?;
     Ok(())
 }
 
-fn bad(path: &Path, reason: impl std::fmt::Display) -> Error {
+fn damaged(path: &Path, reason: impl std::fmt::Display) -> Error {
     Error::Invalid(format!(
         "{}: not a tokenizer of CLIP or SigLIP ({reason})",
         path.display()

@@ -6,7 +6,7 @@ use image::{GrayImage, RgbImage};
 /// A photo is blurred if its sharpness, relative to the median, is below this value.
 const BLURRED: f32 = 0.2;
 /// Smallest weight of a photo.
-const LEAST_WEIGHT: f32 = 0.1;
+const MIN_WEIGHT: f32 = 0.1;
 /// Mean difference of grey values, 0 to 255, below which two thumbnails count as the same photo.
 const SAME: f32 = 1.0;
 /// Side of the thumbnails, in pixels.
@@ -14,14 +14,14 @@ const THUMB: u32 = 32;
 
 /// Sharpness and thumbnail of a photo.
 #[derive(Clone)]
-pub struct Impression {
+pub struct PhotoStats {
     /// Mean squared Laplacian divided by the variance of the grey values. It depends on the content
     /// and its size in the photo.
     pub sharpness: f32,
     thumb: Vec<u8>,
 }
 
-impl Impression {
+impl PhotoStats {
     /// Measures a photo. Division by the variance keeps plain and dark photos from counting as
     /// blurred.
     pub fn of(photo: &RgbImage) -> Self {
@@ -53,7 +53,7 @@ impl Impression {
 }
 
 /// Returns the sharpness of each photo, relative to the median.
-fn relative(photos: &[Impression]) -> impl Iterator<Item = f32> {
+fn relative(photos: &[PhotoStats]) -> impl Iterator<Item = f32> {
     let mut all: Vec<f32> = photos.iter().map(|p| p.sharpness).collect();
     all.sort_by(f32::total_cmp);
     let middle = all.get(all.len() / 2).copied().unwrap_or(0.0).max(1e-12);
@@ -61,7 +61,7 @@ fn relative(photos: &[Impression]) -> impl Iterator<Item = f32> {
 }
 
 /// Returns the indices of blurred photos.
-pub fn blurred(photos: &[Impression]) -> Vec<usize> {
+pub fn blurred(photos: &[PhotoStats]) -> Vec<usize> {
     relative(photos)
         .enumerate()
         .filter(|s| s.1 < BLURRED)
@@ -69,15 +69,15 @@ pub fn blurred(photos: &[Impression]) -> Vec<usize> {
         .collect()
 }
 
-/// Returns the weight of each photo: its relative sharpness, from `LEAST_WEIGHT` to 1.
-pub fn weights(photos: &[Impression]) -> Vec<f32> {
+/// Returns the weight of each photo: its relative sharpness, from `MIN_WEIGHT` to 1.
+pub fn weights(photos: &[PhotoStats]) -> Vec<f32> {
     relative(photos)
-        .map(|sharpness| sharpness.clamp(LEAST_WEIGHT, 1.0))
+        .map(|sharpness| sharpness.clamp(MIN_WEIGHT, 1.0))
         .collect()
 }
 
 /// Returns the indices of photos that repeat the one before them.
-pub fn repeated(photos: &[Impression]) -> Vec<usize> {
+pub fn repeated(photos: &[PhotoStats]) -> Vec<usize> {
     let difference = |a: &[u8], b: &[u8]| {
         a.iter()
             .zip(b)
@@ -109,7 +109,7 @@ mod tests {
         let mut photos: Vec<RgbImage> = (0..5).map(photo).collect();
         photos[2] = image::imageops::blur(&photos[2], 3.0);
         photos.push(photos[4].clone());
-        let seen: Vec<Impression> = photos.iter().map(Impression::of).collect();
+        let seen: Vec<PhotoStats> = photos.iter().map(PhotoStats::of).collect();
         assert_eq!(blurred(&seen), [2]);
         assert_eq!(repeated(&seen), [5]);
         let weights = weights(&seen);

@@ -13,14 +13,14 @@ const PAIRS: usize = 40;
 /// Largest number of key points per photo that are matched. Only shares are estimated.
 const KEY_POINTS: usize = 1200;
 /// Smallest number of matches of a pair that is used.
-const FEW: usize = 20;
+const MIN_MATCHES: usize = 20;
 /// Largest epipolar error of an inlier, as a share of the photo's longer side. It is large because
 /// poses may be rough.
 const TOLERANCE: f32 = 0.01;
 /// Smallest share of inliers with which another convention is accepted.
-const RIGHT: f32 = 0.5;
+const MIN_INLIER_SHARE: f32 = 0.5;
 /// Factor by which its share of inliers must exceed that of every other convention.
-const PLAIN: f32 = 1.5;
+const MIN_RATIO: f32 = 1.5;
 
 /// Matches a sample of the key points of photos that are one or two apart in the order of names.
 /// Pairs with few matches are left out.
@@ -69,7 +69,9 @@ pub fn sample(keypoints: &[Keypoints]) -> Vec<PairMatches> {
                 .collect(),
         }
     });
-    compared.filter(|pair| pair.pairs.len() >= FEW).collect()
+    compared
+        .filter(|pair| pair.pairs.len() >= MIN_MATCHES)
+        .collect()
 }
 
 /// Distance of two cameras below which they count as one position, as a share of their distance
@@ -78,7 +80,7 @@ const ONE_PLACE: f32 = 1e-5;
 
 /// Returns the share of matches that are inliers of the epipolar geometry of these cameras; `None`
 /// without matches.
-pub fn obeying_share(
+pub fn inlier_share(
     cameras: &[Camera],
     keypoints: &[Keypoints],
     matches: &[PairMatches],
@@ -128,25 +130,29 @@ pub fn judge(
     matches: &[PairMatches],
 ) -> Verdict {
     let share = |candidate: &(PoseConvention, Vec<Camera>)| {
-        obeying_share(&candidate.1, keypoints, matches).unwrap_or(0.0)
+        inlier_share(&candidate.1, keypoints, matches).unwrap_or(0.0)
     };
     let Some((standard, others)) = candidates.split_first() else {
         return Verdict::Standard;
     };
-    let usual = share(standard);
+    let standard_share = share(standard);
     let mut shares: Vec<(PoseConvention, f32)> =
         others.iter().map(|other| (other.0, share(other))).collect();
     shares.sort_by(|a, b| b.1.total_cmp(&a.1));
-    tracing::debug!(usual, ?shares, "epipolar inlier share by pose convention");
+    tracing::debug!(
+        standard_share,
+        ?shares,
+        "epipolar inlier share by pose convention"
+    );
     match shares[..] {
-        [(best, share), ..] if share >= RIGHT.max(PLAIN * usual) => {
+        [(best, share), ..] if share >= MIN_INLIER_SHARE.max(MIN_RATIO * standard_share) => {
             let alike: Vec<PoseConvention> = shares
                 .iter()
-                .filter(|other| PLAIN * other.1 > share)
+                .filter(|other| MIN_RATIO * other.1 > share)
                 .map(|other| other.0)
                 .collect();
             if alike.len() == 1 {
-                Verdict::Other(best, [share, usual])
+                Verdict::Other(best, [share, standard_share])
             } else {
                 Verdict::Unclear(alike)
             }

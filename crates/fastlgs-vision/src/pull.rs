@@ -150,7 +150,7 @@ struct Puller<'a> {
 
 /// Downloads all files of a model that are missing or damaged, and returns the records of all its
 /// files.
-/// `say` receives the file, the bytes done and the total bytes. The proxy comes from the
+/// `progress` receives the file, the bytes done and the total bytes. The proxy comes from the
 /// environment (`HTTPS_PROXY`, `ALL_PROXY`).
 ///
 /// # Errors
@@ -247,7 +247,7 @@ impl Puller<'_> {
         &self,
         file: &str,
         expected: &Expected,
-        say: &mut impl FnMut(&str, u64, Option<u64>),
+        progress: &mut impl FnMut(&str, u64, Option<u64>),
     ) -> Result<PathBuf> {
         let partial = self.folder.join(format!("{file}.partial"));
         let parent = partial.parent().unwrap_or(self.folder);
@@ -256,9 +256,9 @@ impl Puller<'_> {
         let mut reason = String::new();
         for _ in 0..TRIES {
             match self.continue_file(&url, &partial, |done, total| {
-                say(file, done, expected.bytes.or(total))
+                progress(file, done, expected.bytes.or(total))
             })? {
-                Ended::Whole => {
+                Transfer::Whole => {
                     if let Err(why) = check(file, &partial, expected) {
                         let _ = std::fs::remove_file(&partial);
                         return Err(Error::Missing(format!(
@@ -267,7 +267,7 @@ impl Puller<'_> {
                     }
                     return Ok(partial);
                 }
-                Ended::BrokeOff(why) => reason = why,
+                Transfer::BrokeOff(why) => reason = why,
             }
         }
         Err(Error::Missing(format!(
@@ -281,7 +281,7 @@ impl Puller<'_> {
         url: &str,
         partial: &Path,
         mut say: impl FnMut(u64, Option<u64>),
-    ) -> Result<Ended> {
+    ) -> Result<Transfer> {
         let have = std::fs::metadata(partial).map_or(0, |m| m.len());
         let mut request = self.agent.get(url);
         if have > 0 {
@@ -291,13 +291,13 @@ impl Puller<'_> {
             Ok(answer) => answer,
             // The host has no bytes beyond those in the file. The file is complete, or too long and
             // fails its check.
-            Err(ureq::Error::StatusCode(416)) => return Ok(Ended::Whole),
+            Err(ureq::Error::StatusCode(416)) => return Ok(Transfer::Whole),
             Err(ureq::Error::StatusCode(code)) => {
                 return Err(Error::Missing(format!(
                     "{url}: the host answered with status {code}; check that it is a mirror of {HOST}"
                 )));
             }
-            Err(e) if have > 0 => return Ok(Ended::BrokeOff(e.to_string())),
+            Err(e) if have > 0 => return Ok(Transfer::BrokeOff(e.to_string())),
             Err(e) => return Err(unreachable(url, &e)),
         };
         let goes_on = answer.status() == 206;
@@ -322,21 +322,21 @@ impl Puller<'_> {
                 Ok(n) => file
                     .write_all(&buffer[..n])
                     .map_err(CoreError::io(partial))?,
-                Err(e) => return Ok(Ended::BrokeOff(e.to_string())),
+                Err(e) => return Ok(Transfer::BrokeOff(e.to_string())),
             }
             done = file.metadata().map_err(CoreError::io(partial))?.len();
             say(done, total);
         }
         Ok(if total.is_none_or(|t| t == done) {
-            Ended::Whole
+            Transfer::Whole
         } else {
-            Ended::BrokeOff("the host sent fewer bytes than announced".to_owned())
+            Transfer::BrokeOff("the host sent fewer bytes than announced".to_owned())
         })
     }
 }
 
 /// How a transfer ended.
-enum Ended {
+enum Transfer {
     Whole,
     BrokeOff(String),
 }

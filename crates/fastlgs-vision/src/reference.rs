@@ -5,7 +5,7 @@ use crate::clip::{ClipImage, ClipText};
 use crate::encoder::Encoder;
 use crate::masks::BitMask;
 use crate::sam::exports::Exports;
-use crate::sam::{Config, generation};
+use crate::sam::{SamConfig, generation};
 use fastlgs_core::{LabelMap, fs, image_io, npy};
 use std::path::{Path, PathBuf};
 
@@ -60,7 +60,7 @@ fn sam_answers_as_the_originals_do() {
             .collect();
         let (low, shape) = numbers(&folder.join("low.npy"));
         let (scores, _) = numbers(&folder.join("scores.npy"));
-        let (mut values, mut told) = (Vec::new(), Vec::new());
+        let (mut values, mut our_scores) = (Vec::new(), Vec::new());
         for points in shares.chunks(exports.fixed_batch().unwrap_or(shares.len())) {
             let found = exports.decode(&encoded, points).unwrap();
             assert_eq!(
@@ -69,12 +69,12 @@ fn sam_answers_as_the_originals_do() {
                 "{which}"
             );
             values.extend(found.values);
-            told.extend(found.scores);
+            our_scores.extend(found.scores);
         }
         let spread = low.iter().fold(0.0f32, |m, v| m.max(v.abs()));
         let (logits, scores) = (
             largest_difference(&values, &low) / spread,
-            largest_difference(&told, &scores),
+            largest_difference(&our_scores, &scores),
         );
         println!("{which}: logits differ by {logits:.1e} of the largest, scores by {scores:.1e}");
         assert!(
@@ -99,13 +99,13 @@ fn compare_masks(folder: &Path) {
     let photo = image_io::load_rgb(&folder.join("photo.png")).unwrap();
     let filters: serde_json::Value = fs::read_json(&folder.join("filters.json")).unwrap();
     let filter = |name: &str| filters[name].as_f64().unwrap();
-    let config = Config {
+    let config = SamConfig {
         points_per_side: filter("points_per_side") as u32,
         predicted_iou: filter("predicted_iou") as f32,
         stability: filter("stability") as f32,
         crop_layers: filter("crop_layers") as u32,
         box_nms: 1.0,
-        ..Config::default()
+        ..SamConfig::default()
     };
     let ours = generation::masks(&exports, &photo, &config).unwrap().0;
     let (pixels, shape) = numbers(&folder.join("masks.npy"));

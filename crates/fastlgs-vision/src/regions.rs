@@ -215,9 +215,9 @@ impl Hierarchy {
     }
 
     /// Returns the nodes of at least `least` pixels, in descending order of area.
-    /// Of nested nodes whose area ratio is above `alike`, only the one with the longest span of
+    /// Of nested nodes whose area ratio is above `max_overlap`, only the one with the longest span of
     /// dissimilarity is kept.
-    pub fn lasting(&self, least: f32, alike: f32) -> Vec<usize> {
+    pub fn stable_nodes(&self, least: f32, max_overlap: f32) -> Vec<usize> {
         let area = |i: usize| self.nodes[i].area;
         let span = |i: usize| {
             self.nodes[i]
@@ -234,7 +234,9 @@ impl Hierarchy {
         let mut largest = vec![0.0f32; self.nodes.len()];
         for &i in &order {
             let around = upwards(i).skip(1).find(|j| kept[*j]);
-            if largest[i] <= alike * area(i) && around.is_none_or(|j| area(i) <= alike * area(j)) {
+            if largest[i] <= max_overlap * area(i)
+                && around.is_none_or(|j| area(i) <= max_overlap * area(j))
+            {
                 kept[i] = true;
                 upwards(i).for_each(|j| largest[j] = largest[j].max(area(i)));
             }
@@ -330,14 +332,14 @@ mod tests {
             (below.iter().filter(|b| **b).count(), below[3], below[4]),
             (2, false, false)
         );
-        assert_eq!(tree.lasting(1.0, 0.85).len(), 5);
+        assert_eq!(tree.stable_nodes(1.0, 0.85).len(), 5);
         assert_eq!(
-            tree.lasting(1.5 * 120.0, 0.85),
+            tree.stable_nodes(1.5 * 120.0, 0.85),
             [4, 3],
             "nodes must be sorted by descending area"
         );
         assert_eq!(
-            tree.lasting(1.5 * 120.0, 0.5),
+            tree.stable_nodes(1.5 * 120.0, 0.5),
             [3],
             "the root spans no range of dissimilarity"
         );

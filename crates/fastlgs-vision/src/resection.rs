@@ -13,12 +13,12 @@ use std::collections::{BTreeMap, BTreeSet};
 const STARTS: usize = 6;
 /// Scales of the Cauchy loss, as shares of the photo's longer side, from coarse to fine. Points
 /// with larger errors count less.
-const SOFT: [f64; 4] = [0.2, 0.05, 0.015, 0.005];
+const LOSS_SCALES: [f64; 4] = [0.2, 0.05, 0.015, 0.005];
 /// Gauss-Newton steps per scale.
 const STEPS: usize = 12;
 /// Smallest number and smallest share of points that must agree on a pose. Repeated texture can
 /// make a quarter of them agree on a wrong pose.
-const FEW: usize = 25;
+const MIN_POINTS: usize = 25;
 const LEAST_SHARE: f32 = 0.3;
 
 /// Computes the poses of `lost` photos from points of the other photos, and returns the photos it
@@ -108,9 +108,9 @@ fn place_one(
         ..camera.clone()
     });
     let found = starts
-        .map(|start| settled(start, &seen))
+        .map(|start| refine_pose(start, &seen))
         .max_by_key(|found| found.1)?;
-    let enough = found.1 >= FEW && found.1 as f32 >= LEAST_SHARE * seen.len() as f32;
+    let enough = found.1 >= MIN_POINTS && found.1 as f32 >= LEAST_SHARE * seen.len() as f32;
     tracing::debug!(
         photo = camera.name,
         points = seen.len(),
@@ -123,9 +123,9 @@ fn place_one(
 
 /// Minimises the reprojection errors of the points over the pose: Gauss-Newton with a Cauchy loss.
 /// Returns the camera and the number of points within twice `TOLERANCE`.
-fn settled(mut camera: Camera, seen: &[(Vec2, Vec3)]) -> (Camera, usize) {
+fn refine_pose(mut camera: Camera, seen: &[(Vec2, Vec3)]) -> (Camera, usize) {
     let side = f64::from(camera.width.max(camera.height));
-    for soft in SOFT.map(|share| share * side) {
+    for soft in LOSS_SCALES.map(|share| share * side) {
         for _ in 0..STEPS {
             let Some(motion) = step(&camera, seen, soft) else {
                 break;

@@ -41,7 +41,7 @@ const MIN_AREA: f32 = 0.003;
 /// Number of features per pixel: L, a, b, then the dense embeddings.
 const FEATURES: usize = 3 + DENSE_SIDES.len() * DENSE;
 /// Of nested regions with an area ratio above this value, only one becomes a mask.
-const ALIKE: f32 = 0.85;
+const MAX_OVERLAP: f32 = 0.85;
 /// Range of dissimilarities for whole objects. Below it, regions are always merged; above it,
 /// never.
 const WHOLE_HEIGHTS: [f32; 2] = [0.25, 0.45];
@@ -134,7 +134,7 @@ impl Segmenter for OfflineSegmenter {
         let [whole, part] = [WHOLE_HEIGHTS, PART_HEIGHTS]
             .map(|[low, high]| tree.is_below(&tree.best_cut(|i| persistence(&tree, i, low, high))));
         let mut list = MaskList::new(photo.width(), photo.height());
-        for node in tree.lasting(MIN_AREA * (w * h) as f32, ALIKE) {
+        for node in tree.stable_nodes(MIN_AREA * (w * h) as f32, MAX_OVERLAP) {
             let level = Level::ALL[usize::from(whole[node]) + usize::from(part[node])];
             list.add(
                 level,
@@ -163,8 +163,8 @@ fn dissimilarity(edge: f32, a: &Node, b: &Node) -> f32 {
     }
     let meaning = 0.5 - 0.5 * dot / (aa * bb).sqrt();
     let small = a.area.min(b.area);
-    let crumbs = small / (small + 300.0);
-    (0.4 * edge + 0.2 * (color / 40.0).min(1.0) + 0.4 * meaning) * crumbs
+    let small_region_factor = small / (small + 300.0);
+    (0.4 * edge + 0.2 * (color / 40.0).min(1.0) + 0.4 * meaning) * small_region_factor
 }
 
 /// Returns the excess of mass of a region: its area times the span of dissimilarity, between `low`

@@ -23,7 +23,7 @@ impl Similarity {
 
     /// Returns this similarity followed by a small one: log scale, rotation vector (3), translation
     /// (3).
-    pub fn nudged(&self, delta: &[f32; 7]) -> Self {
+    pub fn followed_by_small(&self, delta: &[f32; 7]) -> Self {
         let turn = Mat3::from_quat(Quat::from_scaled_axis(Vec3::new(
             delta[1], delta[2], delta[3],
         )));

@@ -30,11 +30,11 @@ const EXHAUSTIVE: usize = 120;
 /// distances of powers of two.
 const FOLLOWING: usize = 12;
 /// In addition, all pairs of this many evenly spread photos are matched, to close loops.
-const SPREAD: usize = 40;
+const LOOP_PHOTOS: usize = 40;
 /// Largest longer side, in pixels, of the images for key point detection.
 const SIDE: u32 = 1000;
 /// Smallest number of matches of a pair that is passed to COLMAP.
-const FEW: usize = 15;
+const MIN_MATCHES: usize = 15;
 
 const RECONSTRUCT: &str = include_str!("../assets/reconstruct.py");
 
@@ -111,18 +111,18 @@ pub fn photos_in(images: &Path) -> Result<Vec<PathBuf>> {
 }
 
 /// Computes the poses of the photos of one folder. Returns the folder of the largest COLMAP model.
-/// The result lies in the folder `work`, which is emptied first. `say` receives the stage and the
+/// The result lies in the folder `work`, which is emptied first. `progress` receives the stage and the
 /// latest output of the tool, at least once a second. It returns whether to continue.
 ///
 /// # Errors
-/// The tool fails, no photo could be placed, or `say` cancelled the work. The message contains the
+/// The tool fails, no photo could be placed, or `progress` cancelled the work. The message contains the
 /// last output of the tool.
 pub fn reconstruct(
     tool: &Tool,
     files: &[PathBuf],
     work: &Path,
     seed: u64,
-    say: impl Fn(&str, &str) -> bool + Sync,
+    progress: impl Fn(&str, &str) -> bool + Sync,
 ) -> Result<PathBuf> {
     let images = files
         .first()
@@ -132,10 +132,10 @@ pub fn reconstruct(
     let models = work.join("sparse");
     std::fs::create_dir_all(&models).map_err(fastlgs_core::Error::io(&models))?;
     match tool {
-        Tool::Colmap(program) => by_program(program, images, work, &models, files, &say)?,
+        Tool::Colmap(program) => by_program(program, images, work, &models, files, &progress)?,
         Tool::Pycolmap(python) => {
-            plan(files, work, seed, &say)?;
-            by_script(python, work, &say)?;
+            plan(files, work, seed, &progress)?;
+            by_script(python, work, &progress)?;
         }
     }
     largest_model(&models).ok_or_else(|| {
@@ -246,7 +246,7 @@ fn plan(
     say: &(impl Fn(&str, &str) -> bool + Sync),
 ) -> Result<()> {
     let found = |path: &PathBuf| -> Result<(u32, u32, Keypoints)> {
-        going(say(
+        check_cancelled(say(
             "features",
             &path.file_name().unwrap_or_default().to_string_lossy(),
         ))?;
@@ -310,8 +310,8 @@ fn write_plan(
 /// emptied first, and the tool stores its files there.
 ///
 /// # Errors
-/// The tool fails, or `say` cancelled the work.
-pub fn placed_anew(
+/// The tool fails, or `progress` cancelled the work.
+pub fn reconstruct_with_lenses(
     python: &Path,
     photos: &[PathBuf],
     cameras: &[Camera],
@@ -354,13 +354,13 @@ pub fn placed_anew(
     }
 }
 
-/// Matches the key points of photo pairs. Pairs with fewer than `FEW` matches are left out.
+/// Matches the key points of photo pairs. Pairs with fewer than `MIN_MATCHES` matches are left out.
 fn matched(
     points: &[&Keypoints],
     say: &(impl Fn(&str, &str) -> bool + Sync),
 ) -> Result<Vec<PairMatches>> {
     let of_pair = |(a, b): (usize, usize)| {
-        going(say("matches", ""))?;
+        check_cancelled(say("matches", ""))?;
         Ok(PairMatches {
             a,
             b,
@@ -371,7 +371,10 @@ fn matched(
         .into_par_iter()
         .map(of_pair)
         .collect::<Result<Vec<_>>>()?;
-    Ok(all.into_iter().filter(|m| m.pairs.len() >= FEW).collect())
+    Ok(all
+        .into_iter()
+        .filter(|m| m.pairs.len() >= MIN_MATCHES)
+        .collect())
 }
 
 /// Returns the pairs of photos to match, as indices in the order of names.
@@ -386,7 +389,7 @@ fn pairs(count: usize) -> Vec<(usize, usize)> {
         let near = (1..=FOLLOWING).chain((0..).map(|k| 1usize << k).take_while(|d| *d < count));
         pairs.extend(near.map(|d| (a, a + d)).filter(|p| p.1 < count));
     }
-    let spread: Vec<usize> = (0..SPREAD).map(|k| k * count / SPREAD).collect();
+    let spread: Vec<usize> = (0..LOOP_PHOTOS).map(|k| k * count / LOOP_PHOTOS).collect();
     pairs.extend(
         spread
             .iter()
@@ -412,7 +415,7 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
 }
 
 /// Returns an error if the callback cancelled the search for poses.
-fn going(on: bool) -> Result<()> {
+fn check_cancelled(on: bool) -> Result<()> {
     if on {
         Ok(())
     } else {
@@ -422,10 +425,10 @@ fn going(on: bool) -> Result<()> {
     }
 }
 
-/// Longest time between two calls of `say` while a tool prints nothing.
+/// Longest time between two calls of `progress` while a tool prints nothing.
 const SILENT: Duration = Duration::from_secs(1);
 
-/// Runs one stage and passes its output to `say`.
+/// Runs one stage and passes its output to `progress`.
 fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
     let name = command.get_program().to_string_lossy().into_owned();
     let failed = |reason: String| {
@@ -433,7 +436,7 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) ->
             "{name} failed while finding poses ({stage}): {reason}"
         ))
     };
-    going(say(stage, ""))?;
+    check_cancelled(say(stage, ""))?;
     // Both streams are read, so that a full pipe does not block the tool.
     let mut child = command
         .stdout(Stdio::piped())
@@ -462,7 +465,7 @@ fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) ->
         if !say(stage, last.trim()) {
             let _ = child.kill();
             let _ = child.wait();
-            return going(false);
+            return check_cancelled(false);
         }
     }
     let status = child.wait().map_err(|e| failed(e.to_string()))?;
@@ -610,7 +613,7 @@ mod tests {
             "the first and the last of the spread photos must be matched"
         );
         assert!(
-            many.len() < 20 * 300 + SPREAD * SPREAD / 2,
+            many.len() < 20 * 300 + LOOP_PHOTOS * LOOP_PHOTOS / 2,
             "{} pairs of {}",
             many.len(),
             300 * 299 / 2

@@ -23,17 +23,17 @@ const NEIGHBOURS: usize = 4;
 /// large angles matter only if photos are few.
 const PARALLAX: [f32; 2] = [2.0, 60.0];
 /// Radius of a patch in pixels; its side is 2 * HALF + 1.
-const HALF: usize = 3;
+const PATCH_RADIUS: usize = 3;
 /// Smallest correlation of an accepted depth.
-const ALIKE: f32 = 0.7;
+const MIN_CORRELATION: f32 = 0.7;
 /// Smallest difference between the best correlation and that at any other depth.
-const UNIQUE: f32 = 0.05;
+const MIN_SCORE_MARGIN: f32 = 0.05;
 /// Planes up to this distance from the best one count as the same depth.
-const NEAR: usize = 3;
+const SAME_DEPTH_PLANES: usize = 3;
 /// Smallest standard deviation of a patch, in grey values of 255. Smaller ones are noise.
-const TEXTURE: f32 = 3.0;
+const MIN_PATCH_DEVIATION: f32 = 3.0;
 /// Number of other photos that must find the same depth, within one pixel.
-const WITNESSES: usize = 2;
+const MIN_AGREEING_VIEWS: usize = 2;
 /// A point replaces other points within `SPACING` pixels if their relative depth difference is
 /// below `SAME_DEPTH`.
 const SPACING: usize = 1;
@@ -181,12 +181,12 @@ fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
     let own = &views[view];
     let (w, h) = (own.width(), own.height());
     let mut out = vec![0.0; w * h];
-    let (Some([near, far]), true) = (own.bounds, neighbours.len() >= WITNESSES) else {
+    let (Some([near, far]), true) = (own.bounds, neighbours.len() >= MIN_AGREEING_VIEWS) else {
         return out;
     };
     let inverse = |plane: f32| 1.0 / far + (1.0 / near - 1.0 / far) * plane / (PLANES - 1) as f32;
     let patches = Patches::of(&own.grey, w, h);
-    let mut work = Work::new(w * h);
+    let mut work = Buffers::new(w * h);
     // `[plane][pixel]`: mean of the two best neighbours. The others may be occluded.
     let mut scores = vec![-1.0f32; PLANES * w * h];
     for (plane, scores) in scores.chunks_exact_mut(w * h).enumerate() {
@@ -215,14 +215,14 @@ fn depths(views: &[View], view: usize, neighbours: &[usize]) -> Vec<f32> {
             .max_by(|a, b| score(*a).total_cmp(&score(*b)))
             .unwrap_or(0);
         let elsewhere = (0..PLANES)
-            .filter(|p| p.abs_diff(best) > NEAR)
+            .filter(|p| p.abs_diff(best) > SAME_DEPTH_PLANES)
             .map(score)
             .fold(-1.0, f32::max);
         if best == 0
             || best == PLANES - 1
-            || score(best) < ALIKE
-            || score(best) - elsewhere < UNIQUE
-            || patches.deviation[pixel] < TEXTURE
+            || score(best) < MIN_CORRELATION
+            || score(best) - elsewhere < MIN_SCORE_MARGIN
+            || patches.deviation[pixel] < MIN_PATCH_DEVIATION
         {
             continue;
         }
@@ -242,7 +242,7 @@ struct Patches {
 
 impl Patches {
     fn of(grey: &[f32], w: usize, h: usize) -> Self {
-        let mut work = Work::new(grey.len());
+        let mut work = Buffers::new(grey.len());
         work.warped.copy_from_slice(grey);
         let (mut mean, mut square) = (vec![0.0; grey.len()], vec![0.0; grey.len()]);
         boxed(&work.warped, w, h, &mut work.rows, &mut mean);
@@ -261,7 +261,7 @@ impl Patches {
 }
 
 /// Reusable buffers, one value per pixel.
-struct Work {
+struct Buffers {
     warped: Vec<f32>,
     product: Vec<f32>,
     rows: Vec<f32>,
@@ -271,7 +271,7 @@ struct Work {
     score: Vec<f32>,
 }
 
-impl Work {
+impl Buffers {
     fn new(pixels: usize) -> Self {
         let plane = || vec![0.0; pixels];
         Self {
@@ -327,7 +327,7 @@ fn warp(own: &View, other: &View, depth: f32, out: &mut [f32]) {
 vectorised! {
     /// Writes the normalised correlation of each patch of `grey` and `work.warped` into
     /// `work.score`: 1 if they are equal, -1 if a patch is cut off.
-    fn correlate(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Work) = correlate_body
+    fn correlate(grey: &[f32], patches: &Patches, w: usize, h: usize, work: &mut Buffers) = correlate_body
 }
 
 #[inline(always)]
@@ -336,7 +336,7 @@ fn correlate_body<const FMA: bool>(
     patches: &Patches,
     w: usize,
     h: usize,
-    work: &mut Work,
+    work: &mut Buffers,
 ) {
     boxed(&work.warped, w, h, &mut work.rows, &mut work.mean);
     work.product
@@ -363,7 +363,7 @@ fn correlate_body<const FMA: bool>(
 /// Computes the mean over each patch; NaN if the patch is cut off.
 #[inline(always)]
 fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
-    const SIDES: usize = 2 * HALF + 1;
+    const SIDES: usize = 2 * PATCH_RADIUS + 1;
     const SHARE: f32 = 1.0 / (SIDES * SIDES) as f32;
     rows.fill(f32::NAN);
     out.fill(f32::NAN);
@@ -372,14 +372,14 @@ fn boxed(plane: &[f32], w: usize, h: usize, rows: &mut [f32], out: &mut [f32]) {
     }
     for (from, to) in plane.chunks_exact(w).zip(rows.chunks_exact_mut(w)) {
         for x in 0..w - SIDES + 1 {
-            to[x + HALF] = (0..SIDES).map(|k| from[x + k]).sum();
+            to[x + PATCH_RADIUS] = (0..SIDES).map(|k| from[x + k]).sum();
         }
     }
-    for y in HALF..h - HALF {
+    for y in PATCH_RADIUS..h - PATCH_RADIUS {
         let to = &mut out[y * w..][..w];
         to.fill(0.0);
         for k in 0..SIDES {
-            let from = &rows[(y + k - HALF) * w..][..w];
+            let from = &rows[(y + k - PATCH_RADIUS) * w..][..w];
             to.iter_mut().zip(from).for_each(|(t, f)| *t += f * SHARE);
         }
     }
@@ -416,7 +416,7 @@ fn merged(views: &[View], neighbours: &[Vec<usize>], depths: &[Vec<f32>]) -> Vec
                     seen_by.push(other as u32);
                 }
             }
-            if seen_by.len() > WITNESSES {
+            if seen_by.len() > MIN_AGREEING_VIEWS {
                 let position = sum / seen_by.len() as f32;
                 let color = view
                     .color
@@ -510,9 +510,8 @@ mod tests {
             (0.0..160.0).contains(&pixel.x) && (0.0..120.0).contains(&pixel.y)
         };
         assert!(
-            found.iter().all(
-                |p| p.seen_by.len() > WITNESSES && p.seen_by.iter().all(|view| shows(p, *view))
-            ),
+            found.iter().all(|p| p.seen_by.len() > MIN_AGREEING_VIEWS
+                && p.seen_by.iter().all(|view| shows(p, *view))),
             "each photo in seen_by must see the point"
         );
         let right = |p: &&SfmPoint| (f32::from(p.color[0]) - texture(p.position)).abs() < 25.0;

@@ -12,7 +12,7 @@ use tokenizers::Tokenizer;
 /// Largest length of a text in tokens; longer texts are truncated.
 const MAX_TOKENS: usize = 128;
 /// Largest number of cached embeddings: 6 MB.
-const REMEMBERED: usize = 4096;
+const CACHE_SIZE: usize = 4096;
 
 /// all-MiniLM-L6-v2 (mean pooling, 384 dimensions).
 pub struct MiniLm {
@@ -20,7 +20,7 @@ pub struct MiniLm {
     tokenizer: Tokenizer,
     /// Cache of embeddings that were computed alone. In a batch, an embedding may differ in the
     /// last digit, and results must not depend on earlier queries.
-    known: Mutex<HashMap<String, Vec<f32>>>,
+    cache: Mutex<HashMap<String, Vec<f32>>>,
 }
 
 impl MiniLm {
@@ -59,14 +59,14 @@ impl MiniLm {
         Ok(Self {
             model,
             tokenizer,
-            known: Mutex::default(),
+            cache: Mutex::default(),
         })
     }
 }
 
 impl TextEncoder for MiniLm {
     fn embed(&self, texts: &[&str]) -> Result<Vec<Vec<f32>>> {
-        let known = || self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = || self.cache.lock().unwrap_or_else(PoisonError::into_inner);
         if let [text] = texts
             && let Some(embedding) = known().get(*text)
         {
@@ -100,7 +100,7 @@ impl TextEncoder for MiniLm {
         }
         if let ([text], [embedding]) = (texts, out.as_slice()) {
             let mut known = known();
-            if known.len() == REMEMBERED {
+            if known.len() == CACHE_SIZE {
                 known.clear();
             }
             known.insert((*text).to_owned(), embedding.clone());
@@ -207,7 +207,7 @@ mod tests {
         }
         assert_eq!(
             (
-                fresh.known.lock().unwrap().len(),
+                fresh.cache.lock().unwrap().len(),
                 fresh.embed(&["juice", "tea"]).unwrap().len()
             ),
             (2, 2)

@@ -6,7 +6,7 @@ use glam::{DMat3, DVec2, DVec3, Vec2, Vec3};
 /// Smallest angle between the two rays of a triangulated point, in radians.
 const MIN_ANGLE: f32 = 0.02;
 /// Number of pixels of a point whose pairs are tried as start values.
-const TRIED: usize = 6;
+const MAX_START_PIXELS: usize = 6;
 /// Gauss-Newton steps. Near the solution, two are sufficient.
 const STEPS: usize = 4;
 
@@ -72,8 +72,8 @@ pub fn locate(seen: &[(&Camera, Vec2)], tolerance: f32) -> Option<Located> {
         let square = near.iter().map(|(_, e)| e * e).sum::<f32>();
         (near.iter().map(|n| n.0).collect(), square)
     };
-    let tried: Vec<usize> = (0..seen.len().min(TRIED))
-        .map(|k| k * seen.len() / seen.len().min(TRIED))
+    let tried: Vec<usize> = (0..seen.len().min(MAX_START_PIXELS))
+        .map(|k| k * seen.len() / seen.len().min(MAX_START_PIXELS))
         .collect();
     let mut best: Option<(Vec3, Vec<usize>, f32)> = None;
     for (n, &i) in tried.iter().enumerate() {

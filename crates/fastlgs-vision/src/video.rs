@@ -3,7 +3,7 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
-use crate::photo_quality::Impression;
+use crate::photo_quality::PhotoStats;
 use crate::printed::lines;
 use crate::{Error, Result};
 use image::GrayImage;
@@ -28,9 +28,9 @@ const SHARED: f32 = 2.0 / 3.0;
 const BLURRED: f32 = 0.4;
 /// After this many consecutive blurred candidates, the next one is accepted: the content is plain
 /// rather than blurred. Also the number of recent candidates of the median.
-const PATIENCE: usize = 10;
+const MAX_BLURRED_RUN: usize = 10;
 /// Largest number of photos. More are thinned out evenly.
-const MOST: usize = 300;
+const MAX_PHOTOS: usize = 300;
 
 /// Returns whether the file extension is that of a video.
 pub fn is_video(path: &Path) -> bool {
@@ -47,16 +47,16 @@ pub fn is_video(path: &Path) -> bool {
 
 /// Writes selected frames of a video as JPEG files into the new folder `images`, in order of time.
 /// Returns their number.
-/// `say` receives the seconds examined and the number of selected frames; its error stops the work.
+/// `progress` receives the seconds examined and the number of selected frames; its error stops the work.
 ///
 /// # Errors
 /// ffmpeg is missing or cannot read the video, or the video has fewer than three different views.
 pub fn photos<E: From<Error>>(
     video: &Path,
     images: &Path,
-    say: impl Fn(f64, usize) -> Result<(), E>,
+    progress: impl Fn(f64, usize) -> Result<(), E>,
 ) -> Result<usize, E> {
-    let frames = choose(video, say)?;
+    let frames = choose(video, progress)?;
     Ok(write(video, frames, images)?)
 }
 
@@ -69,7 +69,7 @@ fn write(video: &Path, frames: Vec<u32>, images: &Path) -> Result<usize> {
             frames.len()
         )));
     }
-    let frames = thinned(frames, MOST);
+    let frames = thinned(frames, MAX_PHOTOS);
     std::fs::create_dir_all(images).map_err(fastlgs_core::Error::io(images))?;
     let these = frames
         .iter()
@@ -332,7 +332,7 @@ struct Chooser {
     /// Latest candidate that shares enough key points with the last selected frame.
     near: Option<Candidate>,
     /// Largest share of matched key points between a selected frame and the next candidate.
-    usual: f32,
+    max_shared: f32,
     /// Numbers of the selected frames.
     chosen: Vec<u32>,
 }
@@ -340,7 +340,7 @@ struct Chooser {
 impl Chooser {
     fn see(&mut self, number: u32, frame: GrayImage) -> Result<()> {
         self.window
-            .push((number, Impression::of_gray(&frame).sharpness, frame));
+            .push((number, PhotoStats::of_gray(&frame).sharpness, frame));
         if self.window.len() == WINDOW {
             self.close_window()
         } else {
@@ -369,17 +369,17 @@ impl Chooser {
         if before
             .get(before.len() / 2)
             .is_some_and(|usual| sharpness < BLURRED * usual)
-            && self.blurred < PATIENCE
+            && self.blurred < MAX_BLURRED_RUN
         {
             self.blurred += 1;
             return Ok(());
         }
-        if self.blurred >= PATIENCE {
+        if self.blurred >= MAX_BLURRED_RUN {
             self.sharpness.clear();
         }
         self.blurred = 0;
         self.sharpness.push_back(sharpness);
-        if self.sharpness.len() > PATIENCE {
+        if self.sharpness.len() > MAX_BLURRED_RUN {
             self.sharpness.pop_front();
         }
         let points = keypoints::detect(&frame)?;
@@ -395,9 +395,9 @@ impl Chooser {
         };
         let shared = share(last, &candidate.points);
         if self.near.is_none() {
-            self.usual = self.usual.max(shared);
+            self.max_shared = self.max_shared.max(shared);
         }
-        if shared >= SHARED * self.usual {
+        if shared >= SHARED * self.max_shared {
             self.near = Some(candidate);
         } else if let Some(near) = self.near.take() {
             self.take(near);

@@ -4,16 +4,16 @@
 //! `cargo run --release -p fastlgs --example photos_to_answers -- PHOTOS SCENE TEXT`
 
 use fastlgs::progress::{Message, Sink};
-use fastlgs::session::answer::Question;
-use fastlgs::session::ask::Ask;
-use fastlgs::{Run, Session, preprocess, train};
+use fastlgs::session::answer::QueryRequest;
+use fastlgs::session::ask::ObjectQuery;
+use fastlgs::{Run, Scene, preprocess, train};
 use fastlgs_grid::query::QueryConfig;
 
 /// Prints the name of each stage, and warnings.
 struct Stages;
 
 impl Sink for Stages {
-    fn tell(&self, message: Message<'_>) {
+    fn on_message(&self, message: Message<'_>) {
         match message {
             Message::Started { stage, total } => println!("{stage}: {total}"),
             Message::Warning(text) => println!("warning: {text}"),
@@ -32,8 +32,8 @@ fn main() -> fastlgs::Result<()> {
         progress: &Stages,
         ..Run::silent("auto", 0)
     };
-    let found = fastlgs::preprocess(
-        &preprocess::Config {
+    let preprocessed = fastlgs::preprocess(
+        &preprocess::PreprocessConfig {
             photos: photos.into(),
             output: scene.into(),
             max_side: 320,
@@ -43,10 +43,10 @@ fn main() -> fastlgs::Result<()> {
     )?;
     println!(
         "{} photos, {} masks, {} points",
-        found.photos, found.masks, found.points
+        preprocessed.photos, preprocessed.masks, preprocessed.points
     );
-    let made = fastlgs::train(
-        &train::Config {
+    let trained = fastlgs::train(
+        &train::TrainConfig {
             scene: scene.into(),
             iterations: Some(600),
             ..Default::default()
@@ -55,22 +55,22 @@ fn main() -> fastlgs::Result<()> {
     )?;
     println!(
         "{} Gaussians, {} objects, {:.1} dB on held-out views",
-        made.gaussians,
-        made.objects,
-        made.psnr_held_out.unwrap_or(f64::NAN)
+        trained.gaussians,
+        trained.objects,
+        trained.psnr_held_out.unwrap_or(f64::NAN)
     );
 
-    let mut session = Session::open(scene.as_ref(), "auto")?;
+    let mut session = Scene::open(scene.as_ref(), "auto")?;
     let (camera, grid) = (session.cameras[0].clone(), session.grid()?);
     let field = session.field(&camera, None)?;
-    let question = Question {
-        ask: &Ask::Text(text.clone()),
+    let question = QueryRequest {
+        ask: &ObjectQuery::Text(text.clone()),
         negatives: &[],
         config: QueryConfig::default(),
         dilate: None,
         candidates: 3,
     };
-    let (answer, report) = question.put(&session, &grid, &field, &camera, 0.0)?;
+    let (answer, report) = question.answer(&session, &grid, &field, &camera, 0.0)?;
     let pixels = answer.mask.iter().filter(|m| **m).count();
     println!(
         "{text}: {}, score {:.2}, {pixels} pixels of {}",

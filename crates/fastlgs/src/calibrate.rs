@@ -4,8 +4,8 @@ use crate::absent::{ABSENT, COLORS};
 use crate::calibrations::{self, CalibrationFile, Calibrations, calibration_path};
 use crate::error::{Context, bail};
 use crate::eval::best_object;
-use crate::eyes::{EncoderKind, Eyes};
-use crate::{Result, Run, Session, masks};
+use crate::eyes::{EncoderKind, ModelChoice};
+use crate::{Result, Run, Scene, masks};
 use fastlgs_core::labels::LabelledView;
 use fastlgs_core::synth::{Kind, SceneObject, World};
 use fastlgs_core::{LabelMap, fs};
@@ -24,7 +24,7 @@ use std::time::Instant;
 
 /// Report of a calibration.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct CalibrationReport {
     /// Best background around the masks in crops.
     pub background: Background,
     /// By background: how far the cosine of an object with its name exceeds the mean of the other
@@ -64,7 +64,7 @@ struct GeneratedScene {
 ///
 /// # Errors
 /// Towers that cannot be loaded or that distinguish no objects, or a folder that cannot be written.
-pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
+pub fn calibrate(eyes: &ModelChoice, run: &Run) -> Result<CalibrationReport> {
     let clock = Instant::now();
     if eyes.encoder != EncoderKind::Clip {
         bail!(
@@ -139,7 +139,7 @@ pub fn calibrate(eyes: &Eyes, run: &Run) -> Result<Report> {
             calibrations,
         },
     )?;
-    Ok(Report {
+    Ok(CalibrationReport {
         background,
         separation,
         texts,
@@ -226,8 +226,8 @@ impl GeneratedScene {
 ///
 /// # Errors
 /// Labels of views that the scene lacks, or a failing device.
-pub fn samples_of(scene: &mut Session, views: &[LabelledView]) -> Result<Samples> {
-    scene.forget_taught();
+pub fn samples_of(scene: &mut Scene, views: &[LabelledView]) -> Result<Samples> {
+    scene.ignore_taught_names();
     let grid = scene.grid()?;
     let seen = || grid.objects.iter().filter(|o| !o.embeddings.is_empty());
     let mut samples = Samples::default();

@@ -1,6 +1,6 @@
 //! Finds transparent objects. Masks show where they are, and invisible Gaussians represent them.
 
-use crate::objects::{self, Config, Mapped};
+use crate::objects::{self, Mapped, MappingConfig};
 use crate::{Result, Run};
 use fastlgs_core::gaussians::{TRANSPARENT_LOGIT, sigmoid};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
@@ -58,7 +58,7 @@ pub fn map(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
-    config: &Config,
+    config: &MappingConfig,
     run: &Run,
 ) -> Result<Mapped> {
     forget(scene);
@@ -105,7 +105,7 @@ fn add(
     folder: &SceneFolder,
     training: &[Camera],
     unexplained: Vec<Vec<bool>>,
-    config: &Config,
+    config: &MappingConfig,
     run: &Run,
 ) -> Result<Option<Mapped>> {
     let hulls = hulls(scene, training, unexplained, config, run)?;
@@ -158,7 +158,7 @@ fn unexplained(
     camera: &Camera,
     shown: &LabelMap,
     lists: &[Vec<u16>],
-    config: &Config,
+    config: &MappingConfig,
 ) -> Result<Vec<bool>> {
     let pixels = hull::unexplained(
         &objects::atoms(folder, camera)?,
@@ -182,7 +182,7 @@ fn hulls(
     scene: &Gaussians,
     training: &[Camera],
     unexplained: Vec<Vec<bool>>,
-    config: &Config,
+    config: &MappingConfig,
     run: &Run,
 ) -> Result<Vec<Hull>> {
     if unexplained
@@ -334,8 +334,8 @@ mod tests {
         let (mut scene, cameras) = scene(&folder);
         let (wall, config) = (
             scene.clone(),
-            Config {
-                objects: fastlgs_grid::objects::Config::default(),
+            MappingConfig {
+                objects: fastlgs_grid::objects::SelectionConfig::default(),
                 antialias: false,
             },
         );

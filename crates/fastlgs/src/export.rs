@@ -5,7 +5,7 @@ use crate::error::{Context, bail};
 use crate::output::SceneLock;
 use crate::session::selection;
 use crate::staged::StagedOutput;
-use crate::{Result, Run, Session, train};
+use crate::{Result, Run, Scene, train};
 use fastlgs_core::compact::{self, Precision};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::scene_folder::Manifest;
@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct ExportConfig {
     /// Trained scene folder.
     pub scene: PathBuf,
     /// Output file or folder. FILE.ply has 3DGS columns; FILE.spz and FILE.sog are compressed and
@@ -33,7 +33,7 @@ pub struct Config {
 /// Report of `export`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(untagged)]
-pub enum Report {
+pub enum ExportReport {
     /// Exported scene.
     Scene(Box<SceneReport>),
     /// Exported camera path.
@@ -106,12 +106,12 @@ pub fn names_folder(path: &Path) -> bool {
 ///
 /// # Errors
 /// A scene that was never trained, an output that cannot be written, or a failing device.
-pub fn export(config: &Config, run: &Run) -> Result<Report> {
+pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
     if config.output.extension().is_some_and(|e| e == "json") {
         let folder = SceneFolder::open(&config.scene)?;
         let cameras = folder.cameras()?;
         camera_path::write(&config.output, &cameras, &folder.manifest()?.frame)?;
-        return Ok(Report::Path {
+        return Ok(ExportReport::Path {
             scene: config.scene.clone(),
             output: config.output.clone(),
             frames: cameras.len(),
@@ -123,14 +123,14 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         .and_then(|e| e.to_str())
         .unwrap_or_default();
     let folder = names_folder(&config.output);
-    let file = !folder && selection::ENDINGS.contains(&ending);
+    let file = !folder && selection::EXTENSIONS.contains(&ending);
     if !folder && !file && !ending.is_empty() {
         let path = config.output.display();
         bail!(
             "{path}: the format .{ending} is unknown; use .ply, .spz, .sog, .glb or .json, or name a folder (without extension, or with / at the end)"
         );
     }
-    let mut scene = Session::open(&config.scene, run.device)?;
+    let mut scene = Scene::open(&config.scene, run.device)?;
     let held_out = scene.manifest.held_out(&scene.cameras);
     // Without held-out views, one training view measures the loss.
     let shown = if held_out.is_empty() {
@@ -144,7 +144,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
         .unwrap_or(scene.gaussians.sh_degree)
         .min(scene.gaussians.sh_degree);
     if degree < scene.gaussians.sh_degree {
-        scene.show(scene.gaussians.clone().with_sh_degree(degree))?;
+        scene.set_gaussians(scene.gaussians.clone().with_sh_degree(degree))?;
     }
     let (written, precision) = if file {
         let world = selection::World::of(&scene.manifest, &scene.cameras);
@@ -168,15 +168,15 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
             ),
         )
     };
-    scene.show(written)?;
+    scene.set_gaussians(written)?;
     let after = pictures(&mut scene, &shown)?;
     // Compare renders with renders: an exported scene may have no photos.
     let same: Vec<f64> = before.iter().zip(&after).map(|(a, b)| psnr(b, a)).collect();
-    Ok(Report::Scene(Box::new(SceneReport {
+    Ok(ExportReport::Scene(Box::new(SceneReport {
         scene: config.scene.clone(),
         output: config.output.clone(),
         bytes: bytes_of(&config.output),
-        bytes_before: crate::session::bytes(&config.scene),
+        bytes_before: crate::session::query_file_bytes(&config.scene),
         gaussians: scene.gaussians.len(),
         sh_degree: scene.gaussians.sh_degree,
         bytes_a_value: precision,
@@ -190,7 +190,7 @@ pub fn export(config: &Config, run: &Run) -> Result<Report> {
 }
 
 /// Renders the colours of views, `[3][h][w]` each.
-fn pictures(scene: &mut Session, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
+fn pictures(scene: &mut Scene, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
     views
         .iter()
         .map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec()))
@@ -198,7 +198,7 @@ fn pictures(scene: &mut Session, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
 }
 
 /// Returns whether the photos of all views exist. An exported scene has none.
-fn have_photos(scene: &Session, views: &[Camera]) -> bool {
+fn have_photos(scene: &Scene, views: &[Camera]) -> bool {
     views
         .iter()
         .all(|view| scene.folder.photo_path(&view.name).is_file())
@@ -206,7 +206,7 @@ fn have_photos(scene: &Session, views: &[Camera]) -> bool {
 
 /// Returns the mean PSNR of renders against photos in dB, over the pixels that count; `None` if
 /// photos are missing.
-fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> Result<Option<f64>> {
+fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Result<Option<f64>> {
     if !have_photos(scene, views) {
         return Ok(None);
     }
@@ -224,7 +224,7 @@ fn against_photos(scene: &Session, views: &[Camera], pictures: &[Vec<f32>]) -> R
 
 /// Returns the least precision that suffices for some training views; the default if their photos
 /// are missing.
-fn precision(scene: &mut Session) -> Result<Precision> {
+fn precision(scene: &mut Scene) -> Result<Precision> {
     let training = scene.manifest.training(&scene.cameras);
     let views: Vec<Camera> = training
         .iter()
@@ -237,12 +237,12 @@ fn precision(scene: &mut Session) -> Result<Precision> {
         return Ok(Precision::default());
     }
     let chosen = Precision::choose(&original, PRECISION_LOSS, |gaussians| {
-        scene.show(gaussians.clone())?;
+        scene.set_gaussians(gaussians.clone())?;
         let pictures = pictures(scene, &views)?;
         against_photos(scene, &views, &pictures)?
             .context("the photos of the scene are missing now; run 'fastlgs preprocess' again")
     })?;
-    scene.show(original)?;
+    scene.set_gaussians(original)?;
     Ok(chosen)
 }
 
@@ -251,7 +251,7 @@ fn precision(scene: &mut Session) -> Result<Precision> {
 ///
 /// # Errors
 /// The folder is a trained scene, or the features of the scene are not the codes of its objects.
-fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precision)> {
+fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)> {
     if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
         bail!(
             "{}: this folder is the scene itself; choose another folder",
@@ -303,7 +303,7 @@ fn small_folder(scene: &mut Session, root: &Path) -> Result<(Gaussians, Precisio
 
 fn bytes_of(path: &Path) -> u64 {
     if path.is_dir() {
-        crate::session::bytes(path)
+        crate::session::query_file_bytes(path)
     } else {
         std::fs::metadata(path).map_or(0, |m| m.len())
     }

@@ -86,7 +86,7 @@ impl EncoderKind {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Eyes {
+pub struct ModelChoice {
     /// Segmenter, which finds masks.
     #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t))]
     pub segmenter: SegmenterKind,
@@ -146,7 +146,7 @@ pub struct Eyes {
     pub clip_text: Option<PathBuf>,
 }
 
-impl Default for Eyes {
+impl Default for ModelChoice {
     fn default() -> Self {
         Self {
             segmenter: SegmenterKind::default(),
@@ -166,7 +166,7 @@ impl Default for Eyes {
     }
 }
 
-impl Eyes {
+impl ModelChoice {
     /// Checks that no option is set that the chosen segmenter and encoder ignore.
     pub(crate) fn check(&self) -> Result<()> {
         let of_sam = [
@@ -214,12 +214,12 @@ impl Eyes {
         })
     }
 
-    fn sam_config(&self) -> sam::Config {
+    fn sam_config(&self) -> sam::SamConfig {
         let preset = match self.sam_preset.unwrap_or_default() {
-            SamPreset::Meta => sam::Config::default(),
-            SamPreset::LangSplat => sam::Config::langsplat(),
+            SamPreset::Meta => sam::SamConfig::default(),
+            SamPreset::LangSplat => sam::SamConfig::langsplat(),
         };
-        sam::Config {
+        sam::SamConfig {
             points_per_side: self.sam_points.unwrap_or(preset.points_per_side),
             predicted_iou: self.sam_iou.unwrap_or(preset.predicted_iou),
             stability: self.sam_stability.unwrap_or(preset.stability),

@@ -6,7 +6,7 @@
 //! * [`preprocess`](preprocess()): photos to masks, poses, key point matches and points;
 //! * [`train`](train()): Gaussians with colour, then [`objects`];
 //! * [`make`](make()): both, without repeating finished work;
-//! * [`Session`]: an opened scene that renders and answers queries;
+//! * [`Scene`]: an opened scene that renders and answers queries;
 //! * [`eval`](eval()), [`export`](export()), [`synth`](synth()): accuracy, other formats, generated
 //!   scenes;
 //! * [`render`](render()), [`library`]: images of views, and search in many scenes.
@@ -50,6 +50,6 @@ pub use preprocess::preprocess;
 pub use progress::{Run, Silent};
 pub use remove::remove;
 pub use render::render;
-pub use session::Session;
+pub use session::Scene;
 pub use synth::synth;
 pub use train::train;

@@ -18,7 +18,7 @@ const DEPTH: usize = 3;
 
 /// Options of a library query, besides the text.
 #[derive(Clone, Debug)]
-pub struct Config {
+pub struct SearchConfig {
     /// Largest number of scenes in an answer.
     pub scenes: usize,
     /// Accepted share of absent names that a scene answers.
@@ -31,7 +31,7 @@ pub struct Config {
 
 /// An opened library and its text encoder.
 pub struct Search {
-    config: Config,
+    config: SearchConfig,
     texts: Texts,
     scenes: Vec<Opened>,
     skipped: Vec<Skipped>,
@@ -47,7 +47,7 @@ struct Opened {
 
 /// Answer of a library.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct SearchReport {
     /// Text of the query.
     pub text: String,
     /// Whether any scene contains the object.
@@ -111,7 +111,7 @@ impl Search {
     ///
     /// # Errors
     /// A folder without trained scenes, or a file that cannot be read.
-    pub fn open(root: &Path, config: Config, run: &Run) -> Result<Self> {
+    pub fn open(root: &Path, config: SearchConfig, run: &Run) -> Result<Self> {
         let started = Instant::now();
         let (trained, skipped) = scenes_below(root)?;
         for row in &skipped {
@@ -161,9 +161,9 @@ impl Search {
     ///
     /// # Errors
     /// A text that cannot be embedded.
-    pub fn ask(&self, text: &str) -> Result<Report> {
+    pub fn ask(&self, text: &str) -> Result<SearchReport> {
         let started = Instant::now();
-        let embedded = Embedded::words(text, &self.texts, &self.config.negatives)?;
+        let embedded = Embedded::from_text(text, &self.texts, &self.config.negatives)?;
         let encode_ms = started.elapsed().as_secs_f64() * 1e3;
         let started = Instant::now();
         let config = QueryConfig {
@@ -192,7 +192,7 @@ impl Search {
             .iter()
             .map(|scene| scene.grid.objects.len())
             .sum();
-        Ok(Report {
+        Ok(SearchReport {
             text: text.to_owned(),
             found: rows.iter().any(|r| r.found),
             scenes: rows,
@@ -229,7 +229,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
         let manifest = SceneFolder::new(&folder).manifest();
         let why = match &manifest {
             Err(error) => Some(error.to_string()),
-            Ok(own) => match train::Report::from_manifest(own, &folder) {
+            Ok(own) => match train::TrainReport::from_manifest(own, &folder) {
                 Err(error) => Some(error.to_string()),
                 Ok(None) => Some("it was never trained".to_owned()),
                 Ok(Some(_)) => {

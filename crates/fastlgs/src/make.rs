@@ -16,19 +16,19 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct MakeConfig {
     /// Options of `preprocess`: photos, scene folder and models.
     #[cfg_attr(feature = "clap", command(flatten))]
-    pub preprocess: preprocess::Config,
+    pub preprocess: preprocess::PreprocessConfig,
     /// Length of training.
-    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = Config::default().effort))]
+    #[cfg_attr(feature = "clap", arg(long, value_enum, default_value_t = MakeConfig::default().effort))]
     pub effort: train::Preset,
 }
 
-impl Default for Config {
+impl Default for MakeConfig {
     fn default() -> Self {
         Self {
-            preprocess: preprocess::Config::default(),
+            preprocess: preprocess::PreprocessConfig::default(),
             effort: train::Preset::Quick,
         }
     }
@@ -46,21 +46,21 @@ pub enum State {
 
 /// Report of `make`.
 #[derive(Clone, Debug, Serialize)]
-pub struct Report {
+pub struct MakeReport {
     /// Whether the scene was made, or existed already.
     pub state: State,
     /// Number of training photos, and number of held-out photos.
     pub photos: [usize; 2],
     /// Report of the training.
-    pub train: train::Report,
+    pub train: train::TrainReport,
 }
 
 /// Makes the scene `config.preprocess.output`, and continues an interrupted run.
 ///
 /// # Errors
 /// Those of [`preprocess`](crate::preprocess()) and [`train`](crate::train()).
-pub fn make(config: &Config, run: &Run) -> Result<Report> {
-    let train = train::Config {
+pub fn make(config: &MakeConfig, run: &Run) -> Result<MakeReport> {
+    let train = train::TrainConfig {
         scene: config.preprocess.output.clone(),
         preset: config.effort,
         ..Default::default()
@@ -75,7 +75,7 @@ pub fn make(config: &Config, run: &Run) -> Result<Report> {
     let (state, train) = scene(&preprocess, &train, [run, run])?;
     let folder = SceneFolder::open(&config.preprocess.output)?;
     let (manifest, cameras) = (folder.manifest()?, folder.cameras()?);
-    Ok(Report {
+    Ok(MakeReport {
         state,
         photos: [
             manifest.training(&cameras).len(),
@@ -91,24 +91,24 @@ pub fn make(config: &Config, run: &Run) -> Result<Report> {
 /// # Errors
 /// Those of both stages.
 pub fn scene(
-    preprocess: &preprocess::Config,
-    train: &train::Config,
+    preprocess: &preprocess::PreprocessConfig,
+    train: &train::TrainConfig,
     runs: [&Run; 2],
-) -> Result<(State, train::Report)> {
+) -> Result<(State, train::TrainReport)> {
     let photos = &preprocess.photos;
     let photos = photos
         .canonicalize()
         .with_context(|| format!("{}: the photos cannot be opened", photos.display()))?;
     let seeds = runs.map(|run| run.seed);
     // Leave out the paths of the scene, because a scene may be moved.
-    let how = preprocess::Config {
+    let how = preprocess::PreprocessConfig {
         photos: photos.clone(),
         output: PathBuf::new(),
         ..preprocess.clone()
     };
     let how = json!([
         how,
-        train::Config {
+        train::TrainConfig {
             scene: PathBuf::new(),
             ..train.clone()
         }
@@ -132,7 +132,7 @@ pub fn scene(
     if let Some(report) = known
         .as_ref()
         .filter(|_| is_complete)
-        .map(|known| train::Report::from_manifest(known, &folder.root))
+        .map(|known| train::TrainReport::from_manifest(known, &folder.root))
         .transpose()?
         .flatten()
     {
@@ -150,7 +150,7 @@ pub fn scene(
         folder.save_manifest(&manifest)?;
     }
     let report = train::train_locked(
-        &train::Config {
+        &train::TrainConfig {
             resume: begun || train.resume,
             ..train.clone()
         },

@@ -24,7 +24,7 @@ pub struct Example {
 pub struct Names(BTreeMap<String, Vec<Example>>);
 
 /// Normalises a name: lower case, and one space between words.
-pub(crate) fn plain(name: &str) -> String {
+pub(crate) fn normalise_name(name: &str) -> String {
     name.split_whitespace()
         .collect::<Vec<_>>()
         .join(" ")
@@ -82,7 +82,7 @@ impl Names {
         if let Some((name, _)) = names
             .0
             .iter()
-            .find(|(name, examples)| plain(name) != **name || !examples.iter().all(finite))
+            .find(|(name, examples)| normalise_name(name) != **name || !examples.iter().all(finite))
         {
             bail!(
                 "{}: the entry of the name '{name}' is damaged; remove it from the file, or move the file away",
@@ -101,13 +101,13 @@ impl Names {
     }
 
     /// Returns the examples of a name; `None` if it was not taught.
-    pub fn of(&self, name: &str) -> Option<&[Example]> {
-        self.0.get(&plain(name)).map(Vec::as_slice)
+    pub fn examples(&self, name: &str) -> Option<&[Example]> {
+        self.0.get(&normalise_name(name)).map(Vec::as_slice)
     }
 
     /// Adds an example to a name, unless the name already has it.
     pub fn add(&mut self, name: &str, example: Example) {
-        let examples = self.0.entry(plain(name)).or_default();
+        let examples = self.0.entry(normalise_name(name)).or_default();
         if !examples.contains(&example) {
             examples.push(example);
         }
@@ -129,7 +129,7 @@ impl Names {
     /// # Errors
     /// A name that was not taught.
     pub fn remove(&mut self, name: &str) -> Result<()> {
-        match self.0.remove(&plain(name)) {
+        match self.0.remove(&normalise_name(name)) {
             Some(_) => Ok(()),
             None => {
                 bail!("'{name}' was never taught; run 'fastlgs names list' to see all taught names")
@@ -177,7 +177,7 @@ mod tests {
         names.add("Lis  rudy", example("a"));
         names.add("lis rudy", example("a"));
         names.add("LIS RUDY", example("b"));
-        assert_eq!(names.of(" Lis Rudy ").map(<[Example]>::len), Some(2));
+        assert_eq!(names.examples(" Lis Rudy ").map(<[Example]>::len), Some(2));
         let dir = tempfile::tempdir().expect("a folder");
         let path = dir.path().join("names.json");
         names.write(&path).expect("a file");

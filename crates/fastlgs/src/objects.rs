@@ -7,12 +7,12 @@ use fastlgs_core::mask_list::{AtomTable, Atoms};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as chosen, Chosen};
-use fastlgs_grid::sightings::{Sighting, Sightings};
+use fastlgs_grid::sightings::{Observation, Observations};
 use fastlgs_grid::support::support;
 use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
-use fastlgs_vision::photo_quality::{self, Impression};
+use fastlgs_vision::photo_quality::{self, PhotoStats};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
@@ -20,9 +20,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 /// Options of global mapping.
-pub struct Config {
+pub struct MappingConfig {
     /// Conditions under which an elected set is an object.
-    pub objects: chosen::Config,
+    pub objects: chosen::SelectionConfig,
     /// Whether the scene was trained with the 2-D Mip filter, which changes blending weights.
     pub antialias: bool,
 }
@@ -53,7 +53,7 @@ pub fn by_algorithm_1(
         comparisons,
     } = mapping::paper(&compared, &pairs, config)?;
     tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
-    begin_maps(folder)?;
+    mark_maps_unfinished(folder)?;
     for (view, camera) in training.iter().enumerate() {
         let labels = masks::whole_masks(folder, camera)?;
         let mut table = vec![0u16; usize::from(labels.max()) + 1];
@@ -90,7 +90,7 @@ fn unfinished(folder: &SceneFolder) -> PathBuf {
 }
 
 /// Creates the marker file, before the object maps are written.
-fn begin_maps(folder: &SceneFolder) -> Result<()> {
+fn mark_maps_unfinished(folder: &SceneFolder) -> Result<()> {
     let why = "These object maps do not belong to grid.json; train the scene again.\n";
     Ok(fs::write_atomic(&unfinished(folder), |file| {
         std::io::Write::write_all(file, why.as_bytes())
@@ -98,7 +98,7 @@ fn begin_maps(folder: &SceneFolder) -> Result<()> {
 }
 
 /// Removes the marker file, after the object table is saved.
-pub fn end_maps(folder: &SceneFolder) {
+pub fn mark_maps_finished(folder: &SceneFolder) {
     let _ = std::fs::remove_file(unfinished(folder));
 }
 
@@ -106,7 +106,7 @@ pub fn end_maps(folder: &SceneFolder) {
 ///
 /// # Errors
 /// A training view has no object map, or a map does not belong to the object table or to its photo.
-pub fn kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
+pub fn load_kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     let advice = || {
         format!(
             "{}: mapping 'keep' needs the objects of a trained scene; train it first",
@@ -182,7 +182,7 @@ pub fn lift(
                 .or_default() += vote.weight;
         }
     }
-    let most = |found: &BTreeMap<u16, f32>| {
+    let majority_objects = |found: &BTreeMap<u16, f32>| {
         let mut sums: BTreeMap<Reverse<u16>, f32> = BTreeMap::new();
         for (id, weight) in found {
             lists[usize::from(*id)]
@@ -201,7 +201,7 @@ pub fn lift(
             &lists,
         )
     };
-    scene.object_ids = weights.iter().map(most).collect();
+    scene.object_ids = weights.iter().map(majority_objects).collect();
     grid.set_codes(scene);
     Ok(())
 }
@@ -221,7 +221,7 @@ pub fn map(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
-    config: &Config,
+    config: &MappingConfig,
     run: &Run,
 ) -> Result<Mapped> {
     // Mean number of pixels of a view; photos may differ in size.
@@ -231,10 +231,10 @@ pub fn map(
         .sum::<usize>()
         / training.len();
     let clock = std::time::Instant::now();
-    let told = |what: &str, count: usize| {
+    let log_step = |what: &str, count: usize| {
         tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}")
     };
-    let (seen, tables) = sightings(scene, folder, training, config.antialias, run)?;
+    let (observations_by_view, tables) = sightings(scene, folder, training, config.antialias, run)?;
     let masks = tables.iter().map(|t| t.areas.len()).sum();
     let left_out: usize = tables.iter().map(|t| t.left_out).sum();
     if left_out > 0 {
@@ -242,18 +242,18 @@ pub fn map(
             "{left_out} masks were ignored, because a view can have at most 65,535 masks and atoms"
         ));
     }
-    let sightings = Sightings::new(scene.len(), seen, &tables);
+    let sightings = Observations::new(scene.len(), observations_by_view, &tables);
     let megabytes = (sightings.bytes() >> 20) as u32;
-    told("observations", sightings.len());
+    log_step("observations", sightings.len());
     let proposals = consensus::proposals(&sightings, config.objects.min_views);
-    told("proposals", proposals.len());
+    log_step("proposals", proposals.len());
     let elected = election::elected(proposals, config.objects.min_views);
-    told("elected", elected.len());
+    log_step("elected", elected.len());
     let support = support(&sightings, &elected);
-    told("support", support.len());
+    log_step("support", support.len());
     let sets = elected.len();
     let chosen = chosen::choose(&sightings, elected, support, pixels, &config.objects);
-    told("objects", chosen.support.len());
+    log_step("objects", chosen.support.len());
     scene.object_ids.clone_from(&chosen.ids);
     let [few_views, unsupported, same] = chosen.dropped;
     let summary = Summary {
@@ -270,7 +270,7 @@ pub fn map(
 
 /// Completes global mapping: embeds the objects of [`map`] by the object maps that [`write_maps`]
 /// wrote, and gives the Gaussians their codes.
-pub fn by_consensus(
+pub fn embed_objects(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     training: &[Camera],
@@ -318,7 +318,7 @@ pub fn write_maps(
     run: &Run,
     mut tell: impl FnMut(&Camera, &LabelMap) -> Result<()>,
 ) -> Result<()> {
-    begin_maps(folder)?;
+    mark_maps_unfinished(folder)?;
     render_maps(
         scene,
         training,
@@ -353,20 +353,20 @@ pub fn render_maps(
     Ok(())
 }
 
-/// Embeds every object in its best views (`shown`). Returns the masks and their object ids. Objects
+/// Embeds every object in its best views (`embedding_views`). Returns the masks and their object ids. Objects
 /// of one entry of `layers` share no Gaussians, and `lists` holds the objects of each id.
 fn embed(
     folder: &SceneFolder,
     training: &[Camera],
     layers: &[BTreeSet<u16>],
     lists: &[Vec<u16>],
-    shown: &[Vec<usize>],
+    embedding_views: &[Vec<usize>],
     run: &Run,
 ) -> Result<(Vec<Mask>, Vec<u16>)> {
     let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
     let work = run.work("embeddings", training.len() as u64);
     // Views are embedded in parallel, because one view has too few masks for many cores.
-    let of_view = |(view, camera): (usize, &Camera)| -> Result<(Vec<Mask>, Impression)> {
+    let of_view = |(view, camera): (usize, &Camera)| -> Result<(Vec<Mask>, PhotoStats)> {
         let map = folder.objects(&camera.name)?;
         let photo = folder.photo(&camera.name)?;
         let mut found = Vec::new();
@@ -374,7 +374,7 @@ fn embed(
             let wanted: BTreeSet<u16> = layer
                 .iter()
                 .copied()
-                .filter(|id| shown[usize::from(*id) - 1].contains(&view))
+                .filter(|id| embedding_views[usize::from(*id) - 1].contains(&view))
                 .collect();
             if wanted.is_empty() {
                 continue;
@@ -402,9 +402,9 @@ fn embed(
             )?);
         }
         work.advance()?;
-        Ok((found, Impression::of(&photo)))
+        Ok((found, PhotoStats::of(&photo)))
     };
-    let (found, impressions): (Vec<Vec<Mask>>, Vec<Impression>) = training
+    let (found, impressions): (Vec<Vec<Mask>>, Vec<PhotoStats>) = training
         .par_iter()
         .enumerate()
         .map(of_view)
@@ -454,16 +454,16 @@ fn sightings(
     training: &[Camera],
     antialias: bool,
     run: &Run,
-) -> Result<(Vec<Vec<Sighting>>, Vec<AtomTable>)> {
+) -> Result<(Vec<Vec<Observation>>, Vec<AtomTable>)> {
     let (mut seen, mut tables) = (Vec::new(), Vec::new());
     let work = run.work("votes", training.len() as u64);
     for camera in training {
         let atoms = atoms(folder, camera)?;
         let votes = lift::votes(scene, &frame(scene, camera, antialias), &atoms.map);
         // A vector that is collected in place keeps the capacity of the unsummed votes.
-        let mut own: Vec<Sighting> = votes
+        let mut own: Vec<Observation> = votes
             .into_iter()
-            .map(|vote| Sighting::new(vote.gaussian, vote.label, vote.weight))
+            .map(|vote| Observation::new(vote.gaussian, vote.label, vote.weight))
             .collect();
         own.shrink_to_fit();
         seen.push(own);

@@ -13,7 +13,7 @@ use std::path::{Component, Path, PathBuf};
 /// Lock file in a scene folder. It also marks a folder that a killed first run created.
 const LOCK: &str = "scene.lock";
 /// First word of a lock file.
-const MARK: &str = "FastLGS";
+const LOCK_HEADER: &str = "FastLGS";
 
 /// Lock of a scene folder: as long as it exists, no other run writes the scene. The operating
 /// system releases it when the process ends.
@@ -31,7 +31,7 @@ impl SceneLock {
     /// # Errors
     /// The folder holds other files than a scene, another run writes it, or it cannot be created.
     pub fn take(scene: &Path, stage: &str) -> Result<Self> {
-        let folder = resolved(scene)?;
+        let folder = resolve_path(scene)?;
         check_writable(&folder)
             .with_context(|| format!("{} cannot be written", scene.display()))?;
         let created = !folder.exists();
@@ -51,7 +51,7 @@ impl SceneLock {
                 let _ = file.read_to_string(&mut holder);
                 let holder = holder
                     .trim()
-                    .strip_prefix(MARK)
+                    .strip_prefix(LOCK_HEADER)
                     .map_or("another run", |line| line.trim_start_matches([':', ' ']));
                 bail!(
                     "{}: {holder} is writing this scene; wait until it ends, or stop it",
@@ -61,7 +61,7 @@ impl SceneLock {
             Err(TryLockError::Error(error)) => return Err(Error::io(&path)(error).into()),
         }
         let line = format!(
-            "{MARK}: 'fastlgs {stage}' (process {})\n",
+            "{LOCK_HEADER}: 'fastlgs {stage}' (process {})\n",
             std::process::id()
         );
         let note = file
@@ -137,7 +137,7 @@ fn check_writable(folder: &Path) -> Result<()> {
         };
     }
     let ours = std::fs::read_to_string(folder.join(LOCK))
-        .is_ok_and(|text| text.is_empty() || text.starts_with(MARK));
+        .is_ok_and(|text| text.is_empty() || text.starts_with(LOCK_HEADER));
     match names.first() {
         Some(name) if !ours => {
             bail!(
@@ -154,34 +154,35 @@ fn check_writable(folder: &Path) -> Result<()> {
 /// # Errors
 /// A message with both paths.
 pub(crate) fn check_apart(photos: &Path, scene: &Path) -> Result<()> {
-    let folder = resolved(scene)?;
-    let album = resolved(photos)?;
+    let folder = resolve_path(scene)?;
+    let album = resolve_path(photos)?;
     // Linked photos must not lie in the scene, which is replaced while they are read.
     let folders = std::iter::once(photos.to_owned()).chain(images_folder(photos));
     let links = folders.flat_map(|folder| folder.read_dir().into_iter().flatten().flatten());
     let links = links
         .filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_symlink()))
         .filter_map(|entry| entry.path().canonicalize().ok());
-    let within = std::iter::once(album.clone())
+    let photo_in_scene = std::iter::once(album.clone())
         .chain(links)
         .find(|place| place.starts_with(&folder));
-    let Some(place) = within.or_else(|| folder.starts_with(&album).then(|| album.clone())) else {
+    let Some(place) = photo_in_scene.or_else(|| folder.starts_with(&album).then(|| album.clone()))
+    else {
         return Ok(());
     };
-    let how = match (place == folder, place.starts_with(&folder)) {
+    let relation = match (place == folder, place.starts_with(&folder)) {
         (true, _) => "it is the folder of the photos",
         (_, true) => "it contains the photos",
         _ => "it lies in the folder of the photos",
     };
-    let (scene, photos, other) = (scene.display(), photos.display(), beside(&album));
+    let (scene, photos, other) = (scene.display(), photos.display(), suggested_scene(&album));
     bail!(
-        "{scene} cannot be the output folder for the photos {photos}: {how}; nothing was written; choose a folder beside the photos, such as {}",
+        "{scene} cannot be the output folder for the photos {photos}: {relation}; nothing was written; choose a folder beside the photos, such as {}",
         other.display()
     )
 }
 
 /// Returns a path for a scene beside a folder of photos.
-fn beside(photos: &Path) -> PathBuf {
+fn suggested_scene(photos: &Path) -> PathBuf {
     let name = photos
         .file_stem()
         .unwrap_or_default()
@@ -194,7 +195,7 @@ fn beside(photos: &Path) -> PathBuf {
 ///
 /// # Errors
 /// An empty path, or one that cannot be made absolute.
-pub(crate) fn resolved(path: &Path) -> Result<PathBuf> {
+pub(crate) fn resolve_path(path: &Path) -> Result<PathBuf> {
     if path.as_os_str().is_empty() {
         bail!("the path of the folder is empty; name a folder");
     }

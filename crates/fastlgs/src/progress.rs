@@ -28,7 +28,7 @@ impl<'a> Run<'a> {
 
     /// Starts a stage of `total` steps; 0 if their number is unknown.
     pub fn work(&self, stage: &'static str, total: u64) -> Work<'a> {
-        self.progress.tell(Message::Started { stage, total });
+        self.progress.on_message(Message::Started { stage, total });
         Work {
             sink: self.progress,
             stage,
@@ -39,14 +39,14 @@ impl<'a> Run<'a> {
 
     /// Sends a warning to the progress sink.
     pub fn warn(&self, text: &str) {
-        self.progress.tell(Message::Warning(text));
+        self.progress.on_message(Message::Warning(text));
     }
 }
 
 /// Progress sink: receives the messages of a stage. They come from several threads.
 pub trait Sink: Sync {
     /// Receives a message.
-    fn tell(&self, message: Message<'_>);
+    fn on_message(&self, message: Message<'_>);
 
     /// Returns whether the run must end with [`Error::Cancelled`] at its next step. Earlier results
     /// remain, and a training can be resumed from its last checkpoint.
@@ -59,7 +59,7 @@ pub trait Sink: Sync {
 pub struct Silent;
 
 impl Sink for Silent {
-    fn tell(&self, _: Message<'_>) {}
+    fn on_message(&self, _: Message<'_>) {}
 }
 
 /// A message of a stage.
@@ -138,7 +138,7 @@ impl Work<'_> {
     /// [`Error::Cancelled`] if the sink cancels the run.
     pub fn advance(&self) -> Result<()> {
         let done = self.done.fetch_add(1, Ordering::Relaxed) + 1;
-        self.sink.tell(Message::Advanced {
+        self.sink.on_message(Message::Advanced {
             stage: self.stage,
             done,
             total: self.total,
@@ -148,9 +148,9 @@ impl Work<'_> {
     }
 
     /// Reports the current activity.
-    pub fn note(&self, note: &str) {
+    pub fn set_activity(&self, note: &str) {
         let done = self.done.load(Ordering::Relaxed);
-        self.sink.tell(Message::Advanced {
+        self.sink.on_message(Message::Advanced {
             stage: self.stage,
             done,
             total: self.total,
@@ -160,9 +160,9 @@ impl Work<'_> {
 
     /// Reports `done` of `total` steps and the current activity, for stages whose number of steps
     /// is unknown at the start.
-    pub fn set(&self, done: u64, total: u64, note: &str) {
+    pub fn set_progress(&self, done: u64, total: u64, note: &str) {
         self.done.store(done, Ordering::Relaxed);
-        self.sink.tell(Message::Advanced {
+        self.sink.on_message(Message::Advanced {
             stage: self.stage,
             done,
             total,
@@ -185,7 +185,8 @@ impl Work<'_> {
 
 impl Drop for Work<'_> {
     fn drop(&mut self) {
-        self.sink.tell(Message::Finished { stage: self.stage });
+        self.sink
+            .on_message(Message::Finished { stage: self.stage });
     }
 }
 
@@ -196,23 +197,23 @@ mod tests {
 
     /// Records all messages, and cancels after `after` steps.
     struct Record {
-        heard: Mutex<Vec<String>>,
+        messages: Mutex<Vec<String>>,
         after: u64,
     }
 
     impl Sink for Record {
-        fn tell(&self, message: Message<'_>) {
+        fn on_message(&self, message: Message<'_>) {
             let line = match message {
                 Message::Started { stage, total } => format!("{stage} of {total}"),
                 Message::Advanced { done, note, .. } => format!("{done}{note}"),
                 Message::Finished { stage } => format!("{stage} over"),
                 _ => "other".to_owned(),
             };
-            self.heard.lock().unwrap().push(line);
+            self.messages.lock().unwrap().push(line);
         }
 
         fn cancelled(&self) -> bool {
-            self.heard
+            self.messages
                 .lock()
                 .unwrap()
                 .iter()
@@ -225,7 +226,7 @@ mod tests {
     #[test]
     fn work_is_told_and_cancelled() {
         let sink = Record {
-            heard: Mutex::default(),
+            messages: Mutex::default(),
             after: 2,
         };
         let run = Run {
@@ -234,12 +235,12 @@ mod tests {
         };
         let work = || -> Result<()> {
             let work = run.work("masks", 3);
-            work.note(" first");
+            work.set_activity(" first");
             (0..3).try_for_each(|_| work.advance())
         };
         assert!(matches!(work(), Err(Error::Cancelled)));
         assert_eq!(
-            *sink.heard.lock().unwrap(),
+            *sink.messages.lock().unwrap(),
             ["masks of 3", "0 first", "1", "2", "masks over"]
         );
     }

@@ -2,7 +2,7 @@
 
 use crate::error::bail;
 use crate::session::ViewChoice;
-use crate::{Result, Run, Session};
+use crate::{Result, Run, Scene};
 use fastlgs_core::{exr_image, image_io, turbo};
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum))]
-pub enum What {
+pub enum RenderContent {
     /// Colour, as PNG.
     Color,
     /// Expected depth in world units, as EXR.
@@ -28,7 +28,7 @@ pub enum What {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct RenderConfig {
     /// Trained scene folder.
     pub scene: PathBuf,
     /// Cameras to render.
@@ -40,18 +40,18 @@ pub struct Config {
         feature = "clap",
         arg(long, value_enum, default_value = "color", value_delimiter = ',')
     )]
-    pub what: Vec<What>,
+    pub what: Vec<RenderContent>,
     /// Output folder.
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
 }
 
-impl Default for Config {
+impl Default for RenderConfig {
     fn default() -> Self {
         Self {
             scene: PathBuf::new(),
             views: ViewChoice::default(),
-            what: vec![What::Color],
+            what: vec![RenderContent::Color],
             output: PathBuf::new(),
         }
     }
@@ -59,7 +59,7 @@ impl Default for Config {
 
 /// Report of `render`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct RenderReport {
     /// Scene folder.
     pub scene: PathBuf,
     /// Files of the images.
@@ -87,8 +87,8 @@ fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
 /// # Errors
 /// A scene that is not trained, an unknown view, a device that fails, or a file that cannot be
 /// written.
-pub fn render(config: &Config, run: &Run) -> Result<Report> {
-    let mut scene = Session::open(&config.scene, run.device)?;
+pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
+    let mut scene = Scene::open(&config.scene, run.device)?;
     let cameras = config.views.cameras(&scene.folder, &scene.cameras)?;
     let Some(first) = cameras.first() else {
         bail!("{}: the scene has no views", config.scene.display())
@@ -106,14 +106,14 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
             files.push(path.clone());
             path
         };
-        if config.what.contains(&What::Color) {
+        if config.what.contains(&RenderContent::Color) {
             let frame = timed(&mut rendered, || scene.render(camera))?;
             image_io::save_png(
                 &path("color", "png"),
                 image_io::from_planar(frame.channels(0, 3), frame.width, frame.height),
             )?;
         }
-        if config.what.contains(&What::Feature) {
+        if config.what.contains(&RenderContent::Feature) {
             let frame = timed(&mut rendered, || scene.render_feature(camera))?;
             let channels = [
                 ("feature.0", frame.channels(3, 4)),
@@ -122,13 +122,13 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
             ];
             exr_image::write(&path("feature", "exr"), w, h, &channels)?;
         }
-        if config.what.contains(&What::Depth) {
+        if config.what.contains(&RenderContent::Depth) {
             let mut depth = timed(&mut rendered, || scene.render_depth(camera))?;
             let unit = scene.manifest.frame.scale as f32;
             depth.iter_mut().for_each(|depth| *depth *= unit);
             exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
         }
-        if config.what.contains(&What::Objects) {
+        if config.what.contains(&RenderContent::Objects) {
             let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&scene.grid()?);
             let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| {
                 Rgb(turbo::id_color(ids.at(x, y)))
@@ -143,7 +143,7 @@ pub fn render(config: &Config, run: &Run) -> Result<Report> {
         scene.gaussians.len(),
         scene.engine.name(),
     );
-    Ok(Report {
+    Ok(RenderReport {
         scene: scene_root,
         files,
         size,

@@ -9,14 +9,14 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Subfolder of the replaced files, which is removed together with the staged output.
-const BEFORE: &str = "before";
+const REPLACED_FOLDER: &str = "before";
 
 /// A folder within the scene folder; dropping this value removes it.
 pub(crate) struct StagedOutput {
     /// Folder that the stage writes.
     pub folder: SceneFolder,
     /// Whether the folder must remain, because it holds replaced files that could not be restored.
-    stays: bool,
+    keep_folder: bool,
 }
 
 impl StagedOutput {
@@ -27,7 +27,7 @@ impl StagedOutput {
         std::fs::create_dir_all(&root).map_err(Error::io(&root))?;
         Ok(Self {
             folder: SceneFolder::new(root),
-            stays: false,
+            keep_folder: false,
         })
     }
 
@@ -52,8 +52,8 @@ impl StagedOutput {
             .manifest()
             .map(|earlier| earlier.files)
             .unwrap_or_default();
-        let made = files_in(&self.folder.root)?;
-        let new: BTreeSet<String> = made.iter().cloned().chain(reserved).collect();
+        let staged_files = files_in(&self.folder.root)?;
+        let new: BTreeSet<String> = staged_files.iter().cloned().chain(reserved).collect();
         if let Some(foreign) = new
             .iter()
             .find(|file| !listed.contains(*file) && scene.root.join(file).exists())
@@ -78,25 +78,25 @@ impl StagedOutput {
             files,
             ..manifest.clone()
         })?;
-        let before = self.folder.root.join(BEFORE);
+        let before = self.folder.root.join(REPLACED_FOLDER);
         let manifest = [MANIFEST.to_owned()];
-        let away = manifest
+        let moves_out = manifest
             .iter()
             .chain(&old)
             .map(|name| (scene.root.join(name), before.join(name)));
-        let into = made
+        let moves_in = staged_files
             .iter()
             .chain(&manifest)
             .map(|name| (self.folder.root.join(name), scene.root.join(name)));
         let mut moved = Vec::new();
-        let done = away.chain(into).try_for_each(|(from, to)| {
+        let done = moves_out.chain(moves_in).try_for_each(|(from, to)| {
             if rename_if_there(&from, &to)? {
                 moved.push((from, to));
             }
             Ok(())
         });
         if done.is_err() {
-            self.stays = moved
+            self.keep_folder = moved
                 .iter()
                 .rev()
                 .any(|(from, to)| std::fs::rename(to, from).is_err());
@@ -125,7 +125,7 @@ impl StagedOutput {
         if !scene.root.join(MANIFEST).exists() {
             let with_earlier = staged
                 .iter()
-                .find(|staged| staged.root.join(BEFORE).join(MANIFEST).is_file());
+                .find(|staged| staged.root.join(REPLACED_FOLDER).join(MANIFEST).is_file());
             // The first run of a scene replaces no earlier manifest.
             if let Some(staged) = with_earlier.or_else(|| {
                 staged
@@ -144,7 +144,7 @@ impl StagedOutput {
 
 /// Moves the files of a killed run out of the scene, and the replaced files back into it.
 fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
-    let before = staged.root.join(BEFORE);
+    let before = staged.root.join(REPLACED_FOLDER);
     let old = if before.is_dir() {
         files_in(&before)?
     } else {
@@ -172,7 +172,7 @@ fn put_back(scene: &SceneFolder, staged: &SceneFolder) -> Result<()> {
 
 impl Drop for StagedOutput {
     fn drop(&mut self) {
-        if !self.stays {
+        if !self.keep_folder {
             let _ = std::fs::remove_dir_all(&self.folder.root);
         }
     }
@@ -357,7 +357,8 @@ mod tests {
         // A file cannot replace a folder.
         let staged = begun(&scene);
         write(&staged.folder, "scene.ply", "new");
-        std::fs::create_dir_all(staged.folder.root.join(BEFORE).join("scene.ply")).unwrap();
+        std::fs::create_dir_all(staged.folder.root.join(REPLACED_FOLDER).join("scene.ply"))
+            .unwrap();
         staged
             .publish(&scene, &["photos", "scene.ply"], [], &manifest("import"))
             .unwrap_err();
@@ -377,7 +378,7 @@ mod tests {
             let dir = tempfile::tempdir().unwrap();
             let scene = earlier(dir.path());
             let staged = begun(&scene);
-            let before = staged.folder.root.join(BEFORE);
+            let before = staged.folder.root.join(REPLACED_FOLDER);
             // The run is killed after it moved all replaced files away and some new ones in.
             let files = files_in(&staged.folder.root).unwrap();
             let listed = &files | &scene.manifest().unwrap().files;

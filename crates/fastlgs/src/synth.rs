@@ -13,7 +13,7 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct SynthConfig {
     /// Kind of scene.
     #[cfg_attr(feature = "clap", arg(value_parser = kinds()))]
     pub kind: String,
@@ -37,11 +37,11 @@ pub struct Config {
     #[cfg_attr(feature = "clap", arg(long, value_name = "NAME"))]
     pub without: Option<String>,
     /// Label every N-th view, so that it can be held out.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = SynthConfig::default().holdout))]
     pub holdout: usize,
 }
 
-impl Default for Config {
+impl Default for SynthConfig {
     fn default() -> Self {
         Self {
             kind: KINDS[0].0.to_owned(),
@@ -66,7 +66,7 @@ fn kinds() -> Vec<clap::builder::PossibleValue> {
 
 /// Report of `synth`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct SynthReport {
     /// Kind of scene.
     pub kind: String,
     /// Folder of the photos.
@@ -83,7 +83,7 @@ pub struct Report {
 ///
 /// # Errors
 /// An unknown kind, fewer than four views, missing pictures, or a file that cannot be written.
-pub fn synth(config: &Config, run: &Run) -> Result<Report> {
+pub fn synth(config: &SynthConfig, run: &Run) -> Result<SynthReport> {
     let kind = Kind::of(&config.kind).with_context(|| {
         format!(
             "'{}' is not a kind of generated scene; 'fastlgs synth --help' lists all kinds",
@@ -112,7 +112,7 @@ pub fn synth(config: &Config, run: &Run) -> Result<Report> {
         drop(work.advance())
     })?;
     work.check()?;
-    Ok(Report {
+    Ok(SynthReport {
         kind: config.kind.clone(),
         photos: config.output.clone(),
         views,

@@ -1,10 +1,10 @@
 //! Teaches a name by an example: an object of a scene, or a picture.
 
 use crate::error::{Context, bail};
-use crate::names::{Example, Names, plain};
+use crate::names::{Example, Names, normalise_name};
 use crate::session::Pixels;
-use crate::session::ask::{Ask, picture};
-use crate::{Result, Run, Session, eyes};
+use crate::session::ask::{ObjectQuery, picture};
+use crate::{Result, Run, Scene, eyes};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::QueryConfig;
@@ -15,7 +15,7 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Lesson {
+pub struct TeachConfig {
     /// Name to teach, in any language.
     pub name: String,
     /// Trained scene folder with the object, or with the encoder for the picture.
@@ -39,7 +39,7 @@ pub struct Lesson {
 
 /// Report of `teach`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct TeachReport {
     /// The name.
     pub name: String,
     /// Id of the object; `None` for a picture.
@@ -57,18 +57,18 @@ pub struct Report {
 /// # Errors
 /// An empty name, an example without an object, none or several examples, or a file that cannot be
 /// written. The names then remain unchanged.
-pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
-    let mut scene = Session::open(&lesson.scene, run.device)?;
+pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
+    let mut scene = Scene::open(&lesson.scene, run.device)?;
     let object = match (lesson.object, &lesson.point, &lesson.image) {
         (Some(id), None, None) => Some(id),
-        (None, Some(pixels), None) => Some(shown_at(&mut scene, lesson, pixels)?),
+        (None, Some(pixels), None) => Some(object_at(&mut scene, lesson, pixels)?),
         (None, None, Some(_)) => None,
         _ => {
             bail!("give exactly one example: --point X,Y with --view, --object ID, or --image FILE")
         }
     };
     match (object, &lesson.image) {
-        (Some(id), _) => learn(&scene, &scene.grid()?, &lesson.name, id),
+        (Some(id), _) => teach_object(&scene, &scene.grid()?, &lesson.name, id),
         (None, Some(path)) => {
             let embeddings = picture(
                 &scene,
@@ -76,7 +76,7 @@ pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
                 &image_io::load_rgb(path)?,
             )?
             .positive;
-            keep(
+            store_example(
                 &scene,
                 &lesson.name,
                 None,
@@ -92,7 +92,7 @@ pub fn teach(lesson: &Lesson, run: &Run) -> Result<Report> {
 ///
 /// # Errors
 /// As [`teach`].
-pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report> {
+pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<TeachReport> {
     eyes::check_version(&scene.manifest, grid, &scene.folder)?;
     let root = scene.folder.root.display().to_string();
     let Some(object) = usize::from(id)
@@ -104,7 +104,7 @@ pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report
             grid.objects.len()
         )
     };
-    keep(
+    store_example(
         scene,
         name,
         Some(id),
@@ -113,14 +113,14 @@ pub fn learn(scene: &Session, grid: &Grid, name: &str, id: u16) -> Result<Report
     )
 }
 
-fn keep(
-    scene: &Session,
+fn store_example(
+    scene: &Scene,
     name: &str,
     object: Option<u16>,
     from: String,
     embeddings: Vec<Vec<f32>>,
-) -> Result<Report> {
-    let name = plain(name);
+) -> Result<TeachReport> {
+    let name = normalise_name(name);
     if name.is_empty() {
         bail!("the name is empty; enter a name for the object");
     }
@@ -139,9 +139,9 @@ fn keep(
                 embeddings,
             },
         );
-        Ok(names.of(&name).map_or(0, <[Example]>::len))
+        Ok(names.examples(&name).map_or(0, <[Example]>::len))
     })?;
-    Ok(Report {
+    Ok(TeachReport {
         name,
         object,
         views,
@@ -151,14 +151,14 @@ fn keep(
 }
 
 /// Returns the id of the object at pixels of a view.
-fn shown_at(scene: &mut Session, lesson: &Lesson, pixels: &Pixels) -> Result<u16> {
+fn object_at(scene: &mut Scene, lesson: &TeachConfig, pixels: &Pixels) -> Result<u16> {
     let view = lesson
         .view
         .as_deref()
         .context("a point needs the name of its view; set view as well")?;
     let camera = scene.cameras[scene.folder.view_index(&scene.cameras, view)?].clone();
     let (grid, field) = (scene.grid()?, scene.field(&camera, None)?);
-    let found = Ask::Point(pixels.clone()).meaning(scene, &[])?.find(
+    let found = ObjectQuery::Point(pixels.clone()).embed(scene, &[])?.find(
         &grid,
         &field,
         &camera,

@@ -4,20 +4,20 @@ use crate::outcome::Outcome;
 use crate::{report, ui, words};
 use anyhow::{Result, bail};
 use fastlgs::Run;
-use fastlgs::export::{Config, names_folder};
-use fastlgs::session::selection::ENDINGS;
+use fastlgs::export::{ExportConfig, names_folder};
+use fastlgs::session::selection::EXTENSIONS;
 use fastlgs_serve::share;
 
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
-    config: Config,
+    config: ExportConfig,
     /// Write a folder with the viewer page, for any web server. The page answers common words and
     /// taught names; it has no photos.
     #[arg(long)]
     html: bool,
     /// Number of common words that the page answers, with --html.
-    #[arg(long, default_value_t = share::WORDS, requires = "html")]
+    #[arg(long, default_value_t = share::DEFAULT_WORDS, requires = "html")]
     words: usize,
     /// CLIP text tower, with --html; for scenes with imported embeddings, or if the file has moved.
     #[arg(long, value_name = "FILE", requires = "html")]
@@ -27,7 +27,7 @@ pub struct Args {
 pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let config = &args.config;
     if !args.html {
-        return report::tell(common, &fastlgs::export(config, run)?, words::export);
+        return report::write_summary(common, &fastlgs::export(config, run)?, words::export);
     }
     let ending = config
         .output
@@ -35,7 +35,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         .and_then(|e| e.to_str())
         .unwrap_or_default();
     if ending == "json"
-        || ENDINGS.contains(&ending)
+        || EXTENSIONS.contains(&ending)
         || !(names_folder(&config.output) || ending.is_empty())
     {
         bail!(
@@ -43,12 +43,12 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             config.output.display()
         );
     }
-    let share = share::Config {
+    let share = share::ShareConfig {
         scene: config.scene.clone(),
         output: config.output.clone(),
         sh_degree: config.sh_degree,
         words: args.words,
         clip_text: args.clip_text.clone(),
     };
-    report::tell(common, &share::share(&share, run)?, words::share)
+    report::write_summary(common, &share::share(&share, run)?, words::share)
 }

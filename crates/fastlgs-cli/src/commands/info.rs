@@ -39,7 +39,7 @@ fn machine(common: &ui::Common) -> Result<Outcome> {
         "sift": sift,
         "offline_models": installed,
     });
-    report::tell(common, &value, |_| {
+    report::write_summary(common, &value, |_| {
         words::table(&[
             ("fastlgs", format!("{version}, key points by {sift}")),
             ("cpu", format!("{cores} cores")),
@@ -84,13 +84,13 @@ fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
         "bytes": { "scene.ply": bytes("scene.ply"), "grid.safetensors": bytes("grid.safetensors"), "grid.json": bytes("grid.json") },
         "made_by": manifest,
     });
-    let counted = |count: Option<usize>| {
+    let count_or_hint = |count: Option<usize>| {
         count.map_or_else(
             || "none yet; run fastlgs train".to_owned(),
             words::thousands,
         )
     };
-    report::tell(common, &value, |_| {
+    report::write_summary(common, &value, |_| {
         words::table(&[
             (
                 "scene",
@@ -116,11 +116,14 @@ fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
                     manifest.segmenter, manifest.encoder
                 ),
             ),
-            ("Gaussians", counted(gaussians)),
-            ("objects", counted(objects)),
+            ("Gaussians", count_or_hint(gaussians)),
+            ("objects", count_or_hint(objects)),
             (
                 "queries",
-                format!("need {}", words::megabytes(fastlgs::session::bytes(root))),
+                format!(
+                    "need {}",
+                    words::megabytes(fastlgs::session::query_file_bytes(root))
+                ),
             ),
             ("warnings", manifest.warnings.join("\n          ")),
         ])

@@ -1,12 +1,12 @@
 //! `fastlgs query --library`: finds the scenes of a folder that contain an object.
 
-use super::lines::{Line, ends, line_of};
+use super::lines::{Line, is_closed, parse_line};
 use crate::outcome::Outcome;
-use crate::ui::say;
+use crate::ui::print_line;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::Run;
-use fastlgs::library::{Config, Report, Search};
+use fastlgs::library::{Search, SearchConfig, SearchReport};
 use serde_json::json;
 use std::io::{BufRead, Write};
 use std::path::Path;
@@ -15,7 +15,7 @@ use std::path::Path;
 /// JSON.
 pub fn run(
     root: &Path,
-    config: Config,
+    config: SearchConfig,
     texts: &[String],
     common: &ui::Common,
     run: &Run,
@@ -24,7 +24,7 @@ pub fn run(
     if texts == ["-"] {
         let mut out = std::io::stdout();
         for line in std::io::stdin().lock().split(b'\n') {
-            let answer = match line_of(&line?) {
+            let answer = match parse_line(&line?) {
                 Line::None => continue,
                 Line::Unreadable(answer) => answer,
                 Line::Text(text) => match search.ask(&text) {
@@ -32,7 +32,7 @@ pub fn run(
                     Err(error) => json!({ "text": text, "error": fastlgs::one_sentence(&error) }),
                 },
             };
-            if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? {
+            if is_closed(writeln!(out, "{answer}").and_then(|()| out.flush()))? {
                 break;
             }
         }
@@ -44,9 +44,9 @@ pub fn run(
         .collect::<Result<Vec<_>>>()?;
     let found = answers.iter().any(|a| a.found);
     if common.json.is_some() && answers.len() == 1 {
-        report::give(common, &answers.remove(0))?;
+        report::write_fields(common, &answers.remove(0))?;
     } else if common.json.is_some() {
-        report::give(common, &answers)?;
+        report::write_fields(common, &answers)?;
     } else if !common.quiet {
         answers.iter().for_each(print);
     }
@@ -57,25 +57,25 @@ pub fn run(
     })
 }
 
-fn print(answer: &Report) {
+fn print(answer: &SearchReport) {
     let found = answer.scenes.iter().filter(|row| row.found);
-    let (count, asked, all) = (
+    let (count, listed, all) = (
         found.clone().count(),
         answer.scenes.len(),
         answer.searched.scenes,
     );
     // Scenes that are not listed may contain the object, too.
-    let of = if count > 0 && count == asked && asked < all {
-        format!("the best {asked} of {all}")
+    let out_of = if count > 0 && count == listed && listed < all {
+        format!("the best {listed} of {all}")
     } else {
         all.to_string()
     };
-    say!(
-        "\"{}\": in {count} of {of} scenes ({:.1} ms)",
+    print_line!(
+        "\"{}\": in {count} of {out_of} scenes ({:.1} ms)",
         answer.text,
         answer.ms.search
     );
     for row in found {
-        say!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
+        print_line!("  {:.3}  object {:<5} {}", row.score, row.object, row.scene);
     }
 }

@@ -14,12 +14,12 @@ pub(super) enum Line {
 }
 
 /// Parses a line.
-pub(super) fn line_of(line: &[u8]) -> Line {
+pub(super) fn parse_line(line: &[u8]) -> Line {
     match std::str::from_utf8(line) {
         Err(_) => {
-            let shown = String::from_utf8_lossy(line).trim().to_owned();
+            let lossy_text = String::from_utf8_lossy(line).trim().to_owned();
             Line::Unreadable(
-                json!({ "text": shown, "error": "the line is not UTF-8 text; send it in UTF-8" }),
+                json!({ "text": lossy_text, "error": "the line is not UTF-8 text; send it in UTF-8" }),
             )
         }
         Ok(line) => match line.trim().trim_start_matches('\u{feff}') {
@@ -33,7 +33,7 @@ pub(super) fn line_of(line: &[u8]) -> Line {
 ///
 /// # Errors
 /// Any other I/O error.
-pub(super) fn ends(written: std::io::Result<()>) -> Result<bool> {
+pub(super) fn is_closed(written: std::io::Result<()>) -> Result<bool> {
     match written {
         Ok(()) => Ok(false),
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(true),

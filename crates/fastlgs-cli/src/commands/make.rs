@@ -5,19 +5,19 @@ use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::Run;
-use fastlgs::make::{self, Config, State};
+use fastlgs::make::{self, MakeConfig, State};
 
-pub fn run(config: &Config, common: &ui::Common, run: &Run) -> Result<Outcome> {
+pub fn run(config: &MakeConfig, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let made = fastlgs::make(config, run)?;
-    report::tell(common, &made, |made| {
+    report::write_summary(common, &made, |made| {
         words(made, &config.preprocess.output.display().to_string())
     })
 }
 
-fn words(made: &make::Report, scene: &str) -> String {
+fn words(made: &make::MakeReport, scene: &str) -> String {
     let train = &made.train;
     let seconds = train.seconds + train.mapping_seconds;
-    let how = match made.state {
+    let status = match made.state {
         State::Made => {
             format!(
                 "{} iterations and the objects took {seconds:.0} s ({})",
@@ -33,16 +33,16 @@ fn words(made: &make::Report, scene: &str) -> String {
         .map(|psnr| format!("; PSNR {psnr:.1} dB on {held_out} held-out photos"))
         .unwrap_or_default();
     // Quotes a name with characters that the shell interprets.
-    let plain = scene
+    let is_shell_safe = scene
         .chars()
         .all(|c| c.is_alphanumeric() || "/._-".contains(c));
-    let scene = if plain {
+    let scene = if is_shell_safe {
         scene.to_owned()
     } else {
         format!("'{}'", scene.replace('\'', "'\\''"))
     };
     format!(
-        "{scene}: {how}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nquery it:  fastlgs query {scene} \"red cup\"\nview it:   fastlgs serve {scene}",
+        "{scene}: {status}\n{training} photos, {} Gaussians, {} objects and parts{colour}\n\nquery it:  fastlgs query {scene} \"red cup\"\nview it:   fastlgs serve {scene}",
         thousands(train.gaussians),
         thousands(train.objects)
     )
@@ -54,13 +54,13 @@ mod tests {
 
     #[test]
     fn the_next_commands_can_be_copied() {
-        let train = fastlgs::train::Report {
+        let train = fastlgs::train::TrainReport {
             gaussians: 12,
             objects: 3,
             psnr_held_out: Some(31.26),
             ..Default::default()
         };
-        let made = make::Report {
+        let made = make::MakeReport {
             state: State::Kept,
             photos: [7, 1],
             train,

@@ -3,7 +3,7 @@
 use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::Result;
-use fastlgs::eyes::{EncoderKind, Eyes};
+use fastlgs::eyes::{EncoderKind, ModelChoice};
 use fastlgs::{Run, calibrate, calibrations};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_vision::pull::{self, HOST, NAMED, Named, Role};
@@ -65,24 +65,24 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         } => {
             let (clip, clip_image, clip_text) =
                 (clip.clone(), clip_image.clone(), clip_text.clone());
-            let eyes = Eyes {
+            let eyes = ModelChoice {
                 encoder: EncoderKind::Clip,
                 clip,
                 clip_image,
                 clip_text,
-                ..Eyes::default()
+                ..ModelChoice::default()
             };
-            return report::give(common, &calibrate::calibrate(&eyes, run)?);
+            return report::write_fields(common, &calibrate::calibrate(&eyes, run)?);
         }
         Action::Pull { name, base_url } => {
             let model = Named::find(name)?;
             let work = run.work("download", 0);
-            let tell = |file: &str, done: u64, total: Option<u64>| {
-                work.set(done, total.unwrap_or(done), file)
+            let report_progress = |file: &str, done: u64, total: Option<u64>| {
+                work.set_progress(done, total.unwrap_or(done), file)
             };
-            let pulled = pull::pull(&model, base_url, &model.folder(), tell)?;
+            let pulled = pull::pull(&model, base_url, &model.folder(), report_progress)?;
             drop(work);
-            return report::give(
+            return report::write_fields(
                 common,
                 &serde_json::json!({ "model": model, "folder": model.folder(), "files": pulled }),
             );
@@ -113,5 +113,5 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             "how": "export them to ONNX and pass the files with --sam-encoder, --sam-decoder, --clip-image and --clip-text",
         },
     });
-    report::give(common, &value)
+    report::write_fields(common, &value)
 }

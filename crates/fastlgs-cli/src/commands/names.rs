@@ -1,7 +1,7 @@
 //! `fastlgs names`: lists, removes, exports and imports taught names.
 
 use crate::outcome::Outcome;
-use crate::ui::say;
+use crate::ui::print_line;
 use crate::{report, ui};
 use anyhow::Result;
 use fastlgs::names::Names;
@@ -42,7 +42,7 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
             if !common.quiet {
                 let rows = Names::load()?.rows();
                 rows.iter().for_each(|row| {
-                    say!(
+                    print_line!(
                         "{}: {} views, from {}",
                         row.name,
                         row.views,
@@ -50,12 +50,12 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
                     )
                 });
                 if rows.is_empty() {
-                    say!("no names are taught yet; see 'fastlgs teach --help'");
+                    print_line!("no names are taught yet; see 'fastlgs teach --help'");
                 }
             }
             Ok(Outcome::Done)
         }
-        Action::List => report::give(
+        Action::List => report::write_fields(
             common,
             &json!({ "kept": Names::path(), "names": Names::load()?.rows() }),
         ),
@@ -64,21 +64,21 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
                 names.remove(name)?;
                 Ok(names.rows().len())
             })?;
-            report::give(common, &json!({ "forgotten": name, "names": left }))
+            report::write_fields(common, &json!({ "forgotten": name, "names": left }))
         }
         Action::Export { file } => {
             let names = Names::load()?;
             names.write(file)?;
-            report::give(
+            report::write_fields(
                 common,
                 &json!({ "written": file, "names": names.rows().len() }),
             )
         }
         Action::Import { file } => {
             let others = Names::read(file)?;
-            let (came, all) =
+            let (added, all) =
                 Names::change(|names| Ok((names.extend(others), names.rows().len())))?;
-            report::give(common, &json!({ "came": came, "names": all }))
+            report::write_fields(common, &json!({ "came": added, "names": all }))
         }
     }
 }

@@ -4,17 +4,17 @@
 mod dialogue;
 
 use super::library;
-use super::lines::{Line, ends, line_of};
+use super::lines::{Line, is_closed, parse_line};
 use crate::outcome::Outcome;
-use crate::ui::say;
+use crate::ui::print_line;
 use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::{Result, bail};
-use fastlgs::session::answer::{CANDIDATES, ObjectReport, Question, Report};
-use fastlgs::session::ask::Ask;
+use fastlgs::session::answer::{AnswerReport, CANDIDATES, ObjectReport, QueryRequest};
+use fastlgs::session::ask::ObjectQuery;
 use fastlgs::session::sheet::{self, Tile};
 use fastlgs::session::{Pixels, ViewChoice, parse_size, selection};
-use fastlgs::{Run, Session};
+use fastlgs::{Run, Scene};
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -99,8 +99,8 @@ fn parse_share(text: &str) -> Result<f32, String> {
 }
 
 /// Formats an answer for the terminal.
-fn told(report: &Report) -> String {
-    let Report {
+fn answer_text(report: &AnswerReport) -> String {
+    let AnswerReport {
         text, view, score, ..
     } = report;
     let of = |object: &ObjectReport| {
@@ -115,7 +115,7 @@ fn told(report: &Report) -> String {
             object.score
         )
     };
-    let sure = if report.calibrated {
+    let calibration_note = if report.calibrated {
         ""
     } else {
         " (not calibrated; run fastlgs models calibrate)"
@@ -123,7 +123,7 @@ fn told(report: &Report) -> String {
     let taught = if report.taught { ", taught" } else { "" };
     if !report.found {
         return format!(
-            "{text}: not found; the best object has confidence {score:.2}{sure}{taught}"
+            "{text}: not found; the best object has confidence {score:.2}{calibration_note}{taught}"
         );
     }
     let count = if report.objects.len() == 1 {
@@ -136,7 +136,7 @@ fn told(report: &Report) -> String {
         None => format!("{} pixels in {view}", thousands(report.pixels)),
     };
     let mut lines = vec![format!(
-        "{text}: found, confidence {score:.2}{sure}{taught}, {count}, {shown} ({:.0} ms)",
+        "{text}: found, confidence {score:.2}{calibration_note}{taught}, {count}, {shown} ({:.0} ms)",
         report.ms.total
     )];
     if report.objects.len() > 1 {
@@ -152,7 +152,7 @@ fn told(report: &Report) -> String {
 }
 
 /// Formats an answer as the caption of its picture.
-fn in_short(report: &Report) -> String {
+fn caption(report: &AnswerReport) -> String {
     let verdict = if report.found { "found" } else { "not found" };
     format!(
         "{verdict}, {:.2}, {} pixels",
@@ -162,23 +162,23 @@ fn in_short(report: &Report) -> String {
 }
 
 /// Number of tiles per row of the contact sheet of a single view.
-const IN_A_ROW: usize = 4;
+const TILES_PER_ROW: usize = 4;
 
 /// The view that was rendered last.
-struct Shown {
-    place: usize,
+struct RenderedView {
+    view_index: usize,
     field: Field,
     color: Option<Frame>,
 }
 
 /// An opened scene with the options for its queries.
-struct Asker<'a> {
+struct QueryRunner<'a> {
     args: &'a Args,
-    scene: Session,
+    scene: Scene,
     grid: Grid,
     cameras: Vec<Camera>,
     config: QueryConfig,
-    shown: Option<Shown>,
+    shown: Option<RenderedView>,
     tiles: Vec<Tile>,
     /// Folder of the pictures.
     output: Option<PathBuf>,
@@ -211,7 +211,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
             );
         }
         let (negatives, clip_text) = (args.negative.clone(), args.clip_text.clone());
-        let config = fastlgs::library::Config {
+        let config = fastlgs::library::SearchConfig {
             scenes: args.scenes,
             false_alarms: args.false_alarms,
             negatives,
@@ -239,7 +239,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     let Some(path) = &args.scene else {
         bail!("no scene is given; name a trained scene folder")
     };
-    let mut scene = Session::open(path, run.device)?;
+    let mut scene = Scene::open(path, run.device)?;
     let grid = scene.grid()?;
     let cameras = args.views.cameras(&scene.folder, &scene.cameras)?;
     if exports && !args.point.is_empty() && cameras.len() > 1 {
@@ -255,7 +255,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         scene.text_query("warm up")?;
     }
     scene.warm_up()?;
-    let mut asker = Asker {
+    let mut asker = QueryRunner {
         args,
         scene,
         grid,
@@ -274,16 +274,16 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     }
 }
 
-impl Asker<'_> {
+impl QueryRunner<'_> {
     fn answer_arguments(&mut self, common: &ui::Common) -> Result<Outcome> {
-        let texts = self.args.text.iter().cloned().map(Ask::Text);
-        let picture = |path: &PathBuf| -> Result<Ask> {
+        let texts = self.args.text.iter().cloned().map(ObjectQuery::Text);
+        let picture = |path: &PathBuf| -> Result<ObjectQuery> {
             let name = path
                 .file_stem()
                 .unwrap_or_default()
                 .to_string_lossy()
                 .into_owned();
-            Ok(Ask::Image(name, image_io::load_rgb(path)?))
+            Ok(ObjectQuery::Image(name, image_io::load_rgb(path)?))
         };
         let pictures = self
             .args
@@ -291,8 +291,8 @@ impl Asker<'_> {
             .iter()
             .map(picture)
             .collect::<Result<Vec<_>>>()?;
-        let points = self.args.point.iter().cloned().map(Ask::Point);
-        let asks: Vec<Ask> = texts.chain(pictures).chain(points).collect();
+        let points = self.args.point.iter().cloned().map(ObjectQuery::Point);
+        let asks: Vec<ObjectQuery> = texts.chain(pictures).chain(points).collect();
         if asks.len() > 1 && (self.args.export.is_some() || self.args.export_rest.is_some()) {
             bail!("--export and --export-rest need a single query; leave out the others");
         }
@@ -306,14 +306,16 @@ impl Asker<'_> {
         let found = answers.iter().any(|a| a.found);
         let single = answers.len() == 1;
         if common.json.is_some() && single {
-            report::give(common, &answers.remove(0))?;
+            report::write_fields(common, &answers.remove(0))?;
         } else if common.json.is_some() {
-            report::give(common, &answers)?;
+            report::write_fields(common, &answers)?;
         } else if !common.quiet {
-            answers.iter().for_each(|answer| say!("{}", told(answer)));
+            answers
+                .iter()
+                .for_each(|answer| print_line!("{}", answer_text(answer)));
             sheet
                 .iter()
-                .for_each(|path| say!("contact sheet: {}", path.display()));
+                .for_each(|path| print_line!("contact sheet: {}", path.display()));
         }
         if !found && !common.quiet {
             let names: Vec<String> = asks.iter().map(|a| format!("\"{}\"", a.name())).collect();
@@ -326,14 +328,14 @@ impl Asker<'_> {
         })
     }
 
-    /// Writes the contact sheet of all answers. A single view has rows of [`IN_A_ROW`] tiles;
+    /// Writes the contact sheet of all answers. A single view has rows of [`TILES_PER_ROW`] tiles;
     /// several views have one row each.
     fn sheet(&self) -> Result<Option<PathBuf>> {
         let Some(path) = self.output.as_ref().map(|folder| folder.join("sheet.png")) else {
             return Ok(None);
         };
         let columns = if self.cameras.len() == 1 {
-            IN_A_ROW
+            TILES_PER_ROW
         } else {
             self.tiles.len() / self.cameras.len()
         };
@@ -345,11 +347,11 @@ impl Asker<'_> {
     fn answer_lines(&mut self) -> Result<Outcome> {
         let mut out = std::io::stdout();
         for line in std::io::stdin().lock().split(b'\n') {
-            let text = match line_of(&line?) {
+            let text = match parse_line(&line?) {
                 Line::None => continue,
                 Line::Text(text) => text,
                 Line::Unreadable(answer)
-                    if ends(writeln!(out, "{answer}").and_then(|()| out.flush()))? =>
+                    if is_closed(writeln!(out, "{answer}").and_then(|()| out.flush()))? =>
                 {
                     return Ok(Outcome::Done);
                 }
@@ -357,17 +359,17 @@ impl Asker<'_> {
             };
             for place in 0..self.cameras.len() {
                 let answer = self
-                    .answer(&Ask::Text(text.clone()), place)
+                    .answer(&ObjectQuery::Text(text.clone()), place)
                     .and_then(|report| Ok(serde_json::to_value(&report)?));
                 let answer =
                     answer.unwrap_or_else(|e| json!({ "text": text, "error": format!("{e:#}") }));
-                if ends(writeln!(out, "{answer}"))? {
+                if is_closed(writeln!(out, "{answer}"))? {
                     return Ok(Outcome::Done);
                 }
                 // No contact sheet is written in this mode.
                 self.tiles.clear();
             }
-            if ends(out.flush())? {
+            if is_closed(out.flush())? {
                 return Ok(Outcome::Done);
             }
         }
@@ -377,7 +379,7 @@ impl Asker<'_> {
     /// Renders a view unless it was rendered last. Returns the milliseconds, 0 if nothing was
     /// rendered.
     fn show(&mut self, place: usize) -> Result<f64> {
-        if self.shown.as_ref().is_some_and(|s| s.place == place) {
+        if self.shown.as_ref().is_some_and(|s| s.view_index == place) {
             return Ok(0.0);
         }
         let started = Instant::now();
@@ -389,7 +391,7 @@ impl Asker<'_> {
             .map(|_| self.scene.render(&self.cameras[place]))
             .transpose()?;
         if let Some(frame) = &color {
-            self.tiles.extend(sheet::of_view(
+            self.tiles.extend(sheet::view_tiles(
                 &self.scene,
                 &self.grid,
                 &self.cameras[place],
@@ -397,8 +399,8 @@ impl Asker<'_> {
                 &field,
             ));
         }
-        self.shown = Some(Shown {
-            place,
+        self.shown = Some(RenderedView {
+            view_index: place,
             field,
             color,
         });
@@ -406,9 +408,9 @@ impl Asker<'_> {
     }
 
     /// Answers one query in one view.
-    fn answer(&mut self, ask: &Ask, place: usize) -> Result<Report> {
+    fn answer(&mut self, ask: &ObjectQuery, place: usize) -> Result<AnswerReport> {
         let render_ms = self.show(place)?;
-        let Some(Shown { field, color, .. }) = &self.shown else {
+        let Some(RenderedView { field, color, .. }) = &self.shown else {
             bail!("no view was rendered")
         };
         let (args, scene, grid, camera) =
@@ -416,19 +418,19 @@ impl Asker<'_> {
         let dilate = args
             .dilate
             .map(|(w, h)| [w / 2 * args.dilate_times, h / 2 * args.dilate_times]);
-        let question = Question {
+        let question = QueryRequest {
             ask,
             negatives: &args.negative,
             config: self.config,
             dilate,
             candidates: CANDIDATES,
         };
-        let (answer, mut report) = question.put(scene, grid, field, camera, render_ms)?;
+        let (answer, mut report) = question.answer(scene, grid, field, camera, render_ms)?;
         let targets = &answer.found.targets;
         let mut tile = None;
         if let (Some(folder), Some(color)) = (&self.output, color) {
             let picture = answer.write(folder, color, args.heatmap, &mut report)?;
-            tile = Some(Tile::new(&picture, &report.text, in_short(&report)));
+            tile = Some(Tile::new(&picture, &report.text, caption(&report)));
         }
         for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
             if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
@@ -438,7 +440,7 @@ impl Asker<'_> {
                 selection::export(path, &scene.gaussians, &world, &selected, keep)?;
             }
         }
-        report.look_elsewhere(&mut self.scene, &self.grid)?;
+        report.find_best_view(&mut self.scene, &self.grid)?;
         self.tiles.extend(tile);
         Ok(report)
     }

@@ -2,7 +2,7 @@
 
 use super::bind::{DEFAULT_BIND, parse_bind};
 use crate::outcome::Outcome;
-use crate::ui::say;
+use crate::ui::print_line;
 use crate::{report, ui};
 use anyhow::{Result, bail};
 use fastlgs_core::SceneFolder;
@@ -52,9 +52,9 @@ pub fn run(args: &Args, common: &ui::Common) -> Result<Outcome> {
 /// read it.
 fn announce(server: &Server, common: &ui::Common) -> Result<()> {
     if common.json.is_some() {
-        report::give(common, &serde_json::json!({ "url": server.url }))?;
+        report::write_fields(common, &serde_json::json!({ "url": server.url }))?;
     } else {
-        say!("open {} in a browser", server.url);
+        print_line!("open {} in a browser", server.url);
     }
     Ok(std::io::stdout().flush()?)
 }

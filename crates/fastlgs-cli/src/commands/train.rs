@@ -16,19 +16,19 @@ use std::sync::Arc;
 #[command(after_help = "Example: fastlgs train scenes/fox --preset quick")]
 pub struct Args {
     #[command(flatten)]
-    config: train::Config,
+    config: train::TrainConfig,
     /// Show the training in the browser. After training, the page answers queries until Ctrl-C.
     #[arg(long, value_name = "IP:PORT", num_args = 0..=1, require_equals = true, default_missing_value = DEFAULT_BIND, value_parser = parse_bind)]
     serve: Option<SocketAddr>,
 }
 
 /// Forwards progress to the terminal and to the page.
-struct Both<'a>(&'a Console, &'a Server);
+struct ConsoleAndPage<'a>(&'a Console, &'a Server);
 
-impl Sink for Both<'_> {
-    fn tell(&self, message: Message<'_>) {
-        self.0.tell(message);
-        self.1.tell(message);
+impl Sink for ConsoleAndPage<'_> {
+    fn on_message(&self, message: Message<'_>) {
+        self.0.on_message(message);
+        self.1.on_message(message);
     }
 
     fn cancelled(&self) -> bool {
@@ -38,7 +38,7 @@ impl Sink for Both<'_> {
 
 pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcome> {
     let Some(bind) = args.serve else {
-        return report::tell(
+        return report::write_summary(
             common,
             &train::train(&args.config, &common.run(console))?,
             words::train,
@@ -58,8 +58,8 @@ pub fn run(args: &Args, common: &ui::Common, console: &Console) -> Result<Outcom
     )?;
     // Standard output is reserved for the report.
     eprintln!("watch the training at {}", server.url);
-    let report = train::train(config, &common.run(&Both(console, &server)))?;
-    report::tell(common, &report, words::train)?;
+    let report = train::train(config, &common.run(&ConsoleAndPage(console, &server)))?;
+    report::write_summary(common, &report, words::train)?;
     server.open_scene(&common.device, None)?;
     server.wait()?;
     Ok(Outcome::Done)

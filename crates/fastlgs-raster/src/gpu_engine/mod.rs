@@ -16,7 +16,7 @@ use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers};
 use crate::view::{Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
-use fastlgs_core::Shares;
+use fastlgs_core::IdWeights;
 use fastlgs_core::shares::IDS_PER_PIXEL;
 use kernels::{Kernels, kind};
 use lists::{ListBuilder, Lists};
@@ -253,7 +253,7 @@ impl Engine for GpuEngine {
             })
     }
 
-    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<IdWeights> {
         check_ids(&view, ids, self.len())?;
         let mut on_cpu = self.passes_on_cpu;
         let lists = self.prepare(view, Channels::Feature, None, &mut on_cpu)?;
@@ -292,7 +292,7 @@ impl Engine for GpuEngine {
                 .map(pixel)
                 .collect()
         };
-        Ok(Shares {
+        Ok(IdWeights {
             width,
             height,
             pixels: self.gpu.read_with(shares, IDS_PER_PIXEL * plane, gather)?,

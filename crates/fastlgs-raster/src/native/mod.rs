@@ -16,7 +16,7 @@ use crate::engine::{
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use blend::{BackwardInput, Blended, EDGE, Job, Tile};
-use fastlgs_core::Shares;
+use fastlgs_core::IdWeights;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::shares::{IDS_PER_PIXEL, pack};
 pub(crate) use lists::Lists;
@@ -408,7 +408,7 @@ impl Engine for CpuEngine {
         Ok(frame)
     }
 
-    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<Shares> {
+    fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<IdWeights> {
         check_ids(&view, ids, self.n)?;
         let lists = Lists::new(&view, &self.params);
         let [width, height] = view.size;
@@ -428,7 +428,7 @@ impl Engine for CpuEngine {
                     }
                 }
             });
-        Ok(Shares {
+        Ok(IdWeights {
             width,
             height,
             pixels,

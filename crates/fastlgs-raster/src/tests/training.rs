@@ -3,7 +3,8 @@
 
 use super::{camera, cloud, gpu, target};
 use crate::{
-    Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, TrainConfig, TrainReport, Trainer,
+    Budget, CpuEngine, Engine, FreeSpace, Gpu, GpuEngine, Target, Trainer, TrainerConfig,
+    TrainerReport,
 };
 use fastlgs_core::Camera;
 use fastlgs_core::dataset::SfmPoint;
@@ -31,11 +32,11 @@ fn views(count: usize) -> Vec<Target> {
         .collect()
 }
 
-fn trainer(engine: Box<dyn Engine>, config: TrainConfig) -> Trainer {
+fn trainer(engine: Box<dyn Engine>, config: TrainerConfig) -> Trainer {
     Trainer::new(engine, &cloud(200, 8, 0, false), views(24), config).unwrap()
 }
 
-fn run(config: TrainConfig) -> (Trainer, TrainReport) {
+fn run(config: TrainerConfig) -> (Trainer, TrainerReport) {
     let mut trainer = trainer(Box::new(CpuEngine::new()), config);
     let report = trainer.run(None, |_, _| Ok::<_, crate::Error>(())).unwrap();
     (trainer, report)
@@ -45,13 +46,13 @@ fn run(config: TrainConfig) -> (Trainer, TrainReport) {
 fn resumes_to_the_same_bytes() {
     let Some(_) = gpu() else { return };
     let dir = tempfile::tempdir().unwrap();
-    let config = TrainConfig {
+    let config = TrainerConfig {
         iterations: 600,
         budget: Budget::Auto(400),
         sh_degree: 1,
         exposure: true,
         learn_background: true,
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     };
     let start = || {
         trainer(
@@ -94,7 +95,7 @@ fn resumes_to_the_same_bytes() {
     .unwrap();
     let message = { fewer }.resume(&checkpoint).unwrap_err().to_string();
     assert!(message.contains("other photos"), "{message}");
-    let other = TrainConfig {
+    let other = TrainerConfig {
         lambda: 0.3,
         ..config
     };
@@ -109,11 +110,11 @@ fn resumes_to_the_same_bytes() {
 fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
     let dir = tempfile::tempdir().unwrap();
     let checkpoint = dir.path().join("train");
-    let config = TrainConfig {
+    let config = TrainerConfig {
         iterations: 600,
         budget: Budget::Auto(400),
         feature_weight: 0.5,
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     };
     let start = || trainer(Box::new(CpuEngine::new()), config.clone());
     let set_codes = |trainer: &mut Trainer| trainer.set_codes(|_| Ok(target(64, 48).feature));
@@ -154,11 +155,11 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
 
 #[test]
 fn what_views_look_through_stays_empty() {
-    let config = TrainConfig {
+    let config = TrainerConfig {
         iterations: 100,
         refine_until: 0.8,
         budget: Budget::Fixed(400),
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     };
     let cameras: Vec<Camera> = views(24).into_iter().map(|view| view.camera).collect();
     // A wall behind the cloud, observed by three cameras.
@@ -195,10 +196,10 @@ fn what_views_look_through_stays_empty() {
 
 #[test]
 fn density_control_keeps_the_budget() {
-    let (_, report) = run(TrainConfig {
+    let (_, report) = run(TrainerConfig {
         iterations: 800,
         budget: Budget::Fixed(300),
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     });
     assert!(
         report.gaussians <= 300 && report.gaussians > 200,
@@ -210,10 +211,10 @@ fn density_control_keeps_the_budget() {
 
 #[test]
 fn an_automatic_budget_removes_what_changes_little() {
-    let (_, report) = run(TrainConfig {
+    let (_, report) = run(TrainerConfig {
         iterations: 800,
         budget: Budget::Auto(1000),
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     });
     assert_eq!(report.removals.len(), 2);
     assert!(report.removals.iter().all(|r| r.after <= r.before));
@@ -229,14 +230,14 @@ fn exposure_and_background_are_learned() {
     (targets[0].image.color, targets[1].image.color) = (gray(100), gray(110));
     let mut scene = cloud(1, 1, 0, false);
     scene.means[0] = Vec3::new(0.0, 500.0, 0.0);
-    let config = TrainConfig {
+    let config = TrainerConfig {
         iterations: 600,
         exposure: true,
         learn_background: true,
         background: [0.5; 3],
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     };
-    let config = TrainConfig {
+    let config = TrainerConfig {
         refine_until: 0.0,
         ..config
     };
@@ -260,7 +261,7 @@ fn nothing_to_train_is_said() {
         engine,
         &cloud(5, 1, 0, false),
         Vec::new(),
-        TrainConfig::default(),
+        TrainerConfig::default(),
     )
     .err()
     .unwrap()

@@ -7,12 +7,12 @@ mod watched;
 
 use crate::budget::{self, Removal};
 use crate::channels::Channels;
-use crate::checkpoint::{self, Course};
+use crate::checkpoint::{self, TrainingState};
 use crate::density::{self, State};
 use crate::engine::{Engine, Exposure, Frame, Losses, StepOptions};
 use crate::exposure::{self, BACKGROUND_RATE, Learned, LearnedExposure};
 use crate::floaters::FreeSpace;
-use crate::schedule::{Budget, TrainConfig};
+use crate::schedule::{Budget, TrainerConfig};
 use crate::target::{Target, Targets, fingerprint};
 use crate::view::{Step, View};
 use crate::{Error, Result};
@@ -45,7 +45,7 @@ pub struct Progress {
 
 /// Report of a finished run.
 #[derive(Clone, Debug, Serialize)]
-pub struct TrainReport {
+pub struct TrainerReport {
     /// Steps done, including those before a resume.
     pub iterations: u32,
     /// Steps of this process.
@@ -76,12 +76,12 @@ pub struct Trainer {
     contrast: f32,
     /// Space in which density control removes Gaussians.
     free_space: FreeSpace,
-    course: Course,
+    course: TrainingState,
     shown: LoadedTargets,
 }
 
 /// Returns the view of a camera with the options and the background of a run.
-fn view_of(course: &Course, gaussians: usize, camera: &Camera, sh_degree: u32) -> View {
+fn view_of(course: &TrainingState, gaussians: usize, camera: &Camera, sh_degree: u32) -> View {
     let [r, g, b, x, y, z] = course.background.values;
     View {
         antialias: u32::from(course.config.antialias),
@@ -100,7 +100,7 @@ impl Trainer {
         mut engine: Box<dyn Engine>,
         scene: &Gaussians,
         targets: impl Into<Targets>,
-        config: TrainConfig,
+        config: TrainerConfig,
     ) -> Result<Self> {
         let mut targets: Targets = targets.into();
         if scene.is_empty() || targets.is_empty() {
@@ -117,7 +117,7 @@ impl Trainer {
         let background = Learned::new(std::array::from_fn(|c| {
             if c < 3 { config.background[c] } else { 0.0 }
         }));
-        let course = Course {
+        let course = TrainingState {
             iteration: 0,
             gaussians: scene.len(),
             order: Vec::new(),
@@ -249,9 +249,9 @@ impl Trainer {
         } else {
             before
         };
-        let limits = density::Config {
+        let limits = density::DensityConfig {
             budget,
-            ..density::Config::default()
+            ..density::DensityConfig::default()
         };
         let counts = density::refine(
             &mut state,
@@ -353,7 +353,7 @@ impl Trainer {
         &mut self,
         checkpoint: Option<&Path>,
         mut report: impl FnMut(&Progress, &mut Self) -> Result<(), E>,
-    ) -> Result<TrainReport, E> {
+    ) -> Result<TrainerReport, E> {
         let first = self.course.iteration;
         let mut started = Instant::now();
         // The time of `report` does not count.
@@ -412,7 +412,7 @@ impl Trainer {
             started.elapsed().as_secs_f64() - report_seconds - self.shown.reading,
             self.course.iteration - first,
         );
-        Ok(TrainReport {
+        Ok(TrainerReport {
             iterations: self.course.iteration,
             steps_here: steps,
             seconds,
@@ -474,7 +474,7 @@ impl Trainer {
     /// When a file cannot be written; the previous checkpoint then remains.
     pub fn save(&self, path: &Path) -> Result<()> {
         let state = self.engine.state()?;
-        let course = Course {
+        let course = TrainingState {
             gaussians: state.len(),
             ..self.course.clone()
         };

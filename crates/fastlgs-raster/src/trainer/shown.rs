@@ -72,7 +72,7 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use crate::tests::{cloud, target};
-    use crate::{Budget, CpuEngine, Error, Target, TargetImage, Targets, TrainConfig, Trainer};
+    use crate::{Budget, CpuEngine, Error, Target, TargetImage, Targets, Trainer, TrainerConfig};
     use fastlgs_core::Camera;
     use glam::Vec3;
     use std::sync::Arc;
@@ -125,10 +125,10 @@ mod tests {
         broken: usize,
     ) -> crate::Result<(fastlgs_core::Gaussians, usize, u64)> {
         let reads = Arc::new(AtomicUsize::new(0));
-        let config = TrainConfig {
+        let config = TrainerConfig {
             iterations: 240,
             budget: Budget::Fixed(400),
-            ..TrainConfig::default()
+            ..TrainerConfig::default()
         };
         let mut trainer = Trainer::new(
             Box::new(CpuEngine::new()),

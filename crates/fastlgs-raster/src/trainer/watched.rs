@@ -107,7 +107,7 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{CpuEngine, Target, TargetImage, TrainConfig, pack};
+    use crate::{CpuEngine, Target, TargetImage, TrainerConfig, pack};
     use fastlgs_core::Camera;
     use glam::Vec3;
 
@@ -139,9 +139,9 @@ mod tests {
             },
             gain: [1.0; 3],
         };
-        let config = TrainConfig {
+        let config = TrainerConfig {
             budget: Budget::Auto(10),
-            ..TrainConfig::default()
+            ..TrainerConfig::default()
         };
         let mut trainer =
             Trainer::new(Box::new(CpuEngine::new()), &scene, vec![target], config).unwrap();

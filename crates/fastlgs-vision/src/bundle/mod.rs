@@ -22,7 +22,7 @@ const MIN_PHOTOS_PER_LENS: usize = 5;
 
 /// Result of a bundle adjustment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Report {
+pub struct BundleReport {
     /// Root mean square reprojection error in pixels, before and after. Each is computed over the
     /// tracks that agree with those poses.
     pub error: [f32; 2],
@@ -45,7 +45,7 @@ pub fn adjust(
     cameras: &mut [Camera],
     keypoints: &[Keypoints],
     matches: &[PairMatches],
-) -> Option<Report> {
+) -> Option<BundleReport> {
     let given = cameras.to_vec();
     let obeying = |cameras: &[Camera], keypoints: &[Keypoints], tolerance: f32| -> Vec<Track> {
         let matches: Vec<PairMatches> = matches
@@ -89,7 +89,7 @@ pub fn adjust(
         TOLERANCE,
     );
     let lens_of = |view: usize| lens[view].map_or_else(Lens::default, |l| values.lenses[l]);
-    Some(Report {
+    Some(BundleReport {
         error: [before.0, quality(&after).0],
         observations: [before.1, quality(&after).1],
         moved: movements(&given, cameras, &after),

@@ -1,7 +1,7 @@
 //! Fits the similarity that aligns a group of photos with the others: first to triangulated points,
 //! then to the epipolar geometry of all matches.
 
-use super::links::{FEW, Link};
+use super::links::{Link, MIN_MATCHES};
 use crate::keypoints::{Keypoints, epipolar_residual, fundamental};
 use crate::similarity::Similarity;
 use crate::tracks::TOLERANCE;
@@ -101,7 +101,7 @@ pub(super) fn pairs_between(
 /// Returns the similarity that most pairs support: RANSAC over three pairs, then least squares over
 /// the inliers. Returns `None` if too few pairs support it.
 pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<Similarity> {
-    if pairs.len() < FEW {
+    if pairs.len() < MIN_MATCHES {
         tracing::debug!(pairs = pairs.len(), "too few point pairs for a similarity");
         return None;
     }
@@ -138,7 +138,7 @@ pub(super) fn fit(pairs: &[Pair], cameras: &[Camera], rng: &mut Rng) -> Option<S
         best = refined;
     }
     tracing::debug!(pairs = pairs.len(), support = best.len(), "similarity");
-    (best.len() >= FEW && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32)
+    (best.len() >= MIN_MATCHES && best.len() as f32 >= MIN_SUPPORT * pairs.len() as f32)
         .then(|| placing(&best))
         .flatten()
 }
@@ -185,7 +185,7 @@ pub(super) fn refined(
             .map(|k| {
                 let mut delta = [0.0; 7];
                 delta[k] = STEP;
-                residuals(&best.nudged(&delta))
+                residuals(&best.followed_by_small(&delta))
                     .iter()
                     .zip(&now)
                     .map(|(a, b)| (a - b) / STEP)
@@ -203,7 +203,7 @@ pub(super) fn refined(
         let Some(delta) = normal.lu().solve(&right) else {
             break;
         };
-        let next = best.nudged(&std::array::from_fn(|k| delta[k] as f32));
+        let next = best.followed_by_small(&std::array::from_fn(|k| delta[k] as f32));
         if cost(&residuals(&next), width) < cost(&now, width) {
             best = next;
         }

@@ -15,9 +15,9 @@ pub(super) const OVERLAPPING: usize = 6;
 /// matches are mostly repeated texture.
 pub(super) const SAME_DIRECTION: f32 = 0.75;
 /// Smallest number of matches, or of inliers, that counts as evidence.
-pub(super) const FEW: usize = 25;
+pub(super) const MIN_MATCHES: usize = 25;
 
-/// Matches of two photos as (key point in a, key point in b), and their epipolar inliers (`right`).
+/// Matches of two photos as (key point in a, key point in b), and their epipolar inliers (`inliers`).
 pub(super) struct Link {
     pub a: usize,
     pub b: usize,
@@ -27,16 +27,16 @@ pub(super) struct Link {
 
 impl Link {
     pub fn agrees(&self) -> bool {
-        self.right.len() >= FEW && 2 * self.right.len() >= self.all.len()
+        self.right.len() >= MIN_MATCHES && 2 * self.right.len() >= self.all.len()
     }
 
     pub fn contradicts(&self) -> bool {
-        self.all.len() >= FEW && 10 * self.right.len() < 3 * self.all.len()
+        self.all.len() >= MIN_MATCHES && 10 * self.right.len() < 3 * self.all.len()
     }
 }
 
 /// Returns the matches within `TOLERANCE` pixels of their epipolar lines.
-pub(super) fn right(
+pub(super) fn inliers(
     cameras: &[Camera],
     keypoints: &[Keypoints],
     a: usize,
@@ -69,7 +69,7 @@ pub(super) fn matched(
 ) -> Vec<Link> {
     let link = |(a, b): (usize, usize)| {
         let all = matches(&keypoints[a], &keypoints[b]);
-        let right = right(cameras, keypoints, a, b, &all);
+        let right = inliers(cameras, keypoints, a, b, &all);
         Link { a, b, all, right }
     };
     pairs.into_par_iter().map(link).collect()

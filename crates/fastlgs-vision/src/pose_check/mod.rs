@@ -13,12 +13,12 @@ use fastlgs_core::Camera;
 use fastlgs_core::rng::Rng;
 use fit::{fit, pairs_between, points_of, refined};
 use glam::Vec3;
-use links::{FEW, Link, SAME_DIRECTION, WINDOW, groups, links, matched, right};
+use links::{Link, MIN_MATCHES, SAME_DIRECTION, WINDOW, groups, inliers, links, matched};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 /// Result of `repair`.
 #[derive(Clone, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-pub struct Report {
+pub struct PoseCheckReport {
     /// Indices of the photos whose cameras were moved.
     pub moved: Vec<usize>,
     /// Indices of the photos whose poses contradict the others and could not be repaired.
@@ -29,17 +29,17 @@ pub struct Report {
 const EVERYWHERE_STRIDE: usize = 2;
 /// Smallest group, in photos, that other groups may be fitted to in the last attempt. A single
 /// photo does not determine scale.
-const SOLID: usize = 3;
+const MIN_REFERENCE_PHOTOS: usize = 3;
 /// Smallest share of a group's matches with other groups that must be epipolar inliers. Repeated
 /// texture alone reaches about 0.1.
-const MIN_OBEYING: f32 = 0.3;
+const MIN_INLIER_SHARE: f32 = 0.3;
 
 /// Moves groups of cameras that are misplaced, and returns the moved and the contradictory photos.
 ///
 /// First, each group is fitted to the groups placed before it. The links come from the order of the
 /// photos and from their poses. Then each moved or unplaced group is fitted to all settled groups,
 /// with additional links to all parts of the scene.
-pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Report {
+pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> PoseCheckReport {
     let links = links(cameras, keypoints);
     let group = groups(cameras.len(), &links);
     let sizes = group
@@ -53,11 +53,11 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
         .max_by(|a, b| a.1.cmp(b.1).then(b.0.cmp(a.0)))
         .map(|s| *s.0)
     else {
-        return Report::default();
+        return PoseCheckReport::default();
     };
     let points = points_of(cameras, keypoints, &links, &group);
     let before = cameras.to_vec();
-    let mut work = Work {
+    let mut work = Repair {
         cameras,
         keypoints,
         links,
@@ -82,7 +82,7 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
         .all(|(now, then)| now == then)
         && failed.is_empty()
     {
-        return Report::default();
+        return PoseCheckReport::default();
     }
     let moved: BTreeSet<usize> = (0..before.len())
         .filter(|&i| work.cameras[i] != before[i])
@@ -109,9 +109,9 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
         let shares = good
             .iter()
             .filter(|g| **g != base)
-            .map(|&g| (g, work.obeying_share(g, &good)));
+            .map(|&g| (g, work.inlier_share(g, &good)));
         match shares.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0))) {
-            Some((g, share)) if share < MIN_OBEYING => bad.insert(g),
+            Some((g, share)) if share < MIN_INLIER_SHARE => bad.insert(g),
             _ => break,
         };
     }
@@ -120,13 +120,13 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
         let good: BTreeSet<usize> = sizes
             .keys()
             .copied()
-            .filter(|g| !bad.contains(g) && sizes[g] >= SOLID)
+            .filter(|g| !bad.contains(g) && sizes[g] >= MIN_REFERENCE_PHOTOS)
             .collect();
-        if work.place(next, &good, true) && work.obeying_share(next, &good) >= MIN_OBEYING {
+        if work.place(next, &good, true) && work.inlier_share(next, &good) >= MIN_INLIER_SHARE {
             bad.remove(&next);
         }
     }
-    Report {
+    PoseCheckReport {
         moved: (0..before.len())
             .filter(|&i| work.cameras[i] != before[i] && !bad.contains(&work.group[i]))
             .collect(),
@@ -137,7 +137,7 @@ pub fn repair(cameras: &mut [Camera], keypoints: &[Keypoints], seed: u64) -> Rep
 }
 
 /// State of a repair.
-struct Work<'a> {
+struct Repair<'a> {
     cameras: &'a mut [Camera],
     keypoints: &'a [Keypoints],
     links: Vec<Link>,
@@ -147,7 +147,7 @@ struct Work<'a> {
     seed: u64,
 }
 
-impl Work<'_> {
+impl Repair<'_> {
     /// Returns whether a link joins group `next` and one of `others`.
     fn joins(&self, link: &Link, next: usize, others: &BTreeSet<usize>) -> bool {
         let (a, b) = (self.group[link.a], self.group[link.b]);
@@ -156,9 +156,10 @@ impl Work<'_> {
 
     /// Returns the share of epipolar inliers among the matches between a group and `others`. It is
     /// 1 if there are no matches.
-    fn obeying_share(&self, next: usize, others: &BTreeSet<usize>) -> f32 {
-        let counts =
-            |l: &&Link| l.all.len() >= FEW && self.joins(l, next, others) && self.same_direction(l);
+    fn inlier_share(&self, next: usize, others: &BTreeSet<usize>) -> f32 {
+        let counts = |l: &&Link| {
+            l.all.len() >= MIN_MATCHES && self.joins(l, next, others) && self.same_direction(l)
+        };
         let (right, all) = self
             .links
             .iter()
@@ -192,7 +193,9 @@ impl Work<'_> {
     /// viewing directions.
     fn place(&mut self, next: usize, others: &BTreeSet<usize>, lost: bool) -> bool {
         let counts = |l: &&Link| {
-            l.all.len() >= FEW && self.joins(l, next, others) && (lost || self.same_direction(l))
+            l.all.len() >= MIN_MATCHES
+                && self.joins(l, next, others)
+                && (lost || self.same_direction(l))
         };
         let across: Vec<&Link> = self.links.iter().filter(counts).collect();
         let moves = |i: usize| self.group[i] == next;
@@ -214,7 +217,7 @@ impl Work<'_> {
         // produce wrong matches between distant views.
         let obeying = |cameras: &[Camera]| {
             across.iter().fold((0, 0), |(all, near), l| {
-                let count = right(cameras, self.keypoints, l.a, l.b, &l.all).len();
+                let count = inliers(cameras, self.keypoints, l.a, l.b, &l.all).len();
                 (
                     all + count,
                     near + if l.b - l.a <= WINDOW { count } else { 0 },
@@ -231,7 +234,7 @@ impl Work<'_> {
             ?after,
             "epipolar inliers between groups before and after a move"
         );
-        if after.0 <= before.0 || after.1 + FEW < before.1 {
+        if after.0 <= before.0 || after.1 + MIN_MATCHES < before.1 {
             return false;
         }
         self.cameras.clone_from_slice(&moved);
@@ -245,7 +248,7 @@ impl Work<'_> {
             .iter_mut()
             .filter(|l| (group[l.a] == next) != (group[l.b] == next))
         {
-            link.right = right(self.cameras, self.keypoints, link.a, link.b, &link.all);
+            link.right = inliers(self.cameras, self.keypoints, link.a, link.b, &link.all);
         }
         true
     }
@@ -263,7 +266,7 @@ impl Work<'_> {
         let new = pairs.filter(|p| !known.contains(p)).collect();
         let found = matched(new, self.cameras, self.keypoints);
         self.links
-            .extend(found.into_iter().filter(|l| l.all.len() >= FEW));
+            .extend(found.into_iter().filter(|l| l.all.len() >= MIN_MATCHES));
     }
 }
 
@@ -320,7 +323,10 @@ mod tests {
     fn right_poses_stay_as_they_are() {
         let (mut cameras, keypoints) = exact_ring(16);
         let before = cameras.clone();
-        assert_eq!(repair(&mut cameras, &keypoints, 0), Report::default());
+        assert_eq!(
+            repair(&mut cameras, &keypoints, 0),
+            PoseCheckReport::default()
+        );
         assert_eq!(cameras, before);
     }
 
@@ -337,7 +343,7 @@ mod tests {
         let report = repair(&mut cameras, &keypoints, 0);
         assert_eq!(
             report,
-            Report {
+            PoseCheckReport {
                 moved: (11..16).collect(),
                 contradictory: Vec::new()
             }

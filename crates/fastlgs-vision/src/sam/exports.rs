@@ -10,9 +10,9 @@ use std::path::Path;
 /// Longer side, in pixels, of the images that the models were trained on.
 const SIDE: usize = 1024;
 /// Side of the low-resolution masks, in cells.
-const LOW: usize = 256;
+const MASK_SIDE: usize = 256;
 /// Largest size of the mask logits of one inference, in bytes.
-const ANSWER: usize = 64 << 20;
+const MAX_MASK_BYTES: usize = 64 << 20;
 /// Largest number of masks that a decoder returns per prompt.
 const MASKS: usize = 4;
 /// Mean and standard deviation of the training images, RGB in [0, 255]. SAM and SAM 2 use the same
@@ -52,7 +52,7 @@ pub struct Exports {
     decoder: Model,
     kind: Kind,
     /// Pairs of a decoder input and the encoder output that fills it.
-    passed: Vec<(String, String)>,
+    decoder_inputs: Vec<(String, String)>,
 }
 
 /// An encoded image.
@@ -62,7 +62,7 @@ pub struct Encoded {
     /// Width and height of the image in pixels.
     pub size: [u32; 2],
     /// Width and height of the image in the coordinates of prompt points.
-    prompted: [f32; 2],
+    prompt_size: [f32; 2],
 }
 
 /// Answer of the decoder to a batch of prompts.
@@ -160,7 +160,7 @@ impl Exports {
             encoder,
             decoder,
             kind,
-            passed,
+            decoder_inputs: passed,
         })
     }
 
@@ -213,14 +213,19 @@ impl Exports {
                 )));
             }
         };
-        let outputs: Vec<&str> = self.passed.iter().map(|p| p.1.as_str()).collect();
+        let outputs: Vec<&str> = self.decoder_inputs.iter().map(|p| p.1.as_str()).collect();
         let found = self
             .encoder
             .run(vec![(slot.name.as_str(), input)], &outputs)?;
         Ok(Encoded {
-            embeddings: self.passed.iter().map(|p| p.0.clone()).zip(found).collect(),
+            embeddings: self
+                .decoder_inputs
+                .iter()
+                .map(|p| p.0.clone())
+                .zip(found)
+                .collect(),
             size,
-            prompted,
+            prompt_size: prompted,
         })
     }
 
@@ -239,7 +244,7 @@ impl Exports {
         let n = points.len();
         let on_picture: Vec<[f32; 2]> = points
             .iter()
-            .map(|p| [p[0] * encoded.prompted[0], p[1] * encoded.prompted[1]])
+            .map(|p| [p[0] * encoded.prompt_size[0], p[1] * encoded.prompt_size[1]])
             .collect();
         let mut inputs: Vec<(&str, Array)> = encoded
             .embeddings
@@ -257,14 +262,17 @@ impl Exports {
                 let labels = (0..n).flat_map(|_| [1.0, -1.0]).collect();
                 // Size of the full-resolution masks. They are not used, so the size is kept small.
                 let [w, h] = encoded
-                    .prompted
-                    .map(|v| (v * LOW as f32 / SIDE as f32).ceil());
+                    .prompt_size
+                    .map(|v| (v * MASK_SIDE as f32 / SIDE as f32).ceil());
                 inputs.extend([
                     ("point_coords", Array::new([n, 2, 2], coordinates)),
                     ("point_labels", Array::new([n, 2], labels)),
                     (
                         "mask_input",
-                        Array::new([1, 1, LOW, LOW], vec![0.0; LOW * LOW]),
+                        Array::new(
+                            [1, 1, MASK_SIDE, MASK_SIDE],
+                            vec![0.0; MASK_SIDE * MASK_SIDE],
+                        ),
                     ),
                     ("has_mask_input", Array::new([1], vec![0.0])),
                     ("orig_im_size", Array::new([2], vec![h, w])),
@@ -315,7 +323,7 @@ impl Exports {
         {
             return Err(self.decoder.refuse(format!("{n} prompts returned masks of shape {:?} and {} scores; these numbers do not fit together", logits.shape, scores.len())));
         }
-        let shown = self.shown(encoded, [columns, rows]);
+        let shown = self.image_cells(encoded, [columns, rows]);
         let scale = [0, 1].map(|k| shown[k] / encoded.size[k] as f32);
         let shown = [
             (shown[0].ceil() as usize).min(columns),
@@ -335,15 +343,15 @@ impl Exports {
     /// Returns the numbers of cells along x and y that cover the image.
     /// These are all cells if the grid has the proportions of the image, or if the image was
     /// stretched. Otherwise they are the unpadded part of the square.
-    fn shown(&self, encoded: &Encoded, cells: [usize; 2]) -> [f32; 2] {
+    fn image_cells(&self, encoded: &Encoded, cells: [usize; 2]) -> [f32; 2] {
         let [w, h] = encoded.size.map(|v| v as f32);
         let all = cells.map(|c| c as f32);
         let alike = (all[0] * h - all[1] * w).abs() <= w.max(h);
         if self.stretched() || self.kind == Kind::Efficient || (cells[0] != cells[1] && alike) {
             return all;
         }
-        let long = encoded.prompted[0].max(encoded.prompted[1]);
-        [0, 1].map(|k| all[k] * encoded.prompted[k] / long)
+        let long = encoded.prompt_size[0].max(encoded.prompt_size[1]);
+        [0, 1].map(|k| all[k] * encoded.prompt_size[k] / long)
     }
 
     /// Returns the number of prompts per inference if the export fixes it.
@@ -359,15 +367,15 @@ impl Exports {
         *points.shape.get(prompts)?
     }
 
-    /// Returns the largest number of prompts per inference whose masks fit into [`ANSWER`] bytes.
+    /// Returns the largest number of prompts per inference whose masks fit into [`MAX_MASK_BYTES`] bytes.
     /// EfficientSAM returns masks in the size of the image.
     pub fn most_prompts(&self, encoded: &Encoded) -> usize {
         let cells = if self.kind == Kind::Efficient {
             encoded.size[0] * encoded.size[1]
         } else {
-            (LOW * LOW) as u32
+            (MASK_SIDE * MASK_SIDE) as u32
         };
-        (ANSWER / (4 * MASKS * cells as usize)).max(1)
+        (MAX_MASK_BYTES / (4 * MASKS * cells as usize)).max(1)
     }
 
     /// Returns an error that names the decoder and the reason.

@@ -3,7 +3,7 @@
 
 use super::exports::{Exports, Logits};
 use super::windows::Grid;
-use super::{Config, Suppression};
+use super::{SamConfig, Suppression};
 use crate::Result;
 use crate::masks::{BitMask, box_iou};
 use fastlgs_core::Level;
@@ -24,7 +24,7 @@ const OVERLAP: f32 = 512.0 / 1500.0;
 const BORDER: f32 = 20.0 / 1024.0;
 /// Smallest area, as a share of the photo, of a whole and of a part. Used if the decoder returns
 /// one mask per prompt.
-const SHARES: [f32; 2] = [0.03, 0.005];
+const MIN_LEVEL_AREAS: [f32; 2] = [0.03, 0.005];
 
 /// A mask that passed the filters.
 #[derive(Clone, Debug)]
@@ -68,18 +68,18 @@ fn crops([w, h]: [u32; 2], layer: u32) -> Vec<[u32; 4]> {
 pub fn masks(
     exports: &Exports,
     photo: &RgbImage,
-    config: &Config,
+    config: &SamConfig,
 ) -> Result<(Vec<Candidate>, bool)> {
     let (mut all, mut single) = (Vec::new(), false);
     for layer in 0..=config.crop_layers {
         for crop in crops([photo.width(), photo.height()], layer) {
-            let found = of_crop(exports, photo, crop, config, &mut single)?;
+            let found = masks_of_crop(exports, photo, crop, config, &mut single)?;
             all.extend(found);
         }
     }
     if config.crop_layers > 0 {
         // Masks from smaller crops are preferred: they have a finer resolution.
-        all = thinned(
+        all = non_maximum_suppression(
             all,
             config.box_nms,
             |a, b| a.level == b.level || config.across_levels,
@@ -89,11 +89,11 @@ pub fn masks(
     Ok((all, single))
 }
 
-fn of_crop(
+fn masks_of_crop(
     exports: &Exports,
     photo: &RgbImage,
     crop: [u32; 4],
-    config: &Config,
+    config: &SamConfig,
     single: &mut bool,
 ) -> Result<Vec<Candidate>> {
     let [x0, y0, width, height] = crop;
@@ -111,7 +111,7 @@ fn of_crop(
         asked.resize(batch.unwrap_or(points.len()), points[0]);
         let logits = exports.decode(&encoded, &asked)?;
         for prompt in 0..points.len() {
-            let mut own = of_prompt(&logits, prompt, [width, height], config);
+            let mut own = masks_of_prompt(&logits, prompt, [width, height], config);
             if logits.masks == 1 {
                 *single = true;
                 own.iter_mut()
@@ -128,7 +128,7 @@ fn of_crop(
             found = without_copies(found);
         }
     }
-    Ok(thinned(
+    Ok(non_maximum_suppression(
         found,
         config.box_nms,
         |a, b| a.level == b.level || config.across_levels,
@@ -147,7 +147,12 @@ fn without_copies(mut candidates: Vec<Candidate>) -> Vec<Candidate> {
 }
 
 /// Returns the masks of a prompt that pass the filters, at the size of the crop.
-fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) -> Vec<Candidate> {
+fn masks_of_prompt(
+    logits: &Logits,
+    prompt: usize,
+    crop: [u32; 2],
+    config: &SamConfig,
+) -> Vec<Candidate> {
     let cells = logits.rows * logits.columns;
     // The first of four masks is for prompts of several points.
     let skipped = usize::from(logits.masks == 4);
@@ -199,7 +204,7 @@ fn of_prompt(logits: &Logits, prompt: usize, crop: [u32; 2], config: &Config) ->
 /// Returns the level of a mask by its share of the photo's area.
 fn by_size(mask: &BitMask, photo: &RgbImage) -> Level {
     let share = mask.area() as f32 / (photo.width() * photo.height()) as f32;
-    Level::ALL[SHARES.iter().filter(|s| share < **s).count()]
+    Level::ALL[MIN_LEVEL_AREAS.iter().filter(|s| share < **s).count()]
 }
 
 /// Moves a mask from crop to photo coordinates. Returns `None` if the crop's border cut it off.
@@ -232,7 +237,7 @@ fn placed(
 
 /// Non-maximum suppression: of competing candidates whose boxes have an IoU above `most`, keeps the
 /// one with the highest score. Of equal scores it keeps the first.
-fn thinned(
+fn non_maximum_suppression(
     mut candidates: Vec<Candidate>,
     most: f32,
     compete: impl Fn(&Candidate, &Candidate) -> bool,
@@ -334,7 +339,7 @@ mod tests {
             candidate([0, 0, 10, 9], 0.9),
             candidate([20, 0, 30, 10], 0.7),
         ];
-        let kept = thinned(all, 0.7, |_, _| true, |c| c.predicted_iou);
+        let kept = non_maximum_suppression(all, 0.7, |_, _| true, |c| c.predicted_iou);
         assert_eq!(
             kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(),
             [0.9, 0.7]
@@ -353,7 +358,7 @@ mod tests {
                 found.push(all[k].clone());
                 found = without_copies(found);
             }
-            let kept = thinned(found, 0.7, |_, _| true, |c| c.predicted_iou);
+            let kept = non_maximum_suppression(found, 0.7, |_, _| true, |c| c.predicted_iou);
             assert_eq!(
                 kept.iter().map(|c| c.predicted_iou).collect::<Vec<_>>(),
                 [0.95, 0.8],

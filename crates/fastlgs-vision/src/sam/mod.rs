@@ -22,7 +22,7 @@ pub const VERSION: u32 = 2;
 /// Options of mask generation. The defaults are those of SAM's own generator, except that masks of
 /// different levels do not suppress each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Config {
+pub struct SamConfig {
     /// Number of point prompts along each side of the photo and of each crop.
     pub points_per_side: u32,
     /// Smallest IoU that the model predicts for its own mask, 0 to 1.
@@ -53,7 +53,7 @@ pub struct Suppression {
     pub held: f32,
 }
 
-impl Default for Config {
+impl Default for SamConfig {
     fn default() -> Self {
         Self {
             points_per_side: 32,
@@ -67,7 +67,7 @@ impl Default for Config {
     }
 }
 
-impl Config {
+impl SamConfig {
     /// Returns the options of LangSplat, whose pipeline the paper follows: laxer filters, one layer
     /// of crops, and mask suppression.
     pub fn langsplat() -> Self {
@@ -93,17 +93,17 @@ const SPECK: f32 = 2e-4;
 const SAME: f32 = 0.9;
 
 /// Number of photos without a mask, before any photo with one, at which segmentation fails.
-const IN_NONE: usize = 5;
+const MAX_EMPTY_PHOTOS: usize = 5;
 
 /// Segmenter with SAM's image encoder and prompt decoder.
 pub struct Sam {
     exports: Exports,
-    config: Config,
-    told: std::sync::Once,
+    config: SamConfig,
+    single_mask_warning: std::sync::Once,
     /// Whether any photo had a mask.
     found: AtomicBool,
     /// Number of photos without a mask.
-    without: AtomicUsize,
+    photos_without_mask: AtomicUsize,
 }
 
 impl Sam {
@@ -111,13 +111,13 @@ impl Sam {
     ///
     /// # Errors
     /// A missing file, or a model of an unknown kind.
-    pub fn load(encoder: &Path, decoder: &Path, config: Config) -> Result<Self> {
+    pub fn load(encoder: &Path, decoder: &Path, config: SamConfig) -> Result<Self> {
         Ok(Self {
             exports: Exports::load(encoder, decoder)?,
             config,
-            told: std::sync::Once::new(),
+            single_mask_warning: std::sync::Once::new(),
             found: AtomicBool::new(false),
-            without: AtomicUsize::new(0),
+            photos_without_mask: AtomicUsize::new(0),
         })
     }
 }
@@ -132,7 +132,7 @@ impl Segmenter for Sam {
         let least = (SPECK * (width * height) as f32) as usize;
         let (found, single) = generation::masks(&self.exports, photo, &self.config)?;
         if single {
-            self.told.call_once(|| {
+            self.single_mask_warning.call_once(|| {
                 tracing::warn!("this SAM export returns one mask per prompt; the level of each mask is derived from its area")
             });
         }
@@ -164,7 +164,7 @@ impl Segmenter for Sam {
             // probably wrong.
             tracing::warn!("SAM found no mask in '{view}'");
             if !self.found.load(Ordering::Relaxed)
-                && self.without.fetch_add(1, Ordering::Relaxed) + 1 >= IN_NONE
+                && self.photos_without_mask.fetch_add(1, Ordering::Relaxed) + 1 >= MAX_EMPTY_PHOTOS
             {
                 return Err(self.exports.refuse("it found no mask in any of the first photos; check that encoder and decoder belong to the same model"));
             }
@@ -212,7 +212,7 @@ mod tests {
         })
     }
 
-    fn sam(export: SamExport, config: Config) -> Option<(tempfile::TempDir, Sam)> {
+    fn sam(export: SamExport, config: SamConfig) -> Option<(tempfile::TempDir, Sam)> {
         let dir = tempfile::tempdir().unwrap();
         let (encoder, decoder) = (
             dir.path().join("encoder.onnx"),
@@ -243,9 +243,9 @@ mod tests {
 
     #[test]
     fn every_export_gives_the_same_masks_at_their_levels() {
-        let config = Config {
+        let config = SamConfig {
             points_per_side: 12,
-            ..Config::default()
+            ..SamConfig::default()
         };
         let official = [true, false].map(|batched| SamExport::Official { batched });
         let others = [
@@ -300,9 +300,9 @@ mod tests {
 
     #[test]
     fn crops_and_suppression_leave_the_same_things() {
-        let config = Config {
+        let config = SamConfig {
             points_per_side: 8,
-            ..Config::langsplat()
+            ..SamConfig::langsplat()
         };
         let Some((_dir, sam)) = sam(SamExport::Official { batched: true }, config) else {
             return;
@@ -333,9 +333,9 @@ mod tests {
 
     #[test]
     fn a_single_mask_a_prompt_gets_its_level_by_its_size() {
-        let config = Config {
+        let config = SamConfig {
             points_per_side: 12,
-            ..Config::default()
+            ..SamConfig::default()
         };
         let Some((_dir, sam)) = sam(SamExport::Single, config) else {
             return;
@@ -357,20 +357,20 @@ mod tests {
 
     #[test]
     fn filters_drop_what_the_model_doubts() {
-        let config = Config {
+        let config = SamConfig {
             points_per_side: 4,
             predicted_iou: 0.99,
-            ..Config::default()
+            ..SamConfig::default()
         };
         let Some((_dir, sam)) = sam(SamExport::Transformers, config) else {
             return;
         };
         // A few photos may have no mask; after IN_NONE photos it is an error.
-        let mut photos = (0..IN_NONE).map(|_| sam.segment("", &photo()));
+        let mut photos = (0..MAX_EMPTY_PHOTOS).map(|_| sam.segment("", &photo()));
         assert!(
             photos
                 .by_ref()
-                .take(IN_NONE - 1)
+                .take(MAX_EMPTY_PHOTOS - 1)
                 .all(|list| list.unwrap().masks.is_empty())
         );
         assert!(
@@ -386,11 +386,11 @@ mod tests {
 
     #[test]
     fn other_models_are_refused_by_name() {
-        let Some((dir, _)) = sam(SamExport::Transformers, Config::default()) else {
+        let Some((dir, _)) = sam(SamExport::Transformers, SamConfig::default()) else {
             return;
         };
         let encoder = dir.path().join("encoder.onnx");
-        let error = Sam::load(&encoder, &encoder, Config::default())
+        let error = Sam::load(&encoder, &encoder, SamConfig::default())
             .err()
             .unwrap()
             .to_string();
@@ -398,10 +398,14 @@ mod tests {
             error.contains("encoder.onnx") && error.contains("pixel_values"),
             "{error}"
         );
-        let missing = Sam::load(&dir.path().join("none.onnx"), &encoder, Config::default())
-            .err()
-            .unwrap()
-            .to_string();
+        let missing = Sam::load(
+            &dir.path().join("none.onnx"),
+            &encoder,
+            SamConfig::default(),
+        )
+        .err()
+        .unwrap()
+        .to_string();
         assert!(
             missing.contains("none.onnx") && missing.contains("models pull"),
             "{missing}"

@@ -2,7 +2,7 @@
 //! poses and fitted exposures.
 
 use crate::compared::Compared;
-use crate::{Result, Session, train};
+use crate::{Result, Scene, train};
 use fastlgs_core::{Camera, metrics};
 use fastlgs_raster::{Target, align};
 
@@ -22,7 +22,7 @@ pub struct Quality {
 }
 
 /// Measures the held-out views in which any pixel counts; `None` if there are none.
-pub fn quality(scene: &mut Session) -> Result<Option<Quality>> {
+pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
     let cameras = scene.manifest.held_out(&scene.cameras);
     let background = train::Background {
         color: scene.trained.background,
@@ -40,7 +40,7 @@ pub fn quality(scene: &mut Session) -> Result<Option<Quality>> {
         sum.psnr += compared.psnr();
         let [w, h] = [camera.width, camera.height].map(|side| side as usize);
         sum.ssim += metrics::ssim(&compared.rendered, &compared.photo, w, h, &compared.counts);
-        let camera = aligned(scene, &target)?;
+        let camera = align_camera(scene, &target)?;
         let aligned = scene.render(&camera)?;
         let Some(mut compared) = Compared::of(&target, aligned.channels(0, 3)) else {
             continue;
@@ -65,8 +65,8 @@ pub fn quality(scene: &mut Session) -> Result<Option<Quality>> {
     Ok((views > 0).then_some(all))
 }
 
-fn aligned(scene: &mut Session, target: &Target) -> Result<Camera> {
-    let Session {
+fn align_camera(scene: &mut Scene, target: &Target) -> Result<Camera> {
+    let Scene {
         engine,
         gaussians,
         trained,

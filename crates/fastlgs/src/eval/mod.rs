@@ -4,8 +4,8 @@ mod color;
 
 use crate::absent::{ABSENT, COLORS};
 use crate::error::{Context, bail};
-use crate::session::ask::Ask;
-use crate::{Result, Run, Session};
+use crate::session::ask::ObjectQuery;
+use crate::{Result, Run, Scene};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
 use fastlgs_grid::Grid;
@@ -21,7 +21,7 @@ use std::time::Instant;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct EvalConfig {
     /// Trained scene folder.
     pub scene: PathBuf,
     /// Folder of labels in the layout of LERF-OVS, 3D-OVS or SPIn-NeRF. Without it, only colour is
@@ -46,7 +46,7 @@ pub struct Config {
     pub clip_text: Option<PathBuf>,
 }
 
-impl Default for Config {
+impl Default for EvalConfig {
     fn default() -> Self {
         let false_alarms = QueryConfig::default().false_alarms;
         Self {
@@ -64,7 +64,7 @@ impl Default for Config {
 /// Report of an evaluation. Values are means over all labels of all views, unless stated otherwise.
 /// `docs/evaluation.md` defines them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct Report {
+pub struct EvalReport {
     /// The scene folder.
     pub scene: PathBuf,
     /// Number of labelled views.
@@ -154,7 +154,7 @@ pub enum Outcome {
 }
 
 /// Least IoU of a right answer.
-const RIGHT: f64 = 0.5;
+const MIN_RIGHT_IOU: f64 = 0.5;
 
 /// An absent name with its score.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -192,8 +192,8 @@ fn mean(values: &[f64]) -> Option<f64> {
 ///
 /// # Errors
 /// A scene that is not trained, labels of a view that is not held out, or a device that fails.
-pub fn eval(config: &Config, run: &Run) -> Result<Report> {
-    let mut session = Session::open(&config.scene, run.device)?;
+pub fn eval(config: &EvalConfig, run: &Run) -> Result<EvalReport> {
+    let mut session = Scene::open(&config.scene, run.device)?;
     session.clip_text.clone_from(&config.clip_text);
     eval_session(session, config)
 }
@@ -202,8 +202,8 @@ pub fn eval(config: &Config, run: &Run) -> Result<Report> {
 ///
 /// # Errors
 /// As [`eval`].
-pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
-    scene.forget_taught();
+pub fn eval_session(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport> {
+    scene.ignore_taught_names();
     let grid = scene.grid()?;
     let color = color::quality(&mut scene)?;
     let label_text = config.label_text.as_deref();
@@ -247,7 +247,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
             }
             best.push(masks);
         }
-        sums.apart.extend(apart(&best));
+        sums.apart.extend(label_separation(&best));
     }
     let absent = absent_scores(config, &scene, &grid, &views)?;
     let rejected = |absent: &[(String, f64)]| {
@@ -257,13 +257,13 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
             .count()
     };
     let colored = colored_absent_scores(&absent, &scene, &grid)?;
-    let loudest = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
+    let best_absent = absent.iter().max_by(|a, b| a.1.total_cmp(&b.1));
     let auroc = metrics::auroc(
         &sums.present,
         &absent.iter().map(|a| a.1).collect::<Vec<_>>(),
     );
     let camera = &scene.cameras[0];
-    Ok(Report {
+    Ok(EvalReport {
         scene: config.scene.clone(),
         views_scored: views.len(),
         labels_scored: sums.iou.len(),
@@ -308,7 +308,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         absent_colored_rejected: (!colored.is_empty())
             .then(|| rejected(&colored) as f64 / colored.len() as f64),
         absent_scores: absent.iter().cloned().collect(),
-        absent_best: loudest.map(|(text, score)| Absent {
+        absent_best: best_absent.map(|(text, score)| Absent {
             text: text.clone(),
             score: *score,
         }),
@@ -324,7 +324,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
         ssim: color.map(|c| c.ssim),
         gaussians: scene.gaussians.len(),
         objects: grid.objects.len(),
-        scene_bytes: crate::session::bytes(&config.scene),
+        scene_bytes: crate::session::query_file_bytes(&config.scene),
         query_ms_first: mean(&sums.first_ms),
         query_ms_next: mean(&sums.next_ms),
         size: format!("{}x{}", camera.width, camera.height),
@@ -333,7 +333,7 @@ pub fn eval_session(mut scene: Session, config: &Config) -> Result<Report> {
 }
 
 /// Masks of a label and of the object that fits it best.
-struct Best {
+struct LabelMasks {
     truth: Vec<bool>,
     found: Vec<bool>,
 }
@@ -341,9 +341,9 @@ struct Best {
 /// Returns for each label the share of its pixels that the best object of no other label covers.
 /// The share is 1 if the objects are separate, even if no text finds them. Labels that overlap are
 /// not compared. An object that is the best one of two labels separates neither.
-fn apart(best: &[Best]) -> Vec<f64> {
+fn label_separation(best: &[LabelMasks]) -> Vec<f64> {
     let pixels = best.first().map_or(0, |b| b.truth.len());
-    let at = |p: usize, mask: fn(&Best) -> &Vec<bool>| {
+    let at = |p: usize, mask: fn(&LabelMasks) -> &Vec<bool>| {
         (0..best.len())
             .filter(|&k| mask(&best[k])[p])
             .collect::<Vec<_>>()
@@ -363,10 +363,10 @@ fn apart(best: &[Best]) -> Vec<f64> {
     let mut counts = vec![[0usize; 2]; best.len()];
     for [truth, found] in &there {
         for &own in truth {
-            let mixed = found
+            let is_confused = found
                 .iter()
                 .any(|other| !overlapping.contains(&(own, *other)));
-            counts[own][0] += usize::from(mixed);
+            counts[own][0] += usize::from(is_confused);
             counts[own][1] += 1;
         }
     }
@@ -378,7 +378,7 @@ fn apart(best: &[Best]) -> Vec<f64> {
 
 /// Scores one label. Returns the milliseconds of the query without rendering, and the masks.
 fn score_label(
-    scene: &Session,
+    scene: &Scene,
     grid: &Grid,
     config: &QueryConfig,
     view: &LabelledView,
@@ -386,7 +386,7 @@ fn score_label(
     camera: &Camera,
     field: &Field,
     sums: &mut Sums,
-) -> Result<(f64, Best)> {
+) -> Result<(f64, LabelMasks)> {
     let (w, h) = (camera.width, camera.height);
     let truth = view.mask(label, w, h);
     if !truth.contains(&true) {
@@ -399,8 +399,8 @@ fn score_label(
     // The text encoder is loaded once, before the first query is timed.
     scene.text_query("warm up")?;
     let started = Instant::now();
-    let query::Found { ranked, targets } = Ask::Text(label.category.clone())
-        .meaning(scene, &[])?
+    let query::Found { ranked, targets } = ObjectQuery::Text(label.category.clone())
+        .embed(scene, &[])?
         .find(grid, field, camera, config)?;
     let mask = field.mask(grid, &targets);
     let ms = started.elapsed().as_secs_f64() * 1e3;
@@ -439,7 +439,7 @@ fn score_label(
     );
     let outcome = match targets.first() {
         None => Outcome::Refused,
-        _ if iou >= RIGHT => Outcome::Right,
+        _ if iou >= MIN_RIGHT_IOU => Outcome::Right,
         Some(first) if first.id == id => Outcome::WrongMask,
         Some(first) if grid.related(id)[usize::from(first.id) - 1] => Outcome::WrongLevel,
         Some(_) => Outcome::WrongObject,
@@ -460,7 +460,7 @@ fn score_label(
     sums.top1.push(f64::from(u8::from(
         ranked.first().is_some_and(|r| inside(object_mask(r.id))),
     )));
-    Ok((ms, Best { truth, found }))
+    Ok((ms, LabelMasks { truth, found }))
 }
 
 /// Returns IoU, mask and id of the object that fits a mask best; id 0 if there are no objects.
@@ -500,8 +500,8 @@ fn candidates(grid: &Grid, field: &Field, truth: &[bool]) -> Vec<u16> {
 /// Returns the largest score of each absent name. Names that occur in a label are left out; without
 /// labels, the result is empty.
 fn absent_scores(
-    options: &Config,
-    scene: &Session,
+    options: &EvalConfig,
+    scene: &Scene,
     grid: &Grid,
     views: &[LabelledView],
 ) -> Result<Vec<(String, f64)>> {
@@ -532,7 +532,7 @@ fn absent_scores(
 /// Returns the largest score of each absent name with a colour in front.
 fn colored_absent_scores(
     absent: &[(String, f64)],
-    scene: &Session,
+    scene: &Scene,
     grid: &Grid,
 ) -> Result<Vec<(String, f64)>> {
     let texts = absent
@@ -542,7 +542,7 @@ fn colored_absent_scores(
 }
 
 /// Returns a text with its largest score over all objects.
-fn scored(scene: &Session, grid: &Grid, text: String) -> Result<(String, f64)> {
+fn scored(scene: &Scene, grid: &Grid, text: String) -> Result<(String, f64)> {
     let score = f64::from(query::best_score(&query::rank(
         grid,
         &scene.text_query(&text)?,
@@ -557,7 +557,7 @@ mod tests {
     #[test]
     fn twins_are_apart_where_each_has_its_own_object() {
         let mask = |pixels: &str| pixels.bytes().map(|b| b == b'x').collect::<Vec<_>>();
-        let best = |truth: &str, found: &str| Best {
+        let best = |truth: &str, found: &str| LabelMasks {
             truth: mask(truth),
             found: mask(found),
         };
@@ -568,10 +568,10 @@ mod tests {
             best("....xx", ".x..xx"),
             best("xx..xx", "xxxxxx"),
         ];
-        assert_eq!(apart(&both), [0.5, 1.0, 1.0]);
+        assert_eq!(label_separation(&both), [0.5, 1.0, 1.0]);
         // One object for both twins.
         assert_eq!(
-            apart(&[best("xx..", "xxxx"), best("..xx", "xxxx")]),
+            label_separation(&[best("xx..", "xxxx"), best("..xx", "xxxx")]),
             [0.0, 0.0]
         );
     }

@@ -1,6 +1,6 @@
 //! Options and report of `preprocess`.
 
-use crate::eyes::Eyes;
+use crate::eyes::ModelChoice;
 use fastlgs_core::dataset::PoseConvention;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
@@ -39,7 +39,7 @@ pub enum Poses {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct PreprocessConfig {
     /// Folder of photos (in images/ or directly in it), or a video. Poses are read from sparse/0
     /// (COLMAP), transforms.json or poses_bounds.npy in the folder. Without them, structure from
     /// motion computes the poses.
@@ -48,11 +48,11 @@ pub struct Config {
     #[cfg_attr(feature = "clap", arg(short, long))]
     pub output: PathBuf,
     /// Limit on the longer side of prepared photos, in pixels.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().max_side))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PreprocessConfig::default().max_side))]
     pub max_side: u32,
     /// Hold out every N-th photo (sorted by name) from training and mapping; 0 holds out none. If
     /// the data set marks photos for testing, those are held out instead.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().holdout))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PreprocessConfig::default().holdout))]
     pub holdout: usize,
     /// Hold out the photos that these labels name (LERF-OVS, 3D-OVS or SPIn-NeRF), instead of every
     /// N-th.
@@ -74,16 +74,16 @@ pub struct Config {
     /// Segmenter and encoder.
     #[serde(flatten)]
     #[cfg_attr(feature = "clap", command(flatten))]
-    pub eyes: Eyes,
+    pub eyes: ModelChoice,
     /// Number of neighbouring photos with which each photo is matched.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = Config::default().neighbours))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = PreprocessConfig::default().neighbours))]
     pub neighbours: usize,
     /// Memory limit for reading photos, such as 500M or 4G.
     #[cfg_attr(feature = "clap", arg(long, default_value = "4G", value_name = "BYTES", value_parser = parse_bytes))]
     pub memory: u64,
 }
 
-impl Default for Config {
+impl Default for PreprocessConfig {
     fn default() -> Self {
         Self {
             photos: PathBuf::new(),
@@ -94,7 +94,7 @@ impl Default for Config {
             sfm: Sfm::default(),
             poses: Poses::default(),
             pose_convention: None,
-            eyes: Eyes::default(),
+            eyes: ModelChoice::default(),
             neighbours: 10,
             memory: 4_000_000_000,
         }
@@ -134,7 +134,7 @@ fn parse_bytes(text: &str) -> Result<u64, String> {
 
 /// Report of `preprocess`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct Report {
+pub struct PreprocessReport {
     /// The scene folder.
     pub scene: PathBuf,
     /// Number of photos that were read.

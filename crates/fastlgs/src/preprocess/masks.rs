@@ -1,6 +1,6 @@
 //! Segments the training photos.
 
-use super::config::Config;
+use super::config::PreprocessConfig;
 use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::error::{Context, bail};
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 /// # Errors
 /// No training photo has a mask, the segmenter fails, or the run is cancelled.
 pub(super) fn segment(
-    config: &Config,
+    config: &PreprocessConfig,
     segmenter: &dyn Segmenter,
     training: &[PreparedPhoto],
     folder: &SceneFolder,

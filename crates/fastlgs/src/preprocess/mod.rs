@@ -13,7 +13,7 @@ use crate::eyes::EncoderKind;
 use crate::output::{SceneLock, check_apart};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, calibrations, checkpoints};
-pub use config::{Adjusted, Brightness, Config, Poses, Report, Sfm};
+pub use config::{Adjusted, Brightness, Poses, PreprocessConfig, PreprocessReport, Sfm};
 use fastlgs_core::dataset::Dataset;
 use fastlgs_core::scene_folder::{Manifest, find_view};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
@@ -47,13 +47,17 @@ const REPLACED: [&str; 9] = [
 /// Photos that cannot be read, poses that fit no photo, fewer than two training photos, missing
 /// models, or a cancelled run. The earlier scene then stays unchanged, and the next run reuses
 /// finished results.
-pub fn preprocess(config: &Config, run: &Run) -> Result<Report> {
+pub fn preprocess(config: &PreprocessConfig, run: &Run) -> Result<PreprocessReport> {
     check_apart(&config.photos, &config.output)?;
     preprocess_locked(config, &SceneLock::take(&config.output, "preprocess")?, run)
 }
 
 /// Preprocesses into a scene that the caller has locked.
-pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
+pub(crate) fn preprocess_locked(
+    config: &PreprocessConfig,
+    _lock: &SceneLock,
+    run: &Run,
+) -> Result<PreprocessReport> {
     let started = Instant::now();
     let mut seconds = BTreeMap::new();
     let mut clock = Instant::now();
@@ -69,7 +73,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
         );
     }
     let of_video = |video| {
-        Ok::<_, crate::Error>(Config {
+        Ok::<_, crate::Error>(PreprocessConfig {
             photos: video::photos(video, &SceneFolder::new(&config.output), run)?,
             ..config.clone()
         })
@@ -256,7 +260,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
     // Checkpoints of a training on other photos are invalid.
     checkpoints::forget(&scene);
     cache.tidy();
-    Ok(Report {
+    Ok(PreprocessReport {
         scene: config.output.clone(),
         photos: cameras.len(),
         training_photos: poses.len(),
@@ -287,7 +291,7 @@ pub(crate) fn preprocess_locked(config: &Config, _lock: &SceneLock, run: &Run) -
 /// # Errors
 /// A labelled view is not among the photos.
 fn held_out(
-    config: &Config,
+    config: &PreprocessConfig,
     dataset: &Dataset,
     cameras: &[Camera],
 ) -> Result<(usize, Vec<String>)> {

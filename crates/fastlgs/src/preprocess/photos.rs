@@ -1,7 +1,7 @@
 //! Loads photos: undistorts and scales them, writes them into the scene folder, and detects key
 //! points.
 
-use super::config::Config;
+use super::config::PreprocessConfig;
 use crate::cache::{self, Cache, Key};
 use crate::error::{Context, bail};
 use crate::{Result, Run};
@@ -11,7 +11,7 @@ use fastlgs_core::mask_image::MaskImage;
 use fastlgs_core::undistort::{Distortion, coverage_mask, undistort, undistort_gray};
 use fastlgs_core::{Camera, SceneFolder, image_io};
 use fastlgs_vision::keypoints::{self, Keypoints};
-use fastlgs_vision::photo_quality::{self, Impression};
+use fastlgs_vision::photo_quality::{self, PhotoStats};
 use glam::Vec2;
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
@@ -55,7 +55,7 @@ pub(super) struct PreparedPhoto {
     pub camera: Camera,
     /// Fingerprint of the pixels.
     pub key: Key,
-    impression: Impression,
+    impression: PhotoStats,
     /// Share of the photo that its mask file keeps; `None` without a mask file.
     drawn: Option<Extent>,
     /// Share of the photo that is not fully transparent.
@@ -69,7 +69,7 @@ pub(super) struct PreparedPhoto {
 
 /// Warns about blurred and repeated photos, which are used nevertheless.
 pub(super) fn warn_of_bad_photos(photos: &[PreparedPhoto], run: &Run, warnings: &mut Vec<String>) {
-    let seen: Vec<Impression> = photos.iter().map(|p| p.impression.clone()).collect();
+    let seen: Vec<PhotoStats> = photos.iter().map(|p| p.impression.clone()).collect();
     for (list, what) in [
         (photo_quality::blurred(&seen), "are blurred"),
         (
@@ -207,7 +207,7 @@ const BYTES_A_PIXEL: u64 = 12;
 /// points. `config.memory` limits how many are loaded at once.
 pub(super) fn load(
     dataset: &Dataset,
-    config: &Config,
+    config: &PreprocessConfig,
     folder: &SceneFolder,
     cache: &Cache,
     run: &Run,
@@ -276,7 +276,7 @@ fn prepare(
     };
     let colors = points.positions.iter().map(color).collect();
     Ok(PreparedPhoto {
-        impression: Impression::of(&pixels),
+        impression: PhotoStats::of(&pixels),
         drawn,
         opaque,
         camera,
@@ -506,9 +506,9 @@ mod tests {
                 progress: &crate::Silent,
             },
         );
-        let config = Config {
+        let config = PreprocessConfig {
             photos,
-            ..Config::default()
+            ..PreprocessConfig::default()
         };
         let known = load(&dataset, &config, &folder, &cache, &run).unwrap();
         color_points(&mut dataset, &known, &folder).unwrap();

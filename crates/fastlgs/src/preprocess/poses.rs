@@ -196,7 +196,7 @@ fn reconstruct(
 
 /// Reports a line that a tool printed. Returns whether to continue.
 fn report_line(work: &Work, stage: &str, line: &str) -> bool {
-    work.note(&format!("{stage}: {line}"));
+    work.set_activity(&format!("{stage}: {line}"));
     work.check().is_ok()
 }
 
@@ -213,7 +213,7 @@ pub(super) fn check(
     cache: &Cache,
     run: &Run,
     warnings: &mut Vec<String>,
-) -> Result<pose_check::Report> {
+) -> Result<pose_check::PoseCheckReport> {
     let given: Vec<Camera> = photos
         .iter()
         .map(|p| p.camera.shrunk_to(CHECK_SIDE))
@@ -282,7 +282,7 @@ const PARTIAL: &str = "sfm.partial";
 const WRONG_POSES_RATIO: usize = 10;
 
 /// Returns the number of wrong poses: moved ones, and those that could not be corrected.
-fn wrong_pose_count(report: &pose_check::Report) -> usize {
+fn wrong_pose_count(report: &pose_check::PoseCheckReport) -> usize {
     report.moved.len() + report.contradictory.len()
 }
 
@@ -293,10 +293,10 @@ fn wrong_pose_count(report: &pose_check::Report) -> usize {
 fn recompute_poses(
     given: &[Camera],
     points: &[Keypoints],
-    checked: &pose_check::Report,
+    checked: &pose_check::PoseCheckReport,
     folder: &SceneFolder,
     run: &Run,
-) -> Result<Option<(Vec<Camera>, pose_check::Report)>> {
+) -> Result<Option<(Vec<Camera>, pose_check::PoseCheckReport)>> {
     let Tool::Pycolmap(python) = Tool::find(false)? else {
         let mend = "this needs pycolmap, but only the program 'colmap' is installed; run 'fastlgs models install-offline' to install pycolmap";
         return Err(Error::Vision(fastlgs_vision::Error::Missing(
@@ -307,7 +307,8 @@ fn recompute_poses(
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();
     let say = |stage: &str, line: &str| report_line(&work, stage, line);
     let partial = folder.root.join(PARTIAL);
-    let found = structure::placed_anew(&python, &files, given, points, &partial, run.seed, say);
+    let found =
+        structure::reconstruct_with_lenses(&python, &files, given, points, &partial, run.seed, say);
     let _ = std::fs::remove_dir_all(&partial);
     work.check()?;
     let found = found?;
@@ -338,7 +339,7 @@ fn recompute_poses(
     let moved = moved.difference(&lost).copied().collect();
     Ok(Some((
         cameras,
-        pose_check::Report {
+        pose_check::PoseCheckReport {
             moved,
             contradictory: lost.into_iter().collect(),
         },
@@ -354,7 +355,7 @@ const SUPPORT: (usize, f32) = (15, 0.5);
 pub(super) fn leave_out_lost(
     photos: &[PreparedPhoto],
     cache: &Cache,
-    checked: &mut pose_check::Report,
+    checked: &mut pose_check::PoseCheckReport,
 ) -> Result<()> {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
     let points: Vec<Keypoints> = photos.iter().map(|p| p.points.clone()).collect();
@@ -391,7 +392,7 @@ pub(super) fn leave_out_lost(
 /// `checked`.
 pub(super) fn place(
     photos: &mut [PreparedPhoto],
-    checked: &mut pose_check::Report,
+    checked: &mut pose_check::PoseCheckReport,
     matches: &[PairMatches],
 ) {
     if checked.contradictory.is_empty() {
@@ -414,7 +415,7 @@ pub(super) fn place(
 /// Warns about photos whose poses were wrong.
 pub(super) fn warn(
     photos: &[PreparedPhoto],
-    checked: &pose_check::Report,
+    checked: &pose_check::PoseCheckReport,
     run: &Run,
     warnings: &mut Vec<String>,
 ) {

@@ -67,7 +67,7 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
     std::fs::create_dir_all(&partial).map_err(fastlgs_core::Error::io(&partial))?;
     let work = run.work("frames", 0);
     let looked = |seconds: f64, chosen: usize| {
-        work.note(&format!("{seconds:.0} s, {chosen} photos"));
+        work.set_activity(&format!("{seconds:.0} s, {chosen} photos"));
         work.check()
     };
     let made = fastlgs_vision::video::photos(video, &partial.join("images"), looked);

@@ -1,14 +1,14 @@
 //! Decides which Gaussians remain when an object is removed.
 
-use crate::{Result, Session};
+use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_raster::lift;
 use glam::Vec3;
 
 /// Least number of views that must show a Gaussian outside of the hidden pixels.
-const WITNESSES: u8 = 2;
+const MIN_VIEWS: u8 = 2;
 /// Least sum of blending weights of a Gaussian in such a view, in pixels.
-const SHARE: f32 = 0.5;
+const MIN_WEIGHT: f32 = 0.5;
 
 /// Returns for each Gaussian whether it remains. `views` holds the hidden pixels of each view:
 /// those that the object may have coloured.
@@ -16,8 +16,8 @@ const SHARE: f32 = 0.5;
 /// A Gaussian remains if two views show it outside of the hidden pixels. It also remains if no view
 /// shows it, or its centre, within them. All others belong to the object or lie inside or below it,
 /// where photos do not constrain training.
-pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
-    let mut witnesses = vec![0u8; session.gaussians.len()];
+pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
+    let mut view_counts = vec![0u8; session.gaussians.len()];
     let mut within = vec![false; session.gaussians.len()];
     for (camera, hidden) in views {
         let labels = hidden.iter().map(|hidden| u16::from(!hidden)).collect();
@@ -28,8 +28,8 @@ pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool
         };
         for vote in lift::votes(&session.gaussians, &session.view(camera), &map) {
             within[vote.gaussian as usize] |= vote.label == 0;
-            if vote.label == 1 && vote.weight >= SHARE {
-                let count = &mut witnesses[vote.gaussian as usize];
+            if vote.label == 1 && vote.weight >= MIN_WEIGHT {
+                let count = &mut view_counts[vote.gaussian as usize];
                 *count = count.saturating_add(1);
             }
         }
@@ -42,9 +42,9 @@ pub fn seen(session: &Session, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool
         })
     };
     let stays = |((count, within), mean): ((u8, bool), &Vec3)| {
-        count >= WITNESSES || !(within || is_within(*mean))
+        count >= MIN_VIEWS || !(within || is_within(*mean))
     };
-    Ok(witnesses
+    Ok(view_counts
         .into_iter()
         .zip(within)
         .zip(&session.gaussians.means)

@@ -1,7 +1,7 @@
 //! Writes the scene folder of a scene without the removed object.
 
 use crate::staged::StagedOutput;
-use crate::{Result, Session, clear, train};
+use crate::{Result, Scene, clear, train};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
@@ -10,10 +10,10 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Files that are not copied, because they describe the original photos.
-const LEFT_BEHIND: [&str; 2] = ["masks/objects", "embeddings.safetensors"];
+const NOT_COPIED: [&str; 2] = ["masks/objects", "embeddings.safetensors"];
 
 /// Share of hidden pixels from which a mask belongs to the removed object.
-const OF_THE_THING: f64 = 0.5;
+const MIN_HIDDEN_SHARE: f64 = 0.5;
 
 /// A view and its hidden pixels: those that the object may have coloured.
 type Hidden = (Camera, Vec<bool>);
@@ -25,7 +25,7 @@ type Hidden = (Camera, Vec<bool>);
 /// object, so their hidden pixels are ignored.
 pub fn write(
     output: &Path,
-    session: &mut Session,
+    session: &mut Scene,
     grid: &Grid,
     views: &[Hidden],
     what: &str,
@@ -56,7 +56,7 @@ pub fn write(
             continue;
         }
         let mut photo = folder.photo(&camera.name)?;
-        let counts = counting(folder, &camera.name, hidden.len())?;
+        let counts = counted_pixels(folder, &camera.name, hidden.len())?;
         patch(
             &mut photo,
             hidden,
@@ -73,7 +73,7 @@ pub fn write(
                     .places(width, height)
                     .filter(|p| hidden[*p])
                     .count();
-                (own as f64) < OF_THE_THING * mask.runs.area() as f64
+                (own as f64) < MIN_HIDDEN_SHARE * mask.runs.area() as f64
             });
             masks.save(&folder.masks_path(&camera.name))?;
         }
@@ -110,7 +110,7 @@ pub fn write(
 }
 
 /// Returns the pixels of a photo that count: opaque ones that no mask ignores.
-fn counting(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
+fn counted_pixels(folder: &SceneFolder, name: &str, pixels: usize) -> Result<Vec<bool>> {
     let mut counts = vec![true; pixels];
     for path in [folder.alpha_path(name), folder.ignore_path(name)]
         .into_iter()
@@ -132,12 +132,12 @@ const GAINS: [f32; 2] = [0.25, 4.0];
 fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) {
     let n = hidden.len();
     let gain: [f32; 3] = std::array::from_fn(|c| {
-        let open = photo
+        let visible_pixels = photo
             .pixels()
             .zip(&color[c * n..(c + 1) * n])
             .zip(hidden.iter().zip(counts))
             .filter(|(_, (hidden, counts))| !**hidden && **counts);
-        let (shown, rendered) = open.fold((0.0, 0.0), |(a, b), ((p, v), _)| {
+        let (shown, rendered) = visible_pixels.fold((0.0, 0.0), |(a, b), ((p, v), _)| {
             (a + f32::from(p[c]) / 255.0, b + v.clamp(0.0, 1.0))
         });
         if rendered > 0.0 {
@@ -153,10 +153,10 @@ fn patch(photo: &mut RgbImage, hidden: &[bool], counts: &[bool], color: &[f32]) 
     }
 }
 
-/// Copies the files of a scene that exist, except those in `LEFT_BEHIND`.
+/// Copies the files of a scene that exist, except those in `NOT_COPIED`.
 fn copy(files: &BTreeSet<String>, from: &Path, to: &Path) -> Result<()> {
     let stays = |file: &&String| {
-        !LEFT_BEHIND
+        !NOT_COPIED
             .iter()
             .any(|left| Path::new(file).starts_with(left))
             && from.join(file).is_file()

@@ -7,33 +7,33 @@ use fastlgs_vision::inpaint::Inpainter;
 pub struct Membrane;
 
 /// Factor of successive over-relaxation.
-const OVER: f32 = 1.9;
+const RELAXATION: f32 = 1.9;
 /// Number of iterations, enough for holes that are a few hundred pixels wide.
-const STEPS: usize = 400;
+const ITERATIONS: usize = 400;
 
 impl Inpainter for Membrane {
     fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> fastlgs_vision::Result<()> {
-        Self::span(colors, hole, width as usize);
+        Self::fill_planes(colors, hole, width as usize);
         Ok(())
     }
 }
 
 impl Membrane {
     /// Fills `hole` in each plane of `[planes][height][width]`.
-    pub fn span(planes: &mut [f32], hole: &[bool], width: usize) {
+    pub fn fill_planes(planes: &mut [f32], hole: &[bool], width: usize) {
         let inside: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
         let around: Vec<Vec<usize>> = inside
             .iter()
             .map(|p| neighbours(*p, width, hole.len()))
             .collect();
         for plane in planes.chunks_exact_mut(hole.len()) {
-            inwards(plane, hole, width, |known| {
+            fill_by_rings(plane, hole, width, |known| {
                 known.iter().sum::<f32>() / known.len() as f32
             });
-            for _ in 0..STEPS {
+            for _ in 0..ITERATIONS {
                 for (p, near) in inside.iter().zip(&around) {
                     let mean = near.iter().map(|q| plane[*q]).sum::<f32>() / near.len() as f32;
-                    plane[*p] += OVER * (mean - plane[*p]);
+                    plane[*p] += RELAXATION * (mean - plane[*p]);
                 }
             }
         }
@@ -42,14 +42,19 @@ impl Membrane {
 
 /// Returns the labels of an image. Each pixel of `hole` gets the label of a known neighbour, ring
 /// by ring.
-pub fn continued(labels: &[u16], hole: &[bool], width: usize) -> Vec<u16> {
+pub fn extend_labels(labels: &[u16], hole: &[bool], width: usize) -> Vec<u16> {
     let mut labels = labels.to_vec();
-    inwards(&mut labels, hole, width, |known| known[0]);
+    fill_by_rings(&mut labels, hole, width, |known| known[0]);
     labels
 }
 
 /// Fills the pixels of `hole` ring by ring. `value` computes a pixel from its known neighbours.
-fn inwards<T: Copy>(values: &mut [T], hole: &[bool], width: usize, value: impl Fn(&[T]) -> T) {
+fn fill_by_rings<T: Copy>(
+    values: &mut [T],
+    hole: &[bool],
+    width: usize,
+    value: impl Fn(&[T]) -> T,
+) {
     let mut open = hole.to_vec();
     let mut rest: Vec<usize> = (0..hole.len()).filter(|p| hole[*p]).collect();
     while !rest.is_empty() {
@@ -103,7 +108,7 @@ mod tests {
                 }
             })
             .collect();
-        Membrane::span(&mut planes, &hole, width);
+        Membrane::fill_planes(&mut planes, &hole, width);
         for (p, found) in planes.iter().enumerate() {
             assert!(
                 (found - value(p % hole.len())).abs() < 1e-3,

@@ -11,10 +11,10 @@ mod folder;
 mod membrane;
 
 use crate::error::{Context, bail};
-use crate::output::{SceneLock, resolved};
-use crate::session::ask::Ask;
+use crate::output::{SceneLock, resolve_path};
+use crate::session::ask::ObjectQuery;
 use crate::session::selection;
-use crate::{Result, Run, Session, clear};
+use crate::{Result, Run, Scene, clear};
 use fastlgs_core::{Camera, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -30,7 +30,7 @@ use std::path::PathBuf;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct RemoveConfig {
     /// Trained scene folder.
     pub scene: PathBuf,
     /// Text that names the object to remove.
@@ -54,7 +54,7 @@ pub struct Config {
     pub clip_text: Option<PathBuf>,
 }
 
-impl Default for Config {
+impl Default for RemoveConfig {
     fn default() -> Self {
         let inpainter = "membrane".to_owned();
         Self {
@@ -70,7 +70,7 @@ impl Default for Config {
 
 /// Report of a removal.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct Report {
+pub struct RemoveReport {
     /// Folder of the original scene.
     pub scene: PathBuf,
     /// Folder of the new scene.
@@ -88,24 +88,24 @@ pub struct Report {
 }
 
 /// Dilation of masks in x and y, in pixels: five times a window of 5x5 (paper).
-const WIDENED: [u32; 2] = [10; 2];
+const MASK_DILATION: [u32; 2] = [10; 2];
 /// Opacity of the Gaussians that fill a gap.
-const SOLID: f32 = 0.95;
+const FILL_OPACITY: f32 = 0.95;
 /// Radius of these Gaussians in pixel spacings at their depth: wide enough to close the space
 /// between neighbours.
-const RADIUS: f32 = 0.7;
+const FILL_RADIUS: f32 = 0.7;
 /// Share of the pixels of a view up to which a gap is not filled.
-const SMALL: f64 = 1e-5;
+const MIN_GAP_SHARE: f64 = 1e-5;
 /// Transmittance above which a pixel is empty.
-const EMPTY: f32 = 0.5;
+const EMPTY_TRANSMITTANCE: f32 = 0.5;
 
 /// Removes the objects that `config` names, fills the gaps, and writes a new scene.
 ///
 /// # Errors
 /// A text or id without an object, an output folder that holds a scene, photos that are missing, or
 /// a device that fails.
-pub fn remove(config: &Config, run: &Run) -> Result<Report> {
-    let (output, scene) = (resolved(&config.output)?, resolved(&config.scene)?);
+pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
+    let (output, scene) = (resolve_path(&config.output)?, resolve_path(&config.scene)?);
     if output.starts_with(&scene) || scene.starts_with(&output) {
         bail!(
             "{}: the output folder and the scene must not contain each other; choose a folder beside {}",
@@ -125,7 +125,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     } else {
         inpaint::by_name(&config.inpainter).context("the inpainter cannot be opened")?
     };
-    let mut session = Session::open(&config.scene, run.device)?;
+    let mut session = Scene::open(&config.scene, run.device)?;
     session.clip_text.clone_from(&config.clip_text);
     if session
         .cameras
@@ -141,23 +141,23 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     let targets = targets(config, &mut session, &grid)?;
     let views = session.manifest.training(&session.cameras);
     let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
-    let (mut hidden, mut shown) = (Vec::new(), Vec::new());
+    let (mut hidden, mut hidden_in_training) = (Vec::new(), Vec::new());
     for camera in session.cameras.clone() {
         let widened = |field: Field| {
             metrics::dilate(
                 &field.mask(&grid, &targets),
                 camera.width,
                 camera.height,
-                WIDENED,
+                MASK_DILATION,
             )
         };
         let thing = widened(session.field(&camera, None)?);
         if trained_on(&camera) {
             // A transparent object does not hide the surface behind it.
-            shown.push((
+            hidden_in_training.push((
                 camera.clone(),
                 if session.trained.clear > 0 {
-                    widened(session.field_of_shown(&camera)?)
+                    widened(session.field_without_transparent(&camera)?)
                 } else {
                     thing.clone()
                 },
@@ -166,36 +166,43 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
         hidden.push((camera, thing));
     }
     let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
-    let mut stays = behind::seen(&session, &shown)?;
+    let mut remains = behind::remaining_gaussians(&session, &hidden_in_training)?;
     // Photos do not show transparent Gaussians, so all of them remain, except those of the removed
     // objects.
-    stays
+    remains
         .iter_mut()
         .enumerate()
         .for_each(|(i, stays)| *stays |= clear::is_clear(&session.gaussians, i));
     selection::gaussians(&session.gaussians, &grid, &objects)
         .into_iter()
-        .for_each(|i| stays[i] = false);
-    let left: Vec<usize> = (0..stays.len()).filter(|i| stays[*i]).collect();
+        .for_each(|i| remains[i] = false);
+    let left: Vec<usize> = (0..remains.len()).filter(|i| remains[*i]).collect();
     if left.is_empty() {
         bail!(
             "{}: no Gaussians of the scene would remain; choose a smaller object",
             config.scene.display()
         );
     }
-    let removed = stays.len() - left.len();
+    let removed = remains.len() - left.len();
     let rest = session.gaussians.select(&left);
-    session.show(rest)?;
+    session.set_gaussians(rest)?;
 
     let mut gaps = Vec::new();
-    for (camera, hidden) in &shown {
+    for (camera, hidden) in &hidden_in_training {
         gaps.push(gap(&mut session, camera, hidden)?);
     }
     let count = |pixels: &mut dyn Iterator<Item = usize>| pixels.sum::<usize>() as f64;
     let seen = 1.0
-        - count(&mut gaps.iter().map(|g| set(g)))
-            / count(&mut shown.iter().map(|s| set(&s.1))).max(1.0);
-    let filled = fill(&mut session, &grid, &shown, &gaps, &*inpainter, run)?;
+        - count(&mut gaps.iter().map(|g| count_set(g)))
+            / count(&mut hidden_in_training.iter().map(|s| count_set(&s.1))).max(1.0);
+    let filled = fill(
+        &mut session,
+        &grid,
+        &hidden_in_training,
+        &gaps,
+        &*inpainter,
+        run,
+    )?;
 
     let (left_over, ids) = grid.without(&objects);
     for id in &mut session.gaussians.object_ids {
@@ -206,7 +213,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
         .clone()
         .unwrap_or_else(|| format!("object {}", objects[0]));
     folder::write(&config.output, &mut session, &left_over, &hidden, &what)?;
-    Ok(Report {
+    Ok(RemoveReport {
         scene: config.scene.clone(),
         output: config.output.clone(),
         objects,
@@ -217,7 +224,7 @@ pub fn remove(config: &Config, run: &Run) -> Result<Report> {
     })
 }
 
-fn set(pixels: &[bool]) -> usize {
+fn count_set(pixels: &[bool]) -> usize {
     pixels.iter().filter(|p| **p).count()
 }
 
@@ -225,7 +232,7 @@ fn set(pixels: &[bool]) -> usize {
 ///
 /// # Errors
 /// There is no such object.
-fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hit>> {
+fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Vec<Hit>> {
     let root = config.scene.display();
     if let Some(id) = config.object {
         if id == 0 || usize::from(id) > grid.objects.len() {
@@ -243,7 +250,7 @@ fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hi
         .cloned()
         .with_context(|| format!("{root}: the scene has no views"))?;
     let field = session.field(&camera, None)?;
-    let found = Ask::Text(text.clone()).meaning(session, &[])?.find(
+    let found = ObjectQuery::Text(text.clone()).embed(session, &[])?.find(
         grid,
         &field,
         &camera,
@@ -259,14 +266,14 @@ fn targets(config: &Config, session: &mut Session, grid: &Grid) -> Result<Vec<Hi
 
 /// Renders colours without the share of the background, `[3][h][w]`. At the border of a gap, this
 /// share is up to half of the light.
-fn solid_colors(session: &mut Session, camera: &Camera) -> Result<Vec<f32>> {
+fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
     let frame = session.render(camera)?;
     let behind = session.trained.background;
     let transmittance = frame.channels(6, 7);
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
         channel.map(move |(color, t)| {
-            if *t < EMPTY {
+            if *t < EMPTY_TRANSMITTANCE {
                 (color - t * behind[c]) / (1.0 - t)
             } else {
                 *color
@@ -277,20 +284,20 @@ fn solid_colors(session: &mut Session, camera: &Camera) -> Result<Vec<f32>> {
 }
 
 /// Returns the hidden pixels of a view that are empty.
-fn gap(session: &mut Session, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
+fn gap(session: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
     let frame = session
         .engine
         .render(session.view(camera), Channels::Color)?;
     Ok(hidden
         .iter()
         .zip(frame.channels(6, 7))
-        .map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY)
+        .map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY_TRANSMITTANCE)
         .collect())
 }
 
 /// Fills the gaps of all views with Gaussians, and returns their number.
 fn fill(
-    session: &mut Session,
+    session: &mut Scene,
     grid: &Grid,
     views: &[(Camera, Vec<bool>)],
     gaps: &[Vec<bool>],
@@ -299,14 +306,14 @@ fn fill(
 ) -> Result<usize> {
     let before = session.gaussians.len();
     let mut order: Vec<usize> = (0..views.len()).collect();
-    order.sort_by_key(|k| std::cmp::Reverse(set(&gaps[*k])));
+    order.sort_by_key(|k| std::cmp::Reverse(count_set(&gaps[*k])));
     let work = run.work("gaps", order.len() as u64);
     for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
         work.advance()?;
         // Other views may have filled a part of this gap.
         let gap = gap(session, camera, hidden)?;
         let (n, width) = (gap.len(), camera.width as usize);
-        if set(&gap) as f64 <= SMALL * n as f64 || set(&gap) == n {
+        if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
             continue;
         }
         let depth = session.render_depth(camera)?;
@@ -314,11 +321,11 @@ fn fill(
             .iter()
             .map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 })
             .collect();
-        Membrane::span(&mut inverse, &gap, width);
+        Membrane::fill_planes(&mut inverse, &gap, width);
         let mut colors = solid_colors(session, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
-        let ids = membrane::continued(
-            &session.field_of_shown(camera)?.ids(grid).labels,
+        let ids = membrane::extend_labels(
+            &session.field_without_transparent(camera)?.ids(grid).labels,
             &gap,
             width,
         );
@@ -330,14 +337,14 @@ fn fill(
             let place = to_world.transform_point3(camera.ray(pixel) * depth);
             scene.push_sphere(
                 place,
-                RADIUS * depth / camera.fx,
-                SOLID,
+                FILL_RADIUS * depth / camera.fx,
+                FILL_OPACITY,
                 std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)),
             );
             let last = scene.len() - 1;
             (scene.object_ids[last], scene.features[last]) = (ids[p], grid.code_of(ids[p]));
         }
-        session.show(scene)?;
+        session.set_gaussians(scene)?;
     }
     Ok(session.gaussians.len() - before)
 }

@@ -1,8 +1,8 @@
 //! The answer to a query in one view, with its report and images.
 
-use super::ask::Ask;
+use super::ask::ObjectQuery;
 use super::pictures::{heatmap, mask_picture, overlay};
-use super::{Session, selection};
+use super::{Scene, selection};
 use crate::Result;
 use fastlgs_core::{Camera, image_io, metrics};
 use fastlgs_grid::Grid;
@@ -17,12 +17,12 @@ use std::time::Instant;
 /// Default number of objects that a report lists as candidates.
 pub const CANDIDATES: usize = 8;
 /// Number of pixels below which an answer counts as hardly visible in a view.
-const VISIBLE: usize = 30;
+const MIN_VISIBLE_PIXELS: usize = 30;
 
 /// A query with the options of its answer.
-pub struct Question<'a> {
+pub struct QueryRequest<'a> {
     /// The query.
-    pub ask: &'a Ask,
+    pub ask: &'a ObjectQuery,
     /// Texts that must not fit an object better than the query.
     pub negatives: &'a [String],
     /// Options of object selection.
@@ -34,20 +34,20 @@ pub struct Question<'a> {
     pub candidates: usize,
 }
 
-impl Question<'_> {
+impl QueryRequest<'_> {
     /// Answers the query in a rendered view. Returns the answer and its report. `render_ms` is the
     /// time that rendering `field` took, which the report adds to the total.
     ///
     /// # Errors
     /// A text or picture that cannot be embedded, or a point outside the view.
-    pub fn put<'a>(
+    pub fn answer<'a>(
         &self,
-        session: &Session,
+        session: &Scene,
         grid: &'a Grid,
         field: &'a Field,
         camera: &Camera,
         render_ms: f64,
-    ) -> Result<(Answer<'a>, Report)> {
+    ) -> Result<(Answer<'a>, AnswerReport)> {
         let mut clock = Instant::now();
         let mut lap = || {
             std::mem::replace(&mut clock, Instant::now())
@@ -55,7 +55,7 @@ impl Question<'_> {
                 .as_secs_f64()
                 * 1e3
         };
-        let meaning = self.ask.meaning(session, self.negatives)?;
+        let meaning = self.ask.embed(session, self.negatives)?;
         let encode_ms = lap();
         let found = meaning.find(grid, field, camera, &self.config)?;
         let select_ms = lap();
@@ -87,7 +87,7 @@ impl Question<'_> {
 
 /// Report of an answer.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub struct Report {
+pub struct AnswerReport {
     /// Text, picture name or pixels of the query.
     pub text: String,
     /// Name of the view.
@@ -109,7 +109,7 @@ pub struct Report {
     pub candidates: Vec<Hit>,
     /// Number of pixels in the mask.
     pub pixels: usize,
-    /// View that shows the answer best, if this view hardly shows it; see [`Self::look_elsewhere`].
+    /// View that shows the answer best, if this view hardly shows it; see [`Self::find_best_view`].
     pub seen_best: Option<String>,
     /// File of the mask, if it was written.
     pub mask: Option<PathBuf>,
@@ -123,12 +123,12 @@ pub struct Report {
     pub ms: Milliseconds,
 }
 
-impl Report {
-    /// Sets `seen_best` if this view shows fewer than 30 pixels of the answer.
+impl AnswerReport {
+    /// Sets `most_visible_view` if this view shows fewer than 30 pixels of the answer.
     ///
     /// # Errors
     /// The device fails.
-    pub fn look_elsewhere(&mut self, session: &mut Session, grid: &Grid) -> Result<()> {
+    pub fn find_best_view(&mut self, session: &mut Scene, grid: &Grid) -> Result<()> {
         // Pixels that dilation adds do not count.
         if self.found
             && self
@@ -136,10 +136,10 @@ impl Report {
                 .iter()
                 .map(|object| object.pixels)
                 .sum::<usize>()
-                < VISIBLE
+                < MIN_VISIBLE_PIXELS
         {
             let ids: Vec<u16> = self.objects.iter().map(|o| o.id).collect();
-            self.seen_best = session.seen_best(grid, &ids)?;
+            self.seen_best = session.most_visible_view(grid, &ids)?;
         }
         Ok(())
     }
@@ -195,9 +195,9 @@ fn file_name(text: &str) -> String {
         .map(|c| if c.is_alphanumeric() { c } else { '_' })
         .take(NAME_LENGTH)
         .collect();
-    let is_told = text.chars().count() <= NAME_LENGTH
+    let is_unchanged = text.chars().count() <= NAME_LENGTH
         && text.chars().all(|c| c.is_alphanumeric() || c == ' ');
-    if is_told {
+    if is_unchanged {
         safe
     } else {
         format!(
@@ -219,19 +219,19 @@ pub struct Answer<'a> {
     pub found: Found,
     /// Mask of the answer, row by row.
     pub mask: Vec<bool>,
-    /// See [`Report::calibrated`].
+    /// See [`ShareReport::calibrated`].
     pub calibrated: bool,
 }
 
 impl Answer<'_> {
     fn report(
         &self,
-        session: &Session,
-        ask: &Ask,
+        session: &Scene,
+        ask: &ObjectQuery,
         camera: &Camera,
         candidates: usize,
         mut ms: Milliseconds,
-    ) -> Report {
+    ) -> AnswerReport {
         let Found { ranked, targets } = &self.found;
         let text = ask.name();
         let started = Instant::now();
@@ -240,13 +240,13 @@ impl Answer<'_> {
             .map(|t| selection::gaussians(&session.gaussians, self.grid, &[t.id]))
             .collect();
         ms.gaussians = started.elapsed().as_secs_f64() * 1e3;
-        Report {
+        AnswerReport {
             view: camera.name.clone(),
             size: format!("{}x{}", camera.width, camera.height),
             found: !targets.is_empty(),
             score: best_score(ranked),
             calibrated: self.calibrated,
-            taught: matches!(ask, Ask::Text(_)) && session.is_taught(&text),
+            taught: matches!(ask, ObjectQuery::Text(_)) && session.is_taught(&text),
             text,
             objects: targets
                 .iter()
@@ -265,7 +265,7 @@ impl Answer<'_> {
     }
 
     /// Measures one object: its boxes in this view and in the world, its pixels and its Gaussians.
-    fn object(&self, session: &Session, width: u32, hit: &Hit, own: &[usize]) -> ObjectReport {
+    fn object(&self, session: &Scene, width: u32, hit: &Hit, own: &[usize]) -> ObjectReport {
         let mut bounds: Option<[u32; 4]> = None;
         let mask = self.field.mask(self.grid, &[*hit]);
         for p in (0..mask.len() as u32).filter(|p| mask[*p as usize]) {
@@ -296,14 +296,14 @@ impl Answer<'_> {
         folder: &Path,
         frame: &Frame,
         heat: bool,
-        report: &mut Report,
+        report: &mut AnswerReport,
     ) -> Result<RgbImage> {
         let (w, h) = (frame.width, frame.height);
         let safe = file_name(&report.text);
         let view = report.view.clone();
         let path = |what: &str| folder.join(format!("{view}.{safe}.{what}.png"));
         let color = image_io::from_planar(frame.channels(0, 3), w, h);
-        let lit = overlay(&color, &self.mask);
+        let overlay_image = overlay(&color, &self.mask);
         if self.found.targets.is_empty() {
             // Without targets, mask and overlay of an earlier run would be wrong.
             for what in ["mask", "overlay"] {
@@ -311,7 +311,7 @@ impl Answer<'_> {
             }
         } else {
             image_io::save_png(&path("mask"), mask_picture(&self.mask, w, h))?;
-            image_io::save_png(&path("overlay"), lit.clone())?;
+            image_io::save_png(&path("overlay"), overlay_image.clone())?;
             report.mask = Some(path("mask"));
         }
         if heat {
@@ -321,7 +321,7 @@ impl Answer<'_> {
             )?;
             report.heatmap = Some(path("heatmap"));
         }
-        Ok(lit)
+        Ok(overlay_image)
     }
 }
 

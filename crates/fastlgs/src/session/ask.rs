@@ -1,6 +1,6 @@
 //! Queries by text, picture or pixels of a view, and the objects that they select.
 
-use super::{Pixels, Session, Texts, phrase, texts};
+use super::{Pixels, Scene, Texts, phrase, texts};
 use crate::Result;
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
@@ -12,7 +12,7 @@ use fastlgs_grid::relevancy::TextQuery;
 use image::RgbImage;
 
 /// A query.
-pub enum Ask {
+pub enum ObjectQuery {
     /// A text or a taught name. "A of B" selects the part A of object B if that scores higher than
     /// the whole phrase.
     Text(String),
@@ -23,7 +23,7 @@ pub enum Ask {
 }
 
 /// An embedded query, which does not depend on a view yet.
-pub enum Meaning {
+pub enum EmbeddedQuery {
     /// Embeddings of a text or picture.
     Embedded(Box<Embedded>),
     /// Pixels of the view that show one object.
@@ -32,11 +32,11 @@ pub enum Meaning {
 
 /// Embeddings of a text or picture. For "A of B", `split` holds the queries of B and A.
 pub struct Embedded {
-    whole: TextQuery,
+    phrase_query: TextQuery,
     split: Option<[TextQuery; 2]>,
 }
 
-impl Ask {
+impl ObjectQuery {
     /// Returns the name of the query in reports and file names.
     pub fn name(&self) -> String {
         match self {
@@ -51,9 +51,9 @@ impl Ask {
     ///
     /// # Errors
     /// A text or picture that cannot be embedded.
-    pub fn meaning(&self, session: &Session, negatives: &[String]) -> Result<Meaning> {
+    pub fn embed(&self, session: &Scene, negatives: &[String]) -> Result<EmbeddedQuery> {
         Ok(match self {
-            Self::Point(pixels) => Meaning::Point(pixels.clone()),
+            Self::Point(pixels) => EmbeddedQuery::Point(pixels.clone()),
             Self::Image(name, photo) => {
                 let whole = picture(session, name, photo)?;
                 let whole = if negatives.is_empty() {
@@ -61,9 +61,9 @@ impl Ask {
                 } else {
                     session.texts()?.with_negatives(whole, negatives)?
                 };
-                Meaning::Embedded(Box::new(whole.into()))
+                EmbeddedQuery::Embedded(Box::new(whole.into()))
             }
-            Self::Text(text) => Meaning::Embedded(Box::new(Embedded::words(
+            Self::Text(text) => EmbeddedQuery::Embedded(Box::new(Embedded::from_text(
                 text,
                 session.texts()?,
                 negatives,
@@ -74,7 +74,10 @@ impl Ask {
 
 impl From<TextQuery> for Embedded {
     fn from(whole: TextQuery) -> Self {
-        Self { whole, split: None }
+        Self {
+            phrase_query: whole,
+            split: None,
+        }
     }
 }
 
@@ -84,7 +87,7 @@ impl Embedded {
     ///
     /// # Errors
     /// Those of [`Texts::query`] and [`Texts::with_negatives`].
-    pub fn words(text: &str, texts: &Texts, negatives: &[String]) -> Result<Self> {
+    pub fn from_text(text: &str, texts: &Texts, negatives: &[String]) -> Result<Self> {
         let embedded = |text: &str| texts.with_negatives(texts.query(text)?, negatives);
         let plain = phrase::normalised(text);
         let text = if texts.is_taught(text) {
@@ -98,14 +101,14 @@ impl Embedded {
         let split =
             split.and_then(|(part, object)| Some([embedded(object).ok()?, embedded(part).ok()?]));
         Ok(Self {
-            whole: embedded(text)?,
+            phrase_query: embedded(text)?,
             split,
         })
     }
 
     /// Returns the queries of which a scene must match one: the whole phrase, and B of "A of B".
-    pub fn sought(&self) -> impl Iterator<Item = &TextQuery> {
-        std::iter::once(&self.whole).chain(self.split.iter().map(|[object, _]| object))
+    pub fn required_queries(&self) -> impl Iterator<Item = &TextQuery> {
+        std::iter::once(&self.phrase_query).chain(self.split.iter().map(|[object, _]| object))
     }
 
     /// Ranks all objects and selects the targets.
@@ -117,17 +120,17 @@ impl Embedded {
                 ranked,
             }
         };
-        let whole = by(&self.whole);
+        let whole = by(&self.phrase_query);
         let Some([object, part]) = &self.split else {
             return whole;
         };
-        let around = by(object);
-        match query::part(grid, &around.targets, part, config) {
+        let object_answer = by(object);
+        match query::part(grid, &object_answer.targets, part, config) {
             Some(part) if query::best_score(&part.ranked) > query::best_score(&whole.ranked) => {
                 part
             }
             _ if !whole.targets.is_empty() => whole,
-            _ => around,
+            _ => object_answer,
         }
     }
 }
@@ -149,7 +152,7 @@ fn part_of(text: &str) -> Option<(&str, &str)> {
 /// # Errors
 /// The encoder of the scene cannot embed pictures, or its embeddings do not fit those of the
 /// objects.
-pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result<TextQuery> {
+pub(crate) fn picture(session: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
     let (width, height) = photo.dimensions();
     let everything = LabelMap {
         width,
@@ -162,7 +165,7 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
         .pop()
         .filter(|e| e.iter().any(|v| *v != 0.0));
     let whole = found.with_context(|| format!("{name}: this picture cannot be embedded, because the embeddings of the scene were imported; use a text or a point instead"))?;
-    texts::check(
+    texts::check_embeddings(
         &session.manifest,
         &session.grid()?,
         &session.folder,
@@ -178,11 +181,11 @@ pub(crate) fn picture(session: &Session, name: &str, photo: &RgbImage) -> Result
     ))
 }
 
-impl Meaning {
+impl EmbeddedQuery {
     /// Returns whether scores rest on a measured calibration. Pixels need none.
     pub fn is_calibrated(&self) -> bool {
         match self {
-            Self::Embedded(meant) => meant.whole.calibration.measured,
+            Self::Embedded(meant) => meant.phrase_query.calibration.measured,
             Self::Point(..) => true,
         }
     }
@@ -209,13 +212,14 @@ impl Meaning {
                         camera.height
                     );
                 }
-                let (there, meant) = query::select_at_pixels(grid, &field.at(grid, pixels.all()));
+                let (at_pixels, meant) =
+                    query::select_at_pixels(grid, &field.at(grid, pixels.all()));
                 let hit = |id: u16| Hit {
                     id,
                     score: grid.objects[usize::from(id) - 1].support,
                 };
                 Ok(Found {
-                    ranked: there.into_iter().map(hit).collect(),
+                    ranked: at_pixels.into_iter().map(hit).collect(),
                     targets: meant.map(hit).into_iter().collect(),
                 })
             }

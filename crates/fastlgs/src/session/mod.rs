@@ -30,7 +30,7 @@ pub use texts::Texts;
 pub use views::{ViewChoice, parse_size};
 
 /// A trained scene on a device.
-pub struct Session {
+pub struct Scene {
     /// Its folder.
     pub folder: SceneFolder,
     /// Manifest of the scene.
@@ -44,17 +44,17 @@ pub struct Session {
     /// File of a CLIP text tower to use instead of the one that the manifest records.
     pub clip_text: Option<PathBuf>,
     /// Report of the training.
-    pub trained: train::Report,
+    pub trained: train::TrainReport,
     /// Calibrations to use instead of those of the encoder.
     pub calibrations: Option<Calibrations>,
     texts: OnceCell<Texts>,
     /// Whether taught names are used.
-    taught: bool,
+    use_taught_names: bool,
     /// Cache of the view that shows most of some objects, by object ids.
     seen_best: BTreeMap<Vec<u16>, Option<String>>,
 }
 
-impl Session {
+impl Scene {
     /// Loads the scene in the folder `root`, and copies its Gaussians to the device.
     ///
     /// # Errors
@@ -63,7 +63,7 @@ impl Session {
         let folder = SceneFolder::open(root)?;
         let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
-        let Some(trained) = train::Report::from_manifest(&manifest, root)? else {
+        let Some(trained) = train::TrainReport::from_manifest(&manifest, root)? else {
             let root = root.display();
             bail!(
                 "{root}: the photos were preprocessed again after the training; run 'fastlgs train {root}' again"
@@ -87,13 +87,13 @@ impl Session {
             trained,
             calibrations: None,
             texts: OnceCell::new(),
-            taught: true,
+            use_taught_names: true,
             seen_best: BTreeMap::new(),
         })
     }
 
     /// Replaces the Gaussians of the scene, on the device as well.
-    pub fn show(&mut self, gaussians: Gaussians) -> Result<()> {
+    pub fn set_gaussians(&mut self, gaussians: Gaussians) -> Result<()> {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
         self.seen_best.clear();
@@ -172,7 +172,7 @@ impl Session {
     /// transparent objects, drawn as solid.
     pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
         let solid = u32::from(self.trained.clear > 0);
-        self.field_of(
+        self.render_field(
             View {
                 solid,
                 ..self.view(camera)
@@ -182,11 +182,11 @@ impl Session {
     }
 
     /// Renders the object data of a view without transparent objects.
-    pub fn field_of_shown(&mut self, camera: &Camera) -> Result<Field> {
-        self.field_of(self.view(camera), None)
+    pub fn field_without_transparent(&mut self, camera: &Camera) -> Result<Field> {
+        self.render_field(self.view(camera), None)
     }
 
-    fn field_of(&mut self, view: View, tau_ac: Option<f32>) -> Result<Field> {
+    fn render_field(&mut self, view: View, tau_ac: Option<f32>) -> Result<Field> {
         let lifted = self.trained.feature_mode == train::FeatureMode::Lift;
         if lifted && tau_ac.is_none() {
             return Ok(Field::Shares(
@@ -200,7 +200,7 @@ impl Session {
         // Trained codes compensate for the transmittance; lifted codes must be divided by the
         // coverage.
         let values = if lifted {
-            covered(&frame).concat()
+            mean_features(&frame).concat()
         } else {
             frame.channels(3, 6).to_vec()
         };
@@ -217,9 +217,9 @@ impl Session {
     ///
     /// # Errors
     /// The device fails.
-    pub fn seen_best(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
+    pub fn most_visible_view(&mut self, grid: &Grid, ids: &[u16]) -> Result<Option<String>> {
         /// Longer side of the rendered views, in pixels.
-        const SIDE: u32 = 128;
+        const SEARCH_SIDE: u32 = 128;
         if let Some(known) = self.seen_best.get(ids) {
             return Ok(known.clone());
         }
@@ -233,7 +233,7 @@ impl Session {
         let mut best = (0, None);
         for camera in self.cameras.clone() {
             let longer = camera.width.max(camera.height);
-            let side = |v: u32| (v * SIDE.min(longer) / longer).max(1);
+            let side = |v: u32| (v * SEARCH_SIDE.min(longer) / longer).max(1);
             let small = camera.resized(side(camera.width), side(camera.height));
             let pixels = self
                 .field(&small, None)?
@@ -253,17 +253,17 @@ impl Session {
     fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
             let texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
-            let _ = self.texts.set(self.as_asked_here(texts));
+            let _ = self.texts.set(self.configure_texts(texts));
         }
         Ok(self.texts.get().expect("set above"))
     }
 
     /// Applies the calibrations of this scene to a text encoder, and removes taught names if they
     /// are not used.
-    fn as_asked_here(&self, mut texts: Texts) -> Texts {
+    fn configure_texts(&self, mut texts: Texts) -> Texts {
         texts.calibrations = self.calibrations.unwrap_or(texts.calibrations);
-        if !self.taught {
-            texts.forget_names();
+        if !self.use_taught_names {
+            texts.ignore_taught_names();
         }
         texts
     }
@@ -303,16 +303,16 @@ impl Session {
     /// # Errors
     /// An encoder whose embeddings have another length than those of the scene.
     pub fn use_text_encoder(&mut self, encoder: Box<dyn TextEncoder>) -> Result<()> {
-        let texts = Texts::of(encoder, &self.folder, &self.manifest)?;
-        self.texts = OnceCell::from(self.as_asked_here(texts));
+        let texts = Texts::from_encoder(encoder, &self.folder, &self.manifest)?;
+        self.texts = OnceCell::from(self.configure_texts(texts));
         Ok(())
     }
 
     /// Ignores taught names from now on, so that an evaluation measures the encoder alone.
-    pub fn forget_taught(&mut self) {
-        self.taught = false;
+    pub fn ignore_taught_names(&mut self) {
+        self.use_taught_names = false;
         if let Some(texts) = self.texts.get_mut() {
-            texts.forget_names();
+            texts.ignore_taught_names();
         }
     }
 
@@ -329,7 +329,7 @@ impl Session {
 
 /// Returns the mean feature of each pixel, one plane for each channel: the blended feature divided
 /// by 1 - transmittance. It is 0 at a transmittance of 0.999 or more.
-pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
+pub fn mean_features(frame: &Frame) -> [Vec<f32>; 3] {
     let over = |(v, t): (&f32, &f32)| if *t < 0.999 { v / (1.0 - t) } else { 0.0 };
     [3, 4, 5].map(|k| {
         frame
@@ -342,7 +342,7 @@ pub fn covered(frame: &Frame) -> [Vec<f32>; 3] {
 }
 
 /// Returns the size of all files that a query needs, in bytes.
-pub fn bytes(root: &Path) -> u64 {
+pub fn query_file_bytes(root: &Path) -> u64 {
     let model = if root.join("scene.ply").is_file() {
         "scene.ply"
     } else {

@@ -31,19 +31,19 @@ pub fn export(
 ) -> Result<()> {
     let mut inside = vec![false; scene.len()];
     selected.iter().for_each(|&i| inside[i] = true);
-    let places: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
-    if places.is_empty() {
+    let indices: Vec<usize> = (0..inside.len()).filter(|&i| inside[i] == keep).collect();
+    if indices.is_empty() {
         bail!(
             "{}: no Gaussians are left to write; change the selection",
             path.display()
         );
     }
-    let selected = scene.select(&places);
+    let selected = scene.select(&indices);
     write(path, &selected, world).context("the selection cannot be written")
 }
 
 /// File extensions of the formats to which Gaussians can be written.
-pub const ENDINGS: [&str; 4] = ["ply", "spz", "sog", "glb"];
+pub const EXTENSIONS: [&str; 4] = ["ply", "spz", "sog", "glb"];
 
 /// World frame and upward direction of a scene.
 pub struct World {
@@ -74,8 +74,8 @@ pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
     let frame = &world.frame;
     match path.extension().and_then(|e| e.to_str()) {
         Some("ply") => ply::write_in(path, gaussians, frame)?,
-        Some("spz") => spz::write(path, &of_few_bits(path, gaussians, frame))?,
-        Some("sog") => sog::write(path, &of_few_bits(path, gaussians, frame))?,
+        Some("spz") => spz::write(path, &for_low_precision(path, gaussians, frame))?,
+        Some("sog") => sog::write(path, &for_low_precision(path, gaussians, frame))?,
         Some("glb") => glb::write(path, gaussians, world.up, frame)?,
         _ => bail!(
             "{}: the file extension is unknown; use .ply, .spz, .sog or .glb",
@@ -87,7 +87,7 @@ pub fn write(path: &Path, gaussians: &Gaussians, world: &World) -> Result<()> {
 
 /// Removes distant outliers for a format with few bits. Warns about them, and about scene
 /// coordinates that are not world coordinates.
-fn of_few_bits(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> Gaussians {
+fn for_low_precision(path: &Path, gaussians: &Gaussians, frame: &WorldFrame) -> Gaussians {
     let (written, dropped) = gaussians.without_far_outliers();
     let path = path.display();
     if dropped > 0 {

@@ -1,6 +1,6 @@
 //! Contact sheets: rows of images, each with a title and a note below.
 
-use super::Session;
+use super::Scene;
 use ab_glyph::{Font, FontRef, PxScale, ScaleFont, point};
 use fastlgs_core::{Camera, image_io, turbo};
 use fastlgs_grid::Grid;
@@ -28,8 +28,8 @@ impl Tile {
 }
 
 /// Returns the tiles of a view: its photo if there is one, the render, and the object map.
-pub fn of_view(
-    session: &Session,
+pub fn view_tiles(
+    session: &Scene,
     grid: &Grid,
     camera: &Camera,
     frame: &Frame,
@@ -53,13 +53,13 @@ pub fn of_view(
 }
 
 /// Longer side of an image on the sheet, in pixels.
-const SIDE: u32 = 320;
+const IMAGE_SIDE: u32 = 320;
 /// Space between images, in pixels.
 const GAP: u32 = 10;
 /// Font sizes of title and note, in pixels.
-const LETTERS: [f32; 2] = [19.0, 15.0];
+const FONT_SIZES: [f32; 2] = [19.0, 15.0];
 /// Height of the text below an image, in pixels.
-const WORDS: u32 = 48;
+const TEXT_HEIGHT: u32 = 48;
 const PAPER: Rgb<u8> = Rgb([255; 3]);
 const INK: [Rgb<u8>; 2] = [Rgb([20; 3]), Rgb([90; 3])];
 
@@ -70,14 +70,14 @@ pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
         .iter()
         .map(|tile| tile.picture.width())
         .max()
-        .unwrap_or(SIDE)
+        .unwrap_or(IMAGE_SIDE)
         + GAP;
     let height = tiles
         .iter()
         .map(|tile| tile.picture.height())
         .max()
         .unwrap_or(0)
-        + WORDS
+        + TEXT_HEIGHT
         + GAP;
     let rows = (tiles.len() as u32).div_ceil(columns);
     let mut page = RgbImage::from_pixel(columns * width + GAP, rows * height + GAP, PAPER);
@@ -88,29 +88,29 @@ pub fn sheet(tiles: &[Tile], columns: usize) -> RgbImage {
         );
         overlay(&mut page, picture, i64::from(left), i64::from(top));
         let base = (top + picture.height()) as f32;
-        write(
+        draw_text(
             &mut page,
             &tile.title,
-            [left as f32, base + LETTERS[0] + 2.0],
+            [left as f32, base + FONT_SIZES[0] + 2.0],
             width - GAP,
-            LETTERS[0],
+            FONT_SIZES[0],
             INK[0],
         );
-        write(
+        draw_text(
             &mut page,
             &tile.note,
-            [left as f32, base + LETTERS[0] + LETTERS[1] + 5.0],
+            [left as f32, base + FONT_SIZES[0] + FONT_SIZES[1] + 5.0],
             width - GAP,
-            LETTERS[1],
+            FONT_SIZES[1],
             INK[1],
         );
     }
     page
 }
 
-/// Scales an image so that its longer side is [`SIDE`].
+/// Scales an image so that its longer side is [`IMAGE_SIDE`].
 fn fitted(picture: &RgbImage) -> RgbImage {
-    let scale = SIDE as f32 / picture.width().max(picture.height()).max(1) as f32;
+    let scale = IMAGE_SIDE as f32 / picture.width().max(picture.height()).max(1) as f32;
     let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
     resize(
         picture,
@@ -122,7 +122,7 @@ fn fitted(picture: &RgbImage) -> RgbImage {
 
 /// Draws a line of text with its baseline starting at `base` (x, y). Text beyond `room` pixels is
 /// cut off.
-fn write(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32, ink: Rgb<u8>) {
+fn draw_text(page: &mut RgbImage, words: &str, base: [f32; 2], room: u32, size: f32, ink: Rgb<u8>) {
     let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT)
         .expect("the font is part of the program");
     let font = font.as_scaled(PxScale::from(size));
@@ -176,10 +176,13 @@ mod tests {
         );
         assert_eq!(
             page.dimensions(),
-            (2 * (SIDE + GAP) + GAP, 2 * (SIDE / 2 + WORDS + GAP) + GAP)
+            (
+                2 * (IMAGE_SIDE + GAP) + GAP,
+                2 * (IMAGE_SIDE / 2 + TEXT_HEIGHT + GAP) + GAP
+            )
         );
         let [second_column, second_row] =
-            [2 * GAP + SIDE, 2 * GAP + SIDE / 2 + WORDS].map(|v| v + 5);
+            [2 * GAP + IMAGE_SIDE, 2 * GAP + IMAGE_SIDE / 2 + TEXT_HEIGHT].map(|v| v + 5);
         assert_eq!(page.get_pixel(GAP + 5, GAP + 5), &Rgb([255, 0, 0]));
         assert_eq!(page.get_pixel(second_column, GAP + 5), &Rgb([0, 255, 0]));
         assert_eq!(page.get_pixel(GAP + 5, second_row), &Rgb([0, 0, 255]));
@@ -189,11 +192,11 @@ mod tests {
                 .filter(|&(x, y)| page.get_pixel(x, y)[0] < 128)
                 .count()
         };
-        let under = GAP + SIDE / 2..GAP + SIDE / 2 + 22;
-        assert!(dark(GAP..GAP + SIDE, under.clone()) > 20);
+        let under = GAP + IMAGE_SIDE / 2..GAP + IMAGE_SIDE / 2 + 22;
+        assert!(dark(GAP..GAP + IMAGE_SIDE, under.clone()) > 20);
         assert_eq!(
             (
-                dark(GAP + SIDE..2 * GAP + SIDE, 0..page.height()),
+                dark(GAP + IMAGE_SIDE..2 * GAP + IMAGE_SIDE, 0..page.height()),
                 dark(second_column..page.width(), under)
             ),
             (0, 0)

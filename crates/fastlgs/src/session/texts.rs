@@ -17,7 +17,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// The object table has embeddings of another encoder or length.
-pub(super) fn check(
+pub(super) fn check_embeddings(
     manifest: &Manifest,
     grid: &Grid,
     folder: &SceneFolder,
@@ -59,7 +59,7 @@ impl Texts {
         manifest: &Manifest,
         clip_text: Option<&Path>,
     ) -> Result<Self> {
-        Self::of(
+        Self::from_encoder(
             eyes::text_encoder_of(manifest, clip_text)?,
             folder,
             manifest,
@@ -71,7 +71,7 @@ impl Texts {
     /// # Errors
     /// Its embeddings have another length than those of the scene, or the object table cannot be
     /// read.
-    pub fn of(
+    pub fn from_encoder(
         encoder: Box<dyn TextEncoder>,
         folder: &SceneFolder,
         manifest: &Manifest,
@@ -84,7 +84,7 @@ impl Texts {
         let length = encoder.embed(&CANONICAL[..1])?[0].len();
         let grid = Grid::load(folder)
             .context("the object grid cannot be read; run 'fastlgs train' again")?;
-        check(manifest, &grid, folder, "texts", length)?;
+        check_embeddings(manifest, &grid, folder, "texts", length)?;
         let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
         Ok(Self {
             encoder,
@@ -96,13 +96,13 @@ impl Texts {
     }
 
     /// Ignores taught names from now on.
-    pub fn forget_names(&mut self) {
+    pub fn ignore_taught_names(&mut self) {
         self.names = Names::default();
     }
 
     /// Returns whether a text is a taught name.
     pub fn is_taught(&self, text: &str) -> bool {
-        self.names.of(text).is_some()
+        self.names.examples(text).is_some()
     }
 
     /// Returns the query of a text: the examples of a taught name, or else the embedding of the
@@ -122,14 +122,14 @@ impl Texts {
             bail!("the text is empty; enter the name of an object");
         }
         if self.is_taught(text) {
-            return self.of_examples(text).with_context(|| {
+            return self.example_query(text).with_context(|| {
                 format!(
                     "'{text}' was taught with another encoder or encoder version than this scene has; teach it in this scene as well, \
                      or remove it: fastlgs names remove '{text}'"
                 )
             });
         }
-        Ok(self.worded(text, self.encoder.embed(&[text])?.remove(0)))
+        Ok(self.embedded_query(text, self.encoder.embed(&[text])?.remove(0)))
     }
 
     /// Returns the queries of many texts. A name that was taught only with another encoder is
@@ -139,7 +139,7 @@ impl Texts {
     /// Inference fails.
     pub fn queries(&self, texts: &[String]) -> Result<Vec<TextQuery>> {
         let plain = |text: &String| {
-            if self.of_examples(text).is_some() {
+            if self.example_query(text).is_some() {
                 text.clone()
             } else {
                 phrase::normalised(text)
@@ -150,8 +150,8 @@ impl Texts {
             .encoder
             .embed(&texts.iter().map(String::as_str).collect::<Vec<_>>())?;
         let query = |(text, embedding): (&String, Vec<f32>)| {
-            self.of_examples(text)
-                .unwrap_or_else(|| self.worded(text, embedding))
+            self.example_query(text)
+                .unwrap_or_else(|| self.embedded_query(text, embedding))
         };
         Ok(texts.iter().zip(embeddings).map(query).collect())
     }
@@ -162,7 +162,7 @@ impl Texts {
             .rows()
             .into_iter()
             .map(|row| row.name)
-            .filter(|name| self.of_examples(name).is_some())
+            .filter(|name| self.example_query(name).is_some())
             .collect()
     }
 
@@ -188,10 +188,10 @@ impl Texts {
     }
 
     /// Returns the query of the examples of a name; `None` if it was not taught with this encoder.
-    fn of_examples(&self, name: &str) -> Option<TextQuery> {
+    fn example_query(&self, name: &str) -> Option<TextQuery> {
         let own = self
             .names
-            .of(name)?
+            .examples(name)?
             .iter()
             .filter(|e| e.encoder == self.identity);
         let meant: Vec<Vec<f32>> = own.flat_map(|e| e.embeddings.iter().cloned()).collect();
@@ -199,7 +199,7 @@ impl Texts {
     }
 
     /// Returns the query of a text from its embedding.
-    fn worded(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
+    fn embedded_query(&self, text: &str, embedding: Vec<f32>) -> TextQuery {
         let calibration = self.calibrations.texts;
         let anything = calibration.anything + self.encoder.advantage(text);
         TextQuery {

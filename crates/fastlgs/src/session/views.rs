@@ -43,18 +43,18 @@ impl ViewChoice {
     ///
     /// # Errors
     /// An unknown view, a damaged camera file, or a scene without views.
-    pub fn cameras(&self, folder: &SceneFolder, known: &[Camera]) -> Result<Vec<Camera>> {
+    pub fn cameras(&self, folder: &SceneFolder, scene_cameras: &[Camera]) -> Result<Vec<Camera>> {
         let frame = || Ok::<_, crate::Error>(folder.manifest()?.frame);
         let chosen = if let Some(path) = &self.camera {
             vec![Camera::load(path, &frame()?)?]
         } else if let Some(path) = &self.path {
             camera_path::read(path, &frame()?)?
         } else if self.all_views {
-            known.to_vec()
+            scene_cameras.to_vec()
         } else if let Some(name) = &self.view {
-            vec![known[folder.view_index(known, name)?].clone()]
+            vec![scene_cameras[folder.view_index(scene_cameras, name)?].clone()]
         } else {
-            known.first().cloned().into_iter().collect()
+            scene_cameras.first().cloned().into_iter().collect()
         };
         if chosen.is_empty() {
             bail!("{}: the scene has no views", folder.root.display());

@@ -33,11 +33,11 @@ fn target_path(folder: &SceneFolder, name: &str) -> PathBuf {
 pub fn begin(
     trainer: &mut Trainer,
     folder: &SceneFolder,
-    config: &objects::Config,
+    config: &objects::MappingConfig,
     run: &Run,
 ) -> Result<()> {
     let run = Run {
-        progress: &Amid(run.progress),
+        progress: &MutedSink(run.progress),
         ..*run
     };
     trainer.couple(|scene, cameras| find(scene, folder, cameras, config, &run))?;
@@ -46,10 +46,10 @@ pub fn begin(
 
 /// Progress sink that drops all messages, but can cancel. The stages of finding objects, and their
 /// warnings, are reported after training.
-struct Amid<'a>(&'a dyn Sink);
+struct MutedSink<'a>(&'a dyn Sink);
 
-impl Sink for Amid<'_> {
-    fn tell(&self, _: Message<'_>) {}
+impl Sink for MutedSink<'_> {
+    fn on_message(&self, _: Message<'_>) {}
 
     fn cancelled(&self) -> bool {
         self.0.cancelled()
@@ -98,7 +98,7 @@ fn find(
     scene: &mut Gaussians,
     folder: &SceneFolder,
     cameras: &[Camera],
-    config: &objects::Config,
+    config: &objects::MappingConfig,
     run: &Run,
 ) -> Result<()> {
     let lists = objects::map(scene, folder, cameras, config, run)?

@@ -194,7 +194,7 @@ fn parse_budget(text: &str) -> Result<BudgetChoice, String> {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default)]
 #[cfg_attr(feature = "clap", derive(clap::Args))]
-pub struct Config {
+pub struct TrainConfig {
     /// Scene folder that `preprocess` made.
     pub scene: PathBuf,
     /// Length of training.
@@ -271,7 +271,7 @@ pub struct Config {
     )]
     pub cues: Vec<Cue>,
     /// Global mapping: least support of an object, its mean IoU with the best mask of each view.
-    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::Config::default().min_support))]
+    #[cfg_attr(feature = "clap", arg(long, default_value_t = chosen::SelectionConfig::default().min_support))]
     pub support: f32,
     /// Measure the PSNR of held-out views every N iterations, and report it over time. N is rounded
     /// up to a multiple of 20.
@@ -286,9 +286,9 @@ pub struct Config {
     pub resume: bool,
 }
 
-impl Default for Config {
+impl Default for TrainConfig {
     fn default() -> Self {
-        let (paper, objects) = (PaperConfig::default(), chosen::Config::default());
+        let (paper, objects) = (PaperConfig::default(), chosen::SelectionConfig::default());
         Self {
             scene: PathBuf::new(),
             preset: Preset::default(),
@@ -316,7 +316,7 @@ impl Default for Config {
     }
 }
 
-impl Config {
+impl TrainConfig {
     /// Returns the options with those that the preset implies.
     pub(super) fn resolved(&self) -> Self {
         match self.preset {
@@ -385,12 +385,12 @@ impl Config {
     }
 
     /// Returns the constants of global mapping.
-    pub(super) fn global(&self) -> objects::Config {
-        objects::Config {
+    pub(super) fn global(&self) -> objects::MappingConfig {
+        objects::MappingConfig {
             antialias: self.antialias,
-            objects: chosen::Config {
+            objects: chosen::SelectionConfig {
                 min_support: self.support,
-                ..chosen::Config::default()
+                ..chosen::SelectionConfig::default()
             },
         }
     }

@@ -13,13 +13,13 @@ use crate::progress::{Message, TrainStep};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, checkpoints, clear, objects, preprocess};
 pub use config::{
-    Align, Background, Borders, Config, Cue, Exposures, FeatureMode, Mapping, Preset,
+    Align, Background, Borders, Cue, Exposures, FeatureMode, Mapping, Preset, TrainConfig,
 };
 use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::Trainer;
-pub use report::{CurvePoint, Report};
+pub use report::{CurvePoint, TrainReport};
 use settings::settings;
 pub(crate) use start::target;
 use std::time::Instant;
@@ -40,12 +40,16 @@ const REPLACED: [&str; 4] = [
 /// # Errors
 /// Contradictory options, a scene that was not preprocessed, a failing device, or a cancelled run.
 /// The earlier scene then stays unchanged, and `config.resume` continues from the last checkpoint.
-pub fn train(config: &Config, run: &Run) -> Result<Report> {
+pub fn train(config: &TrainConfig, run: &Run) -> Result<TrainReport> {
     train_locked(config, &SceneLock::of_scene(&config.scene, "train")?, run)
 }
 
 /// Trains a scene that the caller has locked.
-pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Result<Report> {
+pub(crate) fn train_locked(
+    config: &TrainConfig,
+    _lock: &SceneLock,
+    run: &Run,
+) -> Result<TrainReport> {
     if config.preset == Preset::LikePaper && config.mapping == Mapping::Keep {
         bail!(
             "preset 'like-paper' finds objects by Algorithm 1 and cannot keep existing ones: omit mapping 'keep', or choose another preset"
@@ -75,7 +79,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
             &config.paper(&manifest.encoder),
             run,
         )?),
-        Mapping::Keep => Some(objects::kept(&folder, &training)?),
+        Mapping::Keep => Some(objects::load_kept(&folder, &training)?),
         Mapping::Global => None,
     };
     let codes = prior_objects.as_ref().filter(|_| trains_features);
@@ -133,7 +137,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     if trainer.is_coupled() {
         borders::resume_targets(&mut trainer, &folder)?;
     }
-    run.progress.tell(Message::TrainingBegins(&first));
+    run.progress.on_message(Message::TrainingBegins(&first));
     let (mut curve, mut mapping_seconds) = (Vec::new(), 0.0);
     let result = trainer.run(Some(&checkpoint), |p, trainer| {
         work.check()?;
@@ -166,7 +170,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
             );
             curve.push(CurvePoint::from(step));
         }
-        run.progress.tell(Message::Trained {
+        run.progress.on_message(Message::Trained {
             step,
             total: settings.iterations,
             scene: &|| Ok(trainer.gaussians()?),
@@ -195,7 +199,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     let degree = trainer.needed_degree()?;
     let psnr = trainer.quality(&held_out, Some(degree))?;
     let mut scene = trainer.gaussians()?.with_sh_degree(degree);
-    run.progress.tell(Message::TrainingEnds(&scene));
+    run.progress.on_message(Message::TrainingEnds(&scene));
     let started = Instant::now();
     let mut summary = None;
     let grid = match prior_objects {
@@ -214,7 +218,8 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         }
         None => {
             let mapped = clear::map(&mut scene, &folder, &training, &config.global(), run)?;
-            let (grid, found) = objects::by_consensus(&mut scene, &folder, &training, mapped, run)?;
+            let (grid, found) =
+                objects::embed_objects(&mut scene, &folder, &training, mapped, run)?;
             summary = Some(found);
             grid
         }
@@ -227,7 +232,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
         .save_trained_cameras(aligned.then_some(&cameras))?;
     ply::write(&staged.folder.ply_path(), &scene).context("the trained scene cannot be written")?;
     let [r, g, b, ..] = result.background;
-    let report = Report {
+    let report = TrainReport {
         scene: config.scene.clone(),
         preset: config.preset,
         mapping: config.mapping,
@@ -259,7 +264,7 @@ pub(crate) fn train_locked(config: &Config, _lock: &SceneLock, run: &Run) -> Res
     manifest.notes.remove(MADE);
     report.note(&mut manifest)?;
     staged.publish(&folder, &REPLACED, [], &manifest)?;
-    objects::end_maps(&folder);
+    objects::mark_maps_finished(&folder);
     // Only an interrupted run needs its checkpoints.
     checkpoints::forget(&folder);
     Ok(report)

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// Report of `train`. The manifest stores it as a note.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Report {
+pub struct TrainReport {
     /// The scene folder.
     pub scene: PathBuf,
     /// Preset of the run.
@@ -93,7 +93,7 @@ impl From<TrainStep> for CurvePoint {
 /// Key of the training note in the manifest.
 const NOTE: &str = "train";
 
-impl Report {
+impl TrainReport {
     /// Reads the training note of a manifest; `None` if the scene was not trained since it was
     /// preprocessed. `root` is the scene folder.
     ///

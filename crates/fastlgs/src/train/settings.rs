@@ -1,27 +1,27 @@
 //! Translates options into the trainer's configuration.
 
 use super::borders;
-use super::config::{Align, Config, Exposures, FeatureMode};
+use super::config::{Align, Exposures, FeatureMode, TrainConfig};
 use crate::Result;
 use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_raster::{Alignment, Channels, Targets, TrainConfig};
+use fastlgs_raster::{Alignment, Channels, Targets, TrainerConfig};
 
 /// Typical brightness difference of two photos, in stops, from which `auto` learns exposures.
 const VARYING: f32 = 0.15;
 
 /// Returns the trainer's configuration. The preset decides what no option sets.
 pub fn settings(
-    config: &Config,
+    config: &TrainConfig,
     first: &Gaussians,
     views: &Targets,
     manifest: &Manifest,
     seed: u64,
-) -> Result<TrainConfig> {
+) -> Result<TrainerConfig> {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
-    Ok(TrainConfig {
+    Ok(TrainerConfig {
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
@@ -54,6 +54,6 @@ pub fn settings(
             Align::On => Alignment::On,
             Align::Off => Alignment::Off,
         },
-        ..TrainConfig::default()
+        ..TrainerConfig::default()
     })
 }

@@ -1,7 +1,7 @@
 //! Inputs of training: initial Gaussians and target images.
 
-use super::config::{Background, Config};
-use super::report::Report;
+use super::config::{Background, TrainConfig};
+use super::report::TrainReport;
 use crate::error::bail;
 use crate::{Result, Run};
 use fastlgs_core::rng::Rng;
@@ -21,7 +21,7 @@ const MIN_INITIAL_GAUSSIANS: usize = 5000;
 /// Returns the initial Gaussians: those of `config.init`, else one for each point of the scene. A
 /// backdrop is added if views are few, and random points if there are fewer than `MIN_INITIAL_GAUSSIANS`.
 pub fn gaussians(
-    config: &Config,
+    config: &TrainConfig,
     folder: &SceneFolder,
     views: &Targets,
     run: &Run,
@@ -81,7 +81,7 @@ fn with_matching_axes(
     first: Gaussians,
     path: &Path,
     views: &Targets,
-    config: &Config,
+    config: &TrainConfig,
     run: &Run,
 ) -> Result<Gaussians> {
     let background = config.background.unwrap_or_default();
@@ -129,21 +129,21 @@ fn is_own(folder: &SceneFolder, path: &Path) -> bool {
 /// Returns the options. If training starts from the scene's own Gaussians, their background and
 /// filter are the defaults.
 pub fn with_earlier_settings(
-    config: &Config,
+    config: &TrainConfig,
     folder: &SceneFolder,
     manifest: &Manifest,
-) -> Result<Config> {
+) -> Result<TrainConfig> {
     let own = config.init.as_ref().filter(|path| is_own(folder, path));
     let earlier = if own.is_some() {
-        Report::from_manifest(manifest, &folder.root)?.unwrap_or_default()
+        TrainReport::from_manifest(manifest, &folder.root)?.unwrap_or_default()
     } else {
-        Report::default()
+        TrainReport::default()
     };
     let background = config.background.unwrap_or(Background {
         color: earlier.background,
         learn: false,
     });
-    Ok(Config {
+    Ok(TrainConfig {
         background: Some(background),
         antialias: config.antialias || earlier.antialias,
         ..config.clone()
@@ -153,7 +153,7 @@ pub fn with_earlier_settings(
 /// Returns the space that the views show to be empty, in which density control removes floaters. It
 /// is empty with `FEW_VIEWS` or more views, or without iterations.
 pub fn free_space(
-    config: &Config,
+    config: &TrainConfig,
     folder: &SceneFolder,
     cameras: &[Camera],
     first: &Gaussians,

@@ -1,16 +1,16 @@
 //! Interactive dialogue: `fastlgs query SCENE -` on a terminal.
 
-use super::{Asker, told};
+use super::{QueryRunner, answer_text};
 use crate::outcome::Outcome;
-use crate::ui::say;
+use crate::ui::print_line;
 use anyhow::{Result, bail};
-use fastlgs::session::ask::Ask;
+use fastlgs::session::ask::ObjectQuery;
 use std::io::{BufRead, Write};
 use std::path::PathBuf;
 
 /// A parsed line of the dialogue.
 #[derive(Debug, PartialEq)]
-enum Said<'a> {
+enum Command<'a> {
     Nothing,
     Text(&'a str),
     View(&'a str),
@@ -20,7 +20,7 @@ enum Said<'a> {
     Quit,
 }
 
-impl<'a> Said<'a> {
+impl<'a> Command<'a> {
     fn of(line: &'a str) -> Self {
         let line = line.trim();
         match line.split_once(' ') {
@@ -39,10 +39,10 @@ impl<'a> Said<'a> {
 
 const HELP: &str = "enter a text to find it; view NAME: change the view; views: list the views; save: write the pictures of the last answer; quit: end";
 
-impl Asker<'_> {
+impl QueryRunner<'_> {
     /// Runs the dialogue until `quit` or the end of input.
     pub(super) fn converse(&mut self) -> Result<Outcome> {
-        say!("{HELP}");
+        print_line!("{HELP}");
         let mut last = None;
         loop {
             // The contact sheet shows only the answer that is saved.
@@ -51,41 +51,41 @@ impl Asker<'_> {
             std::io::stdout().flush()?;
             let mut line = Vec::new();
             if std::io::stdin().lock().read_until(b'\n', &mut line)? == 0 {
-                say!("");
+                print_line!("");
                 return Ok(Outcome::Done);
             }
             let Ok(line) = String::from_utf8(line) else {
-                say!("the line is not UTF-8 text; send it in UTF-8");
+                print_line!("the line is not UTF-8 text; send it in UTF-8");
                 continue;
             };
-            let said = match Said::of(&line) {
-                Said::Quit => return Ok(Outcome::Done),
-                Said::Nothing => continue,
-                Said::Help => Ok(HELP.to_owned()),
-                Said::Views => Ok(self
+            let said = match Command::of(&line) {
+                Command::Quit => return Ok(Outcome::Done),
+                Command::Nothing => continue,
+                Command::Help => Ok(HELP.to_owned()),
+                Command::Views => Ok(self
                     .scene
                     .cameras
                     .iter()
                     .map(|c| c.name.as_str())
                     .collect::<Vec<_>>()
                     .join("  ")),
-                Said::View(name) => self.look_from(name).map(|()| String::new()),
-                Said::Save => self.save(last.as_deref()),
-                Said::Text(text) => {
+                Command::View(name) => self.set_view(name).map(|()| String::new()),
+                Command::Save => self.save(last.as_deref()),
+                Command::Text(text) => {
                     last = Some(text.to_owned());
-                    self.answer(&Ask::Text(text.to_owned()), 0)
-                        .map(|report| told(&report))
+                    self.answer(&ObjectQuery::Text(text.to_owned()), 0)
+                        .map(|report| answer_text(&report))
                 }
             };
             match said {
                 Ok(words) if words.is_empty() => {}
-                Ok(words) => say!("{words}"),
-                Err(error) => say!("{error:#}"),
+                Ok(words) => print_line!("{words}"),
+                Err(error) => print_line!("{error:#}"),
             }
         }
     }
 
-    fn look_from(&mut self, name: &str) -> Result<()> {
+    fn set_view(&mut self, name: &str) -> Result<()> {
         let index = self.scene.folder.view_index(&self.scene.cameras, name)?;
         let camera = self.scene.cameras[index].clone();
         self.cameras = vec![
@@ -109,14 +109,14 @@ impl Asker<'_> {
             .clone();
         self.shown = None;
         let saved = self
-            .answer(&Ask::Text(text.to_owned()), 0)
+            .answer(&ObjectQuery::Text(text.to_owned()), 0)
             .and_then(|report| Ok((report, self.sheet()?.unwrap_or(named))));
         // Also reset after an error: later answers are written only with --output.
         self.output.clone_from(&self.args.output);
         let (report, sheet) = saved?;
         Ok(format!(
             "{}\ncontact sheet: {}",
-            told(&report),
+            answer_text(&report),
             sheet.display()
         ))
     }
@@ -138,19 +138,19 @@ mod tests {
             "?",
             "exit",
         ]
-        .map(Said::of);
-        let view = Said::View("003.png");
+        .map(Command::of);
+        let view = Command::View("003.png");
         assert_eq!(
             said,
             [
-                Said::Nothing,
-                Said::Text("red cup"),
+                Command::Nothing,
+                Command::Text("red cup"),
                 view,
-                Said::Text("view"),
-                Said::Views,
-                Said::Save,
-                Said::Help,
-                Said::Quit
+                Command::Text("view"),
+                Command::Views,
+                Command::Save,
+                Command::Help,
+                Command::Quit
             ]
         );
     }
