@@ -1,7 +1,7 @@
 //! The benches on generated scenes: that they run, that their figures are consistent, and the bounds
 //! that are promised. All but the first take minutes: `./test.sh --all` runs them.
 
-use fastlgs::eyes::SegmenterKind;
+use fastlgs::model_choice::SegmenterKind;
 use fastlgs::{Run, preprocess, synth, train};
 use serde_json::Value;
 use std::path::{Path, PathBuf};

@@ -14,7 +14,7 @@ mod toy_models;
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::{SceneFolder, ply};
 use fastlgs_grid::Grid;
-use run::{coffee_iou, copy_folder, fails, fastlgs, fixture, json, text};
+use run::{assert_fails, coffee_iou, copy_folder, fastlgs, fixture, json, text};
 use serde_json::Value;
 use std::path::Path;
 
@@ -72,7 +72,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
         2 * right > found,
         "only {right} of {found} pixels belong to the coffee"
     );
-    fails(
+    assert_fails(
         &["train", text(&scene), "--feature-mode", "train"],
         &["--mapping paper"],
     );
@@ -164,7 +164,7 @@ fn either_feature_mode_refines_the_other() {
         "{lifted:?} {trained:?} {again:?}"
     );
     std::fs::remove_file(scene.join("masks/objects").join("001.png.png")).expect("an object map");
-    fails(
+    assert_fails(
         &[
             "train",
             text(&scene),
@@ -243,7 +243,7 @@ fn exports_keep_what_queries_need() {
         (pixels(&whole) / pixels(&compressed) - 1.0).abs() < 0.05,
         "{whole} {compressed}"
     );
-    fails(
+    assert_fails(
         &["export", text(&f.scene), text(&f.scene)],
         &["the scene itself"],
     );
@@ -252,7 +252,7 @@ fn exports_keep_what_queries_need() {
     let model = small.join("scene.safetensors");
     let original = std::fs::read(&model).expect("the model");
     std::fs::write(&model, &original[..original.len() / 2]).expect("a file");
-    fails(
+    assert_fails(
         &["query", text(&small), "coffee"],
         &["scene.safetensors", "export the scene again"],
     );
@@ -409,15 +409,15 @@ fn onnx_exports_of_sam_and_clip() {
         manifest.replace("\"encoder\": \"clip\"", "\"encoder\": \"offline\""),
     )
     .expect("a file");
-    fails(
+    assert_fails(
         &["query", text(&scene), "red"],
         &["another encoder", "--iterations 0"],
     );
     std::fs::write(scene.join("scene.json"), manifest).expect("a file");
     // A scene knows the hashes of its models and rejects other files.
     std::fs::write(&words, b"short").expect("a file");
-    fails(&["query", text(&scene), "red"], &["text.onnx", "made with"]);
-    fails(
+    assert_fails(&["query", text(&scene), "red"], &["text.onnx", "made with"]);
+    assert_fails(
         &[
             "preprocess",
             text(&f.photos),
@@ -441,10 +441,10 @@ fn onnx_exports_of_sam_and_clip() {
         "--clip-text",
         text(&image),
     ];
-    fails(&alone, &["image.onnx", "--clip-image"]);
+    assert_fails(&alone, &["image.onnx", "--clip-image"]);
     args[3] = "unused";
     *args.last_mut().expect("options") = text(&image);
-    fails(&args, &["image.onnx", "no text tower"]);
+    assert_fails(&args, &["image.onnx", "no text tower"]);
 }
 
 #[test]
@@ -515,15 +515,15 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     let at = |name: &str| dir.path().join(name);
     let out = at("out");
     std::fs::create_dir(at("empty")).expect("a folder");
-    fails(
+    assert_fails(
         &["preprocess", text(&at("empty")), "-o", text(&out)],
         &["empty", "no poses"],
     );
-    fails(
+    assert_fails(
         &["preprocess", text(&at("nowhere")), "-o", text(&out)],
         &["nowhere", "no such folder"],
     );
-    fails(&["train", text(&out)], &["not a scene", "preprocess"]);
+    assert_fails(&["train", text(&out)], &["not a scene", "preprocess"]);
 
     // A photo that cannot be decoded, a pose without a photo, a photo without a pose, and NaN in a
     // pose.
@@ -549,17 +549,17 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     };
     let photos = transforms(&|_| {});
     std::fs::write(photos.join("images/001.png"), b"not a photo").expect("a file");
-    fails(
+    assert_fails(
         &["preprocess", text(&photos), "-o", text(&out)],
         &["001.png", "cannot be read"],
     );
     let photos = transforms(&|v| v["frames"][1]["transform_matrix"][0][0] = Value::Null);
-    fails(
+    assert_fails(
         &["preprocess", text(&photos), "-o", text(&out)],
         &["001.png", "NaN"],
     );
     let photos = transforms(&|v| v["frames"].as_array_mut().expect("frames").truncate(0));
-    fails(
+    assert_fails(
         &["preprocess", text(&photos), "-o", text(&out)],
         &["transforms.json", "no frames"],
     );
@@ -579,14 +579,14 @@ fn bad_input_is_named_and_nothing_is_damaged() {
         output.status.success() && printed.contains("lost.png") && printed.contains("001.png"),
         "a warning names each of both files: {printed}"
     );
-    fails(
+    assert_fails(
         &["render", text(&out), "-o", text(&at("r"))],
         &["never trained"],
     );
 
     // A trained scene: an unknown view, a truncated PLY file, and a failed run that leaves the
     // scene unchanged.
-    fails(
+    assert_fails(
         &[
             "render",
             text(&f.scene),
@@ -600,7 +600,7 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     let copy = at("copy");
     copy_folder(&f.scene, &copy);
     let ply = std::fs::read(copy.join("scene.ply")).expect("the scene");
-    fails(
+    assert_fails(
         &[
             "train",
             text(&copy),
@@ -617,11 +617,11 @@ fn bad_input_is_named_and_nothing_is_damaged() {
         "a failed run leaves the scene unchanged"
     );
     std::fs::write(copy.join("scene.ply"), &ply[..ply.len() - 11]).expect("a file");
-    fails(&["query", text(&copy), "cat"], &["scene.ply", "truncated"]);
+    assert_fails(&["query", text(&copy), "cat"], &["scene.ply", "truncated"]);
     let cut = std::fs::read(copy.join("grid.safetensors")).expect("the grid");
     std::fs::write(copy.join("scene.ply"), &ply).expect("a file");
     std::fs::write(copy.join("grid.safetensors"), &cut[..cut.len() / 2]).expect("a file");
-    fails(&["query", text(&copy), "cat"], &["grid.safetensors"]);
+    assert_fails(&["query", text(&copy), "cat"], &["grid.safetensors"]);
     // Embeddings of another encoder version fail, with a message that names the remedy.
     std::fs::write(copy.join("grid.safetensors"), &cut).expect("a file");
     let folder = SceneFolder::new(&copy);
@@ -633,7 +633,7 @@ fn bad_input_is_named_and_nothing_is_damaged() {
     }
     .save(&folder)
     .expect("a file");
-    fails(
+    assert_fails(
         &["query", text(&copy), "cat"],
         &["another encoder", "--iterations 0"],
     );
@@ -646,11 +646,11 @@ fn bad_input_is_named_and_nothing_is_damaged() {
         "0",
     ]);
     json(&["query", text(&copy), "cat"]);
-    fails(
+    assert_fails(
         &["info", "--device", "nonsense", text(&at("nowhere"))],
         &["nowhere"],
     );
-    fails(
+    assert_fails(
         &[
             "render",
             text(&f.scene),

@@ -11,7 +11,7 @@ mod run;
 use fastlgs_core::{SceneFolder, ply};
 use glam::{DMat4, DVec3, DVec4};
 use image::{GrayImage, Luma, Rgba, RgbaImage};
-use run::{fails, json, text};
+use run::{assert_fails, json, text};
 use serde_json::{Value, json as value};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ use std::sync::OnceLock;
 fn album() -> Option<&'static Path> {
     static ALBUM: OnceLock<Option<tempfile::TempDir>> = OnceLock::new();
     let make = || {
-        let dir = run::ready().then(|| tempfile::tempdir().expect("a folder"))?;
+        let dir = run::requirements_met().then(|| tempfile::tempdir().expect("a folder"))?;
         json(&[
             "synth",
             "table",
@@ -94,10 +94,10 @@ fn albums_are_never_written() {
             } else {
                 "nothing was written"
             };
-            fails(&[command, text(&photos), "-o", text(output)], &[why]);
+            assert_fails(&[command, text(&photos), "-o", text(output)], &[why]);
         }
     }
-    fails(
+    assert_fails(
         &["synth", "table", "-o", text(&raw), "--views", "8"],
         &["not empty"],
     );
@@ -174,7 +174,7 @@ fn trained_share(mask: impl Fn(u32, u32, &Path)) -> Option<Result<f64, String>> 
     ];
     let output = run::fastlgs(&args);
     if !output.status.success() {
-        return Some(Err(run::complaint(&args, &output)));
+        return Some(Err(run::error_line(&args, &output)));
     }
     let mask = image::open(scene.join("ignore/003.png.png"))
         .expect("a mask")
@@ -420,7 +420,7 @@ fn photos_that_were_cut_off_are_refused() {
         .expect("a JPEG");
     let whole = jpeg.into_inner();
     std::fs::write(&path, &whole[..whole.len() / 2]).expect("half of it");
-    fails(
+    assert_fails(
         &[
             "preprocess",
             text(&photos),
@@ -450,8 +450,8 @@ fn what_another_editor_saved_without_objects_is_said_to_have_none() {
     std::fs::write(&path, [&data[..at], b"something", &data[at + 9..]].concat())
         .expect("the scene");
     let remedy = ["object_id", "--iterations 0"];
-    fails(&["query", text(&scene), "coffee"], &remedy);
-    fails(
+    assert_fails(&["query", text(&scene), "coffee"], &remedy);
+    assert_fails(
         &[
             "remove",
             text(&scene),

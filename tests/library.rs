@@ -86,7 +86,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
         output: scene.clone(),
         ..Default::default()
     };
-    config.eyes.segmenter = fastlgs::eyes::SegmenterKind::Import;
+    config.eyes.segmenter = fastlgs::model_choice::SegmenterKind::Import;
     let report = fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
     assert_eq!(
         (report.photos, report.training_photos, report.size.as_str()),
@@ -219,7 +219,7 @@ fn noise_on_poses_is_removed() {
             poses,
             ..Default::default()
         };
-        config.eyes.segmenter = fastlgs::eyes::SegmenterKind::Import;
+        config.eyes.segmenter = fastlgs::model_choice::SegmenterKind::Import;
         let report = fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
         (SceneFolder::new(scene).cameras().expect("cameras"), report)
     };
@@ -286,7 +286,7 @@ fn moved_cameras_stay_with_their_gaussians() {
         output: scene.clone(),
         ..Default::default()
     };
-    config.eyes.segmenter = fastlgs::eyes::SegmenterKind::Import;
+    config.eyes.segmenter = fastlgs::model_choice::SegmenterKind::Import;
     fastlgs::preprocess(&config, &run).expect("a preprocessed scene");
     let cameras = || SceneFolder::new(&scene).cameras().expect("cameras");
     let given = cameras();

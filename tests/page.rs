@@ -26,7 +26,11 @@ use std::time::{Duration, Instant};
 /// Returns the window size. `--all` uses the size of the README's picture. Otherwise a smaller
 /// window saves time.
 fn window() -> (u32, u32) {
-    if run::all() { (1180, 740) } else { (860, 560) }
+    if run::full_tests() {
+        (1180, 740)
+    } else {
+        (860, 560)
+    }
 }
 
 /// Returns the peak signal-to-noise ratio of two pictures of the same size, in dB.
@@ -614,7 +618,7 @@ fn a_shared_folder_answers_without_a_program() {
     };
     assert_eq!(share("40")["words"], 40);
     // A second export replaces the first.
-    let report = share(if run::all() { "20000" } else { "6000" });
+    let report = share(if run::full_tests() { "20000" } else { "6000" });
     println!("shared: {report}");
     assert!(
         report["words"].as_u64() >= Some(6000) && report["found"].as_u64() > Some(0),
@@ -626,7 +630,7 @@ fn a_shared_folder_answers_without_a_program() {
     std::fs::create_dir(&other)
         .and_then(|()| std::fs::write(other.join("letter.txt"), "dear"))
         .expect("a folder");
-    run::fails(
+    run::assert_fails(
         &["export", text(scene), text(&other), "--html"],
         &["is not an export"],
     );
@@ -696,14 +700,14 @@ fn the_fox_lights_up_in_the_browser() {
         eprintln!("SKIPPED: {} is not there", photos.display());
         return;
     }
-    if !chromium() || !run::ready() {
+    if !chromium() || !run::requirements_met() {
         return;
     }
     let dir = tempfile::tempdir().expect("a temporary folder");
     let scene = dir.path().join("fox");
     let half = dir.path().join("few");
     // The short run uses every second photo.
-    let photos = if run::all() {
+    let photos = if run::full_tests() {
         photos
     } else {
         every_second(&photos, &half)

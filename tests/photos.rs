@@ -12,14 +12,14 @@ use fastlgs_core::dataset::SfmPoint;
 use fastlgs_core::image_io::{load_rgb, save_png};
 use fastlgs_core::metrics::{iou, psnr};
 use fastlgs_core::undistort::{Distortion, undistort};
-use run::{fails, json, text};
+use run::{assert_fails, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Returns an empty folder for scenes. `None` without models or device.
 fn scene_dir() -> Option<tempfile::TempDir> {
-    run::ready().then(|| tempfile::tempdir().expect("a temporary folder"))
+    run::requirements_met().then(|| tempfile::tempdir().expect("a temporary folder"))
 }
 
 #[test]
@@ -90,7 +90,7 @@ fn transparent_and_masked_pixels_do_not_count() {
     let report = train("0,1,0");
     assert_eq!(report["background"], serde_json::json!([0.0, 1.0, 0.0]));
     assert_eq!(report["curve"][0]["iteration"], 40);
-    fails(
+    assert_fails(
         &[
             "train",
             text(&scene),
@@ -585,7 +585,7 @@ fn poses_of_which_many_are_wrong_are_found_anew() {
 /// A video around a table, with a short blurred section.
 #[test]
 fn videos_become_photos() {
-    if !run::ready() {
+    if !run::requirements_met() {
         return;
     }
     if Command::new("ffmpeg").arg("-version").output().is_err() {
@@ -671,7 +671,7 @@ fn videos_become_photos() {
     );
 
     std::fs::write(&video, "no video").expect("a file");
-    fails(
+    assert_fails(
         &["preprocess", text(&video), "-o", text(&scene)],
         &["walk 100%.mp4", "ffmpeg cannot read"],
     );

@@ -5,7 +5,7 @@
 mod run;
 
 use fastlgs_core::rng::Rng;
-use run::{complaint, copy_folder, json, text};
+use run::{copy_folder, error_line, json, text};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ fn fixture() -> Option<&'static Fixture> {
     static FIXTURE: OnceLock<Option<Fixture>> = OnceLock::new();
     FIXTURE
         .get_or_init(|| {
-            if !run::ready() {
+            if !run::requirements_met() {
                 return None;
             }
             let dir = tempfile::tempdir().expect("a temporary folder");
@@ -82,7 +82,7 @@ fn training_survives_kills() {
     let mut rng = Rng::new(20, "kills");
     let (mut kills, mut resumed, mut finished) = (0, 0, 0);
     // Later runs find a checkpoint more often, because resumed runs start in the middle.
-    let target_kills = if run::all() { 20 } else { 5 };
+    let target_kills = if run::full_tests() { 20 } else { 5 };
     while kills < target_kills {
         resumed += usize::from(scene.join("checkpoints/train.json").is_file());
         let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
@@ -228,7 +228,7 @@ fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
         "--device",
         "cpu",
     ];
-    run::fails(
+    run::assert_fails(
         &[&smaller[..], &["--holdout-labels", text(&labels)]].concat(),
         &["999", "none of the photos"],
     );
@@ -343,7 +343,7 @@ fn a_full_disk_leaves_earlier_results_whole() {
         (&["export", text(&scene), text(&ply)], "out.ply"),
         (&["export", text(&scene), text(&small)], "small"),
     ] {
-        let line = complaint(args, &limited(args));
+        let line = error_line(args, &limited(args));
         assert!(
             line.contains("too large") || line.contains("No space"),
             "{line}"
@@ -409,7 +409,7 @@ fn places_that_cannot_be_written_are_named() {
             "cpu",
         ],
     ] {
-        let line = complaint(&args, &run::fastlgs(&args));
+        let line = error_line(&args, &run::fastlgs(&args));
         assert!(line.contains(nowhere), "{args:?}: {line}");
         tried += 1;
     }

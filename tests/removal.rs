@@ -7,7 +7,7 @@ use fastlgs::session::selection;
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, exr_image, image_io, metrics};
 use fastlgs_grid::Grid;
-use run::{Fixture, fails, fastlgs, fixture, json, text};
+use run::{Fixture, assert_fails, fastlgs, fixture, json, text};
 use serde_json::Value;
 use std::path::Path;
 use std::time::Instant;
@@ -204,7 +204,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
     json(&["export", text(&removed_scene), text(&at("tidy.spz"))]);
     let small = at("small/");
     json(&["export", text(&f.scene), text(&small)]);
-    fails(
+    assert_fails(
         &[
             "remove",
             text(&small),
@@ -215,7 +215,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         ],
         &["photos are not there"],
     );
-    fails(
+    assert_fails(
         &[
             "remove",
             text(&f.scene),
@@ -226,7 +226,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         ],
         &["tidy", "already"],
     );
-    fails(
+    assert_fails(
         &[
             "remove",
             text(&f.scene),
@@ -237,12 +237,12 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         ],
         &["none is 999"],
     );
-    fails(
+    assert_fails(
         &["remove", text(&f.scene), "submarine", "-o", text(&at("x"))],
         &["'submarine' is not found", "--object"],
     );
     assert!(!at("x").exists());
-    fails(
+    assert_fails(
         &[
             "synth",
             "room",

@@ -8,7 +8,7 @@ mod run;
 
 use fastlgs_core::gaussians::sigmoid;
 use fastlgs_core::{Camera, Gaussians, camera_path, ply, sog, spz};
-use run::{copy_folder, fails, fastlgs, json, text};
+use run::{assert_fails, copy_folder, fastlgs, json, text};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -24,7 +24,7 @@ struct Library {
 fn library() -> Option<&'static Library> {
     static LIBRARY: OnceLock<Option<Library>> = OnceLock::new();
     let make = || {
-        if !run::ready() {
+        if !run::requirements_met() {
             return None;
         }
         let dir = tempfile::tempdir().expect("a temporary folder");
@@ -124,7 +124,7 @@ fn one_command_makes_a_scene_and_keeps_it_until_the_photos_change() {
     // Replaces the first photo by another one.
     std::fs::copy(photos.join("images/001.png"), photos.join("images/000.png")).expect("a photo");
     assert_eq!(json(&args)["state"], "made");
-    fails(
+    assert_fails(
         &["make", text(&photos.join("none")), "-o", text(&scene)],
         &["none", "cannot be opened"],
     );
@@ -235,12 +235,12 @@ fn a_library_names_the_scenes_that_hold_a_thing() {
     );
     assert_eq!(answers[0]["skipped"][0]["scene"], "broken");
 
-    fails(
+    assert_fails(
         &["query", "--library", text(&l.photos), "cat"],
         &["no trained scenes"],
     );
-    fails(&["query", "--library", library], &["give a text to find"]);
-    fails(
+    assert_fails(&["query", "--library", library], &["give a text to find"]);
+    assert_fails(
         &["query", "--library", library, "cat", "--point", "1,1"],
         &["--library"],
     );
@@ -373,7 +373,7 @@ fn selections_and_camera_paths_go_out_and_in() {
         selected + rest,
         ply::read(&room.join("scene.ply")).expect("a scene").len()
     );
-    fails(
+    assert_fails(
         &[
             "query",
             text(&room),
@@ -732,7 +732,7 @@ fn a_workflow_engine_spreads_scenes() {
         eprintln!("SKIPPED: FASTLGS_SNAKEMAKE is not set to the path of snakemake");
         return;
     };
-    if !run::ready() {
+    if !run::requirements_met() {
         return;
     }
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -11,7 +11,7 @@ mod served;
 use fastlgs_core::image_io;
 use run::{copy_folder, json, text};
 use serde_json::Value;
-use served::{Served, room};
+use served::{Server, room};
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
 use std::net::TcpStream;
@@ -30,7 +30,7 @@ fn keys(value: &Value) -> BTreeSet<&str> {
 #[test]
 fn the_interface_answers_as_the_query_command_does() {
     let Some(scene) = room() else { return };
-    let served = Served::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
+    let served = Server::start(&["serve", text(scene), "--bind", "0", "--device", "cpu"]);
     let mut answer = served.json(
         "/api/query",
         Some(serde_json::json!({ "text": "cat", "view": "008.png" })),
@@ -110,7 +110,7 @@ fn the_interface_answers_as_the_query_command_does() {
                     },
                 )
             });
-        let (status, data) = served.ask(&path, body.as_deref());
+        let (status, data) = served.request(&path, body.as_deref());
         assert_eq!(
             status,
             200,
@@ -126,12 +126,12 @@ fn the_interface_answers_as_the_query_command_does() {
     );
     assert!(
         served
-            .ask(&format!("/api/export?objects={id}&format=ply"), None)
+            .request(&format!("/api/export?objects={id}&format=ply"), None)
             .1
             .starts_with(b"ply\n")
     );
     let picture = |body: &str| {
-        let (status, data) = served.ask("/api/render", Some(body));
+        let (status, data) = served.request("/api/render", Some(body));
         assert_eq!(
             status,
             200,
@@ -229,7 +229,7 @@ fn the_interface_answers_as_the_query_command_does() {
     let statuses: Vec<u16> = std::thread::scope(|scope| {
         let work = |k: usize| {
             served
-                .ask(
+                .request(
                     "/api/query",
                     Some(&format!(
                         r#"{{"text":"thing {k}","size":"{}x240"}}"#,
@@ -263,7 +263,7 @@ fn the_interface_answers_as_the_query_command_does() {
 #[test]
 fn only_those_may_ask_who_should() {
     let Some(scene) = room() else { return };
-    let host = |served: &Served, host: &str| {
+    let host = |served: &Server, host: &str| {
         let agent: ureq::Agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
             .build()
@@ -276,7 +276,7 @@ fn only_those_may_ask_who_should() {
             .status()
             .as_u16()
     };
-    let own = Served::start(&[
+    let own = Server::start(&[
         "serve",
         text(scene),
         "--bind",
@@ -295,7 +295,7 @@ fn only_those_may_ask_who_should() {
     );
 
     // A proxy on this machine that passes its own host name on.
-    let behind = Served::start(&[
+    let behind = Server::start(&[
         "serve",
         text(scene),
         "--bind",
@@ -314,7 +314,7 @@ fn only_those_may_ask_who_should() {
         (200, 200, 403)
     );
 
-    let mut open = Served::start(&[
+    let mut open = Server::start(&[
         "serve",
         text(scene),
         "--bind",
@@ -326,7 +326,7 @@ fn only_those_may_ask_who_should() {
     let token = open.token.clone().expect("a token");
     assert_eq!(token.len(), 32);
     assert_eq!(open.json("/api/scene", None)["name"], "room");
-    assert_eq!(open.ask("/", None).0, 200);
+    assert_eq!(open.request("/", None).0, 200);
     for wrong in [
         None,
         Some(String::new()),
@@ -336,7 +336,10 @@ fn only_those_may_ask_who_should() {
         open.token = wrong;
         assert!(open.refusal("/api/scene", None, 401).contains("token"));
     }
-    assert_eq!(open.ask(&format!("/api/scene?token={token}"), None).0, 200);
+    assert_eq!(
+        open.request(&format!("/api/scene?token={token}"), None).0,
+        200
+    );
 
     // A refused client receives the reason even while it is still sending.
     let mut stranger =
@@ -365,7 +368,7 @@ fn a_growing_scene_can_be_watched() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let copy = dir.path().join("growing");
     copy_folder(scene, &copy);
-    let mut served = Served::start(&[
+    let mut served = Server::start(&[
         "train",
         text(&copy),
         "--iterations",
@@ -385,11 +388,11 @@ fn a_growing_scene_can_be_watched() {
     while !is_ready() {
         let progress = served.json("/api/training", None);
         revisions.insert(progress["revision"].as_u64());
-        let (status, splats) = served.ask("/api/splats", None);
+        let (status, splats) = served.request("/api/splats", None);
         assert!(status == 200 && splats.starts_with(b"FLGS"));
         if progress["finished"] == false {
             // On a fast or busy machine, the run may finish between two requests.
-            let (status, said) = served.ask("/api/query", Some(r#"{"text":"cat"}"#));
+            let (status, said) = served.request("/api/query", Some(r#"{"text":"cat"}"#));
             let refused = status == 409 && String::from_utf8_lossy(&said).contains("in training");
             assert!(refused || is_ready(), "{status}");
         }

@@ -6,10 +6,10 @@
 use crate::autoencoder::Autoencoder;
 use anyhow::{Context, Result, bail};
 use fastlgs::session::mean_features;
-use fastlgs::{Run, Scene, eval, eyes};
+use fastlgs::{Run, Scene, eval, model_choice};
+use fastlgs_core::id_weights::{IdWeights, pack, unpack};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::shares::{IdWeights, pack, unpack};
 use fastlgs_core::{Camera, LabelMap, Level, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -144,7 +144,7 @@ impl PerPixel {
                 own.map(|m| {
                     (
                         m.label,
-                        eyes::for_texts(&scene.manifest, m.embedding.clone()),
+                        model_choice::for_texts(&scene.manifest, m.embedding.clone()),
                     )
                 })
                 .collect(),
@@ -157,7 +157,7 @@ impl PerPixel {
     }
 
     fn lerf(scene: &Scene, run: &Run) -> Result<Self> {
-        let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
+        let encoder = model_choice::encoder_of(&scene.folder, &scene.manifest)?;
         let progress = run.work(
             "tiles",
             (TILE_SIDES.len() * scene.manifest.training(&scene.cameras).len()) as u64,
@@ -186,7 +186,7 @@ impl PerPixel {
     }
 
     fn langsplat(scene: &Scene, run: &Run) -> Result<Self> {
-        let encoder = eyes::encoder_of(&scene.folder, &scene.manifest)?;
+        let encoder = model_choice::encoder_of(&scene.folder, &scene.manifest)?;
         let training = scene.manifest.training(&scene.cameras);
         let progress = run.work("embeddings", 2 * training.len() as u64);
         let mut levels: [Vec<Labelled>; 2] = Default::default();
@@ -387,7 +387,7 @@ fn embedded(
         .filter(|(_, e)| e.iter().any(|v| *v != 0.0));
     Ok((
         map,
-        own.map(|(k, e)| (k as u16 + 1, eyes::for_texts(&scene.manifest, e)))
+        own.map(|(k, e)| (k as u16 + 1, model_choice::for_texts(&scene.manifest, e)))
             .collect(),
     ))
 }

@@ -1,7 +1,7 @@
 //! Disturbances of photos, masks and embeddings, for `fastlgs-bench stability`.
 
 use anyhow::{Context, Result};
-use fastlgs::eyes;
+use fastlgs::model_choice;
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::mask_list::{Mask, RunLengths};
 use fastlgs_core::rng::Rng;
@@ -393,7 +393,7 @@ pub fn embeddings(scene: &SceneFolder, noise: f32, seed: u64) -> Result<()> {
     let mut grid = Grid::load(scene)?;
     let manifest = scene.manifest()?;
     for embedding in grid.objects.iter_mut().flat_map(|o| &mut o.embeddings) {
-        let words = eyes::text_components(&manifest, embedding);
+        let words = model_choice::text_components(&manifest, embedding);
         let deviation = noise / (words.len() as f32).sqrt();
         words
             .iter_mut()

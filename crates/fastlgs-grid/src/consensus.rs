@@ -12,7 +12,7 @@
 //! As in MaskClustering (arXiv 2401.07745), whole masks of all views decide, not the borders of
 //! two. There, however, each mask belongs to one object only.
 
-use crate::sightings::{Fit, MIN_PIXELS, MaskId, Observations, Scratch};
+use crate::observations::{Fit, MIN_PIXELS, MaskId, Observations, Scratch};
 use rayon::prelude::*;
 
 /// A set of Gaussians on which masks of several views agree.
@@ -99,7 +99,7 @@ fn refine(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Observation;
+    use crate::observations::Observation;
     use fastlgs_core::mask_list::{AtomTable, Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 

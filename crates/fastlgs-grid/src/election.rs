@@ -1,7 +1,7 @@
 //! Global mapping, step 2: masks vote for proposals.
 
 use crate::consensus::Proposal;
-use crate::sightings::{Fit, MaskId};
+use crate::observations::{Fit, MaskId};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Returns the proposals with at least `min_votes` votes, sorted in descending order by the sum of

@@ -4,7 +4,7 @@ use crate::decision::decide;
 use crate::grid::Grid;
 use crate::overlaps::representative_id;
 use crate::query::Hit;
-use fastlgs_core::shares::{IDS_PER_PIXEL, unpack};
+use fastlgs_core::id_weights::{IDS_PER_PIXEL, unpack};
 use fastlgs_core::{IdWeights, LabelMap};
 
 /// Returns for each pixel the id that represents its objects. `lists`: the objects of each id,
@@ -161,7 +161,7 @@ impl Field {
 mod tests {
     use super::*;
     use crate::query::tests::grid;
-    use fastlgs_core::shares::pack;
+    use fastlgs_core::id_weights::pack;
 
     #[test]
     fn an_object_is_shown_by_its_parts_as_well() {

@@ -17,10 +17,10 @@ pub mod grid;
 pub mod hull;
 pub mod mapping;
 pub mod objects;
+pub mod observations;
 pub mod overlaps;
 pub mod query;
 pub mod relevancy;
-pub mod sightings;
 pub mod support;
 
 pub use grid::{Grid, Object};

@@ -2,8 +2,8 @@
 
 use crate::consensus::Proposal;
 use crate::grid::PART;
+use crate::observations::Observations;
 use crate::overlaps::{self, Overlaps};
-use crate::sightings::Observations;
 use crate::support::Support;
 use std::collections::BTreeSet;
 
@@ -11,7 +11,7 @@ use std::collections::BTreeSet;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SelectionConfig {
     /// Smallest number of views that show it, each with at least
-    /// [`MIN_PIXELS`](crate::sightings::MIN_PIXELS). Distant glimpses do not count.
+    /// [`MIN_PIXELS`](crate::observations::MIN_PIXELS). Distant glimpses do not count.
     pub min_views: usize,
     /// Smallest support: mean IoU with masks, 0 to 1.
     pub min_support: f32,
@@ -203,7 +203,7 @@ impl SetsByGaussian {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Observation;
+    use crate::observations::Observation;
 
     /// Returns the objects of sets of 20 Gaussians with these supports. Each Gaussian covers 100
     /// pixels in each of four views of 10,000.

@@ -1,7 +1,7 @@
 //! Global mapping, step 3: IoU of each elected set with the masks of each view.
 
 use crate::consensus::Proposal;
-use crate::sightings::Observations;
+use crate::observations::Observations;
 use rayon::prelude::*;
 
 /// Support of a set of Gaussians by masks.
@@ -9,7 +9,7 @@ use rayon::prelude::*;
 pub struct Support {
     /// Mean IoU with the best mask of each view, weighted by the set's pixels there; 0 to 1.
     pub iou: f32,
-    /// (pixels, view) of each view that shows at least [`MIN_PIXELS`](crate::sightings::MIN_PIXELS)
+    /// (pixels, view) of each view that shows at least [`MIN_PIXELS`](crate::observations::MIN_PIXELS)
     /// of it.
     pub areas: Vec<(u32, u32)>,
 }
@@ -41,7 +41,7 @@ pub fn support(sightings: &Observations, sets: &[Proposal]) -> Vec<Support> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sightings::Observation;
+    use crate::observations::Observation;
     use fastlgs_core::mask_list::{Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
 

@@ -1,8 +1,8 @@
 //! Handlers of the HTTP interface. `web/openapi.json` describes it for programs.
 
-use crate::desk::{SceneWorker, VisibleObjects};
 use crate::failure::Failure;
 use crate::guard::LARGEST_BODY;
+use crate::scene_worker::{SceneWorker, VisibleObjects};
 use crate::shared::AppState;
 use axum::Json;
 use axum::body::Bytes;

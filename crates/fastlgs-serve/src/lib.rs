@@ -2,11 +2,11 @@
 //! training.
 
 mod api;
-mod desk;
 mod failure;
 mod guard;
 mod live;
 mod page;
+mod scene_worker;
 pub mod share;
 mod shared;
 mod splats;
@@ -16,12 +16,12 @@ use anyhow::{Context, Result};
 use axum::extract::DefaultBodyLimit;
 use axum::routing::{get, post};
 use axum::{Router, middleware};
-use desk::SceneWorker;
 use fastlgs::progress::{Message, Sink};
 use fastlgs_core::{Camera, SceneFolder};
 use glam::Vec3;
 use guard::Guard;
 pub use live::Live;
+use scene_worker::SceneWorker;
 use shared::AppState;
 use std::net::SocketAddr;
 use std::path::PathBuf;

@@ -1,7 +1,7 @@
 //! Exports a scene as a static folder for any web server: the page, the Gaussians, and answers for
 //! common words.
 
-use crate::desk::SceneWorker;
+use crate::scene_worker::SceneWorker;
 use crate::shared::views;
 use crate::{page, splats, subject_distance};
 use anyhow::{Context, Result, bail};

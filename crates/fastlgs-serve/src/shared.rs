@@ -1,8 +1,8 @@
 //! State that all requests share.
 
-use crate::desk::SceneHandle;
 use crate::failure::Failure;
 use crate::live::Live;
+use crate::scene_worker::SceneHandle;
 use anyhow::Result;
 use axum::http::StatusCode;
 use fastlgs_core::{Camera, SceneFolder};

@@ -3,7 +3,7 @@
 //! CLIP's is read from the `tokenizer.json` beside a model, or built from the merges that OpenAI
 //! published. SigLIP's is read from `tokenizer.json`.
 
-use crate::{Error, Result, places};
+use crate::{Error, Result, model_paths};
 use fastlgs_core::fs;
 use flate2::read::GzDecoder;
 use serde_json::json;
@@ -47,7 +47,7 @@ impl Tokens {
                 Tokenizer::from_file(&path).map_err(|e| damaged(&path, e))?,
                 &path,
             ),
-            None => Self::published(&places::offline_dir().join(places::CLIP_MERGES)),
+            None => Self::published(&model_paths::offline_dir().join(model_paths::CLIP_MERGES)),
         }
     }
 
@@ -267,7 +267,7 @@ mod tests {
     use super::*;
 
     fn tokens() -> Option<Tokens> {
-        match Tokens::published(&places::offline_dir().join(places::CLIP_MERGES)) {
+        match Tokens::published(&model_paths::offline_dir().join(model_paths::CLIP_MERGES)) {
             Ok(tokens) => Some(tokens),
             Err(e) if std::env::var_os("FASTLGS_REQUIRE_MODELS").is_some() => panic!("{e}"),
             Err(e) => {

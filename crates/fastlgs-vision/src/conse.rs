@@ -5,11 +5,11 @@
 
 use crate::appearance::{self, Appearance};
 use crate::attributes;
+use crate::brighten;
 use crate::crops::{self, Surround};
 use crate::encoder::{Encoder, normalise};
-use crate::exposure;
 use crate::runtime::{Array, Model};
-use crate::{Result, names, places};
+use crate::{Result, model_paths, names};
 use fastlgs_core::LabelMap;
 use fastlgs_core::rng::Rng;
 use image::RgbImage;
@@ -60,7 +60,7 @@ impl Conse {
     /// # Errors
     /// When they are not installed.
     pub fn load() -> Result<Self> {
-        let folder = places::offline_dir();
+        let folder = model_paths::offline_dir();
         let classifier = Model::load_for_each_core(&folder.join("classifier.onnx"))?;
         let class_embeddings = names::embeddings()?;
         let mut rng = Rng::new(0, "dense projection");
@@ -169,7 +169,7 @@ impl Conse {
     ///
     /// Each mask is classified alone and with its surroundings; the result is the mean of both.
     fn mask_logits(&self, photo: &RgbImage, masks: &LabelMap) -> Result<Vec<Vec<f32>>> {
-        let photo = &exposure::brightened(photo);
+        let photo = &brighten::brightened(photo);
         let boxes = masks.boxes();
         let present: Vec<(u16, [u32; 4])> = (1..=masks.max())
             .filter_map(|l| Some((l, boxes[usize::from(l)]?)))
@@ -216,7 +216,7 @@ impl Encoder for Conse {
         photo: &RgbImage,
         masks: &LabelMap,
     ) -> Result<Vec<Vec<f32>>> {
-        let colors = attributes::of_masks(&exposure::brightened(photo), masks);
+        let colors = attributes::of_masks(&brighten::brightened(photo), masks);
         let embed =
             |(logits, colors): (&Vec<f32>, [f32; attributes::COUNT])| match logits.as_slice() {
                 [] => vec![0.0; LENGTH],

@@ -1,7 +1,7 @@
 //! Learned edges: HED (Xie & Tu 2015).
 
 use crate::runtime::{Array, Model};
-use crate::{Result, places};
+use crate::{Result, model_paths};
 use image::RgbImage;
 
 /// Mean of the training pictures, BGR in [0, 255].
@@ -17,7 +17,7 @@ impl Hed {
     /// When it is not installed.
     pub fn load() -> Result<Self> {
         Ok(Self(Model::load_for_each_core(
-            &places::offline_dir().join("edges.onnx"),
+            &model_paths::offline_dir().join("edges.onnx"),
         )?))
     }
 

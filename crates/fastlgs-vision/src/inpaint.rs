@@ -182,7 +182,7 @@ mod tests {
     /// A model that paints holes black: image x (1 - mask), from 0 to 255.
     #[test]
     fn a_network_fills_only_the_hole() {
-        if let Err(e) = crate::places::runtime_library() {
+        if let Err(e) = crate::model_paths::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
             eprintln!("skipped: {e}");
             return;

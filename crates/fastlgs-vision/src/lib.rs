@@ -5,6 +5,7 @@
 
 pub mod appearance;
 pub mod attributes;
+pub mod brighten;
 pub mod brightness;
 pub mod bundle;
 pub mod clip;
@@ -13,7 +14,6 @@ pub mod conse;
 pub mod crops;
 pub mod edges;
 pub mod encoder;
-pub mod exposure;
 pub mod frame;
 pub mod histogram;
 pub mod import;
@@ -21,15 +21,15 @@ pub mod inpaint;
 pub mod keypoints;
 pub mod masks;
 pub mod matching;
+pub mod model_paths;
 pub mod models;
 pub mod names;
 #[cfg(feature = "opencv")]
 mod opencv;
 pub mod photo_quality;
-pub mod places;
 pub mod pose_check;
 pub mod pose_convention;
-mod printed;
+mod process_output;
 pub mod pull;
 #[cfg(test)]
 mod reference;

@@ -1,6 +1,6 @@
 //! The offline models: the packages that contain them, and their installation.
 
-use crate::places::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
+use crate::model_paths::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
 use fastlgs_core::synth::{PICTURES, TEXTURES};
@@ -93,11 +93,11 @@ pub fn offline_installed() -> bool {
 /// # Errors
 /// When Python is missing, or a download or the conversion fails. Files installed earlier stay.
 pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
-    if !places::poses_python().is_file() {
+    if !model_paths::poses_python().is_file() {
         report("installing pycolmap, which computes poses of photos without poses");
         // pycolmap is not available for every machine, and photos with poses do not need it.
         if let Err(error) = install_poses() {
-            let _ = std::fs::remove_dir_all(places::poses_venv());
+            let _ = std::fs::remove_dir_all(model_paths::poses_venv());
             report(&format!(
                 "pycolmap is not installed, so photos need poses: {error}"
             ));
@@ -171,13 +171,13 @@ pub fn install_offline(mut report: impl FnMut(&str)) -> Result<()> {
 
 /// Creates a Python environment and installs pycolmap in it.
 fn install_poses() -> Result<()> {
-    let venv = places::poses_venv();
+    let venv = model_paths::poses_venv();
     run(
         Command::new("python3").args(["-m", "venv"]).arg(&venv),
         "python3 with venv (on Debian: apt-get install python3-venv)",
     )?;
     run(
-        Command::new(places::poses_python()).args([
+        Command::new(model_paths::poses_python()).args([
             "-m",
             "pip",
             "install",

@@ -1,7 +1,7 @@
 //! Text embeddings of the classifier's 1,000 class names, computed once and saved with the models.
 
 use crate::encoder::{TextEncoder, normalise};
-use crate::places::{NAMES, offline_dir};
+use crate::model_paths::{NAMES, offline_dir};
 use crate::{Error, MiniLm, Result};
 use fastlgs_core::fs;
 use fastlgs_core::scene_folder::{load_tensors, save_tensors};

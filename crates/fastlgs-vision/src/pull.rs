@@ -4,7 +4,7 @@
 //! LFS pointers. `pulled.json` records each downloaded file, and a later download must match this
 //! record.
 
-use crate::places::digest;
+use crate::model_paths::digest;
 use crate::{Error, Result};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_core::{Error as CoreError, fs};

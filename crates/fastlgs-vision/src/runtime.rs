@@ -1,7 +1,7 @@
 //! Runs ONNX models. ONNX Runtime is loaded from a shared library, or linked in with the feature
 //! `download-ort`.
 
-use crate::{Error, Result, places};
+use crate::{Error, Result, model_paths};
 use half::f16;
 use ort::environment::Environment;
 use ort::session::Session;
@@ -17,7 +17,7 @@ fn environment() -> Result<Environment> {
     if let Some(environment) = slot.as_ref() {
         return Ok(environment.clone());
     }
-    let library = places::runtime_library()?;
+    let library = model_paths::runtime_library()?;
     let failed = |e: &dyn std::fmt::Display| {
         Error::Missing(format!(
             "{}: ONNX Runtime cannot be loaded: {e}",

@@ -1,9 +1,9 @@
 //! Segmenters: find object masks in photos.
 
 use crate::Result;
+use crate::brighten;
 use crate::conse::{Conse, DENSE, DenseMap};
 use crate::edges::Hed;
-use crate::exposure;
 use crate::regions::{Hierarchy, Node, watershed};
 use fastlgs_core::color::lab;
 use fastlgs_core::{LabelMap, Level, MaskList, image_io};
@@ -114,7 +114,7 @@ impl Segmenter for OfflineSegmenter {
     }
 
     fn segment(&self, _view: &str, photo: &RgbImage) -> Result<MaskList> {
-        let photo = &exposure::brightened(photo);
+        let photo = &brighten::brightened(photo);
         let small = at_side(photo, WORK_SIDE.min(photo.width().max(photo.height())));
         let (w, h) = (small.width() as usize, small.height() as usize);
         let edges = self.edges.edges(&small)?;

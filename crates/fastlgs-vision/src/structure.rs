@@ -6,9 +6,9 @@
 
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
-use crate::printed::lines;
+use crate::process_output::lines;
 use crate::tracks::PairMatches;
-use crate::{Error, Result, places};
+use crate::{Error, Result, model_paths};
 use fastlgs_core::dataset::{self, colmap, is_photo};
 use fastlgs_core::image_io::OrientationRule;
 use fastlgs_core::{Camera, fs, image_io};
@@ -64,7 +64,7 @@ impl Tool {
                 .output()
                 .is_ok_and(|o| o.status.success())
         };
-        let pythons = std::iter::once(places::poses_python())
+        let pythons = std::iter::once(model_paths::poses_python())
             .chain(on_path("python3"))
             .filter(|p| p.is_file() && !program);
         let pycolmap = pythons.into_iter().find(imports).map(Self::Pycolmap);

@@ -4,7 +4,7 @@ use crate::appearance;
 use crate::attributes;
 use crate::encoder::{TextEncoder, normalise};
 use crate::runtime::{Array, Model};
-use crate::{Error, Result, places};
+use crate::{Error, Result, model_paths};
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use tokenizers::Tokenizer;
@@ -43,7 +43,7 @@ impl MiniLm {
     /// # Errors
     /// A file that is missing or invalid.
     pub fn load() -> Result<Self> {
-        let folder = places::offline_dir();
+        let folder = model_paths::offline_dir();
         let model = Model::load(&folder.join("text.onnx"))?;
         let path = folder.join("tokenizer.json");
         let mut tokenizer = Tokenizer::from_file(&path)

@@ -4,7 +4,7 @@
 use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
 use crate::photo_quality::PhotoStats;
-use crate::printed::lines;
+use crate::process_output::lines;
 use crate::{Error, Result};
 use image::GrayImage;
 use serde::Deserialize;

@@ -4,7 +4,7 @@ use crate::absent::{ABSENT, COLORS};
 use crate::calibrations::{self, CalibrationFile, Calibrations, calibration_path};
 use crate::error::{Context, bail};
 use crate::eval::best_object;
-use crate::eyes::{EncoderKind, ModelChoice};
+use crate::model_choice::{EncoderKind, ModelChoice};
 use crate::{Result, Run, Scene, masks};
 use fastlgs_core::labels::LabelledView;
 use fastlgs_core::synth::{Kind, SceneObject, World};

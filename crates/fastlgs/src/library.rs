@@ -3,7 +3,7 @@
 use crate::error::{Context, bail};
 use crate::session::Texts;
 use crate::session::ask::Embedded;
-use crate::{Result, Run, eyes, train};
+use crate::{Result, Run, model_choice, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
@@ -133,7 +133,7 @@ impl Search {
             let grid = Grid::load(&folder).with_context(|| {
                 format!("{path}: the object table cannot be read; train this scene again")
             })?;
-            eyes::check_version(manifest, &grid, &folder)?;
+            model_choice::check_version(manifest, &grid, &folder)?;
             Ok(Opened {
                 path: path.clone(),
                 grid,
@@ -233,7 +233,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
                 Err(error) => Some(error.to_string()),
                 Ok(None) => Some("it was never trained".to_owned()),
                 Ok(Some(_)) => {
-                    scenes.first().map(|s| &s.1).filter(|first| eyes::identity_of(first) != eyes::identity_of(own)).map(|first| {
+                    scenes.first().map(|s| &s.1).filter(|first| model_choice::identity_of(first) != model_choice::identity_of(own)).map(|first| {
                         let [own, first] = [own, first].map(|m| [m.encoder.as_str(), m.crops.as_str()].join(" ").trim_end().to_owned());
                         format!(
                             "its encoder ('{own}') is not that of the library ('{first}'); preprocess and train it again with that of the library"

@@ -1,7 +1,7 @@
 //! Runs preprocessing and training, and skips finished work.
 
 use crate::error::Context;
-use crate::eyes::SamPreset;
+use crate::model_choice::SamPreset;
 use crate::output::{SceneLock, check_apart};
 use crate::preprocess::fingerprint;
 use crate::{Result, Run, checkpoints, preprocess, train};

@@ -1,7 +1,7 @@
 //! Masks of a view with their descriptors: embedding and colour histogram.
 
 use crate::cache::{self, Cache};
-use crate::{Result, Run, eyes};
+use crate::{Result, Run, model_choice};
 use fastlgs_core::{Camera, Error, LabelMap, Level, SceneFolder};
 use fastlgs_grid::evidence;
 use fastlgs_grid::mapping::Mask;
@@ -59,7 +59,7 @@ pub fn training_descriptors(
     if evidence::masks_path(folder).is_file() {
         let (masks, encoder) = evidence::load_masks(folder)?;
         // Stored descriptors may come from another encoder.
-        if eyes::is_current(
+        if model_choice::is_current(
             &manifest,
             &encoder,
             masks.iter().map(|mask| &mask.embedding),
@@ -67,12 +67,12 @@ pub fn training_descriptors(
             return Ok(masks);
         }
     }
-    let encoder = eyes::encoder_of(folder, &manifest)?;
+    let encoder = model_choice::encoder_of(folder, &manifest)?;
     compute_descriptors(
         folder,
         training,
         encoder.as_ref(),
-        Some(&eyes::identity_of(&manifest)),
+        Some(&model_choice::identity_of(&manifest)),
         run,
     )
 }

@@ -2,12 +2,12 @@
 //! it. Alternatively loads the objects of an earlier run.
 
 use crate::error::{Context, bail};
-use crate::{Result, Run, eyes, masks};
+use crate::{Result, Run, masks, model_choice};
 use fastlgs_core::mask_list::{AtomTable, Atoms};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
 use fastlgs_grid::mapping::{self, Mask, PaperConfig};
 use fastlgs_grid::objects::{self as chosen, Chosen};
-use fastlgs_grid::sightings::{Observation, Observations};
+use fastlgs_grid::observations::{Observation, Observations};
 use fastlgs_grid::support::support;
 use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
 use fastlgs_raster::density::State;
@@ -45,7 +45,7 @@ pub fn by_algorithm_1(
     // as many objects.
     let mut compared = masks.clone();
     compared.iter_mut().for_each(|mask| {
-        mask.embedding = eyes::for_texts(&manifest, std::mem::take(&mut mask.embedding))
+        mask.embedding = model_choice::for_texts(&manifest, std::mem::take(&mut mask.embedding))
     });
     let mapping::Mapped {
         object_of,
@@ -72,7 +72,7 @@ pub fn by_algorithm_1(
         };
         map.save(&folder.objects_path(&camera.name))?;
     }
-    let encoder = eyes::identity_of(&manifest);
+    let encoder = model_choice::identity_of(&manifest);
     Ok(Grid {
         encoder,
         ..Grid::build(
@@ -114,7 +114,7 @@ pub fn load_kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
         )
     };
     let grid = Grid::load(folder).with_context(advice)?;
-    eyes::check_version(&folder.manifest()?, &grid, folder)?;
+    model_choice::check_version(&folder.manifest()?, &grid, folder)?;
     if unfinished(folder).is_file() {
         bail!(
             "{}: an interrupted training left object maps that do not belong to grid.json; train the scene again",
@@ -302,7 +302,7 @@ pub fn embed_objects(
     (grid.overlaps, grid.id_areas, grid.encoder) = (
         chosen.overlaps,
         chosen.shown,
-        eyes::identity_of(&folder.manifest()?),
+        model_choice::identity_of(&folder.manifest()?),
     );
     grid.set_codes(scene);
     Ok((grid, summary))
@@ -363,7 +363,7 @@ fn embed(
     embedding_views: &[Vec<usize>],
     run: &Run,
 ) -> Result<(Vec<Mask>, Vec<u16>)> {
-    let encoder = eyes::encoder_of(folder, &folder.manifest()?)?;
+    let encoder = model_choice::encoder_of(folder, &folder.manifest()?)?;
     let work = run.work("embeddings", training.len() as u64);
     // Views are embedded in parallel, because one view has too few masks for many cores.
     let of_view = |(view, camera): (usize, &Camera)| -> Result<(Vec<Mask>, PhotoStats)> {

@@ -4,7 +4,7 @@ use crate::error::{Context, bail};
 use crate::names::{Example, Names, normalise_name};
 use crate::session::Pixels;
 use crate::session::ask::{ObjectQuery, picture};
-use crate::{Result, Run, Scene, eyes};
+use crate::{Result, Run, Scene, model_choice};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
 use fastlgs_grid::query::QueryConfig;
@@ -93,7 +93,7 @@ pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
 /// # Errors
 /// As [`teach`].
 pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<TeachReport> {
-    eyes::check_version(&scene.manifest, grid, &scene.folder)?;
+    model_choice::check_version(&scene.manifest, grid, &scene.folder)?;
     let root = scene.folder.root.display().to_string();
     let Some(object) = usize::from(id)
         .checked_sub(1)
@@ -134,7 +134,7 @@ fn store_example(
         names.add(
             &name,
             Example {
-                encoder: eyes::identity_of(&scene.manifest),
+                encoder: model_choice::identity_of(&scene.manifest),
                 from,
                 embeddings,
             },

@@ -3,11 +3,11 @@
 use crate::outcome::Outcome;
 use crate::{report, ui};
 use anyhow::Result;
-use fastlgs::eyes::{EncoderKind, ModelChoice};
+use fastlgs::model_choice::{EncoderKind, ModelChoice};
 use fastlgs::{Run, calibrate, calibrations};
 use fastlgs_core::scene_folder::ModelFile;
 use fastlgs_vision::pull::{self, HOST, NAMED, Named, Role};
-use fastlgs_vision::{models, places};
+use fastlgs_vision::{model_paths, models};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -90,7 +90,7 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     }
     let mut files = Vec::new();
     for file in models::OFFLINE_FILES {
-        let found = places::digest(&places::offline_dir().join(file)).ok();
+        let found = model_paths::digest(&model_paths::offline_dir().join(file)).ok();
         files.push(serde_json::json!({ "file": file, "bytes": found.as_ref().map(|f| f.0), "sha256": found.map(|f| f.1) }));
     }
     let packages = models::OFFLINE_PACKAGES
@@ -101,9 +101,9 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         serde_json::json!({ "model": model, "from": format!("{HOST}/{}", model.repository), "pulled": files, "calibrated": calibrated })
     });
     let value = serde_json::json!({
-        "folder": places::offline_dir(),
+        "folder": model_paths::offline_dir(),
         "installed": models::offline_installed(),
-        "runtime": places::runtime_library().ok(),
+        "runtime": model_paths::runtime_library().ok(),
         "packages": packages,
         "files": files,
         "can_be_pulled": named,

@@ -2,7 +2,7 @@
 
 use super::{BATCH, Splat, alpha, pixels_of, shown};
 use crate::View;
-use fastlgs_core::shares::{IDS_PER_PIXEL, pack};
+use fastlgs_core::id_weights::{IDS_PER_PIXEL, pack};
 use rayon::prelude::*;
 
 /// Marks a free slot. No object has this id.

@@ -17,7 +17,7 @@ use crate::view::{Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
 use fastlgs_core::IdWeights;
-use fastlgs_core::shares::IDS_PER_PIXEL;
+use fastlgs_core::id_weights::IDS_PER_PIXEL;
 use kernels::{Kernels, kind};
 use lists::{ListBuilder, Lists};
 use pages::Gaussians;

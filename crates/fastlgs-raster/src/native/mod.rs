@@ -18,7 +18,7 @@ use crate::{Error, Result};
 use blend::{BackwardInput, Blended, EDGE, Job, Tile};
 use fastlgs_core::IdWeights;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
-use fastlgs_core::shares::{IDS_PER_PIXEL, pack};
+use fastlgs_core::id_weights::{IDS_PER_PIXEL, pack};
 pub(crate) use lists::Lists;
 use picture::TiledPlanes;
 use rayon::prelude::*;

@@ -2,8 +2,8 @@
 
 mod alignment;
 mod coupling;
-mod shown;
-mod watched;
+mod loaded_targets;
+mod validation;
 
 use crate::budget::{self, Removal};
 use crate::channels::Channels;
@@ -22,8 +22,8 @@ use fastlgs_core::gaussians::{self, BASE_CHANNELS};
 use fastlgs_core::metrics::psnr;
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians};
+use loaded_targets::LoadedTargets;
 use serde::Serialize;
-use shown::LoadedTargets;
 use std::path::Path;
 use std::time::Instant;
 

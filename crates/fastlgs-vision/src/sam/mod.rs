@@ -219,7 +219,7 @@ mod tests {
             dir.path().join("decoder.onnx"),
         );
         toy_models::sam(export, &encoder, &decoder);
-        if let Err(e) = crate::places::runtime_library() {
+        if let Err(e) = crate::model_paths::runtime_library() {
             assert!(std::env::var_os("FASTLGS_REQUIRE_MODELS").is_none(), "{e}");
             eprintln!("SKIPPED: {e}");
             return None;

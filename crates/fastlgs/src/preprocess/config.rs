@@ -1,6 +1,6 @@
 //! Options and report of `preprocess`.
 
-use crate::eyes::ModelChoice;
+use crate::model_choice::ModelChoice;
 use fastlgs_core::dataset::PoseConvention;
 use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};

@@ -4,7 +4,7 @@ use super::config::PreprocessConfig;
 use super::photos::PreparedPhoto;
 use crate::cache::{self, Cache};
 use crate::error::{Context, bail};
-use crate::eyes::SegmenterKind;
+use crate::model_choice::SegmenterKind;
 use crate::{Result, Run};
 use fastlgs_core::undistort::Distortion;
 use fastlgs_core::{Level, SceneFolder};

@@ -9,7 +9,7 @@ mod video;
 
 use crate::cache::Cache;
 use crate::error::{Context, bail};
-use crate::eyes::EncoderKind;
+use crate::model_choice::EncoderKind;
 use crate::output::{SceneLock, check_apart};
 use crate::staged::StagedOutput;
 use crate::{Result, Run, calibrations, checkpoints};

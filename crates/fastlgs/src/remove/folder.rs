@@ -1,7 +1,7 @@
 //! Writes the scene folder of a scene without the removed object.
 
 use crate::staged::StagedOutput;
-use crate::{Result, Scene, clear, train};
+use crate::{Result, Scene, train, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};
@@ -99,7 +99,7 @@ pub fn write(
     if let Some(train) = manifest.notes.get_mut("train") {
         (train["gaussians"], train["objects"]) =
             (session.gaussians.len().into(), grid.objects.len().into());
-        train["clear"] = clear::count(&session.gaussians).into();
+        train["clear"] = transparent::count(&session.gaussians).into();
     }
     let maps = session
         .manifest

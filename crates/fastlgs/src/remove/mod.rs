@@ -14,7 +14,7 @@ use crate::error::{Context, bail};
 use crate::output::{SceneLock, resolve_path};
 use crate::session::ask::ObjectQuery;
 use crate::session::selection;
-use crate::{Result, Run, Scene, clear};
+use crate::{Result, Run, Scene, transparent};
 use fastlgs_core::{Camera, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -172,7 +172,7 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     remains
         .iter_mut()
         .enumerate()
-        .for_each(|(i, stays)| *stays |= clear::is_clear(&session.gaussians, i));
+        .for_each(|(i, stays)| *stays |= transparent::is_clear(&session.gaussians, i));
     selection::gaussians(&session.gaussians, &grid, &objects)
         .into_iter()
         .for_each(|i| remains[i] = false);

@@ -12,7 +12,7 @@ mod views;
 
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
-use crate::{Result, eyes, train};
+use crate::{Result, model_choice, train};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
@@ -323,7 +323,7 @@ impl Scene {
 
     /// Loads the image encoder of the scene.
     pub fn image_encoder(&self) -> Result<Box<dyn Encoder>> {
-        eyes::encoder_of(&self.folder, &self.manifest)
+        model_choice::encoder_of(&self.folder, &self.manifest)
     }
 }
 

@@ -4,7 +4,7 @@ use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
 use crate::names::Names;
 use crate::session::phrase;
-use crate::{Result, eyes};
+use crate::{Result, model_choice};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;
@@ -24,7 +24,7 @@ pub(super) fn check_embeddings(
     what: &str,
     length: usize,
 ) -> Result<()> {
-    eyes::check_version(manifest, grid, folder)?;
+    model_choice::check_version(manifest, grid, folder)?;
     let own = grid
         .objects
         .iter()
@@ -60,7 +60,7 @@ impl Texts {
         clip_text: Option<&Path>,
     ) -> Result<Self> {
         Self::from_encoder(
-            eyes::text_encoder_of(manifest, clip_text)?,
+            model_choice::text_encoder_of(manifest, clip_text)?,
             folder,
             manifest,
         )
@@ -85,7 +85,10 @@ impl Texts {
         let grid = Grid::load(folder)
             .context("the object grid cannot be read; run 'fastlgs train' again")?;
         check_embeddings(manifest, &grid, folder, "texts", length)?;
-        let (calibrations, identity) = (Calibrations::of(manifest), eyes::identity_of(manifest));
+        let (calibrations, identity) = (
+            Calibrations::of(manifest),
+            model_choice::identity_of(manifest),
+        );
         Ok(Self {
             encoder,
             canonical,

@@ -1,6 +1,6 @@
 //! Options of `train`.
 
-use crate::eyes::{EncoderKind, SegmenterKind};
+use crate::model_choice::{EncoderKind, SegmenterKind};
 use crate::objects;
 use fastlgs_grid::mapping::PaperConfig;
 use fastlgs_grid::objects as chosen;

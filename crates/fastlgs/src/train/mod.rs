@@ -1,17 +1,17 @@
 //! Training: optimises Gaussians with colour and features, then finds their objects (paper,
 //! training features for Gaussians).
 
-mod borders;
 mod config;
+mod init;
+mod mask_supervision;
 mod report;
 mod settings;
-mod start;
 
 use crate::error::{Context, bail};
 use crate::output::SceneLock;
 use crate::progress::{Message, TrainStep};
 use crate::staged::StagedOutput;
-use crate::{Result, Run, checkpoints, clear, objects, preprocess};
+use crate::{Result, Run, checkpoints, objects, preprocess, transparent};
 pub use config::{
     Align, Background, Borders, Cue, Exposures, FeatureMode, Mapping, Preset, TrainConfig,
 };
@@ -19,9 +19,9 @@ use fastlgs_core::{Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::codebook::Codebook;
 use fastlgs_raster::Trainer;
+pub(crate) use init::target;
 pub use report::{CurvePoint, TrainReport};
 use settings::settings;
-pub(crate) use start::target;
 use std::time::Instant;
 
 /// Key of the manifest note with the inputs and options of `make`.
@@ -84,16 +84,16 @@ pub(crate) fn train_locked(
     };
     let codes = prior_objects.as_ref().filter(|_| trains_features);
     let light = preprocess::Brightness::from_manifest(&manifest)?;
-    let config = &start::with_earlier_settings(config, &folder, &manifest)?;
+    let config = &init::with_earlier_settings(config, &folder, &manifest)?;
     let background = config.background.unwrap_or_default();
-    let targets = start::targets(
+    let targets = init::targets(
         &folder,
         &training,
-        codes.map(start::codes).as_ref(),
+        codes.map(init::codes).as_ref(),
         &background,
         |name| light.gain(name),
     );
-    let held_out = start::targets(
+    let held_out = init::targets(
         &folder,
         &manifest.held_out(&cameras),
         None,
@@ -101,15 +101,15 @@ pub(crate) fn train_locked(
         |_| [1.0; 3],
     );
     held_out.check()?;
-    let mut first = start::gaussians(config, &folder, &targets, run)?;
+    let mut first = init::gaussians(config, &folder, &targets, run)?;
     // Gaussians of transparent objects have no colour to train.
-    clear::take(&mut first);
+    transparent::take(&mut first);
     let kept_clear = if config.mapping == Mapping::Keep {
-        clear::take(&mut folder.gaussians()?)
+        transparent::take(&mut folder.gaussians()?)
     } else {
         Gaussians::default()
     };
-    let free = start::free_space(config, &folder, &training, &first)?;
+    let free = init::free_space(config, &folder, &training, &first)?;
     if let Some(codes) = codes.filter(|_| config.init.is_none() || config.mapping != Mapping::Keep)
     {
         // Start from the objects on which most views agree. From elsewhere, descent ends between
@@ -135,7 +135,7 @@ pub(crate) fn train_locked(
         ));
     }
     if trainer.is_coupled() {
-        borders::resume_targets(&mut trainer, &folder)?;
+        mask_supervision::resume_targets(&mut trainer, &folder)?;
     }
     run.progress.on_message(Message::TrainingBegins(&first));
     let (mut curve, mut mapping_seconds) = (Vec::new(), 0.0);
@@ -143,7 +143,7 @@ pub(crate) fn train_locked(
         work.check()?;
         if settings.couples_at == Some(p.iteration) {
             let started = Instant::now();
-            borders::begin(trainer, &folder, &config.global(), run)?;
+            mask_supervision::begin(trainer, &folder, &config.global(), run)?;
             mapping_seconds += started.elapsed().as_secs_f64();
         }
         let loss = 0.8 * p.losses.color_l1 + 0.2 * (1.0 - p.losses.color_ssim);
@@ -213,11 +213,11 @@ pub(crate) fn train_locked(
         Some(found) => {
             scene.append(kept_clear.with_sh_degree(degree));
             objects::lift(&mut scene, &folder, &training, &found, config.antialias)?;
-            clear::keep_owned(&mut scene);
+            transparent::keep_owned(&mut scene);
             found
         }
         None => {
-            let mapped = clear::map(&mut scene, &folder, &training, &config.global(), run)?;
+            let mapped = transparent::map(&mut scene, &folder, &training, &config.global(), run)?;
             let (grid, found) =
                 objects::embed_objects(&mut scene, &folder, &training, mapped, run)?;
             summary = Some(found);
@@ -244,7 +244,7 @@ pub(crate) fn train_locked(
         seconds: result.seconds,
         iterations_per_second: result.iterations_per_second,
         gaussians: scene.len(),
-        clear: clear::count(&scene),
+        clear: transparent::count(&scene),
         removals: result.removals,
         sh_degree: scene.sh_degree,
         exposure: settings.exposure,

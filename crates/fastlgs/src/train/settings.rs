@@ -1,7 +1,7 @@
 //! Translates options into the trainer's configuration.
 
-use super::borders;
 use super::config::{Align, Exposures, FeatureMode, TrainConfig};
+use super::mask_supervision;
 use crate::Result;
 use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
@@ -40,7 +40,7 @@ pub fn settings(
         feature_weight: config.feature_weight,
         couples_at: config
             .masks_guide_training(&manifest.segmenter)
-            .then(|| borders::begin_at(config.iterations())),
+            .then(|| mask_supervision::begin_at(config.iterations())),
         antialias: config.antialias,
         background: background.color,
         learn_background: background.learn,

@@ -11,7 +11,7 @@ use fastlgs_vision::pull::Named;
 use fastlgs_vision::sam::{self, Sam};
 use fastlgs_vision::{
     ClipImage, ClipText, Conse, Encoder, OfflineSegmenter, OfflineText, Segmenter, TextEncoder,
-    appearance, clip, conse, models, places, segmenter,
+    appearance, clip, conse, model_paths, models, segmenter,
 };
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -286,7 +286,7 @@ impl ModelChoice {
         let mut add = |role: &str, path: PathBuf| -> Result<()> {
             // Do not resolve links: other files of the model lie beside the link.
             let path = std::path::absolute(&path).unwrap_or(path);
-            let (bytes, sha256) = places::digest(&path)?;
+            let (bytes, sha256) = model_paths::digest(&path)?;
             files.insert(
                 role.to_owned(),
                 ModelFile {
@@ -436,7 +436,7 @@ fn recorded_model<'a>(manifest: &'a Manifest, role: &str) -> Result<&'a Path> {
         })?
         .len();
     // Compare the size first, because hashing is slow.
-    if bytes != file.bytes || places::digest(&file.path)?.1 != file.sha256 {
+    if bytes != file.bytes || model_paths::digest(&file.path)?.1 != file.sha256 {
         bail!(
             "{}: this is not the {what} that the scene was made with, because its content differs; restore the original file",
             file.path.display()
