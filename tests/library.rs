@@ -147,7 +147,7 @@ fn stages_report_and_a_cancelled_one_leaves_the_scene_as_it_was() {
     assert_eq!(
         Scene::open(&scene, "cpu")
             .expect("the scene")
-            .gaussians
+            .gaussians()
             .len(),
         report.gaussians
     );

@@ -3,7 +3,7 @@
 #[path = "support/run.rs"]
 mod run;
 
-use fastlgs::session::selection;
+use fastlgs::query::selection;
 use fastlgs_core::label_map::LabelMap;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, exr_image, image_io, metrics};
 use fastlgs_grid::Grid;

@@ -333,7 +333,7 @@ fn selections_and_camera_paths_go_out_and_in() {
     let Some(l) = library() else { return };
     let room = l.scenes.join("room");
     let out = l.dir.path().join("exchange");
-    for ending in fastlgs::session::selection::EXTENSIONS {
+    for ending in fastlgs::query::selection::EXTENSIONS {
         let file = out.join(format!("cat.{ending}"));
         let answer = json(&[
             "query",

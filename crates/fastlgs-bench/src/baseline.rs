@@ -5,18 +5,17 @@
 
 use crate::autoencoder::Autoencoder;
 use anyhow::{Context, Result, bail};
-use fastlgs::session::mean_features;
+use fastlgs::scene::mean_features;
 use fastlgs::{Run, Scene, eval, model_choice};
 use fastlgs_core::id_weights::{IdWeights, pack, unpack};
 use fastlgs_core::labels::{self, LabelledView};
 use fastlgs_core::rng::Rng;
-use fastlgs_core::{Camera, LabelMap, Level, metrics};
+use fastlgs_core::{Camera, Gaussians, LabelMap, Level, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_raster::density::State;
-use fastlgs_raster::{Channels, lift};
+use fastlgs_raster::lift;
 use fastlgs_vision::Encoder;
 use glam::Vec3;
 use ndarray::{Array2, Axis};
@@ -55,7 +54,7 @@ type Vectors = Array2<f32>;
 pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let mut scene = Scene::open(&args.scene, run.device)?;
     let grid = scene.grid()?;
-    let views = labels::load(&Path::new(&scene.manifest.photos).join("labels"), None)?;
+    let views = labels::load(&Path::new(&scene.manifest().photos).join("labels"), None)?;
     let started = Instant::now();
     let field = match args.method.as_str() {
         "raw" => PerPixel::raw(&scene, run)?,
@@ -76,7 +75,8 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     let (mut oracle, mut text, mut localised, mut milliseconds, mut wrong) =
         (Vec::new(), Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for view in &views {
-        let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
+        let camera =
+            scene.cameras()[scene.folder().view_index(scene.cameras(), &view.name)?].clone();
         let started = Instant::now();
         let pictures = field
             .layers
@@ -92,7 +92,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         }
     }
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
-    let camera = &scene.cameras[0];
+    let camera = &scene.cameras()[0];
     let value = json!({
         "scene": args.scene,
         "method": args.method,
@@ -104,10 +104,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         "seconds": seconds,
         "render_ms": mean(&milliseconds),
         "field_bytes": bytes,
-        "gaussians": scene.gaussians.len(),
+        "gaussians": scene.gaussians().len(),
         "objects": grid.objects.len(),
         "size": format!("{}x{}", camera.width, camera.height),
-        "adapter": scene.engine.name(),
+        "adapter": scene.adapter(),
     });
     Ok(value)
 }
@@ -132,19 +132,19 @@ struct PerPixel {
 impl PerPixel {
     fn raw(scene: &Scene, run: &Run) -> Result<Self> {
         let masks = fastlgs::masks::training_descriptors(
-            &scene.folder,
-            &scene.manifest.training(&scene.cameras),
+            scene.folder(),
+            &scene.manifest().training(scene.cameras()),
             run,
         )?;
         let lifted = lifted(scene, |view, camera| {
-            let map = scene.folder.masks(camera)?.painted(Level::Whole);
+            let map = scene.folder().masks(camera)?.painted(Level::Whole);
             let own = masks.iter().filter(|m| m.view == view);
             Ok((
                 map,
                 own.map(|m| {
                     (
                         m.label,
-                        model_choice::for_texts(&scene.manifest, m.embedding.clone()),
+                        model_choice::for_texts(scene.manifest(), m.embedding.clone()),
                     )
                 })
                 .collect(),
@@ -157,10 +157,10 @@ impl PerPixel {
     }
 
     fn lerf(scene: &Scene, run: &Run) -> Result<Self> {
-        let encoder = model_choice::encoder_of(&scene.folder, &scene.manifest)?;
+        let encoder = model_choice::encoder_of(scene.folder(), scene.manifest())?;
         let progress = run.work(
             "tiles",
-            (TILE_SIDES.len() * scene.manifest.training(&scene.cameras).len()) as u64,
+            (TILE_SIDES.len() * scene.manifest().training(scene.cameras()).len()) as u64,
         );
         let of_scale = |share: &f32| {
             lifted(scene, |_, camera| {
@@ -186,13 +186,13 @@ impl PerPixel {
     }
 
     fn langsplat(scene: &Scene, run: &Run) -> Result<Self> {
-        let encoder = model_choice::encoder_of(&scene.folder, &scene.manifest)?;
-        let training = scene.manifest.training(&scene.cameras);
+        let encoder = model_choice::encoder_of(scene.folder(), scene.manifest())?;
+        let training = scene.manifest().training(scene.cameras());
         let progress = run.work("embeddings", 2 * training.len() as u64);
         let mut levels: [Vec<Labelled>; 2] = Default::default();
         for (level, found) in [Level::Whole, Level::Part].into_iter().zip(&mut levels) {
             for camera in &training {
-                let masks = scene.folder.masks(camera)?;
+                let masks = scene.folder().masks(camera)?;
                 // A scene without part masks uses its whole masks twice.
                 let level = if masks.count(level) > 0 {
                     level
@@ -240,13 +240,14 @@ impl PerPixel {
     /// which is not a code.
     fn of_codes(scene: &Scene, grid: &Grid, codes: Vectors) -> Self {
         let own = |g: usize, axis: usize| {
-            grid.chain(scene.gaussians.object_ids[g])
+            grid.chain(scene.gaussians().object_ids[g])
                 .next()
                 .map_or(0.0, |id| codes[[usize::from(id) - 1, axis]])
         };
-        let layer = Vectors::from_shape_fn((scene.gaussians.len(), codes.ncols()), |(g, axis)| {
-            own(g, axis)
-        });
+        let layer =
+            Vectors::from_shape_fn((scene.gaussians().len(), codes.ncols()), |(g, axis)| {
+                own(g, axis)
+            });
         Self {
             layers: vec![layer],
             meaning: Representation::Object(codes),
@@ -263,8 +264,8 @@ impl PerPixel {
         camera: &Camera,
         picture: &Vectors,
     ) -> Result<Option<f64>> {
-        let (Representation::Object(codes), Field::Shares(shares)) =
-            (&self.meaning, scene.field(camera, None)?)
+        let field = scene.field(camera, None)?;
+        let (Representation::Object(codes), Field::Shares(shares)) = (&self.meaning, &*field)
         else {
             return Ok(None);
         };
@@ -380,14 +381,14 @@ fn embedded(
     camera: &Camera,
     map: LabelMap,
 ) -> Result<Labelled> {
-    let found = encoder.embed_masks(&camera.name, &scene.folder.photo(&camera.name)?, &map)?;
+    let found = encoder.embed_masks(&camera.name, &scene.folder().photo(&camera.name)?, &map)?;
     let own = found
         .into_iter()
         .enumerate()
         .filter(|(_, e)| e.iter().any(|v| *v != 0.0));
     Ok((
         map,
-        own.map(|(k, e)| (k as u16 + 1, model_choice::for_texts(&scene.manifest, e)))
+        own.map(|(k, e)| (k as u16 + 1, model_choice::for_texts(scene.manifest(), e)))
             .collect(),
     ))
 }
@@ -410,21 +411,26 @@ fn lifted(
     labelled_view: impl Fn(usize, &Camera) -> Result<Labelled>,
 ) -> Result<Vectors> {
     let mut sums = Vectors::zeros((0, 0));
-    let mut weights = vec![0.0f32; scene.gaussians.len()];
-    for (view, camera) in scene.manifest.training(&scene.cameras).iter().enumerate() {
+    let mut weights = vec![0.0f32; scene.gaussians().len()];
+    for (view, camera) in scene
+        .manifest()
+        .training(scene.cameras())
+        .iter()
+        .enumerate()
+    {
         let (map, vectors) = labelled_view(view, camera)?;
         let width = vectors.first().map_or(sums.ncols(), |v| v.1.len());
         if sums.is_empty() {
-            let bytes = 4 * width * scene.gaussians.len();
+            let bytes = 4 * width * scene.gaussians().len();
             if bytes > MAX_VECTOR_BYTES {
                 bail!(
                     "vectors of {width} numbers for {} Gaussians need {} MB, but the limit is {} MB; use a smaller scene",
-                    scene.gaussians.len(),
+                    scene.gaussians().len(),
                     bytes >> 20,
                     MAX_VECTOR_BYTES >> 20
                 );
             }
-            sums = Vectors::zeros((scene.gaussians.len(), width));
+            sums = Vectors::zeros((scene.gaussians().len(), width));
         }
         let mut place = vec![None; usize::from(map.max()) + 1];
         for (k, (label, _)) in vectors.iter().enumerate() {
@@ -432,7 +438,7 @@ fn lifted(
                 *place = Some(k);
             }
         }
-        for vote in lift::votes(&scene.gaussians, &scene.view(camera), &map) {
+        for vote in lift::votes(scene.gaussians(), &scene.view(camera), &map) {
             if let Some(k) = place[usize::from(vote.label)] {
                 let mut row = sums.row_mut(vote.gaussian as usize);
                 row.iter_mut()
@@ -454,17 +460,20 @@ fn lifted(
 fn rendered(scene: &mut Scene, camera: &Camera, vectors: &Vectors) -> Result<Vectors> {
     let (pixels, width) = ((camera.width * camera.height) as usize, vectors.ncols());
     let mut out = Vectors::zeros((pixels, width));
-    let before = scene.gaussians.features.clone();
+    let original = scene.gaussians().clone();
     for first in (0..width).step_by(3) {
         let at =
             |row: ndarray::ArrayView1<f32>, k: usize| row.get(first + k).copied().unwrap_or(0.0);
-        scene.gaussians.features = vectors
+        let features = vectors
             .rows()
             .into_iter()
             .map(|row| Vec3::new(at(row, 0), at(row, 1), at(row, 2)))
             .collect();
-        scene.engine.set_state(&State::of(&scene.gaussians))?;
-        let frame = scene.engine.render(scene.view(camera), Channels::Feature)?;
+        scene.set_gaussians(Gaussians {
+            features,
+            ..original.clone()
+        })?;
+        let frame = scene.render_feature(camera)?;
         for (k, channel) in mean_features(&frame)
             .into_iter()
             .enumerate()
@@ -476,7 +485,7 @@ fn rendered(scene: &mut Scene, camera: &Camera, vectors: &Vectors) -> Result<Vec
                 .for_each(|(o, v)| *o = v);
         }
     }
-    scene.gaussians.features = before;
+    scene.set_gaussians(original)?;
     Ok(out)
 }
 

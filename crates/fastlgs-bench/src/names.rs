@@ -52,10 +52,10 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
         };
         let evaluated = |left_out: Option<usize>| -> Result<(Calibration, eval::EvalReport)> {
             let mut scene = Scene::open(root, run.device)?;
-            let own = Calibrations::of(&scene.manifest);
+            let own = Calibrations::of(scene.manifest());
             let measured = calibration_of(samples_without(left_out), own.texts.anything);
             let texts = measured.with_context(|| format!("{}: the labels of the other scenes are too few or do not separate objects; add scenes", root.display()))?;
-            scene.calibrations = Some(Calibrations { texts, ..own });
+            scene.set_calibrations(Calibrations { texts, ..own });
             let config = eval::EvalConfig {
                 scene: root.into(),
                 labels: Some(folder.into()),

@@ -108,7 +108,7 @@ fn large_query_ms(scene: &Path, run: &Run) -> Result<f64> {
         })
         .into_iter()
         .collect();
-    let camera = session.cameras[0].resized(LARGE_VIEW.0, LARGE_VIEW.1);
+    let camera = session.cameras()[0].resized(LARGE_VIEW.0, LARGE_VIEW.1);
     let started = Instant::now();
     session.field(&camera, None)?.mask(&grid, &target);
     Ok(started.elapsed().as_secs_f64() * 1e3)

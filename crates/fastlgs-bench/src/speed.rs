@@ -7,7 +7,7 @@
 use crate::plot;
 use anyhow::{Result, bail};
 use fastlgs::Run;
-use fastlgs::session::parse_size;
+use fastlgs::query::parse_size;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::{Camera, Gaussians, SceneFolder};

@@ -1,7 +1,7 @@
 //! The Python class `Answer`.
 
 use crate::options::to_python;
-use fastlgs::session::answer::AnswerReport;
+use fastlgs::query::answer::AnswerReport;
 use numpy::PyArray2;
 use pyo3::prelude::*;
 

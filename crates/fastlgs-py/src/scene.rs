@@ -6,12 +6,9 @@ use crate::fork;
 use crate::options::to_python;
 use crate::texts::Texts;
 use crate::{Error, to_py_error};
-use fastlgs::session::answer::{CANDIDATES, QueryRequest};
-use fastlgs::session::ask::ObjectQuery;
-use fastlgs::session::{Pixels, selection};
+use fastlgs::query::{ObjectQuery, Pixels, selection};
 use fastlgs_core::gaussians::rest_len;
 use fastlgs_grid::Grid;
-use fastlgs_grid::field::Field;
 use fastlgs_grid::grid::Object;
 use fastlgs_grid::query::QueryConfig;
 use glam::Vec3;
@@ -21,8 +18,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::json;
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
-use std::time::Instant;
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// One pixel, or several pixels of one object.
 #[derive(FromPyObject)]
@@ -48,10 +44,8 @@ pub struct Scene {
 }
 
 struct Opened {
-    session: fastlgs::Scene,
-    grid: Grid,
-    /// Camera and field of the view that was rendered last.
-    last_field: Option<(fastlgs_core::Camera, Field)>,
+    scene: fastlgs::Scene,
+    grid: Arc<Grid>,
 }
 
 /// The view of a query or picture.
@@ -95,30 +89,17 @@ impl Scene {
 
 impl Opened {
     fn camera(&self, which: &ViewArgument) -> fastlgs::Result<fastlgs_core::Camera> {
-        let cameras = &self.session.cameras;
+        let cameras = &self.scene.cameras();
         Ok(match which {
-            ViewArgument::Given(camera) => camera.to_scene(&self.session.manifest.frame),
+            ViewArgument::Given(camera) => camera.to_scene(&self.scene.manifest().frame),
             ViewArgument::Named(name) => {
-                cameras[self.session.folder.view_index(cameras, name)?].clone()
+                cameras[self.scene.folder().view_index(cameras, name)?].clone()
             }
             ViewArgument::First => {
                 let first = cameras.first().cloned();
                 first.ok_or_else(|| fastlgs::Error::Invalid("the scene has no views".to_owned()))?
             }
         })
-    }
-
-    /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
-    fn render_field(&mut self, camera: &fastlgs_core::Camera) -> fastlgs::Result<f64> {
-        let started = Instant::now();
-        if self
-            .last_field
-            .as_ref()
-            .is_none_or(|(shown, _)| shown != camera)
-        {
-            self.last_field = Some((camera.clone(), self.session.field(camera, None)?));
-        }
-        Ok(started.elapsed().as_secs_f64() * 1e3)
     }
 }
 
@@ -148,17 +129,13 @@ impl Scene {
     ) -> PyResult<Self> {
         fork::check()?;
         let open = || -> fastlgs::Result<Opened> {
-            let mut session = fastlgs::Scene::open(&path, device)?;
-            session.clip_text = clip_text;
+            let mut scene = fastlgs::Scene::open(&path, device)?;
+            scene.set_clip_text(clip_text);
             if let Some(embed) = embed_text {
-                session.use_text_encoder(Box::new(Texts(embed)))?;
+                scene.use_text_encoder(Box::new(Texts(embed)))?;
             }
-            let grid = session.grid()?;
-            Ok(Opened {
-                session,
-                grid,
-                last_field: None,
-            })
+            let grid = scene.grid()?;
+            Ok(Opened { scene, grid })
         };
         Ok(Self {
             opened: Mutex::new(py.detach(open).map_err(to_py_error)?),
@@ -168,13 +145,13 @@ impl Scene {
     /// The scene folder.
     #[getter]
     fn path(&self, py: Python<'_>) -> PyResult<PathBuf> {
-        self.with(py, |opened| Ok(opened.session.folder.root.clone()))
+        self.with(py, |opened| Ok(opened.scene.folder().root.clone()))
     }
 
     /// Name of the device.
     #[getter]
     fn device(&self, py: Python<'_>) -> PyResult<String> {
-        self.with(py, |opened| Ok(opened.session.engine.name()))
+        self.with(py, |opened| Ok(opened.scene.adapter()))
     }
 
     /// Names of all views, sorted.
@@ -182,8 +159,8 @@ impl Scene {
     fn views(&self, py: Python<'_>) -> PyResult<Vec<String>> {
         self.with(py, |opened| {
             Ok(opened
-                .session
-                .cameras
+                .scene
+                .cameras()
                 .iter()
                 .map(|c| c.name.clone())
                 .collect())
@@ -193,10 +170,10 @@ impl Scene {
     /// Names of the held-out views.
     #[getter]
     fn held_out(&self, py: Python<'_>) -> PyResult<Vec<String>> {
-        self.with(py, |Opened { session, .. }| {
-            Ok(session
-                .manifest
-                .held_out(&session.cameras)
+        self.with(py, |Opened { scene, .. }| {
+            Ok(scene
+                .manifest()
+                .held_out(scene.cameras())
                 .into_iter()
                 .map(|c| c.name)
                 .collect())
@@ -209,7 +186,7 @@ impl Scene {
         self.with(py, |opened| {
             Ok(Camera::from_scene(
                 opened.camera(&which)?,
-                &opened.session.manifest.frame,
+                &opened.scene.manifest().frame,
             ))
         })
     }
@@ -253,27 +230,16 @@ impl Scene {
         let which = ViewArgument::of(view)?;
         let (camera, report, mask, relevancy) = self.with(py, |opened| {
             let camera = opened.camera(&which)?;
-            let render_ms = opened.render_field(&camera)?;
-            let Opened {
-                session,
-                grid,
-                last_field,
-            } = opened;
-            let Some((_, field)) = last_field else {
-                unreachable!("rendered above")
-            };
-            let question = QueryRequest {
-                ask: &ask,
-                negatives: &negatives,
-                config,
-                dilate: None,
-                candidates: CANDIDATES,
-            };
-            let (answer, mut report) = question.answer(session, grid, field, &camera, render_ms)?;
-            let relevancy = field.relevancy(grid, &answer.found.heat());
-            let mask = answer.mask;
-            report.find_best_view(session, grid)?;
-            Ok((camera, report, mask, relevancy))
+            let answer = opened
+                .scene
+                .query(ask)
+                .camera(&camera)
+                .negatives(&negatives)
+                .false_alarms(config.false_alarms)
+                .top_k(config.top_k)
+                .run()?;
+            let relevancy = answer.relevancy();
+            Ok((camera, answer.report, answer.mask, relevancy))
         })?;
         let shape = [camera.height as usize, camera.width as usize];
         let mask = PyArray1::from_vec(py, mask).reshape(shape)?.unbind();
@@ -337,11 +303,11 @@ impl Scene {
         let planes = |color: bool| {
             self.with(py, |opened| {
                 let camera = opened.camera(&which)?;
-                let session = &mut opened.session;
+                let scene = &mut opened.scene;
                 let frame = if color {
-                    session.render(&camera)
+                    scene.render(&camera)
                 } else {
-                    session.render_feature(&camera)
+                    scene.render_feature(&camera)
                 }?;
                 let pixels = size(&camera).iter().product::<usize>();
                 let planes = if color {
@@ -371,11 +337,11 @@ impl Scene {
             "depth" => {
                 let (size, values) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
-                    let unit = opened.session.manifest.frame.scale as f32;
+                    let unit = opened.scene.manifest().frame.scale as f32;
                     Ok((
                         size(&camera),
                         opened
-                            .session
+                            .scene
                             .render_depth(&camera)?
                             .into_iter()
                             .map(|depth| unit * depth)
@@ -387,12 +353,8 @@ impl Scene {
             "objects" => {
                 let (size, owners) = self.with(py, |opened| {
                     let camera = opened.camera(&which)?;
-                    opened.render_field(&camera)?;
-                    let owners = opened
-                        .last_field
-                        .as_ref()
-                        .map(|(_, field)| field.owners(&opened.grid).labels);
-                    Ok((size(&camera), owners.unwrap_or_default()))
+                    let field = opened.scene.field(&camera, None)?;
+                    Ok((size(&camera), field.owners(&opened.grid).labels))
                 })?;
                 to_numpy(py, owners, &size)
             }
@@ -417,8 +379,8 @@ impl Scene {
     fn gaussians<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let (mut scene, frame) = self.with(py, |opened| {
             Ok((
-                opened.session.gaussians.clone(),
-                opened.session.manifest.frame,
+                opened.scene.gaussians().clone(),
+                opened.scene.manifest().frame,
             ))
         })?;
         let n = scene.len();
@@ -487,7 +449,7 @@ impl Scene {
     fn select<'py>(&self, py: Python<'py>, ids: Vec<u16>) -> PyResult<Bound<'py, PyArray1<u32>>> {
         let places = self.with(py, |opened| {
             Ok(selection::gaussians(
-                &opened.session.gaussians,
+                opened.scene.gaussians(),
                 &opened.grid,
                 &ids,
             ))
@@ -511,40 +473,23 @@ impl Scene {
         if rest && ids.is_none() {
             return Err(Error::new_err("rest needs ids: the objects to leave out"));
         }
-        self.with(
-            py,
-            |Opened {
-                 session:
-                     fastlgs::Scene {
-                         gaussians,
-                         cameras,
-                         manifest,
-                         ..
-                     },
-                 grid,
-                 ..
-             }| {
-                let world = selection::World::of(manifest, cameras);
-                match &ids {
-                    None => selection::write(&path, gaussians, &world),
-                    Some(ids) => selection::export(
-                        &path,
-                        gaussians,
-                        &world,
-                        &selection::gaussians(gaussians, grid, ids),
-                        !rest,
-                    ),
-                }
-            },
-        )
+        self.with(py, |Opened { scene, grid }| {
+            let gaussians = scene.gaussians();
+            let world = selection::World::of(scene.manifest(), scene.cameras());
+            let Some(ids) = &ids else {
+                return selection::write(&path, gaussians, &world);
+            };
+            let selected = selection::gaussians(gaussians, grid, ids);
+            selection::export(&path, gaussians, &world, &selected, !rest)
+        })
     }
 
     fn __repr__(&self, py: Python<'_>) -> PyResult<String> {
-        self.with(py, |Opened { session, grid, .. }| {
-            let root = session.folder.root.display();
+        self.with(py, |Opened { scene, grid, .. }| {
+            let root = scene.folder().root.display();
             Ok(format!(
                 "Scene('{root}', {} Gaussians, {} objects)",
-                session.gaussians.len(),
+                scene.gaussians().len(),
                 grid.objects.len()
             ))
         })

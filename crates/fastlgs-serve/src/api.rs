@@ -11,12 +11,9 @@ use axum::extract::{Path, Query, State};
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use base64::Engine as _;
-use fastlgs::session::Pixels;
-use fastlgs::session::answer::{CANDIDATES, QueryRequest};
-use fastlgs::session::ask::ObjectQuery;
-use fastlgs::session::pictures::{heatmap, mask_picture, overlay};
-use fastlgs::session::selection::World;
-use fastlgs::session::{parse_size, selection};
+use fastlgs::query::pictures::{heatmap, mask_picture, overlay};
+use fastlgs::query::selection::World;
+use fastlgs::query::{CANDIDATES, ObjectQuery, Pixels, parse_size, selection};
 use fastlgs::teach::teach_object;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::{Camera, image_io, turbo};
@@ -50,7 +47,7 @@ pub async fn scene(State(app): App) -> Answer {
             let live = app.live.as_ref().ok_or_else(Failure::busy)?;
             json!({ "stage": "training", "antialias": live.antialias, "background": live.background, "objects": 0 })
         }
-        Some(bell) => bell.ask(|desk| Ok(desk.description())).await?,
+        Some(handle) => handle.ask(|worker| Ok(worker.description())).await?,
     };
     if let (Value::Object(all), Value::Object(more)) = (&mut value, more) {
         all.extend(more);
@@ -72,7 +69,7 @@ pub async fn training(State(app): App) -> Answer<Response> {
 /// `GET /api/splats`: returns the Gaussians, packed for browsers.
 pub async fn splats(State(app): App) -> Answer<Response> {
     let data = match (app.bell(), &app.live) {
-        (Some(bell), _) => bell.ask(|desk| Ok(desk.splats())).await?,
+        (Some(handle), _) => handle.ask(|worker| Ok(worker.splats())).await?,
         (None, Some(live)) => live.splats(),
         (None, None) => return Err(Failure::busy()),
     };
@@ -81,7 +78,7 @@ pub async fn splats(State(app): App) -> Answer<Response> {
 
 /// `GET /api/objects`: lists all objects and parts in order of their ids.
 pub async fn objects(State(app): App) -> Answer {
-    app.ready()?.ask(|desk| Ok(Json(desk.objects()?))).await
+    app.ready()?.ask(|worker| Ok(Json(worker.objects()?))).await
 }
 
 /// `GET /api/objects/{id}/thumbnail.png`: returns a small picture of an object.
@@ -89,7 +86,7 @@ pub async fn thumbnail(State(app): App, id: Result<Path<u16>, PathRejection>) ->
     let Path(id) = id?;
     let made = app
         .ready()?
-        .ask(move |desk| Ok(desk.thumbnail(id)?))
+        .ask(move |worker| Ok(worker.thumbnail(id)?))
         .await?;
     let data = made
         .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
@@ -101,7 +98,7 @@ pub async fn best_view(State(app): App, id: Result<Path<u16>, PathRejection>) ->
     let Path(id) = id?;
     let view = app
         .ready()?
-        .ask(move |desk| Ok(desk.best_view(id)?))
+        .ask(move |worker| Ok(worker.best_view(id)?))
         .await?;
     let view = view
         .ok_or_else(|| Failure::new(StatusCode::NOT_FOUND, format!("no view shows object {id}")))?;
@@ -119,7 +116,7 @@ pub struct NameRequest {
 /// `GET /api/names`: lists the names that were taught with the scene's encoder.
 pub async fn names(State(app): App) -> Answer {
     app.ready()?
-        .ask(|desk| Ok(Json(json!(desk.scene.taught_names()?))))
+        .ask(|worker| Ok(Json(json!(worker.scene.taught_names()?))))
         .await
 }
 
@@ -127,18 +124,18 @@ pub async fn names(State(app): App) -> Answer {
 pub async fn name(State(app): App, request: Result<Json<NameRequest>, JsonRejection>) -> Answer {
     let Json(naming) = request?;
     let name = checked_text(&naming.name)?.to_owned();
-    let work = move |desk: &mut SceneWorker| {
+    let work = move |worker: &mut SceneWorker| {
         let is_object = usize::from(naming.object)
             .checked_sub(1)
-            .is_some_and(|k| k < desk.grid.objects.len());
+            .is_some_and(|k| k < worker.grid.objects.len());
         if !is_object {
             return Err(Failure::new(
                 StatusCode::NOT_FOUND,
                 format!("the scene has no object {}", naming.object),
             ));
         }
-        let learned = teach_object(&desk.scene, &desk.grid, &name, naming.object)?;
-        desk.scene.forget_texts();
+        let learned = teach_object(&worker.scene, &worker.grid, &name, naming.object)?;
+        worker.scene.forget_texts();
         Ok(Json(
             json!({ "name": learned.name, "object": learned.object, "views": learned.views, "examples": learned.examples }),
         ))
@@ -313,42 +310,35 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         hidden: asked.hidden,
         only: asked.only,
     };
-    let work = move |desk: &mut SceneWorker| {
+    let work = move |worker: &mut SceneWorker| {
         let defaults = QueryConfig::default();
         let config = QueryConfig {
             false_alarms: asked.false_alarms.unwrap_or(defaults.false_alarms),
             top_k: asked.top_k.unwrap_or(defaults.top_k).max(1),
         };
-        let candidates = asked.candidates.unwrap_or(CANDIDATES);
-        let Some(render_ms) = desk.render_field(&camera, &choice)? else {
+        if !worker.set_visible(&choice)? {
             return Err(Failure::bad_request(
                 "nothing would be left to query; hide fewer objects",
             ));
-        };
-        let question = QueryRequest {
-            ask: &ask,
-            negatives: &negatives,
-            config,
-            dilate: None,
-            candidates,
-        };
-        let (answer, mut report) = question.answer(
-            &desk.scene,
-            &desk.grid,
-            desk.last_field()?,
-            &camera,
-            render_ms,
-        )?;
-        let mask = (want_mask && report.found)
+        }
+        let answer = worker
+            .scene
+            .query(ask)
+            .camera(&camera)
+            .negatives(&negatives)
+            .false_alarms(config.false_alarms)
+            .top_k(config.top_k)
+            .candidates(asked.candidates.unwrap_or(CANDIDATES))
+            .run()?;
+        let mask = (want_mask && answer.report.found)
             .then(|| mask_picture(&answer.mask, camera.width, camera.height));
-        let relevancy = want_heat.then(|| answer.field.relevancy(&desk.grid, &answer.found.heat()));
-        report.find_best_view(&mut desk.scene, &desk.grid)?;
-        let mut value = serde_json::to_value(&report).map_err(anyhow::Error::from)?;
+        let relevancy = want_heat.then(|| answer.relevancy());
+        let mut value = serde_json::to_value(&answer.report).map_err(anyhow::Error::from)?;
         if let Some(mask) = mask {
             value["mask"] = data_url(mask)?;
         }
         if let Some(relevancy) = relevancy {
-            let frame = desk.scene.render(&camera)?;
+            let frame = worker.scene.render(&camera)?;
             let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
             value["heatmap"] = data_url(heatmap(&color, &relevancy))?;
         }
@@ -413,24 +403,24 @@ pub async fn render(
         hidden: wanted.hidden,
         only: wanted.only,
     };
-    let work = move |desk: &mut SceneWorker| {
-        if !desk.set_visible(&choice)? {
+    let work = move |worker: &mut SceneWorker| {
+        if !worker.set_visible(&choice)? {
             return Err(Failure::bad_request(
                 "nothing would be left to show; hide fewer objects",
             ));
         }
-        let frame = desk.scene.render(&camera)?;
+        let frame = worker.scene.render(&camera)?;
         let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
         let picture = if what == "objects" {
-            let ids = desk.scene.field(&camera, None)?.owners(&desk.grid);
+            let ids = worker.scene.field(&camera, None)?.owners(&worker.grid);
             RgbImage::from_fn(ids.width, ids.height, |x, y| {
                 Rgb(turbo::id_color(ids.at(x, y)))
             })
         } else if let Some(text) = &text {
-            let field = desk.scene.field(&camera, None)?;
-            let meaning = ObjectQuery::Text(text.clone()).embed(&desk.scene, &[])?;
-            let found = meaning.find(&desk.grid, &field, &camera, &QueryConfig::default())?;
-            heatmap(&color, &field.relevancy(&desk.grid, &found.heat()))
+            let field = worker.scene.field(&camera, None)?;
+            let meaning = ObjectQuery::Text(text.clone()).embed(&worker.scene, &[])?;
+            let found = meaning.find(&worker.grid, &field, &camera, &QueryConfig::default())?;
+            heatmap(&color, &field.relevancy(&worker.grid, &found.heat()))
         } else if wanted.selected.is_empty() {
             color
         } else {
@@ -444,7 +434,7 @@ pub async fn render(
                 .collect();
             overlay(
                 &color,
-                &desk.scene.field(&camera, None)?.mask(&desk.grid, &hits),
+                &worker.scene.field(&camera, None)?.mask(&worker.grid, &hits),
             )
         };
         Ok(image_io::encode_png(picture)?)
@@ -497,10 +487,11 @@ pub async fn export(
         app.name,
         if wanted.keep { "selection" } else { "rest" }
     );
-    let work = move |desk: &mut SceneWorker| {
-        desk.set_visible(&VisibleObjects::default())?;
-        let selected = selection::gaussians(&desk.scene.gaussians, &desk.grid, &ids);
-        if selected.is_empty() || (!wanted.keep && selected.len() == desk.scene.gaussians.len()) {
+    let work = move |worker: &mut SceneWorker| {
+        worker.set_visible(&VisibleObjects::default())?;
+        let selected = selection::gaussians(worker.scene.gaussians(), &worker.grid, &ids);
+        if selected.is_empty() || (!wanted.keep && selected.len() == worker.scene.gaussians().len())
+        {
             return Err(Failure::bad_request(
                 "there is nothing to write: the selection has no Gaussians",
             ));
@@ -508,8 +499,14 @@ pub async fn export(
         let folder = tempfile::tempdir()
             .map_err(|e| anyhow::anyhow!("cannot create a temporary folder: {e}"))?;
         let path = folder.path().join("selection").with_extension(&ending);
-        let world = World::of(&desk.scene.manifest, &desk.scene.cameras);
-        selection::export(&path, &desk.scene.gaussians, &world, &selected, wanted.keep)?;
+        let world = World::of(worker.scene.manifest(), worker.scene.cameras());
+        selection::export(
+            &path,
+            worker.scene.gaussians(),
+            &world,
+            &selected,
+            wanted.keep,
+        )?;
         Ok(fastlgs_core::fs::read(&path)?)
     };
     let data: Vec<u8> = app.ready()?.ask(work).await?;

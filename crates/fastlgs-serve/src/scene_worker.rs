@@ -3,20 +3,19 @@
 use crate::failure::Failure;
 use crate::splats;
 use crate::thumbnails::Thumbnails;
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use axum::body::Bytes;
 use axum::http::StatusCode;
 use fastlgs::Scene;
-use fastlgs::session::selection;
-use fastlgs_core::{Camera, Gaussians, WorldFrame, turbo};
+use fastlgs::query::selection;
+use fastlgs_core::{Gaussians, WorldFrame, turbo};
 use fastlgs_grid::Grid;
-use fastlgs_grid::field::Field;
 use fastlgs_grid::grid::Object;
 use fastlgs_grid::query::{self, QueryConfig};
 use image::RgbImage;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::sync::Arc;
 use tokio::sync::{mpsc, oneshot};
 
 /// Largest number of waiting requests; further ones get status 503.
@@ -27,11 +26,9 @@ pub struct SceneWorker {
     /// The scene.
     pub scene: Scene,
     /// Object table of the scene.
-    pub grid: Grid,
+    pub grid: Arc<Grid>,
     /// Cached pictures of objects.
     thumbnails: Thumbnails,
-    /// Camera and visible objects of the last query, and the field rendered for them.
-    seen: Option<(Camera, VisibleObjects, Field)>,
     /// Visible objects, whose Gaussians are on the device. `all` has all Gaussians while some are
     /// hidden.
     visible: VisibleObjects,
@@ -59,13 +56,12 @@ impl SceneWorker {
     /// Opens a scene on a device. `clip_text` replaces the CLIP text tower that the scene names.
     pub fn new(root: &Path, device: &str, clip_text: Option<PathBuf>) -> Result<Self> {
         let mut scene = Scene::open(root, device)?;
-        scene.clip_text = clip_text;
+        scene.set_clip_text(clip_text);
         let grid = scene.grid()?;
         Ok(Self {
             scene,
             grid,
             thumbnails: Thumbnails::default(),
-            seen: None,
             visible: VisibleObjects::default(),
             all: None,
             splats: None,
@@ -74,26 +70,26 @@ impl SceneWorker {
 
     /// Opens a scene on a new thread. Returns when it can answer queries.
     pub fn open(root: PathBuf, device: String, clip_text: Option<PathBuf>) -> Result<SceneHandle> {
-        let (bell, mut work) = mpsc::channel::<Work>(MAX_WAITING);
+        let (sender, mut work) = mpsc::channel::<Work>(MAX_WAITING);
         let (open_result, wait) = std::sync::mpsc::channel();
         std::thread::Builder::new()
             .name("scene".into())
             .spawn(move || {
                 let open = || -> Result<Self> {
-                    let mut desk = Self::new(&root, &device, clip_text)?;
-                    desk.scene.warm_up()?;
+                    let mut worker = Self::new(&root, &device, clip_text)?;
+                    worker.scene.warm_up()?;
                     // Loads the text encoder before the first query. Without it, the page still shows
                     // the scene.
-                    if let Err(error) = desk.scene.text_query("warm up") {
+                    if let Err(error) = worker.scene.text_query("warm up") {
                         tracing::warn!("text queries are not available: {error:#}");
                     }
-                    Ok(desk)
+                    Ok(worker)
                 };
                 match open() {
-                    Ok(mut desk) => {
+                    Ok(mut worker) => {
                         let _ = open_result.send(Ok(()));
                         while let Some(work) = work.blocking_recv() {
-                            work(&mut desk);
+                            work(&mut worker);
                         }
                     }
                     Err(error) => {
@@ -103,42 +99,7 @@ impl SceneWorker {
             })?;
         wait.recv()
             .map_err(|_| anyhow!("the scene worker stopped before the scene was opened"))??;
-        Ok(SceneHandle(bell))
-    }
-
-    /// Renders the field of a view, unless it was rendered last. Returns the milliseconds.
-    ///
-    /// Returns `None` and changes nothing if no Gaussian would be visible.
-    pub fn render_field(
-        &mut self,
-        camera: &Camera,
-        choice: &VisibleObjects,
-    ) -> Result<Option<f64>> {
-        if !self.set_visible(choice)? {
-            return Ok(None);
-        }
-        if self
-            .seen
-            .as_ref()
-            .is_some_and(|(seen, shown, _)| (seen, shown) == (camera, choice))
-        {
-            return Ok(Some(0.0));
-        }
-        let started = Instant::now();
-        let field = self.scene.field(camera, None)?;
-        self.seen = Some((camera.clone(), choice.clone(), field));
-        Ok(Some(started.elapsed().as_secs_f64() * 1e3))
-    }
-
-    /// Returns the field that [`Self::render_field`] rendered last.
-    ///
-    /// # Errors
-    /// No view was rendered yet.
-    pub fn last_field(&self) -> Result<&Field> {
-        self.seen
-            .as_ref()
-            .map(|seen| &seen.2)
-            .context("no view was rendered")
+        Ok(SceneHandle(sender))
     }
 
     /// Sets the visible objects of later renderings.
@@ -148,7 +109,9 @@ impl SceneWorker {
         if self.visible == *choice {
             return Ok(true);
         }
-        let all = &*self.all.get_or_insert_with(|| self.scene.gaussians.clone());
+        let all = &*self
+            .all
+            .get_or_insert_with(|| self.scene.gaussians().clone());
         if *choice == VisibleObjects::default() {
             self.scene.set_gaussians(all.clone())?;
             self.all = None;
@@ -162,11 +125,11 @@ impl SceneWorker {
             };
             let shown =
                 |i: &usize| !among(&hidden, *i) && (choice.only.is_empty() || among(&only, *i));
-            let places: Vec<usize> = (0..all.len()).filter(shown).collect();
-            if places.is_empty() {
+            let visible: Vec<usize> = (0..all.len()).filter(shown).collect();
+            if visible.is_empty() {
                 return Ok(false);
             }
-            self.scene.set_gaussians(all.select(&places))?;
+            self.scene.set_gaussians(all.select(&visible))?;
         }
         self.visible = choice.clone();
         Ok(true)
@@ -176,18 +139,18 @@ impl SceneWorker {
     pub fn description(&self) -> Value {
         json!({
             "stage": "ready",
-            "antialias": self.scene.trained.antialias,
-            "background": self.scene.trained.background,
+            "antialias": self.scene.trained().antialias,
+            "background": self.scene.trained().background,
             "objects": self.grid.objects.len(),
             "overlaps": self.grid.overlaps.0,
             "gaussians": self.gaussians(),
             "min_score": QueryConfig::default().min_score(),
             "support_share": query::SUPPORT_SHARE,
-            "segmenter": self.scene.manifest.segmenter,
-            "encoder": self.scene.manifest.encoder,
-            "adapter": self.scene.engine.name(),
+            "segmenter": self.scene.manifest().segmenter,
+            "encoder": self.scene.manifest().encoder,
+            "adapter": self.scene.adapter(),
             // This interface uses scene coordinates: world = origin + scale x scene.
-            "frame": self.scene.manifest.frame,
+            "frame": self.scene.manifest().frame,
         })
     }
 
@@ -196,7 +159,7 @@ impl SceneWorker {
         self.set_visible(&VisibleObjects::default())?;
         // One pass over all Gaussians. Those of an object include those of its parts.
         let mut own: Vec<Vec<usize>> = vec![Vec::new(); self.grid.objects.len() + 1];
-        for (i, id) in self.scene.gaussians.object_ids.iter().enumerate() {
+        for (i, id) in self.scene.gaussians().object_ids.iter().enumerate() {
             for above in self.grid.chain(*id) {
                 own[usize::from(above)].push(i);
             }
@@ -211,7 +174,7 @@ impl SceneWorker {
                 "share": shares[usize::from(o.id) - 1],
                 "views": o.views,
                 "gaussians": own.len(),
-                "bbox3d": selection::robust_box(&self.scene.gaussians, &WorldFrame::default(), own),
+                "bbox3d": selection::robust_box(self.scene.gaussians(), &WorldFrame::default(), own),
                 "color": turbo::id_color(o.id),
             })
         };
@@ -239,12 +202,12 @@ impl SceneWorker {
 
     /// Returns the number of Gaussians, including hidden ones.
     pub fn gaussians(&self) -> usize {
-        self.all.as_ref().unwrap_or(&self.scene.gaussians).len()
+        self.all.as_ref().unwrap_or(self.scene.gaussians()).len()
     }
 
     /// Returns all Gaussians, packed for browsers.
     pub fn splats(&mut self) -> Bytes {
-        let all = self.all.as_ref().unwrap_or(&self.scene.gaussians);
+        let all = self.all.as_ref().unwrap_or(self.scene.gaussians());
         self.splats
             .get_or_insert_with(|| Bytes::from(splats::pack(all)))
             .clone()
@@ -262,10 +225,10 @@ impl SceneHandle {
         work: impl FnOnce(&mut SceneWorker) -> Result<T, Failure> + Send + 'static,
     ) -> Result<T, Failure> {
         let (reply, answer) = oneshot::channel();
-        let work: Work = Box::new(move |desk| {
+        let work: Work = Box::new(move |worker| {
             if !reply.is_closed() {
                 // A panic fails this request, not the server.
-                let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(desk)));
+                let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(worker)));
                 let failed = || {
                     Failure::new(
                         StatusCode::INTERNAL_SERVER_ERROR,

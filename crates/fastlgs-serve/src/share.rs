@@ -6,7 +6,7 @@ use crate::shared::views;
 use crate::{page, splats, subject_distance};
 use anyhow::{Context, Result, bail};
 use fastlgs::Run;
-use fastlgs::session::phrase::normalised;
+use fastlgs::query::phrase::normalised;
 use fastlgs_core::camera::mean_up;
 use fastlgs_core::fs::{write_atomic, write_json};
 use fastlgs_grid::Grid;
@@ -82,14 +82,14 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
             root.display()
         );
     }
-    let mut desk = SceneWorker::new(&config.scene, run.device, config.clip_text.clone())?;
+    let mut worker = SceneWorker::new(&config.scene, run.device, config.clip_text.clone())?;
     if let Some(degree) = config.sh_degree {
-        let lower = desk
+        let lower = worker
             .scene
-            .gaussians
+            .gaussians()
             .clone()
-            .with_sh_degree(degree.min(desk.scene.gaussians.sh_degree));
-        desk.scene.set_gaussians(lower)?;
+            .with_sh_degree(degree.min(worker.scene.gaussians().sh_degree));
+        worker.scene.set_gaussians(lower)?;
     }
     let parent = std::path::absolute(root)?
         .parent()
@@ -101,7 +101,7 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
         .prefix(".share-")
         .tempdir_in(&parent)
         .with_context(|| parent.display().to_string())?;
-    let (words, found) = write_files(partial.path(), &mut desk, config, run)?;
+    let (words, found) = write_files(partial.path(), &mut worker, config, run)?;
     let size = bytes(partial.path());
     if is_export {
         // Replaces only files of an earlier export: the folder may be a repository.
@@ -135,7 +135,7 @@ pub fn share(config: &ShareConfig, run: &Run) -> Result<ShareReport> {
         scene: config.scene.clone(),
         output: root.clone(),
         bytes: size,
-        gaussians: desk.gaussians(),
+        gaussians: worker.gaussians(),
         words,
         found,
     })
@@ -191,21 +191,21 @@ fn make_readable(folder: &Path) -> Result<()> {
 /// Writes all files. Returns the number of words, and the number of those that name an object.
 fn write_files(
     root: &Path,
-    desk: &mut SceneWorker,
+    worker: &mut SceneWorker,
     config: &ShareConfig,
     run: &Run,
 ) -> Result<(usize, usize)> {
     let data = root.join("data");
-    let (words, rows, found) = words(desk, config.words, run)?;
+    let (words, rows, found) = words(worker, config.words, run)?;
     write_json(&data.join("words.json"), &words)?;
-    write_json(&data.join("names.json"), &desk.scene.taught_names()?)?;
+    write_json(&data.join("names.json"), &worker.scene.taught_names()?)?;
     write(&data.join("words.bin"), &rows)?;
-    let cameras = &desk.scene.cameras;
+    let cameras = &worker.scene.cameras();
     let focus: Vec<f32> = cameras
         .iter()
-        .map(|camera| subject_distance(&desk.scene.gaussians.means, camera))
+        .map(|camera| subject_distance(&worker.scene.gaussians().means, camera))
         .collect();
-    let mut views = views(&desk.scene.folder, cameras, &focus)?;
+    let mut views = views(worker.scene.folder(), cameras, &focus)?;
     // Photos are not exported.
     views
         .iter_mut()
@@ -214,7 +214,7 @@ fn write_files(
         .scene
         .canonicalize()
         .unwrap_or_else(|_| config.scene.clone());
-    let mut about = desk.description();
+    let mut about = worker.description();
     about["name"] = json!(scene.file_name().unwrap_or_default().to_string_lossy());
     about["up"] = json!(mean_up(cameras).to_array());
     about["views"] = json!(views);
@@ -223,18 +223,18 @@ fn write_files(
     write_json(&data.join("scene.json"), &about)?;
     write(
         &data.join("splats.bin"),
-        &splats::pack(&desk.scene.gaussians),
+        &splats::pack(worker.scene.gaussians()),
     )?;
-    write_json(&data.join("objects.json"), &desk.objects()?)?;
-    for id in 1..=desk.grid.objects.len() as u16 {
-        if let Some(picture) = desk.picture(id)? {
+    write_json(&data.join("objects.json"), &worker.objects()?)?;
+    for id in 1..=worker.grid.objects.len() as u16 {
+        if let Some(picture) = worker.picture(id)? {
             let mut jpeg = Vec::new();
             picture.write_with_encoder(JpegEncoder::new_with_quality(&mut jpeg, JPEG_QUALITY))?;
             write(&data.join(format!("objects/{id}/thumbnail.jpg")), &jpeg)?;
         }
         write_json(
             &data.join(format!("objects/{id}/view.json")),
-            &json!({ "view": desk.best_view(id)? }),
+            &json!({ "view": worker.best_view(id)? }),
         )?;
     }
     for (name, content) in page::files() {
@@ -274,8 +274,8 @@ fn write(path: &Path, content: &[u8]) -> Result<()> {
 }
 
 /// Returns the words, one [`Row`] for each, and the number of words that name an object.
-fn words(desk: &SceneWorker, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
-    let taught = desk
+fn words(worker: &SceneWorker, common: usize, run: &Run) -> Result<(Vec<String>, Vec<u8>, usize)> {
+    let taught = worker
         .scene
         .taught_names()?
         .into_iter()
@@ -293,10 +293,10 @@ fn words(desk: &SceneWorker, common: usize, run: &Run) -> Result<(Vec<String>, V
     // Texts of similar length need less padding in a batch.
     words.sort_by_key(|word| (word.split_whitespace().count(), word.len()));
     let work = run.work("words", words.len().div_ceil(BATCH) as u64);
-    let (grid, config) = (&desk.grid, QueryConfig::default());
+    let (grid, config) = (&worker.grid, QueryConfig::default());
     let mut rows = Vec::new();
     for batch in words.chunks(BATCH) {
-        let queries = desk.scene.text_queries(batch)?;
+        let queries = worker.scene.text_queries(batch)?;
         rows.par_extend(queries.par_iter().map(|query| row(grid, query, &config)));
         work.advance()?;
     }

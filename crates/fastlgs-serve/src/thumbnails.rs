@@ -36,7 +36,7 @@ struct Best {
 
 /// Returns the step between searched views.
 fn step(scene: &Scene) -> usize {
-    scene.cameras.len().div_ceil(VIEWS).max(1)
+    scene.cameras().len().div_ceil(VIEWS).max(1)
 }
 
 impl Thumbnails {
@@ -82,7 +82,7 @@ impl Thumbnails {
     /// Returns the name of the searched view that shows most of an object, or `None` if none does.
     pub fn view(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<String>> {
         let best = self.best(scene, grid, id)?;
-        Ok(best.map(|best| scene.cameras[best.view * step(scene)].name.clone()))
+        Ok(best.map(|best| scene.cameras()[best.view * step(scene)].name.clone()))
     }
 
     fn best(&mut self, scene: &mut Scene, grid: &Grid, id: u16) -> Result<Option<Best>> {
@@ -95,7 +95,7 @@ impl Thumbnails {
     /// Renders the searched views, and finds for each object the one with most of its pixels.
     fn search(&mut self, scene: &mut Scene, grid: &Grid) -> Result<()> {
         let cameras: Vec<Camera> = scene
-            .cameras
+            .cameras()
             .iter()
             .step_by(step(scene))
             .map(|c| c.shrunk_to(VIEW_SIDE))

@@ -4,10 +4,7 @@
 //! `cargo run --release -p fastlgs --example photos_to_answers -- PHOTOS SCENE TEXT`
 
 use fastlgs::progress::{Message, Sink};
-use fastlgs::session::answer::QueryRequest;
-use fastlgs::session::ask::ObjectQuery;
 use fastlgs::{Run, Scene, preprocess, train};
-use fastlgs_grid::query::QueryConfig;
 
 /// Prints the name of each stage, and warnings.
 struct Stages;
@@ -60,22 +57,14 @@ fn main() -> fastlgs::Result<()> {
         trained.psnr_held_out.unwrap_or(f64::NAN)
     );
 
-    let mut session = Scene::open(scene.as_ref(), "auto")?;
-    let (camera, grid) = (session.cameras[0].clone(), session.grid()?);
-    let field = session.field(&camera, None)?;
-    let question = QueryRequest {
-        ask: &ObjectQuery::Text(text.clone()),
-        negatives: &[],
-        config: QueryConfig::default(),
-        dilate: None,
-        candidates: 3,
-    };
-    let (answer, report) = question.answer(&session, &grid, &field, &camera, 0.0)?;
-    let pixels = answer.mask.iter().filter(|m| **m).count();
+    let mut scene = Scene::open(scene.as_ref(), "auto")?;
+    let answer = scene.query(text.as_str()).run()?;
+    let report = &answer.report;
     println!(
-        "{text}: {}, score {:.2}, {pixels} pixels of {}",
+        "{text}: {}, score {:.2}, {} pixels of {}",
         if report.found { "found" } else { "not found" },
         report.score,
+        report.pixels,
         report.view
     );
     Ok(())

@@ -232,7 +232,8 @@ pub fn samples_of(scene: &mut Scene, views: &[LabelledView]) -> Result<Samples> 
     let seen = || grid.objects.iter().filter(|o| !o.embeddings.is_empty());
     let mut samples = Samples::default();
     for view in views {
-        let camera = scene.cameras[scene.folder.view_index(&scene.cameras, &view.name)?].clone();
+        let camera =
+            scene.cameras()[scene.folder().view_index(scene.cameras(), &view.name)?].clone();
         let field = scene.field(&camera, None)?;
         for label in &view.labels {
             let (iou, _, id) = best_object(

@@ -3,7 +3,7 @@
 use crate::compared::Compared;
 use crate::error::{Context, bail};
 use crate::output::SceneLock;
-use crate::session::selection;
+use crate::query::selection;
 use crate::staged::StagedOutput;
 use crate::{Result, Run, Scene, train};
 use fastlgs_core::compact::{self, Precision};
@@ -131,27 +131,27 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
         );
     }
     let mut scene = Scene::open(&config.scene, run.device)?;
-    let held_out = scene.manifest.held_out(&scene.cameras);
+    let held_out = scene.manifest().held_out(scene.cameras());
     // Without held-out views, one training view measures the loss.
     let shown = if held_out.is_empty() {
-        scene.cameras.iter().take(1).cloned().collect()
+        scene.cameras().iter().take(1).cloned().collect()
     } else {
         held_out.clone()
     };
     let before = pictures(&mut scene, &shown)?;
     let degree = config
         .sh_degree
-        .unwrap_or(scene.gaussians.sh_degree)
-        .min(scene.gaussians.sh_degree);
-    if degree < scene.gaussians.sh_degree {
-        scene.set_gaussians(scene.gaussians.clone().with_sh_degree(degree))?;
+        .unwrap_or(scene.gaussians().sh_degree)
+        .min(scene.gaussians().sh_degree);
+    if degree < scene.gaussians().sh_degree {
+        scene.set_gaussians(scene.gaussians().clone().with_sh_degree(degree))?;
     }
     let (written, precision) = if file {
-        let world = selection::World::of(&scene.manifest, &scene.cameras);
-        selection::write(&config.output, &scene.gaussians, &world)?;
+        let world = selection::World::of(scene.manifest(), scene.cameras());
+        selection::write(&config.output, scene.gaussians(), &world)?;
         let written = match ending {
             // glTF stores the floats unchanged.
-            "glb" => scene.gaussians.clone(),
+            "glb" => scene.gaussians().clone(),
             _ => splat_file::read(&config.output, &world.frame)?.0,
         };
         (written, None)
@@ -176,16 +176,16 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
         scene: config.scene.clone(),
         output: config.output.clone(),
         bytes: bytes_of(&config.output),
-        bytes_before: crate::session::query_file_bytes(&config.scene),
-        gaussians: scene.gaussians.len(),
-        sh_degree: scene.gaussians.sh_degree,
+        bytes_before: crate::scene::query_file_bytes(&config.scene),
+        gaussians: scene.gaussians().len(),
+        sh_degree: scene.gaussians().sh_degree,
         bytes_a_value: precision,
         psnr_held_out: BeforeAfter {
             before: against_photos(&scene, &held_out, &before)?,
             after: against_photos(&scene, &held_out, &after)?,
         },
         psnr_against_original: same.iter().sum::<f64>() / same.len().max(1) as f64,
-        adapter: scene.engine.name(),
+        adapter: scene.adapter(),
     })))
 }
 
@@ -201,7 +201,7 @@ fn pictures(scene: &mut Scene, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
 fn have_photos(scene: &Scene, views: &[Camera]) -> bool {
     views
         .iter()
-        .all(|view| scene.folder.photo_path(&view.name).is_file())
+        .all(|view| scene.folder().photo_path(&view.name).is_file())
 }
 
 /// Returns the mean PSNR of renders against photos in dB, over the pixels that count; `None` if
@@ -211,12 +211,12 @@ fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Res
         return Ok(None);
     }
     let background = train::Background {
-        color: scene.trained.background,
+        color: scene.trained().background,
         learn: false,
     };
     let mut each = Vec::new();
     for (camera, picture) in views.iter().zip(pictures) {
-        let target = train::target(&scene.folder, camera, None, &background)?;
+        let target = train::target(scene.folder(), camera, None, &background)?;
         each.extend(Compared::of(&target, picture).map(|compared| compared.psnr()));
     }
     Ok((!each.is_empty()).then(|| each.iter().sum::<f64>() / each.len() as f64))
@@ -225,13 +225,13 @@ fn against_photos(scene: &Scene, views: &[Camera], pictures: &[Vec<f32>]) -> Res
 /// Returns the least precision that suffices for some training views; the default if their photos
 /// are missing.
 fn precision(scene: &mut Scene) -> Result<Precision> {
-    let training = scene.manifest.training(&scene.cameras);
+    let training = scene.manifest().training(scene.cameras());
     let views: Vec<Camera> = training
         .iter()
         .step_by(training.len().div_ceil(PRECISION_VIEWS).max(1))
         .cloned()
         .collect();
-    let original = scene.gaussians.clone();
+    let original = scene.gaussians().clone();
     let before = pictures(scene, &views)?;
     if against_photos(scene, &views, &before)?.is_none() {
         return Ok(Precision::default());
@@ -252,7 +252,7 @@ fn precision(scene: &mut Scene) -> Result<Precision> {
 /// # Errors
 /// The folder is a trained scene, or the features of the scene are not the codes of its objects.
 fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)> {
-    if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder.root).ok() {
+    if std::fs::canonicalize(root).ok() == std::fs::canonicalize(&scene.folder().root).ok() {
         bail!(
             "{}: this folder is the scene itself; choose another folder",
             root.display()
@@ -268,10 +268,10 @@ fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)
     }
     let grid = scene.grid()?;
     if scene
-        .gaussians
+        .gaussians()
         .object_ids
         .iter()
-        .zip(&scene.gaussians.features)
+        .zip(&scene.gaussians().features)
         .any(|(id, f)| grid.code_of(*id) != *f)
     {
         bail!(
@@ -280,7 +280,7 @@ fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)
     }
     let precision = precision(scene)?;
     let staged = StagedOutput::new(&folder, "export")?;
-    let (kept, dropped) = scene.gaussians.without_far_outliers();
+    let (kept, dropped) = scene.gaussians().without_far_outliers();
     if dropped > 0 {
         tracing::warn!(
             "{}: {dropped} Gaussians far outside of the scene were left out, because they would reduce the precision of all others",
@@ -289,11 +289,11 @@ fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)
     }
     compact::write(&staged.folder.compact_path(), &kept, &precision)?;
     grid.save(&staged.folder)?;
-    staged.folder.save_cameras(&scene.cameras)?;
+    staged.folder.save_cameras(scene.cameras())?;
     // The export contains no other files of the scene.
     let manifest = Manifest {
         files: Default::default(),
-        ..scene.manifest.clone()
+        ..scene.manifest().clone()
     };
     staged.publish(&folder, &REPLACED, [], &manifest)?;
     let mut written = folder.gaussians()?;
@@ -303,7 +303,7 @@ fn small_folder(scene: &mut Scene, root: &Path) -> Result<(Gaussians, Precision)
 
 fn bytes_of(path: &Path) -> u64 {
     if path.is_dir() {
-        crate::session::query_file_bytes(path)
+        crate::scene::query_file_bytes(path)
     } else {
         std::fs::metadata(path).map_or(0, |m| m.len())
     }

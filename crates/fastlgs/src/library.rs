@@ -1,8 +1,8 @@
 //! Searches many scenes for the object that a text names.
 
 use crate::error::{Context, bail};
-use crate::session::Texts;
-use crate::session::ask::Embedded;
+use crate::query::Texts;
+use crate::query::object_query::Embedded;
 use crate::{Result, Run, model_choice, train};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;

@@ -1,7 +1,7 @@
 //! Renders images of a trained scene.
 
 use crate::error::bail;
-use crate::session::ViewChoice;
+use crate::query::ViewChoice;
 use crate::{Result, Run, Scene};
 use fastlgs_core::{exr_image, image_io, turbo};
 use image::{Rgb, RgbImage};
@@ -89,7 +89,7 @@ fn timed<T>(total: &mut Duration, work: impl FnOnce() -> T) -> T {
 /// written.
 pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
     let mut scene = Scene::open(&config.scene, run.device)?;
-    let cameras = config.views.cameras(&scene.folder, &scene.cameras)?;
+    let cameras = config.views.cameras(scene.folder(), scene.cameras())?;
     let Some(first) = cameras.first() else {
         bail!("{}: the scene has no views", config.scene.display())
     };
@@ -124,12 +124,12 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
         }
         if config.what.contains(&RenderContent::Depth) {
             let mut depth = timed(&mut rendered, || scene.render_depth(camera))?;
-            let unit = scene.manifest.frame.scale as f32;
+            let unit = scene.manifest().frame.scale as f32;
             depth.iter_mut().for_each(|depth| *depth *= unit);
             exr_image::write(&path("depth", "exr"), w, h, &[("Z", &depth)])?;
         }
         if config.what.contains(&RenderContent::Objects) {
-            let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&scene.grid()?);
+            let ids = timed(&mut rendered, || scene.field(camera, None))?.owners(&*scene.grid()?);
             let picture = RgbImage::from_fn(camera.width, camera.height, |x, y| {
                 Rgb(turbo::id_color(ids.at(x, y)))
             });
@@ -140,8 +140,8 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
     }
     let (scene_root, gaussians, adapter) = (
         config.scene.clone(),
-        scene.gaussians.len(),
-        scene.engine.name(),
+        scene.gaussians().len(),
+        scene.adapter(),
     );
     Ok(RenderReport {
         scene: scene_root,

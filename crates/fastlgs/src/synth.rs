@@ -2,7 +2,7 @@
 
 use crate::error::{Context, bail};
 #[cfg(feature = "clap")]
-use crate::session::parse_size;
+use crate::query::parse_size;
 use crate::{Result, Run};
 use fastlgs_core::synth::{self, KINDS, Kind, Masks};
 use fastlgs_vision::models;

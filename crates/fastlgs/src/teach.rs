@@ -2,8 +2,8 @@
 
 use crate::error::{Context, bail};
 use crate::names::{Example, Names, normalise_name};
-use crate::session::Pixels;
-use crate::session::ask::{ObjectQuery, picture};
+use crate::query::Pixels;
+use crate::query::object_query::{ObjectQuery, picture};
 use crate::{Result, Run, Scene, model_choice};
 use fastlgs_core::image_io;
 use fastlgs_grid::Grid;
@@ -68,7 +68,7 @@ pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
         }
     };
     match (object, &lesson.image) {
-        (Some(id), _) => teach_object(&scene, &scene.grid()?, &lesson.name, id),
+        (Some(id), _) => teach_object(&scene, &*scene.grid()?, &lesson.name, id),
         (None, Some(path)) => {
             let embeddings = picture(
                 &scene,
@@ -93,8 +93,8 @@ pub fn teach(lesson: &TeachConfig, run: &Run) -> Result<TeachReport> {
 /// # Errors
 /// As [`teach`].
 pub fn teach_object(scene: &Scene, grid: &Grid, name: &str, id: u16) -> Result<TeachReport> {
-    model_choice::check_version(&scene.manifest, grid, &scene.folder)?;
-    let root = scene.folder.root.display().to_string();
+    model_choice::check_version(scene.manifest(), grid, scene.folder())?;
+    let root = scene.folder().root.display().to_string();
     let Some(object) = usize::from(id)
         .checked_sub(1)
         .and_then(|k| grid.objects.get(k))
@@ -134,7 +134,7 @@ fn store_example(
         names.add(
             &name,
             Example {
-                encoder: model_choice::identity_of(&scene.manifest),
+                encoder: model_choice::identity_of(scene.manifest()),
                 from,
                 embeddings,
             },
@@ -156,7 +156,7 @@ fn object_at(scene: &mut Scene, lesson: &TeachConfig, pixels: &Pixels) -> Result
         .view
         .as_deref()
         .context("a point needs the name of its view; set view as well")?;
-    let camera = scene.cameras[scene.folder.view_index(&scene.cameras, view)?].clone();
+    let camera = scene.cameras()[scene.folder().view_index(scene.cameras(), view)?].clone();
     let (grid, field) = (scene.grid()?, scene.field(&camera, None)?);
     let found = ObjectQuery::Point(pixels.clone()).embed(scene, &[])?.find(
         &grid,

@@ -5,7 +5,7 @@ use crate::{report, ui, words};
 use anyhow::{Result, bail};
 use fastlgs::Run;
 use fastlgs::export::{ExportConfig, names_folder};
-use fastlgs::session::selection::EXTENSIONS;
+use fastlgs::query::selection::EXTENSIONS;
 use fastlgs_serve::share;
 
 #[derive(clap::Args)]

@@ -122,7 +122,7 @@ fn scene(root: &Path, common: &ui::Common) -> Result<Outcome> {
                 "queries",
                 format!(
                     "need {}",
-                    words::megabytes(fastlgs::session::query_file_bytes(root))
+                    words::megabytes(fastlgs::scene::query_file_bytes(root))
                 ),
             ),
             ("warnings", manifest.warnings.join("\n          ")),

@@ -10,10 +10,9 @@ use crate::ui::print_line;
 use crate::words::thousands;
 use crate::{report, ui};
 use anyhow::{Result, bail};
-use fastlgs::session::answer::{AnswerReport, CANDIDATES, ObjectReport, QueryRequest};
-use fastlgs::session::ask::ObjectQuery;
-use fastlgs::session::sheet::{self, Tile};
-use fastlgs::session::{Pixels, ViewChoice, parse_size, selection};
+use fastlgs::query::answer::{AnswerReport, ObjectReport};
+use fastlgs::query::sheet::{self, Tile};
+use fastlgs::query::{Answer, ObjectQuery, Pixels, ViewChoice, parse_size, selection};
 use fastlgs::{Run, Scene};
 use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
@@ -23,7 +22,7 @@ use fastlgs_raster::Frame;
 use serde_json::json;
 use std::io::{BufRead, IsTerminal, Write};
 use std::path::PathBuf;
-use std::time::Instant;
+use std::sync::Arc;
 
 #[derive(clap::Args)]
 #[command(
@@ -167,17 +166,15 @@ const TILES_PER_ROW: usize = 4;
 /// The view that was rendered last.
 struct RenderedView {
     view_index: usize,
-    field: Field,
-    color: Option<Frame>,
+    color: Frame,
 }
 
 /// An opened scene with the options for its queries.
 struct QueryRunner<'a> {
     args: &'a Args,
     scene: Scene,
-    grid: Grid,
+    grid: Arc<Grid>,
     cameras: Vec<Camera>,
-    config: QueryConfig,
     shown: Option<RenderedView>,
     tiles: Vec<Tile>,
     /// Folder of the pictures.
@@ -241,15 +238,11 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
     };
     let mut scene = Scene::open(path, run.device)?;
     let grid = scene.grid()?;
-    let cameras = args.views.cameras(&scene.folder, &scene.cameras)?;
+    let cameras = args.views.cameras(scene.folder(), scene.cameras())?;
     if exports && !args.point.is_empty() && cameras.len() > 1 {
         bail!("--export and --export-rest with --point need a single view; choose it with --view");
     }
-    scene.clip_text.clone_from(&args.clip_text);
-    let config = QueryConfig {
-        false_alarms: args.false_alarms,
-        top_k: args.top_k,
-    };
+    scene.set_clip_text(args.clip_text.clone());
     if !args.text.is_empty() || !args.negative.is_empty() {
         // The text encoder is loaded once, before the first query is timed.
         scene.text_query("warm up")?;
@@ -260,7 +253,6 @@ pub fn run(args: &Args, common: &ui::Common, run: &Run) -> Result<Outcome> {
         scene,
         grid,
         cameras,
-        config,
         shown: None,
         tiles: Vec::new(),
         output: args.output.clone(),
@@ -376,72 +368,67 @@ impl QueryRunner<'_> {
         Ok(Outcome::Done)
     }
 
-    /// Renders a view unless it was rendered last. Returns the milliseconds, 0 if nothing was
-    /// rendered.
-    fn show(&mut self, place: usize) -> Result<f64> {
-        if self.shown.as_ref().is_some_and(|s| s.view_index == place) {
-            return Ok(0.0);
+    /// Renders the colour of a view for pictures, unless there are none or it was rendered last.
+    fn show(&mut self, view_index: usize, field: &Field) -> Result<()> {
+        if self.output.is_none()
+            || self
+                .shown
+                .as_ref()
+                .is_some_and(|s| s.view_index == view_index)
+        {
+            return Ok(());
         }
-        let started = Instant::now();
-        let field = self.scene.field(&self.cameras[place], self.args.tau_ac)?;
-        let ms = started.elapsed().as_secs_f64() * 1e3;
-        let color = self
-            .output
-            .as_ref()
-            .map(|_| self.scene.render(&self.cameras[place]))
-            .transpose()?;
-        if let Some(frame) = &color {
-            self.tiles.extend(sheet::view_tiles(
-                &self.scene,
-                &self.grid,
-                &self.cameras[place],
-                frame,
-                &field,
-            ));
-        }
-        self.shown = Some(RenderedView {
-            view_index: place,
+        let camera = &self.cameras[view_index];
+        let color = self.scene.render(camera)?;
+        self.tiles.extend(sheet::view_tiles(
+            &self.scene,
+            &self.grid,
+            camera,
+            &color,
             field,
-            color,
-        });
-        Ok(ms)
+        ));
+        self.shown = Some(RenderedView { view_index, color });
+        Ok(())
     }
 
     /// Answers one query in one view.
-    fn answer(&mut self, ask: &ObjectQuery, place: usize) -> Result<AnswerReport> {
-        let render_ms = self.show(place)?;
-        let Some(RenderedView { field, color, .. }) = &self.shown else {
-            bail!("no view was rendered")
-        };
-        let (args, scene, grid, camera) =
-            (self.args, &self.scene, &self.grid, &self.cameras[place]);
+    fn answer(&mut self, query: &ObjectQuery, view_index: usize) -> Result<AnswerReport> {
+        let args = self.args;
         let dilate = args
             .dilate
             .map(|(w, h)| [w / 2 * args.dilate_times, h / 2 * args.dilate_times]);
-        let question = QueryRequest {
-            ask,
-            negatives: &args.negative,
-            config: self.config,
-            dilate,
-            candidates: CANDIDATES,
-        };
-        let (answer, mut report) = question.answer(scene, grid, field, camera, render_ms)?;
-        let targets = &answer.found.targets;
-        let mut tile = None;
-        if let (Some(folder), Some(color)) = (&self.output, color) {
-            let picture = answer.write(folder, color, args.heatmap, &mut report)?;
-            tile = Some(Tile::new(&picture, &report.text, caption(&report)));
+        let mut answer = self
+            .scene
+            .query(query.clone())
+            .camera(&self.cameras[view_index])
+            .negatives(&args.negative)
+            .false_alarms(args.false_alarms)
+            .top_k(args.top_k)
+            .dilate(dilate)
+            .tau_ac(args.tau_ac)
+            .run()?;
+        self.show(view_index, &answer.field)?;
+        if let (Some(folder), Some(view)) = (&self.output, &self.shown) {
+            let picture = answer.write(folder, &view.color, args.heatmap)?;
+            let report = &answer.report;
+            self.tiles
+                .push(Tile::new(&picture, &report.text, caption(report)));
         }
-        for (path, keep) in [(&args.export, true), (&args.export_rest, false)] {
-            if let Some(path) = path.as_ref().filter(|_| !targets.is_empty()) {
-                let ids: Vec<u16> = targets.iter().map(|t| t.id).collect();
-                let selected = selection::gaussians(&scene.gaussians, grid, &ids);
-                let world = selection::World::of(&scene.manifest, &scene.cameras);
-                selection::export(path, &scene.gaussians, &world, &selected, keep)?;
+        self.export(&answer)?;
+        Ok(answer.report)
+    }
+
+    /// Writes the Gaussians of an answer, and the others, if asked to.
+    fn export(&self, answer: &Answer) -> Result<()> {
+        let ids = answer.target_ids();
+        for (path, keep) in [(&self.args.export, true), (&self.args.export_rest, false)] {
+            if let Some(path) = path.as_ref().filter(|_| !ids.is_empty()) {
+                let (scene, gaussians) = (&self.scene, self.scene.gaussians());
+                let selected = selection::gaussians(gaussians, &answer.grid, &ids);
+                let world = selection::World::of(scene.manifest(), scene.cameras());
+                selection::export(path, gaussians, &world, &selected, keep)?;
             }
         }
-        report.find_best_view(&mut self.scene, &self.grid)?;
-        self.tiles.extend(tile);
-        Ok(report)
+        Ok(())
     }
 }

@@ -23,15 +23,15 @@ pub struct Quality {
 
 /// Measures the held-out views in which any pixel counts; `None` if there are none.
 pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
-    let cameras = scene.manifest.held_out(&scene.cameras);
+    let cameras = scene.manifest().held_out(scene.cameras());
     let background = train::Background {
-        color: scene.trained.background,
+        color: scene.trained().background,
         learn: false,
     };
     let mut sum = Quality::default();
     let mut views = 0;
     for camera in &cameras {
-        let target = train::target(&scene.folder, camera, None, &background)?;
+        let target = train::target(scene.folder(), camera, None, &background)?;
         let given = scene.render(camera)?;
         let Some(compared) = Compared::of(&target, given.channels(0, 3)) else {
             continue;
@@ -66,15 +66,11 @@ pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
 }
 
 fn align_camera(scene: &mut Scene, target: &Target) -> Result<Camera> {
-    let Scene {
-        engine,
-        gaussians,
-        trained,
-        ..
-    } = scene;
-    let frame = |camera: &Camera| trained.view(camera, gaussians);
+    let (trained, gaussians) = (scene.trained().clone(), scene.gaussians().len());
+    let degree = scene.gaussians().sh_degree;
+    let frame = |camera: &Camera| trained.view_of(camera, gaussians, degree);
     Ok(align::align(
-        engine.as_mut(),
+        scene.engine(),
         frame,
         target,
         &Default::default(),

@@ -4,7 +4,7 @@ mod color;
 
 use crate::absent::{ABSENT, COLORS};
 use crate::error::{Context, bail};
-use crate::session::ask::ObjectQuery;
+use crate::query::object_query::ObjectQuery;
 use crate::{Result, Run, Scene};
 use fastlgs_core::labels::{Label, LabelledView};
 use fastlgs_core::{Camera, labels, metrics};
@@ -194,7 +194,7 @@ fn mean(values: &[f64]) -> Option<f64> {
 /// A scene that is not trained, labels of a view that is not held out, or a device that fails.
 pub fn eval(config: &EvalConfig, run: &Run) -> Result<EvalReport> {
     let mut session = Scene::open(&config.scene, run.device)?;
-    session.clip_text.clone_from(&config.clip_text);
+    session.set_clip_text(config.clip_text.clone());
     eval_session(session, config)
 }
 
@@ -221,11 +221,11 @@ pub fn eval_session(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport>
     let mut sums = Sums::default();
     for view in &views {
         let index = scene
-            .folder
-            .view_index(&scene.cameras, &view.name)
+            .folder()
+            .view_index(scene.cameras(), &view.name)
             .context("the labels do not fit the scene")?;
-        let camera = scene.cameras[index].clone();
-        if !scene.manifest.is_held_out(index, &camera.name) {
+        let camera = scene.cameras()[index].clone();
+        if !scene.manifest().is_held_out(index, &camera.name) {
             bail!(
                 "'{}' has labels but was trained on; preprocess the photos again with --holdout or --holdout-labels, so that it is held out",
                 camera.name
@@ -262,7 +262,7 @@ pub fn eval_session(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport>
         &sums.present,
         &absent.iter().map(|a| a.1).collect::<Vec<_>>(),
     );
-    let camera = &scene.cameras[0];
+    let camera = &scene.cameras()[0];
     Ok(EvalReport {
         scene: config.scene.clone(),
         views_scored: views.len(),
@@ -322,13 +322,13 @@ pub fn eval_session(mut scene: Scene, config: &EvalConfig) -> Result<EvalReport>
         psnr_aligned: color.map(|c| c.psnr_aligned),
         psnr_affine: color.map(|c| c.psnr_affine),
         ssim: color.map(|c| c.ssim),
-        gaussians: scene.gaussians.len(),
+        gaussians: scene.gaussians().len(),
         objects: grid.objects.len(),
-        scene_bytes: crate::session::query_file_bytes(&config.scene),
+        scene_bytes: crate::scene::query_file_bytes(&config.scene),
         query_ms_first: mean(&sums.first_ms),
         query_ms_next: mean(&sums.next_ms),
         size: format!("{}x{}", camera.width, camera.height),
-        adapter: scene.engine.name(),
+        adapter: scene.adapter(),
     })
 }
 

@@ -17,8 +17,8 @@ const MIN_WEIGHT: f32 = 0.5;
 /// shows it, or its centre, within them. All others belong to the object or lie inside or below it,
 /// where photos do not constrain training.
 pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
-    let mut view_counts = vec![0u8; session.gaussians.len()];
-    let mut within = vec![false; session.gaussians.len()];
+    let mut view_counts = vec![0u8; session.gaussians().len()];
+    let mut within = vec![false; session.gaussians().len()];
     for (camera, hidden) in views {
         let labels = hidden.iter().map(|hidden| u16::from(!hidden)).collect();
         let map = LabelMap {
@@ -26,7 +26,7 @@ pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Re
             height: camera.height,
             labels,
         };
-        for vote in lift::votes(&session.gaussians, &session.view(camera), &map) {
+        for vote in lift::votes(session.gaussians(), &session.view(camera), &map) {
             within[vote.gaussian as usize] |= vote.label == 0;
             if vote.label == 1 && vote.weight >= MIN_WEIGHT {
                 let count = &mut view_counts[vote.gaussian as usize];
@@ -47,7 +47,7 @@ pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Re
     Ok(view_counts
         .into_iter()
         .zip(within)
-        .zip(&session.gaussians.means)
+        .zip(&session.gaussians().means)
         .map(stays)
         .collect())
 }

@@ -33,9 +33,13 @@ pub fn write(
     let scene = SceneFolder::new(output);
     let staged = StagedOutput::new(&scene, "remove")?;
     let folder = &staged.folder;
-    copy(&session.manifest.files, &session.folder.root, &folder.root)?;
-    let mut manifest = session.manifest.clone();
-    let held_out = manifest.held_out(&session.cameras);
+    copy(
+        &session.manifest().files,
+        &session.folder().root,
+        &folder.root,
+    )?;
+    let mut manifest = session.manifest().clone();
+    let held_out = manifest.held_out(session.cameras());
     for (camera, hidden) in views {
         let w = camera.width;
         if held_out.iter().any(|c| c.name == camera.name) {
@@ -81,7 +85,7 @@ pub fn write(
     // The masks have other labels now, so the pairs of the original scene are invalid.
     evidence::save_pairs(folder, &Pairs::new())?;
     grid.save(folder)?;
-    ply::write(&folder.ply_path(), &session.gaussians)?;
+    ply::write(&folder.ply_path(), session.gaussians())?;
     let compact = folder.compact_path();
     if compact.is_file() {
         std::fs::remove_file(&compact).map_err(Error::io(&compact))?;
@@ -98,12 +102,12 @@ pub fn write(
         .for_each(|list| list.push(what.into()));
     if let Some(train) = manifest.notes.get_mut("train") {
         (train["gaussians"], train["objects"]) =
-            (session.gaussians.len().into(), grid.objects.len().into());
-        train["clear"] = transparent::count(&session.gaussians).into();
+            (session.gaussians().len().into(), grid.objects.len().into());
+        train["clear"] = transparent::count(session.gaussians()).into();
     }
     let maps = session
-        .manifest
-        .training(&session.cameras)
+        .manifest()
+        .training(session.cameras())
         .into_iter()
         .map(|camera| SceneFolder::objects_name(&camera.name));
     staged.publish(&scene, &[], maps, &manifest)

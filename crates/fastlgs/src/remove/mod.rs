@@ -12,14 +12,13 @@ mod membrane;
 
 use crate::error::{Context, bail};
 use crate::output::{SceneLock, resolve_path};
-use crate::session::ask::ObjectQuery;
-use crate::session::selection;
+use crate::query::object_query::ObjectQuery;
+use crate::query::selection;
 use crate::{Result, Run, Scene, transparent};
 use fastlgs_core::{Camera, SceneFolder, metrics};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{Hit, QueryConfig};
-use fastlgs_raster::Channels;
 use fastlgs_vision::inpaint::{self, Inpainter};
 use glam::Vec2;
 use membrane::Membrane;
@@ -126,11 +125,11 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
         inpaint::by_name(&config.inpainter).context("the inpainter cannot be opened")?
     };
     let mut session = Scene::open(&config.scene, run.device)?;
-    session.clip_text.clone_from(&config.clip_text);
+    session.set_clip_text(config.clip_text.clone());
     if session
-        .cameras
+        .cameras()
         .iter()
-        .any(|camera| !session.folder.photo_path(&camera.name).is_file())
+        .any(|camera| !session.folder().photo_path(&camera.name).is_file())
     {
         bail!(
             "{}: its prepared photos are not there; remove the object from the trained scene, not from an export",
@@ -139,11 +138,11 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     }
     let grid = session.grid()?;
     let targets = targets(config, &mut session, &grid)?;
-    let views = session.manifest.training(&session.cameras);
+    let views = session.manifest().training(session.cameras());
     let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
     let (mut hidden, mut hidden_in_training) = (Vec::new(), Vec::new());
-    for camera in session.cameras.clone() {
-        let widened = |field: Field| {
+    for camera in session.cameras().to_vec() {
+        let widened = |field: &Field| {
             metrics::dilate(
                 &field.mask(&grid, &targets),
                 camera.width,
@@ -151,13 +150,13 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
                 MASK_DILATION,
             )
         };
-        let thing = widened(session.field(&camera, None)?);
+        let thing = widened(&*session.field(&camera, None)?);
         if trained_on(&camera) {
             // A transparent object does not hide the surface behind it.
             hidden_in_training.push((
                 camera.clone(),
-                if session.trained.clear > 0 {
-                    widened(session.field_without_transparent(&camera)?)
+                if session.trained().clear > 0 {
+                    widened(&session.field_without_transparent(&camera)?)
                 } else {
                     thing.clone()
                 },
@@ -172,8 +171,8 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     remains
         .iter_mut()
         .enumerate()
-        .for_each(|(i, stays)| *stays |= transparent::is_clear(&session.gaussians, i));
-    selection::gaussians(&session.gaussians, &grid, &objects)
+        .for_each(|(i, stays)| *stays |= transparent::is_clear(session.gaussians(), i));
+    selection::gaussians(session.gaussians(), &grid, &objects)
         .into_iter()
         .for_each(|i| remains[i] = false);
     let left: Vec<usize> = (0..remains.len()).filter(|i| remains[*i]).collect();
@@ -184,7 +183,7 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
         );
     }
     let removed = remains.len() - left.len();
-    let rest = session.gaussians.select(&left);
+    let rest = session.gaussians().select(&left);
     session.set_gaussians(rest)?;
 
     let mut gaps = Vec::new();
@@ -205,9 +204,15 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
     )?;
 
     let (left_over, ids) = grid.without(&objects);
-    for id in &mut session.gaussians.object_ids {
-        *id = ids.get(usize::from(*id)).copied().unwrap_or(0);
-    }
+    let renumbered = |id: &u16| ids.get(usize::from(*id)).copied().unwrap_or(0);
+    session.set_object_ids(
+        session
+            .gaussians()
+            .object_ids
+            .iter()
+            .map(renumbered)
+            .collect(),
+    );
     let what = config
         .text
         .clone()
@@ -245,7 +250,7 @@ fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Ve
     }
     let text = config.text.clone().unwrap_or_default();
     let camera = session
-        .cameras
+        .cameras()
         .first()
         .cloned()
         .with_context(|| format!("{root}: the scene has no views"))?;
@@ -268,7 +273,7 @@ fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Ve
 /// share is up to half of the light.
 fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
     let frame = session.render(camera)?;
-    let behind = session.trained.background;
+    let behind = session.trained().background;
     let transmittance = frame.channels(6, 7);
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
@@ -285,9 +290,7 @@ fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
 
 /// Returns the hidden pixels of a view that are empty.
 fn gap(session: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
-    let frame = session
-        .engine
-        .render(session.view(camera), Channels::Color)?;
+    let frame = session.render(camera)?;
     Ok(hidden
         .iter()
         .zip(frame.channels(6, 7))
@@ -304,7 +307,7 @@ fn fill(
     inpainter: &dyn Inpainter,
     run: &Run,
 ) -> Result<usize> {
-    let before = session.gaussians.len();
+    let before = session.gaussians().len();
     let mut order: Vec<usize> = (0..views.len()).collect();
     order.sort_by_key(|k| std::cmp::Reverse(count_set(&gaps[*k])));
     let work = run.work("gaps", order.len() as u64);
@@ -330,7 +333,7 @@ fn fill(
             width,
         );
         let to_world = camera.world_to_camera.inverse();
-        let mut scene = session.gaussians.clone();
+        let mut scene = session.gaussians().clone();
         for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {
             let depth = 1.0 / inverse[p];
             let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
@@ -346,5 +349,5 @@ fn fill(
         }
         session.set_gaussians(scene)?;
     }
-    Ok(session.gaussians.len() - before)
+    Ok(session.gaussians().len() - before)
 }

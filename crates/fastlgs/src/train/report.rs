@@ -114,7 +114,12 @@ impl TrainReport {
 
     /// Returns the view of a camera, with the background and filter of the training.
     pub fn view(&self, camera: &Camera, scene: &Gaussians) -> View {
-        let mut view = View::new(camera, scene.len(), scene.sh_degree);
+        self.view_of(camera, scene.len(), scene.sh_degree)
+    }
+
+    /// The same for `gaussians` Gaussians with colour of degree `sh_degree`.
+    pub(crate) fn view_of(&self, camera: &Camera, gaussians: usize, sh_degree: u32) -> View {
+        let mut view = View::new(camera, gaussians, sh_degree);
         view.antialias = u32::from(self.antialias);
         view.background_color[..3].copy_from_slice(&self.background);
         view

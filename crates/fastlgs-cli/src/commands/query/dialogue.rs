@@ -4,7 +4,7 @@ use super::{QueryRunner, answer_text};
 use crate::outcome::Outcome;
 use crate::ui::print_line;
 use anyhow::{Result, bail};
-use fastlgs::session::ask::ObjectQuery;
+use fastlgs::query::ObjectQuery;
 use std::io::{BufRead, Write};
 use std::path::PathBuf;
 
@@ -64,7 +64,7 @@ impl QueryRunner<'_> {
                 Command::Help => Ok(HELP.to_owned()),
                 Command::Views => Ok(self
                     .scene
-                    .cameras
+                    .cameras()
                     .iter()
                     .map(|c| c.name.as_str())
                     .collect::<Vec<_>>()
@@ -86,8 +86,7 @@ impl QueryRunner<'_> {
     }
 
     fn set_view(&mut self, name: &str) -> Result<()> {
-        let index = self.scene.folder.view_index(&self.scene.cameras, name)?;
-        let camera = self.scene.cameras[index].clone();
+        let camera = self.scene.camera(name)?;
         self.cameras = vec![
             self.args
                 .views

@@ -1,9 +1,8 @@
 //! Queries by text, picture or pixels of a view, and the objects that they select.
 
-use super::{Pixels, Scene, Texts, phrase, texts};
-use crate::Result;
-use crate::calibrations::Calibrations;
+use super::{Pixels, Texts, phrase, texts};
 use crate::error::{Context, bail};
+use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
@@ -12,6 +11,7 @@ use fastlgs_grid::relevancy::TextQuery;
 use image::RgbImage;
 
 /// A query.
+#[derive(Clone)]
 pub enum ObjectQuery {
     /// A text or a taught name. "A of B" selects the part A of object B if that scores higher than
     /// the whole phrase.
@@ -51,24 +51,36 @@ impl ObjectQuery {
     ///
     /// # Errors
     /// A text or picture that cannot be embedded.
-    pub fn embed(&self, session: &Scene, negatives: &[String]) -> Result<EmbeddedQuery> {
+    pub fn embed(&self, scene: &Scene, negatives: &[String]) -> Result<EmbeddedQuery> {
         Ok(match self {
             Self::Point(pixels) => EmbeddedQuery::Point(pixels.clone()),
             Self::Image(name, photo) => {
-                let whole = picture(session, name, photo)?;
+                let whole = picture(scene, name, photo)?;
                 let whole = if negatives.is_empty() {
                     whole
                 } else {
-                    session.texts()?.with_negatives(whole, negatives)?
+                    scene.texts()?.with_negatives(whole, negatives)?
                 };
                 EmbeddedQuery::Embedded(Box::new(whole.into()))
             }
             Self::Text(text) => EmbeddedQuery::Embedded(Box::new(Embedded::from_text(
                 text,
-                session.texts()?,
+                scene.texts()?,
                 negatives,
             )?)),
         })
+    }
+}
+
+impl From<&str> for ObjectQuery {
+    fn from(text: &str) -> Self {
+        Self::Text(text.to_owned())
+    }
+}
+
+impl From<Pixels> for ObjectQuery {
+    fn from(pixels: Pixels) -> Self {
+        Self::Point(pixels)
     }
 }
 
@@ -104,11 +116,6 @@ impl Embedded {
             phrase_query: embedded(text)?,
             split,
         })
-    }
-
-    /// Returns the queries of which a scene must match one: the whole phrase, and B of "A of B".
-    pub fn required_queries(&self) -> impl Iterator<Item = &TextQuery> {
-        std::iter::once(&self.phrase_query).chain(self.split.iter().map(|[object, _]| object))
     }
 
     /// Ranks all objects and selects the targets.
@@ -152,32 +159,29 @@ fn part_of(text: &str) -> Option<(&str, &str)> {
 /// # Errors
 /// The encoder of the scene cannot embed pictures, or its embeddings do not fit those of the
 /// objects.
-pub(crate) fn picture(session: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
+pub(crate) fn picture(scene: &Scene, name: &str, photo: &RgbImage) -> Result<TextQuery> {
     let (width, height) = photo.dimensions();
     let everything = LabelMap {
         width,
         height,
         labels: vec![1; (width * height) as usize],
     };
-    let encoder = session.image_encoder()?;
+    let encoder = scene.image_encoder()?;
     let found = encoder
         .embed_masks(name, photo, &everything)?
         .pop()
         .filter(|e| e.iter().any(|v| *v != 0.0));
     let whole = found.with_context(|| format!("{name}: this picture cannot be embedded, because the embeddings of the scene were imported; use a text or a point instead"))?;
     texts::check_embeddings(
-        &session.manifest,
-        &session.grid()?,
-        &session.folder,
+        scene.manifest(),
+        &*scene.grid()?,
+        scene.folder(),
         "pictures",
         whole.len(),
     )?;
     Ok(TextQuery::of_examples(
         vec![whole],
-        session
-            .calibrations
-            .unwrap_or_else(|| Calibrations::of(&session.manifest))
-            .pictures,
+        scene.calibrations().pictures,
     ))
 }
 

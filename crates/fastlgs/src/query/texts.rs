@@ -3,7 +3,7 @@
 use crate::calibrations::{self, Calibrations};
 use crate::error::{Context, bail};
 use crate::names::Names;
-use crate::session::phrase;
+use crate::query::phrase;
 use crate::{Result, model_choice};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;

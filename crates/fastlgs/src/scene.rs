@@ -1,18 +1,10 @@
 //! An opened, trained scene, which renders views and answers queries.
 
-pub mod answer;
-pub mod ask;
-pub mod phrase;
-pub mod pictures;
-mod pixels;
-pub mod selection;
-pub mod sheet;
-mod texts;
-mod views;
-
 use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
-use crate::{Result, model_choice, train};
+use crate::query::{ObjectQuery, Query, Texts};
+use crate::train::{self, TrainReport};
+use crate::{Result, model_choice};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
@@ -22,36 +14,41 @@ use fastlgs_grid::relevancy::TextQuery;
 use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, Frame, View};
 use fastlgs_vision::{Encoder, TextEncoder};
-pub use pixels::Pixels;
 use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-pub use texts::Texts;
-pub use views::{ViewChoice, parse_size};
+use std::sync::Arc;
 
 /// A trained scene on a device.
 pub struct Scene {
-    /// Its folder.
-    pub folder: SceneFolder,
-    /// Manifest of the scene.
-    pub manifest: Manifest,
+    folder: SceneFolder,
+    manifest: Manifest,
     /// Cameras of all views, sorted by name.
-    pub cameras: Vec<Camera>,
-    /// The Gaussians.
-    pub gaussians: Gaussians,
+    cameras: Vec<Camera>,
+    gaussians: Gaussians,
     /// Engine of the device, with the Gaussians loaded.
-    pub engine: Box<dyn Engine>,
+    engine: Box<dyn Engine>,
     /// File of a CLIP text tower to use instead of the one that the manifest records.
-    pub clip_text: Option<PathBuf>,
-    /// Report of the training.
-    pub trained: train::TrainReport,
+    clip_text: Option<PathBuf>,
+    trained: TrainReport,
     /// Calibrations to use instead of those of the encoder.
-    pub calibrations: Option<Calibrations>,
+    calibrations: Option<Calibrations>,
+    /// The object table, once it was needed.
+    grid: OnceCell<Arc<Grid>>,
+    /// The view that was rendered last.
+    last_field: Option<LastField>,
     texts: OnceCell<Texts>,
     /// Whether taught names are used.
     use_taught_names: bool,
     /// Cache of the view that shows most of some objects, by object ids.
     seen_best: BTreeMap<Vec<u16>, Option<String>>,
+}
+
+/// Rendered object data of a view, and what it depends on.
+struct LastField {
+    camera: Camera,
+    tau_ac: Option<f32>,
+    field: Arc<Field>,
 }
 
 impl Scene {
@@ -63,7 +60,7 @@ impl Scene {
         let folder = SceneFolder::open(root)?;
         let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
-        let Some(trained) = train::TrainReport::from_manifest(&manifest, root)? else {
+        let Some(trained) = TrainReport::from_manifest(&manifest, root)? else {
             let root = root.display();
             bail!(
                 "{root}: the photos were preprocessed again after the training; run 'fastlgs train {root}' again"
@@ -86,10 +83,78 @@ impl Scene {
             clip_text: None,
             trained,
             calibrations: None,
+            grid: OnceCell::new(),
+            last_field: None,
             texts: OnceCell::new(),
             use_taught_names: true,
             seen_best: BTreeMap::new(),
         })
+    }
+
+    /// Starts a query by a text, a picture or pixels.
+    pub fn query(&mut self, object: impl Into<ObjectQuery>) -> Query<'_> {
+        Query::new(self, object.into())
+    }
+
+    /// The folder of the scene.
+    pub fn folder(&self) -> &SceneFolder {
+        &self.folder
+    }
+
+    /// The manifest of the scene.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// The cameras of all views, sorted by name.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// Returns the camera of a view, named with or without extension.
+    ///
+    /// # Errors
+    /// No view of this name, or several.
+    pub fn camera(&self, name: &str) -> Result<Camera> {
+        Ok(self.cameras[self.folder.view_index(&self.cameras, name)?].clone())
+    }
+
+    /// The Gaussians.
+    pub fn gaussians(&self) -> &Gaussians {
+        &self.gaussians
+    }
+
+    /// The report of the training.
+    pub fn trained(&self) -> &TrainReport {
+        &self.trained
+    }
+
+    /// Name of the device.
+    pub fn adapter(&self) -> String {
+        self.engine.name()
+    }
+
+    /// The engine of the device, with the Gaussians loaded.
+    pub fn engine(&mut self) -> &mut dyn Engine {
+        &mut *self.engine
+    }
+
+    /// The calibrations of the encoder.
+    pub fn calibrations(&self) -> Calibrations {
+        self.calibrations
+            .unwrap_or_else(|| Calibrations::of(&self.manifest))
+    }
+
+    /// Replaces the calibrations of the encoder, for measurements.
+    pub fn set_calibrations(&mut self, calibrations: Calibrations) {
+        self.calibrations = Some(calibrations);
+        self.forget_texts();
+    }
+
+    /// Uses another CLIP text tower than the one that the manifest records.
+    pub fn set_clip_text(&mut self, file: Option<PathBuf>) {
+        self.clip_text = file;
+        self.forget_texts();
     }
 
     /// Replaces the Gaussians of the scene, on the device as well.
@@ -97,23 +162,34 @@ impl Scene {
         self.engine.set_state(&State::of(&gaussians))?;
         self.gaussians = gaussians;
         self.seen_best.clear();
+        self.last_field = None;
         Ok(())
+    }
+
+    /// Replaces the object ids of the Gaussians, one for each.
+    pub(crate) fn set_object_ids(&mut self, ids: Vec<u16>) {
+        self.gaussians.object_ids = ids;
+        self.seen_best.clear();
+        self.last_field = None;
     }
 
     /// Renders a view of 16x16 pixels, so that the driver compiles the shaders before the first
     /// query.
     pub fn warm_up(&mut self) -> Result<()> {
         match self.cameras.first().map(|c| c.resized(16, 16)) {
-            Some(small) => self.field(&small, None).map(|_| ()),
+            Some(small) => self.render_objects(&small, None).map(|_| ()),
             None => Ok(()),
         }
     }
 
-    /// Loads the object table.
+    /// Returns the object table; the first call loads it.
     ///
     /// # Errors
     /// A damaged table, or a PLY file that another program saved without object ids.
-    pub fn grid(&self) -> Result<Grid> {
+    pub fn grid(&self) -> Result<Arc<Grid>> {
+        if let Some(grid) = self.grid.get() {
+            return Ok(grid.clone());
+        }
         if !self.folder.is_compact() && !ply::has_object_ids(&self.folder.ply_path())? {
             let (path, root) = (self.folder.ply_path(), self.folder.root.display());
             bail!(
@@ -123,8 +199,9 @@ impl Scene {
                 path.display()
             );
         }
-        Grid::load(&self.folder)
-            .context("the object grid cannot be read; run 'fastlgs train' again")
+        let grid = Grid::load(&self.folder)
+            .context("the object grid cannot be read; run 'fastlgs train' again")?;
+        Ok(self.grid.get_or_init(|| Arc::new(grid)).clone())
     }
 
     /// Renders colour and transmittance; features are 0.
@@ -169,8 +246,25 @@ impl Scene {
 
     /// Renders the object data of a view: id weights if features are lifted, codes if they are
     /// trained. With `tau_ac`, codes are rendered in both cases (paper). Id weights include
-    /// transparent objects, drawn as solid.
-    pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
+    /// transparent objects, drawn as solid. The view that was rendered last is kept.
+    pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Arc<Field>> {
+        if let Some(last) = self
+            .last_field
+            .as_ref()
+            .filter(|last| last.camera == *camera && last.tau_ac == tau_ac)
+        {
+            return Ok(last.field.clone());
+        }
+        let field = Arc::new(self.render_objects(camera, tau_ac)?);
+        self.last_field = Some(LastField {
+            camera: camera.clone(),
+            tau_ac,
+            field: field.clone(),
+        });
+        Ok(field)
+    }
+
+    fn render_objects(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
         let solid = u32::from(self.trained.clear > 0);
         self.render_field(
             View {
@@ -236,7 +330,7 @@ impl Scene {
             let side = |v: u32| (v * SEARCH_SIDE.min(longer) / longer).max(1);
             let small = camera.resized(side(camera.width), side(camera.height));
             let pixels = self
-                .field(&small, None)?
+                .render_objects(&small, None)?
                 .mask(grid, &targets)
                 .iter()
                 .filter(|m| **m)
@@ -250,7 +344,7 @@ impl Scene {
     }
 
     /// Returns the text encoder of the scene; the first call loads it.
-    fn texts(&self) -> Result<&Texts> {
+    pub(crate) fn texts(&self) -> Result<&Texts> {
         if self.texts.get().is_none() {
             let texts = Texts::load(&self.folder, &self.manifest, self.clip_text.as_deref())?;
             let _ = self.texts.set(self.configure_texts(texts));

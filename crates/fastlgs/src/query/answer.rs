@@ -1,89 +1,24 @@
 //! The answer to a query in one view, with its report and images.
 
-use super::ask::ObjectQuery;
+use super::object_query::ObjectQuery;
 use super::pictures::{heatmap, mask_picture, overlay};
-use super::{Scene, selection};
-use crate::Result;
-use fastlgs_core::{Camera, image_io, metrics};
+use super::selection;
+use crate::{Result, Scene};
+use fastlgs_core::{Camera, image_io};
 use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
-use fastlgs_grid::query::{Found, Hit, QueryConfig, best_score};
+use fastlgs_grid::query::{Found, Hit, best_score};
 use fastlgs_raster::Frame;
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Default number of objects that a report lists as candidates.
 pub const CANDIDATES: usize = 8;
 /// Number of pixels below which an answer counts as hardly visible in a view.
 const MIN_VISIBLE_PIXELS: usize = 30;
-
-/// A query with the options of its answer.
-pub struct QueryRequest<'a> {
-    /// The query.
-    pub ask: &'a ObjectQuery,
-    /// Texts that must not fit an object better than the query.
-    pub negatives: &'a [String],
-    /// Options of object selection.
-    pub config: QueryConfig,
-    /// Half width and half height of the dilation window in pixels; `None` leaves the mask
-    /// unchanged.
-    pub dilate: Option<[u32; 2]>,
-    /// Number of objects that the report lists as candidates.
-    pub candidates: usize,
-}
-
-impl QueryRequest<'_> {
-    /// Answers the query in a rendered view. Returns the answer and its report. `render_ms` is the
-    /// time that rendering `field` took, which the report adds to the total.
-    ///
-    /// # Errors
-    /// A text or picture that cannot be embedded, or a point outside the view.
-    pub fn answer<'a>(
-        &self,
-        session: &Scene,
-        grid: &'a Grid,
-        field: &'a Field,
-        camera: &Camera,
-        render_ms: f64,
-    ) -> Result<(Answer<'a>, AnswerReport)> {
-        let mut clock = Instant::now();
-        let mut lap = || {
-            std::mem::replace(&mut clock, Instant::now())
-                .elapsed()
-                .as_secs_f64()
-                * 1e3
-        };
-        let meaning = self.ask.embed(session, self.negatives)?;
-        let encode_ms = lap();
-        let found = meaning.find(grid, field, camera, &self.config)?;
-        let select_ms = lap();
-        let mut mask = field.mask(grid, &found.targets);
-        let restore_ms = lap();
-        if let Some(radius) = self.dilate {
-            mask = metrics::dilate(&mask, camera.width, camera.height, radius);
-        }
-        let answer = Answer {
-            grid,
-            field,
-            found,
-            mask,
-            calibrated: meaning.is_calibrated(),
-        };
-        let total = encode_ms + render_ms + select_ms + restore_ms;
-        let ms = Milliseconds {
-            encode: encode_ms,
-            render: render_ms,
-            select: select_ms,
-            restore: restore_ms,
-            total,
-            gaussians: 0.0,
-        };
-        let report = answer.report(session, self.ask, camera, self.candidates, ms);
-        Ok((answer, report))
-    }
-}
 
 /// Report of an answer.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -128,7 +63,7 @@ impl AnswerReport {
     ///
     /// # Errors
     /// The device fails.
-    pub fn find_best_view(&mut self, session: &mut Scene, grid: &Grid) -> Result<()> {
+    pub fn find_best_view(&mut self, scene: &mut Scene, grid: &Grid) -> Result<()> {
         // Pixels that dilation adds do not count.
         if self.found
             && self
@@ -139,7 +74,7 @@ impl AnswerReport {
                 < MIN_VISIBLE_PIXELS
         {
             let ids: Vec<u16> = self.objects.iter().map(|o| o.id).collect();
-            self.seen_best = session.most_visible_view(grid, &ids)?;
+            self.seen_best = scene.most_visible_view(grid, &ids)?;
         }
         Ok(())
     }
@@ -210,64 +145,77 @@ fn file_name(text: &str) -> String {
 }
 
 /// The answer to a query in one view.
-pub struct Answer<'a> {
+pub struct Answer {
     /// The object table.
-    pub grid: &'a Grid,
+    pub grid: Arc<Grid>,
     /// Rendered object data of the view.
-    pub field: &'a Field,
+    pub field: Arc<Field>,
+    /// Camera of the view.
+    pub camera: Camera,
     /// Ranked objects and targets.
     pub found: Found,
     /// Mask of the answer, row by row.
     pub mask: Vec<bool>,
-    /// See [`ShareReport::calibrated`].
-    pub calibrated: bool,
+    /// Report of the answer.
+    pub report: AnswerReport,
 }
 
-impl Answer<'_> {
-    fn report(
+impl Answer {
+    /// Returns the ids of the objects of the answer.
+    pub fn target_ids(&self) -> Vec<u16> {
+        self.found.targets.iter().map(|target| target.id).collect()
+    }
+
+    /// Returns the relevancy of each pixel for a heat map, 0 to 1, row by row.
+    pub fn relevancy(&self) -> Vec<f32> {
+        self.field.relevancy(&self.grid, &self.found.heat())
+    }
+
+    pub(super) fn describe(
         &self,
-        session: &Scene,
-        ask: &ObjectQuery,
-        camera: &Camera,
+        scene: &Scene,
+        query: &ObjectQuery,
+        calibrated: bool,
         candidates: usize,
         mut ms: Milliseconds,
     ) -> AnswerReport {
         let Found { ranked, targets } = &self.found;
-        let text = ask.name();
+        let text = query.name();
         let started = Instant::now();
         let owned: Vec<Vec<usize>> = targets
             .iter()
-            .map(|t| selection::gaussians(&session.gaussians, self.grid, &[t.id]))
+            .map(|t| selection::gaussians(scene.gaussians(), &self.grid, &[t.id]))
             .collect();
         ms.gaussians = started.elapsed().as_secs_f64() * 1e3;
         AnswerReport {
-            view: camera.name.clone(),
-            size: format!("{}x{}", camera.width, camera.height),
+            view: self.camera.name.clone(),
+            size: format!("{}x{}", self.camera.width, self.camera.height),
             found: !targets.is_empty(),
             score: best_score(ranked),
-            calibrated: self.calibrated,
-            taught: matches!(ask, ObjectQuery::Text(_)) && session.is_taught(&text),
+            calibrated,
+            taught: matches!(query, ObjectQuery::Text(_)) && scene.is_taught(&text),
             text,
             objects: targets
                 .iter()
                 .zip(&owned)
-                .map(|(t, own)| self.object(session, camera.width, t, own))
+                .map(|(t, own)| self.object(scene, t, own))
                 .collect(),
             candidates: ranked[..ranked.len().min(candidates)].to_vec(),
             pixels: self.mask.iter().filter(|m| **m).count(),
             seen_best: None,
             mask: None,
             heatmap: None,
-            gaussians: session.gaussians.len(),
-            adapter: session.engine.name(),
+            gaussians: scene.gaussians().len(),
+            adapter: scene.adapter(),
             ms,
         }
     }
 
     /// Measures one object: its boxes in this view and in the world, its pixels and its Gaussians.
-    fn object(&self, session: &Scene, width: u32, hit: &Hit, own: &[usize]) -> ObjectReport {
+    fn object(&self, scene: &Scene, hit: &Hit, own: &[usize]) -> ObjectReport {
+        let width = self.camera.width;
         let mut bounds: Option<[u32; 4]> = None;
-        let mask = self.field.mask(self.grid, &[*hit]);
+        let mask = self.field.mask(&self.grid, &[*hit]);
         for p in (0..mask.len() as u32).filter(|p| mask[*p as usize]) {
             let (x, y) = (p % width, p / width);
             let b = bounds.get_or_insert([x, y, x + 1, y + 1]);
@@ -280,24 +228,19 @@ impl Answer<'_> {
             support: object.support,
             score: hit.score,
             bbox2d: bounds,
-            bbox3d: selection::robust_box(&session.gaussians, &session.manifest.frame, own),
+            bbox3d: selection::robust_box(scene.gaussians(), &scene.manifest().frame, own),
             pixels: mask.iter().filter(|m| **m).count(),
             gaussians: own.len(),
         }
     }
 
     /// Writes the mask, the overlay and, with `heat`, the heat map to `folder`. Records mask and
-    /// heat map in `report`, and returns the overlay.
+    /// heat map in the report, and returns the overlay.
     ///
     /// # Errors
     /// A file cannot be written.
-    pub fn write(
-        &self,
-        folder: &Path,
-        frame: &Frame,
-        heat: bool,
-        report: &mut AnswerReport,
-    ) -> Result<RgbImage> {
+    pub fn write(&mut self, folder: &Path, frame: &Frame, heat: bool) -> Result<RgbImage> {
+        let report = &mut self.report;
         let (w, h) = (frame.width, frame.height);
         let safe = file_name(&report.text);
         let view = report.view.clone();
@@ -315,10 +258,8 @@ impl Answer<'_> {
             report.mask = Some(path("mask"));
         }
         if heat {
-            image_io::save_png(
-                &path("heatmap"),
-                heatmap(&color, &self.field.relevancy(self.grid, &self.found.heat())),
-            )?;
+            let relevancy = self.field.relevancy(&self.grid, &self.found.heat());
+            image_io::save_png(&path("heatmap"), heatmap(&color, &relevancy))?;
             report.heatmap = Some(path("heatmap"));
         }
         Ok(overlay_image)

@@ -42,7 +42,7 @@ pub fn view_tiles(
     });
     let render = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
     let photo = session
-        .folder
+        .folder()
         .photo(&camera.name)
         .ok()
         .map(|photo| tile(photo, "photo"));
