@@ -1,5 +1,5 @@
 // Computes the gradients of blending, front to back from the stored frame, and writes one slot for
-// each (tile, Gaussian) pair; docs/gradients.md, section 1.
+// each (tile, Gaussian) pair; docs/how-it-works.md, section 5.1.
 //
 // R is the colour behind Gaussian i, including the background:
 //     dL/dalpha_i = T_i c_i.g - (R.g) / (1 - alpha_i)

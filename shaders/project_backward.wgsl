@@ -1,5 +1,5 @@
 // Sums the gradient slots of each Gaussian and propagates them through the projection to the
-// trained values: docs/gradients.md, sections 2 to 6, with the same symbols (d_x is dL/dx).
+// trained values: docs/how-it-works.md, 5.2 to 5.6, with the same symbols (d_x is dL/dx).
 //
 // Invocations take the Gaussians in depth order. Neighbours then touch similar numbers of tiles,
 // and their slots are contiguous.

@@ -3,14 +3,20 @@
 //! `fastlgs-bench` shares its options, progress bars and reports.
 
 mod commands;
+mod config_file;
 pub mod console;
 mod outcome;
+mod program;
+#[cfg(test)]
+mod reference;
 pub mod report;
 pub mod ui;
 mod words;
 
-use clap::{CommandFactory, Parser, Subcommand};
+use anyhow::Context;
+use clap::{FromArgMatches, Parser, Subcommand};
 pub use outcome::Outcome;
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 /// Builds 3-D scenes from photos and finds objects in them by text.
@@ -21,6 +27,12 @@ struct Cli {
     command: Command,
     #[command(flatten)]
     common: ui::Common,
+    /// Read options from a TOML file; `--print-config` prints one with all options of the command.
+    #[arg(long, value_name = "FILE", global = true)]
+    config: Option<std::path::PathBuf>,
+    /// Print a configuration file with all options of the command and their values.
+    #[arg(long, global = true, hide = true)]
+    print_config: bool,
 }
 
 #[derive(Subcommand)]
@@ -89,10 +101,39 @@ Run again, it keeps a finished scene and continues an interrupted run. It rebuil
 }
 
 /// Runs the command line with the arguments of this process.
+/// Runs the command line of this process.
 pub fn main() -> ExitCode {
-    let cli = Cli::parse();
+    let arguments = std::env::args_os().collect();
+    let mut program = program::command();
+    program.build();
+    let arguments = match config_file::expand(arguments, &program) {
+        Ok(arguments) => arguments,
+        Err(error) => return exit_code(Err(error)),
+    };
+    if arguments.iter().any(|word| word == "--print-config") {
+        return exit_code(print_config(program, arguments));
+    }
+    let matches = program.get_matches_from(arguments);
+    let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
     init_process(&cli.common);
     exit_code(run(cli.command, &cli.common))
+}
+
+/// Prints a configuration file of the command that `arguments` name.
+fn print_config(program: clap::Command, arguments: Vec<OsString>) -> anyhow::Result<Outcome> {
+    let matches = program
+        .clone()
+        .ignore_errors(true)
+        .get_matches_from(arguments);
+    let Some((name, matches)) = matches.subcommand() else {
+        anyhow::bail!("name a command: fastlgs COMMAND --print-config");
+    };
+    let command = program.find_subcommand(name).context("a command")?;
+    ui::write_line(format_args!(
+        "{}",
+        config_file::print(command, matches).trim_end()
+    ))?;
+    Ok(Outcome::Done)
 }
 
 /// Starts logging and sets the environment variables of graphics drivers.
@@ -153,7 +194,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         }
         Command::Models(args) => commands::models::run(&args, common, run),
         Command::Info(args) => commands::info::run(&args, common),
-        Command::Completions(args) => commands::shell::completions(&args, Cli::command()),
-        Command::Man(args) => commands::shell::man(&args, Cli::command()),
+        Command::Completions(args) => commands::shell::completions(&args, program::command()),
+        Command::Man(args) => commands::shell::man(&args, program::command()),
     }
 }

@@ -22,7 +22,7 @@ pub struct Common {
     #[arg(long, default_value_t = 0, global = true)]
     pub seed: u64,
     /// Device: `auto`, `cpu`, or the name or index of an adapter (`fastlgs info` lists them).
-    /// `auto` prefers a GPU, then the faster of software adapter and `cpu`.
+    /// `auto` uses a graphics card if there is one, else `cpu`.
     #[arg(long, default_value = "auto", global = true, env = "FASTLGS_DEVICE")]
     pub device: String,
 }

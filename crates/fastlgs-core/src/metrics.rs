@@ -1,4 +1,4 @@
-//! Metrics of masks and images. `docs/evaluation.md` states the rules of evaluation.
+//! Metrics of masks and images. `docs/research/evaluation.md` states the rules.
 
 /// Returns the intersection over union; 1 for two empty masks.
 pub fn iou(a: &[bool], b: &[bool]) -> f64 {

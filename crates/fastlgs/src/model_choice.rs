@@ -28,7 +28,7 @@ pub enum SegmenterKind {
     Offline,
     /// SAM, from ONNX files.
     Sam,
-    /// Masks of other programs beside the photos; docs/formats.md lists the layouts.
+    /// Masks of other programs beside the photos; docs/reference/formats.md lists the layouts.
     Import,
 }
 

@@ -1,6 +1,6 @@
 """Masks and embeddings of the caller's own models.
 
-Arrays are written beside the photos, in the layouts that `preprocess` imports (docs/formats.md).
+Arrays are written beside the photos, in the layouts that `preprocess` imports (docs/reference/formats.md).
 """
 
 import io

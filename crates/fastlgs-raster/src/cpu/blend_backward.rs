@@ -1,4 +1,4 @@
-//! CPU twin of `shaders/blend_backward.wgsl`: gradients of blending (docs/gradients.md, section 1).
+//! CPU twin of `shaders/blend_backward.wgsl`: gradients of blending (docs/how-it-works.md, section 5.1).
 
 use super::blend::{pixels_of, shown};
 use super::{Splat, alpha};

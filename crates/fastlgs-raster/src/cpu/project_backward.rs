@@ -70,7 +70,7 @@ fn sum_of(slots: &[f32], floats: usize, pairs: impl Iterator<Item = u32>) -> [f3
 }
 
 /// Propagates the summed slot of one Gaussian to its trained values and passes the gradients to
-/// `store_gradient(channel, gradient)`. Formulas and symbols are those of docs/gradients.md, sections 2 to 6.
+/// `store_gradient(channel, gradient)`. Formulas and symbols are those of docs/how-it-works.md, 5.2 to 5.6.
 /// Returns the length of the gradient of the projected mean in half-image units, 0 with frozen
 /// geometry, or none if the Gaussian is not drawn.
 pub(crate) fn backward_one(

@@ -365,7 +365,7 @@ fn by_change_body<V: Vector>(
 pub struct BackwardInput {
     /// dL/d(colour, feature).
     pub gradient: [Tile; 6],
-    /// R.g, with R the colour behind the Gaussians processed so far; docs/gradients.md, section 1.
+    /// R.g, with R the colour behind the Gaussians processed so far; docs/how-it-works.md, 5.1.
     pub r_dot_g: Tile,
     /// On entry 1 in the image and 0 in the padding.
     pub transmittance: Tile,

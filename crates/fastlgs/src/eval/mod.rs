@@ -1,4 +1,4 @@
-//! Measures accuracy on held-out views. `docs/evaluation.md` defines the measures.
+//! Measures accuracy on held-out views. `docs/guide.md` defines the measures.
 
 mod color;
 
@@ -62,7 +62,7 @@ impl Default for EvalConfig {
 }
 
 /// Report of an evaluation. Values are means over all labels of all views, unless stated otherwise.
-/// `docs/evaluation.md` defines them.
+/// `docs/guide.md` defines them.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct EvalReport {
     /// The scene folder.
