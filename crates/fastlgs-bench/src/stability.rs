@@ -11,7 +11,7 @@ use fastlgs::Run;
 use fastlgs::progress::Work;
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
-use fastlgs_core::synth::{KINDS, Kind};
+use fastlgs_synth::{KINDS, Kind};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};

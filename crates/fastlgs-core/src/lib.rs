@@ -36,7 +36,6 @@ pub mod sog;
 pub mod splat;
 pub mod splat_file;
 pub mod spz;
-pub mod synth;
 pub mod turbo;
 pub mod undistort;
 pub mod world_frame;

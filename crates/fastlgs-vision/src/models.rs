@@ -3,7 +3,7 @@
 use crate::model_paths::{self, CLIP_MERGES, NAMES, RUNTIME, offline_dir, runtime_library};
 use crate::{Error, Result};
 use fastlgs_core::fs::cache_dir;
-use fastlgs_core::synth::{PICTURES, TEXTURES};
+use fastlgs_synth::{PICTURES, TEXTURES};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 

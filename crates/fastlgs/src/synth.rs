@@ -4,7 +4,7 @@ use crate::error::{Context, bail};
 #[cfg(feature = "clap")]
 use crate::query::parse_size;
 use crate::{Result, Run};
-use fastlgs_core::synth::{self, KINDS, Kind, Masks};
+use fastlgs_synth::{KINDS, Kind, Masks};
 use fastlgs_vision::models;
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -108,7 +108,7 @@ pub fn synth(config: &SynthConfig, run: &Run) -> Result<SynthReport> {
     } else {
         Masks::Levels
     };
-    synth::write(&config.output, &world, config.holdout, masks, || {
+    fastlgs_synth::write(&config.output, &world, config.holdout, masks, || {
         drop(work.advance())
     })?;
     work.check()?;

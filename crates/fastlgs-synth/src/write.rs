@@ -1,8 +1,8 @@
 //! Writes a generated scene as a folder of photos.
 
 use super::{SceneObject, World, containing_ids};
-use crate::mask_list::{Mask, RunLengths};
-use crate::{Camera, Error, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
+use fastlgs_core::mask_list::{Mask, RunLengths};
+use fastlgs_core::{Camera, Error, LabelMap, Level, MaskList, Result, exr_image, fs, image_io};
 use serde_json::json;
 use std::path::Path;
 
@@ -104,7 +104,7 @@ pub fn write(
             .iter_mut()
             .zip(&areas)
             .for_each(|(most, area)| *most = *area.max(most));
-        if crate::scene_folder::is_held_out(index, holdout) {
+        if fastlgs_core::scene_folder::is_held_out(index, holdout) {
             labelled.push((camera, view.instances, areas));
         }
         let flip = glam::Mat4::from_diagonal(glam::Vec4::new(1.0, -1.0, -1.0, 1.0));

@@ -1,6 +1,6 @@
 //! Camera paths of generated scenes.
 
-use crate::Camera;
+use fastlgs_core::Camera;
 use glam::{Mat3, Vec3};
 use std::f32::consts::TAU;
 

@@ -15,7 +15,7 @@ mod write;
 pub use kinds::{KINDS, Kind, PICTURES, TEXTURES};
 pub use write::{Masks, write};
 
-use crate::{Camera, LabelMap};
+use fastlgs_core::{Camera, LabelMap};
 use glam::{Mat3, Vec2, Vec3};
 use hierarchy::Hierarchy;
 use image::{Rgb, RgbImage};
