@@ -171,8 +171,9 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
 /// views without them.
 fn importance_order(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize>> {
     let manifest = folder.manifest()?;
-    let trained =
-        fastlgs::train::TrainReport::from_manifest(&manifest, &folder.root)?.unwrap_or_default();
+    let trained = fastlgs::SceneNotes::read(&manifest, &folder.root)?
+        .train
+        .unwrap_or_default();
     let mut changes = Changes::of(scene);
     manifest
         .training(&folder.cameras()?)

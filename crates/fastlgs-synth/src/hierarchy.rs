@@ -97,10 +97,10 @@ impl Hierarchy {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use fastlgs_core::rng::Rng;
     use super::super::solid::Shape;
     use super::super::surface::Surface;
+    use super::*;
+    use fastlgs_core::rng::Rng;
     use glam::Mat3;
 
     #[test]

@@ -1,5 +1,6 @@
 //! Searches many scenes for the object that a text names.
 
+use crate::SceneNotes;
 use crate::error::{Context, bail};
 use crate::query::Texts;
 use crate::query::object_query::Embedded;
@@ -229,7 +230,7 @@ fn scenes_below(root: &Path) -> Result<(Vec<Scene>, Vec<Skipped>)> {
         let manifest = SceneFolder::new(&folder).manifest();
         let why = match &manifest {
             Err(error) => Some(error.to_string()),
-            Ok(own) => match train::TrainReport::from_manifest(own, &folder) {
+            Ok(own) => match SceneNotes::read(own, &folder).map(|notes| notes.train) {
                 Err(error) => Some(error.to_string()),
                 Ok(None) => Some("it was never trained".to_owned()),
                 Ok(Some(_)) => {

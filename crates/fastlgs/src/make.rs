@@ -4,9 +4,8 @@ use crate::error::Context;
 use crate::model_choice::SamPreset;
 use crate::output::{SceneLock, check_apart};
 use crate::preprocess::fingerprint;
-use crate::{Result, Run, checkpoints, preprocess, train};
+use crate::{Result, Run, SceneNotes, checkpoints, preprocess, train};
 use fastlgs_core::SceneFolder;
-use fastlgs_core::scene_folder::Manifest;
 use fastlgs_vision::conse;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -122,19 +121,17 @@ pub fn scene(
         how,
         files(&photos)?
     ]);
-    let known = folder
-        .manifest()
-        .ok()
-        .filter(|manifest| manifest.notes.get(train::MADE) == Some(&made));
+    // A scene that cannot be read is made again.
+    let known = folder.manifest().ok();
+    let known = known.and_then(|manifest| SceneNotes::read(&manifest, &folder.root).ok());
+    let known = known.filter(|notes| notes.made.as_ref() == Some(&made));
     let is_complete = [folder.ply_path(), folder.root.join("grid.json")]
         .iter()
         .all(|file| file.is_file());
     if let Some(report) = known
         .as_ref()
         .filter(|_| is_complete)
-        .map(|known| train::TrainReport::from_manifest(known, &folder.root))
-        .transpose()?
-        .flatten()
+        .and_then(|notes| notes.train.clone())
     {
         return Ok((State::Kept, report));
     }
@@ -145,9 +142,7 @@ pub fn scene(
     if !begun {
         checkpoints::forget(&folder);
         crate::preprocess::preprocess_locked(preprocess, &lock, runs[0])?;
-        let mut manifest: Manifest = folder.manifest()?;
-        manifest.notes.insert(train::MADE.to_owned(), made.clone());
-        folder.save_manifest(&manifest)?;
+        record(&folder, &made)?;
     }
     let report = train::train_locked(
         &train::TrainConfig {
@@ -157,11 +152,18 @@ pub fn scene(
         &lock,
         runs[1],
     )?;
-    let mut manifest = folder.manifest()?;
     // Record the photos as they were before training: later changes are not in the scene.
-    manifest.notes.insert(train::MADE.to_owned(), made);
-    folder.save_manifest(&manifest)?;
+    record(&folder, &made)?;
     Ok((State::Made, report))
+}
+
+/// Records in the manifest what the scene was made of.
+fn record(folder: &SceneFolder, made: &Value) -> Result<()> {
+    let mut manifest = folder.manifest()?;
+    let mut notes = SceneNotes::read(&manifest, &folder.root)?;
+    notes.made = Some(made.clone());
+    notes.store(&mut manifest)?;
+    Ok(folder.save_manifest(&manifest)?)
 }
 
 /// Returns the fingerprint of a video, or those of all files in a folder by name. Hidden files are

@@ -4,7 +4,7 @@ use crate::calibrations::Calibrations;
 use crate::error::{Context, bail};
 use crate::query::{ObjectQuery, Query, Texts};
 use crate::train::{self, TrainReport};
-use crate::{Result, model_choice};
+use crate::{Result, SceneNotes, model_choice};
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, ply};
 use fastlgs_grid::Grid;
@@ -60,7 +60,7 @@ impl Scene {
         let folder = SceneFolder::open(root)?;
         let manifest = folder.manifest()?;
         let mut gaussians = folder.gaussians()?;
-        let Some(trained) = TrainReport::from_manifest(&manifest, root)? else {
+        let Some(trained) = SceneNotes::read(&manifest, root)?.train else {
             let root = root.display();
             bail!(
                 "{root}: the photos were preprocessed again after the training; run 'fastlgs train {root}' again"

@@ -194,9 +194,6 @@ pub struct Adjusted {
     pub used: bool,
 }
 
-/// Key of the brightness note in the manifest.
-const BRIGHTNESS: &str = "brightness";
-
 /// Brightness of the training photos of a scene, relative to each other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Brightness {
@@ -208,29 +205,6 @@ pub struct Brightness {
 }
 
 impl Brightness {
-    /// Reads the brightness note of a manifest. Without a note, all photos count as equally bright.
-    ///
-    /// # Errors
-    /// A note that cannot be read.
-    pub fn from_manifest(manifest: &Manifest) -> crate::Result<Self> {
-        let Some(note) = manifest.notes.get(BRIGHTNESS) else {
-            return Ok(Self::default());
-        };
-        serde_json::from_value(note.clone()).map_err(|error| {
-            let mend = "run 'fastlgs preprocess' again";
-            crate::Error::Invalid(format!(
-                "scene.json: the brightness of the photos cannot be read ({error}); {mend}"
-            ))
-        })
-    }
-
-    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<(), serde_json::Error> {
-        manifest
-            .notes
-            .insert(BRIGHTNESS.to_owned(), serde_json::to_value(self)?);
-        Ok(())
-    }
-
     /// Returns the gain of each colour channel of a photo; 1 for an unknown photo.
     pub fn gain(&self, name: &str) -> [f32; 3] {
         self.gains.get(name).copied().unwrap_or([1.0; 3])

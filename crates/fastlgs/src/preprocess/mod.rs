@@ -7,6 +7,7 @@ mod photos;
 mod poses;
 mod video;
 
+use crate::SceneNotes;
 use crate::cache::Cache;
 use crate::error::{Context, bail};
 use crate::model_choice::EncoderKind;
@@ -251,7 +252,11 @@ pub(crate) fn preprocess_locked(
         lap("embeddings");
     }
     manifest.seconds = seconds.clone();
-    light.note(&mut manifest)?;
+    SceneNotes {
+        brightness: Some(light.clone()),
+        ..SceneNotes::default()
+    }
+    .store(&mut manifest)?;
     // Training writes the object maps in place, so the manifest lists them now.
     let maps = poses
         .iter()

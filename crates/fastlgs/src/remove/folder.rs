@@ -1,5 +1,6 @@
 //! Writes the scene folder of a scene without the removed object.
 
+use crate::SceneNotes;
 use crate::staged::StagedOutput;
 use crate::{Result, Scene, train, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
@@ -91,20 +92,15 @@ pub fn write(
         std::fs::remove_file(&compact).map_err(Error::io(&compact))?;
     }
     // The result is not an output of `make`.
-    manifest.notes.remove(train::MADE);
-    let removed = manifest
-        .notes
-        .entry("removed".to_owned())
-        .or_insert_with(|| serde_json::json!([]));
-    removed
-        .as_array_mut()
-        .into_iter()
-        .for_each(|list| list.push(what.into()));
-    if let Some(train) = manifest.notes.get_mut("train") {
-        (train["gaussians"], train["objects"]) =
-            (session.gaussians().len().into(), grid.objects.len().into());
-        train["clear"] = transparent::count(session.gaussians()).into();
+    let mut notes = SceneNotes::read(&manifest, &folder.root)?;
+    notes.made = None;
+    notes.removed.push(what.to_owned());
+    if let Some(train) = &mut notes.train {
+        train.gaussians = session.gaussians().len();
+        train.objects = grid.objects.len();
+        train.clear = transparent::count(session.gaussians());
     }
+    notes.store(&mut manifest)?;
     let maps = session
         .manifest()
         .training(session.cameras())

@@ -3,7 +3,7 @@
 use super::config::{Background, TrainConfig};
 use super::report::TrainReport;
 use crate::error::bail;
-use crate::{Result, Run};
+use crate::{Result, Run, SceneNotes};
 use fastlgs_core::rng::Rng;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians, SceneFolder, WorldFrame, image_io, splat_file};
@@ -135,7 +135,9 @@ pub fn with_earlier_settings(
 ) -> Result<TrainConfig> {
     let own = config.init.as_ref().filter(|path| is_own(folder, path));
     let earlier = if own.is_some() {
-        TrainReport::from_manifest(manifest, &folder.root)?.unwrap_or_default()
+        SceneNotes::read(manifest, &folder.root)?
+            .train
+            .unwrap_or_default()
     } else {
         TrainReport::default()
     };

@@ -90,28 +90,7 @@ impl From<TrainStep> for CurvePoint {
     }
 }
 
-/// Key of the training note in the manifest.
-const NOTE: &str = "train";
-
 impl TrainReport {
-    /// Reads the training note of a manifest; `None` if the scene was not trained since it was
-    /// preprocessed. `root` is the scene folder.
-    ///
-    /// # Errors
-    /// A note that cannot be read. Without it, background and filter of renders would be wrong.
-    pub fn from_manifest(manifest: &Manifest, root: &Path) -> Result<Option<Self>> {
-        let Some(note) = manifest.notes.get(NOTE) else {
-            return Ok(None);
-        };
-        let read = serde_json::from_value(note.clone()).map_err(|error| {
-            let root = root.display();
-            Error::Invalid(format!(
-                "{root}/scene.json: the training note cannot be read ({error}); run 'fastlgs train {root}' again"
-            ))
-        });
-        read.map(Some)
-    }
-
     /// Returns the view of a camera, with the background and filter of the training.
     pub fn view(&self, camera: &Camera, scene: &Gaussians) -> View {
         self.view_of(camera, scene.len(), scene.sh_degree)
@@ -123,13 +102,5 @@ impl TrainReport {
         view.antialias = u32::from(self.antialias);
         view.background_color[..3].copy_from_slice(&self.background);
         view
-    }
-
-    /// Stores the report in the manifest.
-    pub(super) fn note(&self, manifest: &mut Manifest) -> Result<()> {
-        manifest
-            .notes
-            .insert(NOTE.to_owned(), serde_json::to_value(self)?);
-        Ok(())
     }
 }

@@ -2,7 +2,6 @@
 
 use super::config::{Align, Exposures, FeatureMode, TrainConfig};
 use super::mask_supervision;
-use crate::Result;
 use crate::preprocess::Brightness;
 use fastlgs_core::Gaussians;
 use fastlgs_core::scene_folder::Manifest;
@@ -17,11 +16,12 @@ pub fn settings(
     first: &Gaussians,
     views: &Targets,
     manifest: &Manifest,
+    brightness: &Brightness,
     seed: u64,
-) -> Result<TrainerConfig> {
+) -> TrainerConfig {
     let by_descent = config.feature_mode == FeatureMode::Train;
     let background = config.background.unwrap_or_default();
-    Ok(TrainerConfig {
+    TrainerConfig {
         iterations: config.iterations(),
         seed,
         budget: config.budget(views.pixels()),
@@ -45,7 +45,7 @@ pub fn settings(
         background: background.color,
         learn_background: background.learn,
         exposure: match config.exposure {
-            Exposures::Auto => Brightness::from_manifest(manifest)?.spread_stops >= VARYING,
+            Exposures::Auto => brightness.spread_stops >= VARYING,
             Exposures::On => true,
             Exposures::Off => false,
         },
@@ -55,5 +55,5 @@ pub fn settings(
             Align::Off => Alignment::Off,
         },
         ..TrainerConfig::default()
-    })
+    }
 }
