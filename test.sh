@@ -9,8 +9,10 @@ cd "$(dirname "$0")"
 export NODEVICE_SELECT=1          # Mesa's device chooser prints warnings without a desktop session
 export FASTLGS_REQUIRE_GPU=1      # a missing device is an error, not a skip
 export FASTLGS_REQUIRE_MODELS=1   # missing models as well; setup.sh installs them
+ignored=
 if [ "${1:-}" = --all ]; then
     export FASTLGS_TEST_ALL=1 FASTLGS_FUZZ_SECONDS=${FASTLGS_FUZZ_SECONDS:-5}
+    ignored=--include-ignored
 fi
 # The same options as in setup.sh, so that nothing is built twice.
 with="--workspace --no-default-features --features fastlgs-cli/load-ort,fastlgs-cli/opencv"
@@ -35,7 +37,7 @@ lap "Python"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
 # The log shows the numbers of kills, damaged inputs and benches, and the slowest tests.
 # shellcheck disable=SC2086
-python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output
+python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output $ignored
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
     # Tests both kinds of key points against each other.
     cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output

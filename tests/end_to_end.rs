@@ -18,6 +18,25 @@ use run::{assert_fails, coffee_iou, copy_folder, fastlgs, fixture, json, text};
 use serde_json::Value;
 use std::path::Path;
 
+/// Trains a small scene with the shaders, where the other tests train on the CPU.
+#[test]
+fn the_adapter_trains_a_scene() {
+    if !run::requirements_met() {
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (photos, scene) = (dir.path().join("photos"), dir.path().join("scene"));
+    let synth = ["synth", "table", "--views", "12", "--size", "96x72", "-o"];
+    json(&[&synth[..], &[text(&photos)]].concat());
+    let preprocess = ["preprocess", text(&photos), "-o", text(&scene)];
+    json(&[&preprocess[..], &["--segmenter", "import"]].concat());
+    let train = ["train", text(&scene), "--iterations", "200"];
+    let report = json(&[&train[..], &["--budget", "2000"]].concat());
+    assert_eq!(report["device"]["device"], run::adapter());
+    assert!(report["psnr_held_out"].as_f64() > Some(15.0), "{report}");
+    assert!(report["objects"].as_u64() > Some(3), "{report}");
+}
+
 #[test]
 fn the_papers_mapping_and_trained_features_work_too() {
     let Some(f) = fixture() else { return };
@@ -35,6 +54,8 @@ fn the_papers_mapping_and_trained_features_work_too() {
         "train",
         "--theta",
         "0.8",
+        "--device",
+        "cpu",
     ];
     let mut args = vec!["train", text(&scene), "--init-ply", text(&start)];
     args.extend(options);
@@ -79,7 +100,7 @@ fn the_papers_mapping_and_trained_features_work_too() {
 
     // Trains features alone. Geometry and colour of the Gaussians stay.
     let before = ply::read(&start).expect("the start");
-    args.extend(["--freeze", "--device", "cpu"]);
+    args.push("--freeze");
     args[5] = "100";
     let report = json(&args);
     let after = ply::read(&scene.join("scene.ply")).expect("the scene");

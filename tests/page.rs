@@ -694,6 +694,7 @@ fn a_shared_folder_answers_without_a_program() {
 }
 
 #[test]
+#[ignore = "minutes; ./test.sh --all runs it"]
 fn the_fox_lights_up_in_the_browser() {
     let photos = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data/fox");
     if !photos.is_dir() {

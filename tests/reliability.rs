@@ -4,20 +4,17 @@
 #[path = "support/run.rs"]
 mod run;
 
-use fastlgs_core::rng::Rng;
 use run::{copy_folder, error_line, json, text};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
-use std::time::{Duration, Instant};
 
 /// A small preprocessed and trained scene, with the duration of its training.
 struct Fixture {
     dir: tempfile::TempDir,
     trained: PathBuf,
-    training: Duration,
 }
 
 const TRAINING: [&str; 6] = [
@@ -57,13 +54,8 @@ fn fixture() -> Option<&'static Fixture> {
                 "import",
             ]);
             copy_folder(&trained, &dir.path().join("untrained"));
-            let started = Instant::now();
             json(&[&["train", text(&trained)], &TRAINING[..]].concat());
-            Some(Fixture {
-                dir,
-                trained,
-                training: started.elapsed(),
-            })
+            Some(Fixture { dir, trained })
         })
         .as_ref()
 }
@@ -74,248 +66,162 @@ fn results(scene: &Path) -> [Vec<u8>; 3] {
         .map(|f| std::fs::read(scene.join(f)).expect("a file"))
 }
 
+/// Runs the binary until it ends itself at a stop point, as if it were killed there. Returns whether
+/// it was stopped.
+fn stopped(args: &[&str], stage: &str, step: u64) -> bool {
+    let output = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
+        .env("FASTLGS_STOP_AT", format!("{stage}:{step}"))
+        .args(args)
+        .output()
+        .expect("the binary starts");
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        output.status.success() || output.status.code().is_none(),
+        "{args:?}: {message}"
+    );
+    !output.status.success()
+}
+
 #[test]
 fn training_survives_kills() {
     let Some(f) = fixture() else { return };
     let scene = f.dir.path().join("killed");
     copy_folder(&f.dir.path().join("untrained"), &scene);
-    let mut rng = Rng::new(20, "kills");
-    let (mut kills, mut resumed, mut finished) = (0, 0, 0);
-    // Later runs find a checkpoint more often, because resumed runs start in the middle.
-    let target_kills = if run::full_tests() { 20 } else { 5 };
-    while kills < target_kills {
-        resumed += usize::from(scene.join("checkpoints/train.json").is_file());
-        let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
-            .args([&["train", text(&scene), "--resume", "-q"], &TRAINING[..]].concat())
-            .stderr(Stdio::null())
-            .stdout(Stdio::null())
-            .spawn()
-            .expect("the binary starts");
-        std::thread::sleep(f.training.mul_f32(rng.range(0.05, 0.8)));
-        match child.try_wait().expect("a child") {
-            Some(status) => {
-                assert!(
-                    status.success(),
-                    "the run after {kills} kills failed: {status}"
-                );
-                finished += 1;
-            }
-            None => {
-                child.kill().expect("a child");
-                child.wait().expect("an end");
-                kills += 1;
-            }
-        }
+    let train = [
+        &["train", text(&scene), "--resume", "--quiet"],
+        &TRAINING[..],
+    ]
+    .concat();
+    // Before the first checkpoint, after it, after the second, while objects are found, and while
+    // the finished scene replaces the earlier one.
+    for (stage, step) in [
+        ("train", 200),
+        ("train", 620),
+        ("train", 1100),
+        ("votes", 5),
+        ("publish", 2),
+    ] {
+        assert!(stopped(&train, stage, step), "{stage}:{step}");
     }
-    json(&[&["train", text(&scene), "--resume"], &TRAINING[..]].concat());
-    println!(
-        "kills: {kills}, runs with a checkpoint: {resumed}, runs that finished before their kill: {finished}"
-    );
-    assert!(
-        resumed > target_kills / 7,
-        "too few runs found a checkpoint: {resumed}"
-    );
+    json(&train);
     assert!(
         results(&scene) == results(&f.trained),
-        "a killed and resumed run must give the same bytes"
+        "a training that was killed and resumed ends in the same bytes"
     );
-    let left = std::fs::read_dir(&scene)
-        .expect("the scene")
-        .flatten()
-        .filter(|e| e.file_name().to_string_lossy().contains(".partial"));
-    println!("partial files left by kills: {}", left.count());
 }
 
 #[test]
-fn a_killed_make_goes_on() {
+fn a_killed_make_continues() {
     let Some(f) = fixture() else { return };
     let (photos, scene) = (f.dir.path().join("photos"), f.dir.path().join("made"));
-    let make = [
-        "make",
-        text(&photos),
-        "-o",
-        text(&scene),
-        "--segmenter",
-        "import",
-        "--device",
-        "cpu",
-    ];
-    let begun = scene.join("checkpoints/train.json");
-    let mut child = Command::new(env!("CARGO_BIN_EXE_fastlgs"))
-        .args(make)
-        .arg("-q")
-        .stdout(Stdio::null())
-        .spawn()
-        .expect("the binary starts");
-    while !begun.is_file() {
-        let ended = child.try_wait().expect("a child");
-        assert!(
-            ended.is_none(),
-            "the run ended before its first checkpoint: {ended:?}"
-        );
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    child.kill().expect("a child");
-    child.wait().expect("an end");
-    let output = run::fastlgs(&[&make[..], &["-v"]].concat());
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success(), "{said}");
+    let make = |scene: &Path| -> Vec<String> {
+        let options = ["--segmenter", "import", "--device", "cpu"];
+        let words = ["make", text(&photos), "-o", text(scene)];
+        words
+            .iter()
+            .chain(&options)
+            .map(|word| (*word).to_owned())
+            .collect()
+    };
+    let words = make(&scene);
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    assert!(stopped(&words, "train", 520));
+    let output = run::fastlgs(&[&words[..], &["-v"]].concat());
+    let messages = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{messages}");
     assert!(
-        said.contains("training continues from its checkpoint"),
-        "{said}"
+        messages.contains("training continues from its checkpoint"),
+        "{messages}"
     );
-    assert_eq!(json(&[&make[..], &["-q"]].concat())["state"], "kept");
+    assert_eq!(json(&[&words[..], &["-q"]].concat())["state"], "kept");
     let anew = f.dir.path().join("anew");
-    json(&[
-        "make",
-        text(&photos),
-        "-o",
-        text(&anew),
-        "--segmenter",
-        "import",
-        "--device",
-        "cpu",
-    ]);
+    let words = make(&anew);
+    json(&words.iter().map(String::as_str).collect::<Vec<_>>());
     assert!(
         results(&scene) == results(&anew),
-        "a killed and resumed make must give the same bytes"
+        "an interrupted make ends in the same bytes"
     );
 }
 
+/// The files of a scene but for the manifest, which has seconds in it.
+fn files_of(root: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let folders = ["photos", "cameras", "masks"].map(|folder| root.join(folder));
+    let entries = folders
+        .iter()
+        .flat_map(std::fs::read_dir)
+        .flat_map(Iterator::flatten);
+    let paths = entries
+        .map(|entry| entry.path())
+        .chain([root.join("scene.ply")]);
+    let content = |path: PathBuf| {
+        let name = path.strip_prefix(root).expect("within").to_owned();
+        (name, std::fs::read(&path).expect("a file"))
+    };
+    paths.filter(|path| path.is_file()).map(content).collect()
+}
+
 #[test]
-fn a_preprocess_that_ends_early_leaves_the_scene_whole() {
+fn an_interrupted_preprocess_keeps_the_scene() {
     let Some(f) = fixture() else { return };
     let scene = f.dir.path().join("begun");
     copy_folder(&f.trained, &scene);
     let photos = f.dir.path().join("photos");
-    // Reads the scene's files without the manifest. The manifest holds seconds, which differ
-    // between runs.
-    let made = |root: &Path| {
-        let folders = ["photos", "cameras", "masks"].map(|folder| root.join(folder));
-        let entries = folders
-            .iter()
-            .flat_map(std::fs::read_dir)
-            .flat_map(Iterator::flatten)
-            .map(|entry| entry.path());
-        let file = |path: PathBuf| {
-            (
-                path.strip_prefix(root).expect("within").to_owned(),
-                std::fs::read(&path).expect("a file"),
-            )
-        };
-        entries
-            .filter(|path| path.is_file())
-            .chain([root.join("scene.ply")])
-            .map(file)
-            .collect::<BTreeMap<_, _>>()
-    };
     let manifest = |root: &Path| std::fs::read(root.join("scene.json")).ok();
-    let all = |root: &Path| (made(root), manifest(root));
-    let before = all(&scene);
+    let before = (files_of(&scene), manifest(&scene));
+    let smaller = |scene: &Path| -> Vec<String> {
+        let options = [
+            "--max-side",
+            "96",
+            "--segmenter",
+            "import",
+            "--device",
+            "cpu",
+        ];
+        let words = ["preprocess", text(&photos), "-o", text(scene)];
+        words
+            .iter()
+            .chain(&options)
+            .map(|word| (*word).to_owned())
+            .collect()
+    };
+    let words = smaller(&scene);
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+
     let labels = f.dir.path().join("labels-of-others");
     std::fs::create_dir_all(&labels).expect("a folder");
     let label = std::fs::read_to_string(photos.join("labels/000.json")).expect("a label");
     std::fs::write(labels.join("999.json"), label.replace("000", "999")).expect("a label");
-    let smaller = [
-        "preprocess",
-        text(&photos),
-        "-o",
-        text(&scene),
-        "--max-side",
-        "96",
-        "--segmenter",
-        "import",
-        "--device",
-        "cpu",
-    ];
-    run::assert_fails(
-        &[&smaller[..], &["--holdout-labels", text(&labels)]].concat(),
-        &["999", "none of the photos"],
-    );
+    let with_labels = [&words[..], &["--holdout-labels", text(&labels)]].concat();
+    run::assert_fails(&with_labels, &["999", "none of the photos"]);
     assert!(
-        all(&scene) == before,
-        "a run that fails for labels of other photos must not change the scene"
+        (files_of(&scene), manifest(&scene)) == before,
+        "labels of other photos"
     );
+
+    for (stage, step) in [("photos", 3), ("matches", 5), ("masks", 10)] {
+        assert!(stopped(&words, stage, step), "{stage}:{step}");
+        assert!(
+            (files_of(&scene), manifest(&scene)) == before,
+            "killed at {stage}:{step}"
+        );
+    }
+    // The manifest is moved away first and comes last. Until then the next run restores the scene.
+    for step in [1, 5, 40] {
+        assert!(stopped(&words, "publish", step), "publish:{step}");
+        assert!(manifest(&scene).is_none(), "publish:{step}");
+        assert!(stopped(&words, "photos", 1), "the next run");
+        assert!(
+            (files_of(&scene), manifest(&scene)) == before,
+            "restored after publish:{step}"
+        );
+    }
     let anew = f.dir.path().join("begun-anew");
     copy_folder(&f.trained, &anew);
-    json(&[
-        "preprocess",
-        text(&photos),
-        "-o",
-        text(&anew),
-        "--max-side",
-        "96",
-        "--segmenter",
-        "import",
-        "--device",
-        "cpu",
-    ]);
-    let after = made(&anew);
-    assert!(after != before.0);
-    let begin = || {
-        Command::new(env!("CARGO_BIN_EXE_fastlgs"))
-            .args(smaller)
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-    };
-    let end = |mut run: Child| {
-        let was_running = run.try_wait().expect("a child").is_none();
-        let _ = run.kill();
-        run.wait().expect("an end");
-        was_running
-    };
-    let mut kills = 0;
-    for wait in [20, 60, 120, 200, 400] {
-        let run = begin().expect("the binary starts");
-        std::thread::sleep(Duration::from_millis(wait));
-        // A run that already moves its output into the scene, or has finished, is tested in the
-        // next loop.
-        if !end(run) || manifest(&scene) != before.1 {
-            break;
-        }
-        assert!(
-            all(&scene) == before,
-            "a run killed after {wait} ms must not change the scene"
-        );
-        kills += 1;
-    }
-    // Kills runs while or after they move their output into the scene. If the manifest is missing,
-    // the next run must restore the earlier scene.
-    let mut killed_while_moving = 0;
-    for _ in 0..3 {
-        std::fs::remove_dir_all(&scene).expect("a scene");
-        copy_folder(&f.trained, &scene);
-        let mut run = begin().expect("the binary starts");
-        while manifest(&scene) == before.1 && run.try_wait().expect("a child").is_none() {}
-        end(run);
-        if manifest(&scene).is_none() {
-            killed_while_moving += 1;
-            let run = begin().expect("the binary starts");
-            let started = Instant::now();
-            while manifest(&scene).is_none() {
-                assert!(
-                    started.elapsed() < Duration::from_secs(60),
-                    "the next run does not restore the earlier scene"
-                );
-            }
-            let had_time = !end(run) || made(&scene) == after;
-            assert!(
-                had_time || all(&scene) == before,
-                "the earlier scene must be restored"
-            );
-        } else {
-            assert!(
-                made(&scene) == after,
-                "a run killed after moving its manifest must leave a complete scene"
-            );
-        }
-    }
-    println!(
-        "preprocess: {kills} kills before and {killed_while_moving} of 3 during the final moves, no scene is mixed"
-    );
-    json(&smaller);
-    assert!(kills > 0 && made(&scene) == after && !scene.join("preprocess.partial").exists());
+    let other = smaller(&anew);
+    json(&other.iter().map(String::as_str).collect::<Vec<_>>());
+    json(&words);
+    assert!(files_of(&scene) == files_of(&anew) && files_of(&scene) != before.0);
+    assert!(!scene.join("preprocess.partial").exists());
 }
 
 #[test]

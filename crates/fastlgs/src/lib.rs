@@ -39,6 +39,7 @@ pub mod render;
 pub mod scene;
 pub mod scene_notes;
 mod staged;
+mod stop_point;
 pub mod synth;
 pub mod teach;
 pub mod train;

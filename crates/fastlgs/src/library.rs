@@ -4,7 +4,7 @@ use crate::SceneNotes;
 use crate::error::{Context, bail};
 use crate::query::Texts;
 use crate::query::object_query::Embedded;
-use crate::{Result, Run, model_choice, train};
+use crate::{Result, Run, model_choice};
 use fastlgs_core::SceneFolder;
 use fastlgs_core::scene_folder::Manifest;
 use fastlgs_grid::Grid;

@@ -1,6 +1,6 @@
 //! Progress of a running stage: messages, warnings and cancellation.
 
-use crate::{Error, Result};
+use crate::{Error, Result, stop_point};
 use fastlgs_core::Gaussians;
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -144,6 +144,7 @@ impl Work<'_> {
             total: self.total,
             note: "",
         });
+        stop_point::reach(self.stage, done);
         self.check()
     }
 

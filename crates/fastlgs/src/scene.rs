@@ -248,12 +248,8 @@ impl Scene {
     /// trained. With `tau_ac`, codes are rendered in both cases (paper). Id weights include
     /// transparent objects, drawn as solid. The view that was rendered last is kept.
     pub fn field(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Arc<Field>> {
-        if let Some(last) = self
-            .last_field
-            .as_ref()
-            .filter(|last| last.camera == *camera && last.tau_ac == tau_ac)
-        {
-            return Ok(last.field.clone());
+        if let Some(field) = self.rendered(camera, tau_ac) {
+            return Ok(field);
         }
         let field = Arc::new(self.render_objects(camera, tau_ac)?);
         self.last_field = Some(LastField {
@@ -262,6 +258,12 @@ impl Scene {
             field: field.clone(),
         });
         Ok(field)
+    }
+
+    /// Returns the object data of the view that was rendered last, if it is this one.
+    pub(crate) fn rendered(&self, camera: &Camera, tau_ac: Option<f32>) -> Option<Arc<Field>> {
+        let last = self.last_field.as_ref()?;
+        (last.camera == *camera && last.tau_ac == tau_ac).then(|| last.field.clone())
     }
 
     fn render_objects(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {

@@ -3,6 +3,7 @@
 
 use crate::Result;
 use crate::error::bail;
+use crate::stop_point;
 use fastlgs_core::scene_folder::{MANIFEST, Manifest};
 use fastlgs_core::{Error, SceneFolder};
 use std::collections::BTreeSet;
@@ -92,6 +93,7 @@ impl StagedOutput {
         let done = moves_out.chain(moves_in).try_for_each(|(from, to)| {
             if rename_if_there(&from, &to)? {
                 moved.push((from, to));
+                stop_point::reach("publish", moved.len() as u64);
             }
             Ok(())
         });

@@ -2,7 +2,6 @@
 
 use crate::model_choice::ModelChoice;
 use fastlgs_core::dataset::PoseConvention;
-use fastlgs_core::scene_folder::Manifest;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::PathBuf;

@@ -149,8 +149,9 @@ impl<'a> Query<'a> {
                 .as_secs_f64()
                 * 1e3
         };
+        let is_rendered = scene.rendered(&camera, self.tau_ac).is_some();
         let field = scene.field(&camera, self.tau_ac)?;
-        let render = lap();
+        let render = if is_rendered { 0.0 } else { lap() };
         let embedded = self.object.embed(scene, &self.negatives)?;
         let encode = lap();
         let found = embedded.find(&grid, &field, &camera, &self.config)?;

@@ -2,7 +2,7 @@
 
 use crate::SceneNotes;
 use crate::staged::StagedOutput;
-use crate::{Result, Scene, train, transparent};
+use crate::{Result, Scene, transparent};
 use fastlgs_core::{Camera, Error, SceneFolder, image_io, ply};
 use fastlgs_grid::Grid;
 use fastlgs_grid::evidence::{self, Pairs};

@@ -1,14 +1,13 @@
 //! Report of `train`, which the manifest also stores.
 
 use super::config::{FeatureMode, Mapping, Preset};
+use crate::objects;
 use crate::progress::TrainStep;
-use crate::{Error, Result, objects};
-use fastlgs_core::scene_folder::Manifest;
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_raster::budget::Removal;
 use fastlgs_raster::{Choice, View};
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Report of `train`. The manifest stores it as a note.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]

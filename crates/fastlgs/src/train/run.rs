@@ -3,7 +3,7 @@
 use super::{CurvePoint, Inputs, Mapping, init, mask_supervision};
 use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
-use crate::{Result, Run, checkpoints, objects, transparent};
+use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
 use fastlgs_core::{Camera, Gaussians};
 use fastlgs_raster::{Choice, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
 use std::time::Instant;
@@ -168,6 +168,7 @@ impl Watch<'_> {
             mask_supervision::begin(trainer, &self.inputs.folder, &config, self.run)?;
             self.supervision_seconds += started.elapsed().as_secs_f64();
         }
+        stop_point::reach("train", u64::from(iteration));
         let loss = 0.8 * losses.color_l1 + 0.2 * (1.0 - losses.color_ssim);
         let mut step = TrainStep {
             iteration,
