@@ -227,11 +227,7 @@ fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Resul
     for (id, view) in views.iter().enumerate() {
         let frame = engine.render(*view, Channels::Both)?;
         pairs += f64::from(frame.pairs) / views.len() as f64;
-        splats_per_pixel += frame
-            .channels(7, 8)
-            .iter()
-            .map(|w| f64::from(*w))
-            .sum::<f64>()
+        splats_per_pixel += frame.processed().iter().map(|w| f64::from(*w)).sum::<f64>()
             / (pixels * views.len()) as f64;
         engine.step(view.for_training(), id, &full, &step)?;
         engine.step(view.for_training(), id, &options(Channels::Color), &step)?;

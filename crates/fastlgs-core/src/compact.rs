@@ -9,7 +9,7 @@
 //! bytes, n), most significant byte first, and `GROUP.range` F32 (c, 2). Channels are those of
 //! [`Gaussians::to_channels`].
 
-use crate::gaussians::{BASE_CHANNELS, MAX_SH_DEGREE, channels, rest_len};
+use crate::gaussians::{BASE_CHANNELS, MAX_SH_DEGREE, channel, channels, rest_len};
 use crate::{Error, Gaussians, Result, fs};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -32,11 +32,11 @@ const MAX_BYTES: u8 = 3;
 /// Returns the channels of a group.
 fn group(index: usize, sh_degree: u32) -> Range<usize> {
     match index {
-        0 => 0..3,
-        1 => 3..6,
-        2 => 6..10,
-        3 => 10..11,
-        4 => 11..14,
+        0 => channel::MEAN,
+        1 => channel::LOG_SCALE,
+        2 => channel::ROTATION,
+        3 => channel::OPACITY..channel::OPACITY + 1,
+        4 => channel::COLOR,
         _ => BASE_CHANNELS..channels(sh_degree),
     }
 }

@@ -43,6 +43,24 @@ pub struct Gaussians {
 /// triple after the other.
 pub const BASE_CHANNELS: usize = 17;
 
+/// Channels of the trained floats of a Gaussian; `shaders/shared/channels.wgsl` has the same.
+pub mod channel {
+    use std::ops::Range;
+
+    /// Mean in units of the scene.
+    pub const MEAN: Range<usize> = 0..3;
+    /// Natural logarithms of the scales.
+    pub const LOG_SCALE: Range<usize> = 3..6;
+    /// Rotation quaternion w, x, y, z.
+    pub const ROTATION: Range<usize> = 6..10;
+    /// Logit of the opacity.
+    pub const OPACITY: usize = 10;
+    /// SH coefficients of degree 0.
+    pub const COLOR: Range<usize> = 11..14;
+    /// Feature.
+    pub const FEATURE: Range<usize> = 14..17;
+}
+
 /// Highest SH degree that kernels and file formats support.
 pub const MAX_SH_DEGREE: u32 = 3;
 
@@ -162,18 +180,18 @@ impl Gaussians {
         let at = |c: usize, i: usize| Vec3::new(v(c, i), v(c + 1, i), v(c + 2, i));
         let vec3 = |c: usize| (0..n).map(|i| at(c, i)).collect::<Vec<_>>();
         Self {
-            means: vec3(0),
-            log_scales: vec3(3),
+            means: vec3(channel::MEAN.start),
+            log_scales: vec3(channel::LOG_SCALE.start),
             rotations: (0..n)
-                .map(|i| [v(6, i), v(7, i), v(8, i), v(9, i)])
+                .map(|i| std::array::from_fn(|k| v(channel::ROTATION.start + k, i)))
                 .collect(),
-            opacity_logits: values[10 * n..11 * n].to_vec(),
-            sh_dc: vec3(11),
+            opacity_logits: values[channel::OPACITY * n..(channel::OPACITY + 1) * n].to_vec(),
+            sh_dc: vec3(channel::COLOR.start),
             sh_degree,
             sh_rest: (0..n)
                 .flat_map(|i| (0..rest_len(sh_degree)).map(move |k| at(BASE_CHANNELS + 3 * k, i)))
                 .collect(),
-            features: vec3(14),
+            features: vec3(channel::FEATURE.start),
             object_ids: ids.map_or_else(|| vec![0; n], <[u16]>::to_vec),
         }
     }

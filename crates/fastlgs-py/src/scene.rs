@@ -311,9 +311,9 @@ impl Scene {
                 }?;
                 let pixels = size(&camera).iter().product::<usize>();
                 let planes = if color {
-                    frame.channels(0, 3)
+                    frame.color()
                 } else {
-                    frame.channels(3, 6)
+                    frame.feature()
                 };
                 let values: Vec<f32> = (0..pixels)
                     .flat_map(|p| [planes[p], planes[pixels + p], planes[2 * pixels + p]])

@@ -34,7 +34,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     )?;
     image_io::save_png(
         Path::new(&picture),
-        image_io::from_planar(frame.channels(0, 3), frame.width, frame.height),
+        image_io::from_planar(frame.color(), frame.width, frame.height),
     )?;
     println!(
         "{} Gaussians and {} (tile, Gaussian) pairs, rendered on {}: {picture}",

@@ -197,7 +197,7 @@ fn median_depth(engine: &mut dyn Engine, view: View) -> Result<Option<f32>> {
     let solid = frame
         .channels(3, 4)
         .iter()
-        .zip(frame.channels(6, 7))
+        .zip(frame.transmittance())
         .filter(|(_, t)| **t < 0.5);
     let mut depths: Vec<f32> = solid.map(|(z, t)| z / (1.0 - t)).collect();
     depths.sort_by(f32::total_cmp);

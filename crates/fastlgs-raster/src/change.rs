@@ -131,7 +131,7 @@ mod tests {
             engine
                 .render(view(scene.len()), Channels::Color)
                 .unwrap()
-                .channels(0, 3)
+                .color()
                 .to_vec()
         };
         let whole = rendered(&scene);

@@ -3,7 +3,7 @@
 
 use fastlgs_core::Gaussians;
 use fastlgs_core::curve::morton_order;
-use fastlgs_core::gaussians::{channels, logit, sigmoid};
+use fastlgs_core::gaussians::{channel, channels, logit, sigmoid};
 use fastlgs_core::rng::Rng;
 use glam::{Quat, Vec3};
 use rayon::prelude::*;
@@ -94,11 +94,11 @@ impl State {
     }
 
     fn opacity(&self, i: usize) -> f32 {
-        sigmoid(self.params[10 * self.len() + i])
+        sigmoid(self.params[channel::OPACITY * self.len() + i])
     }
 
     fn largest_scale(&self, i: usize) -> f32 {
-        self.vec3(3, i).max_element().exp()
+        self.vec3(channel::LOG_SCALE.start, i).max_element().exp()
     }
 
     /// Returns the state whose Gaussian k is a copy of `sources[k].0`, with zero moments if
@@ -139,7 +139,9 @@ impl State {
     /// Sorts the Gaussians along a Morton curve. Neighbours in memory are then mostly neighbours in
     /// images, so a step reads contiguous memory.
     pub(crate) fn sort_along_curve(&mut self) {
-        let means: Vec<Vec3> = (0..self.len()).map(|i| self.vec3(0, i)).collect();
+        let means: Vec<Vec3> = (0..self.len())
+            .map(|i| self.vec3(channel::MEAN.start, i))
+            .collect();
         self.keep(&morton_order(&means));
     }
 
@@ -148,7 +150,7 @@ impl State {
         let n = self.len();
         let places: Vec<usize> = (0..n)
             .into_par_iter()
-            .filter(|&i| !free(self.vec3(0, i)))
+            .filter(|&i| !free(self.vec3(channel::MEAN.start, i)))
             .collect();
         if places.len() < n {
             self.keep(&places);
@@ -173,7 +175,7 @@ impl State {
     /// Moves Gaussian `i` to a sample of its own distribution and divides its scales by 1.6 (3DGS).
     fn resample(&mut self, i: usize, rng: &mut Rng) {
         let n = self.len();
-        let scale = self.vec3(3, i).map(f32::exp);
+        let scale = self.vec3(channel::LOG_SCALE.start, i).map(f32::exp);
         let q = [6, 7, 8, 9].map(|c| self.params[c * n + i]);
         let rotation = Quat::from_xyzw(q[1], q[2], q[3], q[0]).normalize();
         let offset = rotation * (scale * Vec3::new(rng.normal(), rng.normal(), rng.normal()));
@@ -244,7 +246,7 @@ pub fn refine(
 /// faint, because no photo needs them.
 pub fn reset_opacity(state: &mut State, ceiling: f32) {
     let n = state.len();
-    for k in 10 * n..11 * n {
+    for k in channel::OPACITY * n..(channel::OPACITY + 1) * n {
         state.params[k] = state.params[k].min(logit(ceiling));
         state.moment1[k] = 0.0;
         state.moment2[k] = 0.0;

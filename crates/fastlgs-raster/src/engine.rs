@@ -62,6 +62,26 @@ impl Frame {
         frame
     }
 
+    /// Colour: three planes, row by row.
+    pub fn color(&self) -> &[f32] {
+        self.channels(0, 3)
+    }
+
+    /// Feature: three planes, row by row.
+    pub fn feature(&self) -> &[f32] {
+        self.channels(3, 6)
+    }
+
+    /// Transmittance behind all Gaussians, 0 to 1, row by row.
+    pub fn transmittance(&self) -> &[f32] {
+        self.channels(6, 7)
+    }
+
+    /// Number of Gaussians that were processed for each pixel, row by row.
+    pub fn processed(&self) -> &[f32] {
+        self.channels(7, 8)
+    }
+
     /// Returns the channels `from..to` as one planar slice.
     pub fn channels(&self, from: usize, to: usize) -> &[f32] {
         let n = (self.width * self.height) as usize;

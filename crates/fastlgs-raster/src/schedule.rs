@@ -2,7 +2,7 @@
 
 use crate::floaters::FEW_VIEWS;
 use crate::view::Rates;
-use fastlgs_core::gaussians::BASE_CHANNELS;
+use fastlgs_core::gaussians::{BASE_CHANNELS, channel};
 use serde::{Deserialize, Serialize};
 
 /// Largest number of Gaussians.
@@ -139,13 +139,13 @@ impl TrainerConfig {
     pub(crate) fn rates(&self, iteration: u32, extent: f32) -> Rates {
         let mut rates = [0.0; BASE_CHANNELS + 1];
         let decay = 0.01f32.powf(self.progress(iteration));
-        rates[0..3].fill(1.6e-4 * extent * decay);
-        rates[3..6].fill(5e-3);
-        rates[6..10].fill(1e-3);
-        rates[10] = 5e-2;
-        rates[11..14].fill(5e-3);
-        rates[14..17].fill(1e-2 * decay);
-        rates[17] = 5e-3 / 20.0;
+        rates[channel::MEAN].fill(1.6e-4 * extent * decay);
+        rates[channel::LOG_SCALE].fill(5e-3);
+        rates[channel::ROTATION].fill(1e-3);
+        rates[channel::OPACITY] = 5e-2;
+        rates[channel::COLOR].fill(5e-3);
+        rates[channel::FEATURE].fill(1e-2 * decay);
+        rates[BASE_CHANNELS] = 5e-3 / 20.0;
         rates
     }
 

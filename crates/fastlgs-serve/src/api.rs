@@ -339,7 +339,7 @@ pub async fn query(State(app): App, request: Result<Json<QueryBody>, JsonRejecti
         }
         if let Some(relevancy) = relevancy {
             let frame = worker.scene.render(&camera)?;
-            let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
+            let color = image_io::from_planar(frame.color(), frame.width, frame.height);
             value["heatmap"] = data_url(heatmap(&color, &relevancy))?;
         }
         Ok(Json(value))
@@ -410,7 +410,7 @@ pub async fn render(
             ));
         }
         let frame = worker.scene.render(&camera)?;
-        let color = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
+        let color = image_io::from_planar(frame.color(), frame.width, frame.height);
         let picture = if what == "objects" {
             let ids = worker.scene.field(&camera, None)?.owners(&worker.grid);
             RgbImage::from_fn(ids.width, ids.height, |x, y| {

@@ -127,7 +127,7 @@ impl Thumbnails {
             }
             let frame = scene.render(camera)?;
             views.push(image_io::from_planar(
-                frame.channels(0, 3),
+                frame.color(),
                 frame.width,
                 frame.height,
             ));

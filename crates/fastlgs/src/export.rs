@@ -193,7 +193,7 @@ pub fn export(config: &ExportConfig, run: &Run) -> Result<ExportReport> {
 fn pictures(scene: &mut Scene, views: &[Camera]) -> Result<Vec<Vec<f32>>> {
     views
         .iter()
-        .map(|camera| Ok(scene.render(camera)?.channels(0, 3).to_vec()))
+        .map(|camera| Ok(scene.render(camera)?.color().to_vec()))
         .collect()
 }
 

@@ -110,7 +110,7 @@ pub fn render(config: &RenderConfig, run: &Run) -> Result<RenderReport> {
             let frame = timed(&mut rendered, || scene.render(camera))?;
             image_io::save_png(
                 &path("color", "png"),
-                image_io::from_planar(frame.channels(0, 3), frame.width, frame.height),
+                image_io::from_planar(frame.color(), frame.width, frame.height),
             )?;
         }
         if config.what.contains(&RenderContent::Feature) {

@@ -239,7 +239,7 @@ impl Scene {
         Ok(frame
             .channels(3, 4)
             .iter()
-            .zip(frame.channels(6, 7))
+            .zip(frame.transmittance())
             .map(solid)
             .collect())
     }
@@ -298,7 +298,7 @@ impl Scene {
         let values = if lifted {
             mean_features(&frame).concat()
         } else {
-            frame.channels(3, 6).to_vec()
+            frame.feature().to_vec()
         };
         Ok(Field::Features {
             width,
@@ -431,7 +431,7 @@ pub fn mean_features(frame: &Frame) -> [Vec<f32>; 3] {
         frame
             .channels(k, k + 1)
             .iter()
-            .zip(frame.channels(6, 7))
+            .zip(frame.transmittance())
             .map(over)
             .collect()
     })

@@ -237,7 +237,7 @@ fn depth(
     Ok(frame
         .channels(3, 4)
         .iter()
-        .zip(frame.channels(6, 7))
+        .zip(frame.transmittance())
         .map(of_pixel)
         .collect())
 }

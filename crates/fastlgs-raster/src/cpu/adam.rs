@@ -1,6 +1,7 @@
 //! CPU twin of `shaders/adam.wgsl`: Adam on the trained values of a page.
 
 use crate::Step;
+use fastlgs_core::gaussians::channel::{FEATURE, OPACITY};
 use fastlgs_core::gaussians::{BASE_CHANNELS, sigmoid};
 
 /// Applies one Adam step to the trained channels of a page.
@@ -49,17 +50,12 @@ fn adam_one(
         moment1,
         moment2,
     );
-    *param = if FEATURES.contains(&channel) {
+    *param = if FEATURE.contains(&channel) {
         next.clamp(0.0, 1.0)
     } else {
         next
     };
 }
-
-/// Channel of the opacity.
-pub(crate) const OPACITY: usize = 10;
-/// Channels of the feature. Its values are clamped to 0..1.
-pub(crate) const FEATURES: std::ops::Range<usize> = 14..BASE_CHANNELS;
 
 /// Returns the gradient of the opacity penalty by the opacity logit.
 #[inline]

@@ -31,7 +31,7 @@ mod tile_load;
 mod tile_ranges;
 
 pub use adam::adam;
-pub(crate) use adam::{FEATURES, OPACITY, adam_step, opacity_penalty};
+pub(crate) use adam::{adam_step, opacity_penalty};
 pub use blend::blend;
 pub(crate) use blend::{BATCH, pixels_of, shown};
 pub use blend_backward::blend_backward;

@@ -1,8 +1,9 @@
 //! Adam on the trained values of a block of Gaussians.
 
 use super::simd::vectorised;
-use crate::cpu::{FEATURES, OPACITY, adam_step, opacity_penalty};
+use crate::cpu::{adam_step, opacity_penalty};
 use crate::view::Step;
+use fastlgs_core::gaussians::channel::{FEATURE, OPACITY};
 
 /// Number of Gaussians updated together, so that their values stay in the cache.
 pub const BLOCK: usize = 32;
@@ -67,7 +68,7 @@ pub fn update_block(step: &Step, width: usize, rates: &[f32], values: Values) {
         }
     }
     for row in params.chunks_exact_mut(width) {
-        FEATURES
+        FEATURE
             .filter(|c| trained.contains(c))
             .for_each(|c| row[c] = row[c].clamp(0.0, 1.0));
     }

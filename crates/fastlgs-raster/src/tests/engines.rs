@@ -407,7 +407,7 @@ fn those_that_are_left_make_up_for_the_others() {
                 .render(view.with_dropout(share, draw), Channels::Color)
                 .unwrap();
             frame
-                .channels(6, 7)
+                .transmittance()
                 .iter()
                 .map(|t| f64::from(*t))
                 .sum::<f64>()

@@ -5,11 +5,9 @@
 use super::Trainer;
 use crate::channels::Channels;
 use crate::{Error, Result};
+use fastlgs_core::gaussians::channel::FEATURE;
 use fastlgs_core::{Camera, Gaussians};
 use std::ops::Range;
-
-/// Channels of the feature.
-pub(super) const FEATURE: Range<usize> = 14..17;
 
 impl Trainer {
     /// Returns whether the feature loss already moves geometry.

@@ -33,7 +33,7 @@ pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
     for camera in &cameras {
         let target = train::target(scene.folder(), camera, None, &background)?;
         let given = scene.render(camera)?;
-        let Some(compared) = Compared::of(&target, given.channels(0, 3)) else {
+        let Some(compared) = Compared::of(&target, given.color()) else {
             continue;
         };
         views += 1;
@@ -42,7 +42,7 @@ pub fn quality(scene: &mut Scene) -> Result<Option<Quality>> {
         sum.ssim += metrics::ssim(&compared.rendered, &compared.photo, w, h, &compared.counts);
         let camera = align_camera(scene, &target)?;
         let aligned = scene.render(&camera)?;
-        let Some(mut compared) = Compared::of(&target, aligned.channels(0, 3)) else {
+        let Some(mut compared) = Compared::of(&target, aligned.color()) else {
             continue;
         };
         sum.psnr_aligned += compared.psnr();

@@ -245,7 +245,7 @@ impl Answer {
         let safe = file_name(&report.text);
         let view = report.view.clone();
         let path = |what: &str| folder.join(format!("{view}.{safe}.{what}.png"));
-        let color = image_io::from_planar(frame.channels(0, 3), w, h);
+        let color = image_io::from_planar(frame.color(), w, h);
         let overlay_image = overlay(&color, &self.mask);
         if self.found.targets.is_empty() {
             // Without targets, mask and overlay of an earlier run would be wrong.

@@ -40,7 +40,7 @@ pub fn view_tiles(
     let objects = RgbImage::from_fn(frame.width, frame.height, |x, y| {
         Rgb(turbo::id_color(owners.at(x, y)))
     });
-    let render = image_io::from_planar(frame.channels(0, 3), frame.width, frame.height);
+    let render = image_io::from_planar(frame.color(), frame.width, frame.height);
     let photo = session
         .folder()
         .photo(&camera.name)

@@ -62,12 +62,7 @@ pub fn write(
         }
         let mut photo = folder.photo(&camera.name)?;
         let counts = counted_pixels(folder, &camera.name, hidden.len())?;
-        patch(
-            &mut photo,
-            hidden,
-            &counts,
-            session.render(camera)?.channels(0, 3),
-        );
+        patch(&mut photo, hidden, &counts, session.render(camera)?.color());
         image_io::save_png(&folder.photo_path(&camera.name), photo)?;
         if folder.masks_path(&camera.name).is_file() {
             let mut masks = folder.masks(camera)?;

@@ -274,7 +274,7 @@ fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Ve
 fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
     let frame = session.render(camera)?;
     let behind = session.trained().background;
-    let transmittance = frame.channels(6, 7);
+    let transmittance = frame.transmittance();
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
         channel.map(move |(color, t)| {
@@ -293,7 +293,7 @@ fn gap(session: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool
     let frame = session.render(camera)?;
     Ok(hidden
         .iter()
-        .zip(frame.channels(6, 7))
+        .zip(frame.transmittance())
         .map(|(hidden, transmittance)| *hidden && *transmittance > EMPTY_TRANSMITTANCE)
         .collect())
 }

@@ -103,7 +103,7 @@ fn with_matching_axes(
                 .filter(|(_, pixel)| pixel[3] == 255);
             let difference = |(p, pixel): (usize, [u8; 4])| {
                 let shown = |c: usize| {
-                    f64::from(frame.channels(0, 3)[c * n + p].clamp(0.0, 1.0))
+                    f64::from(frame.color()[c * n + p].clamp(0.0, 1.0))
                         - f64::from(pixel[c]) / 255.0
                 };
                 (0..3).map(|c| shown(c).powi(2)).sum::<f64>()
