@@ -7,7 +7,6 @@ use crate::channels::Channels;
 use crate::{Error, Result};
 use fastlgs_core::gaussians::channel::FEATURE;
 use fastlgs_core::{Camera, Gaussians};
-use std::ops::Range;
 
 impl Trainer {
     /// Returns whether the feature loss already moves geometry.

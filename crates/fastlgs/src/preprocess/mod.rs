@@ -16,12 +16,14 @@ use crate::staged::StagedOutput;
 use crate::{Result, Run, calibrations, checkpoints};
 pub use config::{Adjusted, Brightness, Poses, PreprocessConfig, PreprocessReport, Sfm};
 use fastlgs_core::dataset::Dataset;
-use fastlgs_core::scene_folder::{Manifest, find_view};
+use fastlgs_core::scene_folder::{Manifest, ModelFile, find_view};
 use fastlgs_core::{Camera, SceneFolder, dataset, labels};
 use fastlgs_grid::evidence;
 use fastlgs_vision::keypoints::{self, Keypoints};
+use fastlgs_vision::pose_check::PoseCheckReport;
+use fastlgs_vision::tracks::PairMatches;
 use fastlgs_vision::video::is_video;
-use fastlgs_vision::{brightness, import, sweep, tracks};
+use fastlgs_vision::{Encoder, Segmenter, brightness, import, sweep, tracks};
 use photos::PreparedPhoto;
 pub use photos::{Photo, load_photo};
 use std::collections::{BTreeMap, BTreeSet};
@@ -59,13 +61,90 @@ pub(crate) fn preprocess_locked(
     _lock: &SceneLock,
     run: &Run,
 ) -> Result<PreprocessReport> {
-    let started = Instant::now();
-    let mut seconds = BTreeMap::new();
-    let mut clock = Instant::now();
-    let mut lap = |stage: &str| {
-        seconds.insert(format!("preprocess.{stage}"), clock.elapsed().as_secs_f64());
-        clock = Instant::now();
+    check(config)?;
+    let mut laps = Laps::default();
+    let config = &extract_frames(config, &mut laps, run)?;
+    let scene = SceneFolder::new(&config.output);
+    let staged = StagedOutput::new(&scene, "preprocess")?;
+    let (folder, cache) = (staged.folder.clone(), Cache::new(&scene));
+    let mut stage = Stage {
+        config,
+        run,
+        folder,
+        cache,
+        laps,
+        warnings: Vec::new(),
     };
+    let mut dataset = stage.read_dataset(&scene)?;
+    // Load the models first, so that a missing one is reported before minutes of work.
+    let models = Models::load(config, &dataset)?;
+    let given: Vec<Camera> = dataset.photos.iter().map(|p| p.camera.clone()).collect();
+    let holdout = held_out(config, &dataset, &given)?;
+    let mut photos = stage.prepare_photos(&mut dataset)?;
+    let placed = stage.place_photos(&mut photos)?;
+    let mut manifest = stage.manifest(&models, holdout, &dataset, &placed);
+    photos::color_points(&mut dataset, &photos, &stage.folder)?;
+    let (kept, training) = training_photos(config, photos, &placed, &manifest)?;
+    let (masks, masks_per_photo) = masks::segment(
+        config,
+        models.segmenter.as_ref(),
+        &training,
+        &stage.folder,
+        &stage.cache,
+        run,
+    )?;
+    drop(models.segmenter);
+    stage.laps.end("masks");
+    let found = stage.find_points(&kept, training, &placed, &dataset)?;
+    if let Some(encoder) = models.import {
+        let (folder, cameras) = (&stage.folder, &found.cameras);
+        crate::masks::compute_descriptors(folder, cameras, encoder.as_ref(), None, run)?;
+        stage.laps.end("embeddings");
+    }
+    manifest.warnings.clone_from(&stage.warnings);
+    manifest.seconds = stage.laps.seconds.clone();
+    let brightness_spread_stops = found.brightness.spread_stops;
+    let notes = SceneNotes {
+        brightness: Some(found.brightness),
+        ..SceneNotes::default()
+    };
+    notes.store(&mut manifest)?;
+    // Training writes the object maps in place, so the manifest lists them now.
+    let maps = found
+        .cameras
+        .iter()
+        .map(|camera| SceneFolder::objects_name(&camera.name));
+    staged.publish(&scene, &REPLACED, maps, &manifest)?;
+    // Checkpoints of a training on other photos are invalid.
+    checkpoints::forget(&scene);
+    stage.cache.tidy();
+    let cameras = &placed.cameras;
+    let cached = stage.cache.counts().into_iter();
+    Ok(PreprocessReport {
+        scene: config.output.clone(),
+        photos: cameras.len(),
+        training_photos: found.cameras.len(),
+        held_out: cameras.len() - found.cameras.len(),
+        size: format!("{}x{}", cameras[0].width, cameras[0].height),
+        masks,
+        masks_per_photo,
+        key_point_matches: found.key_point_matches,
+        points: found.points,
+        sift: keypoints::backend().to_owned(),
+        moved_cameras: placed.checked.moved.len(),
+        adjusted: placed.adjusted,
+        warnings: stage.warnings,
+        brightness_spread_stops,
+        cached: cached
+            .map(|(name, counts)| (name.to_owned(), counts))
+            .collect(),
+        seconds_total: stage.laps.started.elapsed().as_secs_f64(),
+        seconds: stage.laps.seconds,
+    })
+}
+
+/// Refuses options that cannot work.
+fn check(config: &PreprocessConfig) -> Result<()> {
     config.eyes.check()?;
     if config.max_side < 64 {
         bail!(
@@ -73,123 +152,259 @@ pub(crate) fn preprocess_locked(
             config.max_side
         );
     }
-    let of_video = |video| {
-        Ok::<_, crate::Error>(PreprocessConfig {
-            photos: video::photos(video, &SceneFolder::new(&config.output), run)?,
-            ..config.clone()
-        })
-    };
-    let of_video = Some(&config.photos)
-        .filter(|photos| is_video(photos))
-        .map(|video| of_video(video))
-        .transpose()?;
-    let config = of_video.as_ref().unwrap_or(config);
-    if of_video.is_some() {
-        lap("frames");
+    Ok(())
+}
+
+/// Returns the configuration with the frames of a video as photos, if the photos are a video.
+fn extract_frames(
+    config: &PreprocessConfig,
+    laps: &mut Laps,
+    run: &Run,
+) -> Result<PreprocessConfig> {
+    if !is_video(&config.photos) {
+        return Ok(config.clone());
     }
-    let scene = SceneFolder::new(&config.output);
-    let cache = Cache::new(&scene);
-    let staged = StagedOutput::new(&scene, "preprocess")?;
-    let folder = staged.folder.clone();
-    let mut dataset = if dataset::images_folder(&config.photos).is_some()
-        && !dataset::has_poses(&config.photos)
-    {
-        let found = poses::find(&config.photos, &folder, &cache, config.sfm, run)?;
-        lap("poses");
-        found
-    } else {
-        dataset::load(&config.photos)?
-    };
-    dataset.earlier_frame = scene.manifest().ok().map(|earlier| earlier.frame);
-    let lenses = import::lenses(&dataset);
-    // Load the models first, so that a missing one is reported before minutes of work.
-    let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
-    let encoder = config.eyes.encoder(&config.photos, &lenses)?;
-    // Only imported embeddings are stored here, because their files may disappear later.
-    let imported = Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import);
-    dataset
-        .warnings
-        .iter()
-        .for_each(|warning| run.warn(warning));
-    let given: Vec<Camera> = dataset
-        .photos
-        .iter()
-        .map(|photo| photo.camera.clone())
-        .collect();
-    let (holdout, held_out_views) = held_out(config, &dataset, &given)?;
-    let models = config.eyes.files()?;
-    let mut known = photos::load(&dataset, config, &folder, &cache, run)?;
-    lap("photos");
-    let mut warnings = dataset.warnings.clone();
-    photos::check_masks(&known, run, &mut warnings)?;
-    photos::warn_of_bad_photos(&known, run, &mut warnings);
-    poses::settle_convention(
-        &mut dataset,
-        &mut known,
-        config.pose_convention,
-        run,
-        &mut warnings,
-    )?;
-    let mut checked = match config.poses {
-        Poses::Keep => Default::default(),
-        Poses::Check | Poses::Refine => {
-            poses::check(&mut known, &folder, &cache, run, &mut warnings)?
+    let photos = video::photos(&config.photos, &SceneFolder::new(&config.output), run)?;
+    laps.end("frames");
+    Ok(PreprocessConfig {
+        photos,
+        ..config.clone()
+    })
+}
+
+/// Seconds of each step.
+struct Laps {
+    started: Instant,
+    step_started: Instant,
+    seconds: BTreeMap<String, f64>,
+}
+
+impl Default for Laps {
+    fn default() -> Self {
+        let now = Instant::now();
+        Self {
+            started: now,
+            step_started: now,
+            seconds: BTreeMap::new(),
         }
-    };
-    if config.poses != Poses::Keep {
-        poses::leave_out_lost(&known, &cache, &mut checked)?;
     }
-    lap("pose_check");
-    let matches = matches::match_photos(
-        &known,
-        &checked.contradictory,
-        config.neighbours,
-        &cache,
-        run,
-    )?;
-    lap("matches");
-    poses::place(&mut known, &mut checked, &matches);
-    poses::warn(&known, &checked, run, &mut warnings);
-    let adjusted = match config.poses {
-        Poses::Keep => None,
-        asked => poses::adjust(&mut known, &matches, asked, &folder, run, &mut warnings)?,
+}
+
+impl Laps {
+    fn end(&mut self, step: &str) {
+        let seconds = self.step_started.elapsed().as_secs_f64();
+        self.seconds.insert(format!("preprocess.{step}"), seconds);
+        self.step_started = Instant::now();
+    }
+}
+
+/// Segmenter and encoder, and their files.
+struct Models {
+    segmenter: Box<dyn Segmenter>,
+    /// Encoder of imported embeddings. Only these are stored by preprocessing, because their files
+    /// may disappear later.
+    import: Option<Box<dyn Encoder>>,
+    files: BTreeMap<String, ModelFile>,
+}
+
+impl Models {
+    fn load(config: &PreprocessConfig, dataset: &Dataset) -> Result<Self> {
+        let lenses = import::lenses(dataset);
+        let segmenter = config.eyes.segmenter(&config.photos, &lenses)?;
+        let encoder = config.eyes.encoder(&config.photos, &lenses)?;
+        Ok(Self {
+            segmenter,
+            import: Some(encoder).filter(|_| config.eyes.encoder == EncoderKind::Import),
+            files: config.eyes.files()?,
+        })
+    }
+}
+
+/// All photos with their final cameras.
+struct Placed {
+    cameras: Vec<Camera>,
+    checked: PoseCheckReport,
+    adjusted: Option<Adjusted>,
+    matches: Vec<PairMatches>,
+}
+
+/// What the training photos show together.
+struct Found {
+    /// Cameras of the training photos.
+    cameras: Vec<Camera>,
+    brightness: Brightness,
+    points: usize,
+    key_point_matches: usize,
+}
+
+/// What all steps share.
+struct Stage<'a> {
+    config: &'a PreprocessConfig,
+    run: &'a Run<'a>,
+    /// The staged output.
+    folder: SceneFolder,
+    cache: Cache,
+    laps: Laps,
+    warnings: Vec<String>,
+}
+
+impl Stage<'_> {
+    /// Reads photos and poses. Missing poses are computed.
+    fn read_dataset(&mut self, scene: &SceneFolder) -> Result<Dataset> {
+        let photos = &self.config.photos;
+        let lacks_poses = dataset::images_folder(photos).is_some() && !dataset::has_poses(photos);
+        let mut dataset = if lacks_poses {
+            let found = poses::find(photos, &self.folder, &self.cache, self.config.sfm, self.run)?;
+            self.laps.end("poses");
+            found
+        } else {
+            dataset::load(photos)?
+        };
+        dataset.earlier_frame = scene.manifest().ok().map(|earlier| earlier.frame);
+        for warning in &dataset.warnings {
+            self.run.warn(warning);
+        }
+        self.warnings.clone_from(&dataset.warnings);
+        Ok(dataset)
+    }
+
+    /// Writes the prepared photos, and settles the convention of the poses.
+    fn prepare_photos(&mut self, dataset: &mut Dataset) -> Result<Vec<PreparedPhoto>> {
+        let (config, run) = (self.config, self.run);
+        let mut photos = photos::load(dataset, config, &self.folder, &self.cache, run)?;
+        self.laps.end("photos");
+        photos::check_masks(&photos, run, &mut self.warnings)?;
+        photos::warn_of_bad_photos(&photos, run, &mut self.warnings);
+        let convention = config.pose_convention;
+        poses::settle_convention(dataset, &mut photos, convention, run, &mut self.warnings)?;
+        Ok(photos)
+    }
+
+    /// Checks the poses, matches key points, and refines the cameras.
+    fn place_photos(&mut self, photos: &mut [PreparedPhoto]) -> Result<Placed> {
+        let (config, run, warnings) = (self.config, self.run, &mut self.warnings);
+        let mut checked = PoseCheckReport::default();
+        if config.poses != Poses::Keep {
+            checked = poses::check(photos, &self.folder, &self.cache, run, warnings)?;
+            poses::leave_out_lost(photos, &self.cache, &mut checked)?;
+        }
+        self.laps.end("pose_check");
+        let lost = &checked.contradictory;
+        let matches = matches::match_photos(photos, lost, config.neighbours, &self.cache, run)?;
+        self.laps.end("matches");
+        poses::place(photos, &mut checked, &matches);
+        poses::warn(photos, &checked, run, warnings);
+        let adjusted = match config.poses {
+            Poses::Keep => None,
+            asked => poses::adjust(photos, &matches, asked, &self.folder, run, warnings)?,
+        };
+        self.laps.end("adjusting");
+        let cameras: Vec<Camera> = photos.iter().map(|p| p.camera.clone()).collect();
+        self.folder.save_cameras(&cameras)?;
+        Ok(Placed {
+            cameras,
+            checked,
+            adjusted,
+            matches,
+        })
+    }
+
+    fn manifest(
+        &self,
+        models: &Models,
+        (holdout, held_out_views): (usize, Vec<String>),
+        dataset: &Dataset,
+        placed: &Placed,
+    ) -> Manifest {
+        let excluded = placed.checked.contradictory.iter();
+        Manifest {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            photos: self.config.photos.clone(),
+            holdout,
+            held_out_views,
+            segmenter: self.config.eyes.segmenter.name().to_owned(),
+            encoder: self.config.eyes.encoder.name().to_owned(),
+            crops: calibrations::word_of(calibrations::best_background(&models.files)),
+            models: models.files.clone(),
+            seed: self.run.seed,
+            warnings: Vec::new(),
+            excluded: excluded.map(|&i| placed.cameras[i].name.clone()).collect(),
+            frame: dataset.frame,
+            files: BTreeSet::new(),
+            seconds: BTreeMap::new(),
+            notes: BTreeMap::new(),
+        }
+    }
+
+    /// Writes first points and pairs of masks, and compares the brightness of the photos. `kept`
+    /// has the index of each training photo among all photos.
+    fn find_points(
+        &mut self,
+        kept: &[usize],
+        training: Vec<PreparedPhoto>,
+        placed: &Placed,
+        dataset: &Dataset,
+    ) -> Result<Found> {
+        let cameras: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
+        let (keypoints, colors): (Vec<Keypoints>, Vec<_>) =
+            training.into_iter().map(|p| (p.points, p.colors)).unzip();
+        let matches = matches::consistent_matches(kept, &placed.matches, &cameras, &keypoints);
+        if let Some(warning) = matches::warn_of_gaps(&cameras, &matches) {
+            self.run.warn(&warning);
+            self.warnings.push(warning);
+        }
+        let compared = brightness::compare(&colors, &matches);
+        let names = cameras.iter().map(|c| c.name.clone());
+        let brightness = Brightness {
+            spread_stops: compared.spread_stops,
+            gains: names.zip(compared.gains).collect(),
+        };
+        let matches = matches::guided(&matches, &cameras, &keypoints);
+        let tracks = tracks::tracks(&cameras, &keypoints, &matches, tracks::TOLERANCE);
+        // Given points are valid only for the given poses.
+        let poses_are_given =
+            placed.checked.moved.is_empty() && !placed.adjusted.is_some_and(|a| a.used);
+        let mut points = if poses_are_given && dataset.points.len() > tracks.len() {
+            dataset.points.clone()
+        } else {
+            tracks::points(&tracks, &colors)
+        };
+        self.laps.end("tracks");
+        let folder = &self.folder;
+        let work = self.run.work("depths", cameras.len() as u64);
+        let photo = |camera: &Camera| Ok(folder.photo(&camera.name)?);
+        points.extend(sweep::points(&cameras, &tracks, photo, || work.advance())?);
+        drop(work);
+        self.laps.end("depths");
+        folder.save_points(&points)?;
+        let pairs = matches::between_masks(folder, &cameras, &keypoints, &matches)?;
+        evidence::save_pairs(folder, &pairs)?;
+        self.laps.end("points");
+        Ok(Found {
+            cameras,
+            brightness,
+            points: points.len(),
+            key_point_matches: matches.iter().map(|m| m.pairs.len()).sum(),
+        })
+    }
+}
+
+/// Returns the training photos, and their indices among all photos.
+fn training_photos(
+    config: &PreprocessConfig,
+    photos: Vec<PreparedPhoto>,
+    placed: &Placed,
+    manifest: &Manifest,
+) -> Result<(Vec<usize>, Vec<PreparedPhoto>)> {
+    let is_usable = |i: usize| {
+        !manifest.is_held_out(i, &placed.cameras[i].name)
+            && !placed.checked.contradictory.contains(&i)
     };
-    lap("adjusting");
-    let cameras: Vec<Camera> = known.iter().map(|p| p.camera.clone()).collect();
-    folder.save_cameras(&cameras)?;
-    let excluded: Vec<String> = checked
-        .contradictory
-        .iter()
-        .map(|&i| cameras[i].name.clone())
-        .collect();
-    let mut manifest = Manifest {
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        photos: config.photos.clone(),
-        holdout,
-        held_out_views,
-        segmenter: config.eyes.segmenter.name().to_owned(),
-        encoder: config.eyes.encoder.name().to_owned(),
-        crops: calibrations::word_of(calibrations::best_background(&models)),
-        models,
-        seed: run.seed,
-        warnings: warnings.clone(),
-        excluded,
-        frame: dataset.frame,
-        files: BTreeSet::new(),
-        seconds: BTreeMap::new(),
-        notes: BTreeMap::new(),
-    };
-    photos::color_points(&mut dataset, &known, &folder)?;
-    let usable = |i: usize| {
-        !manifest.is_held_out(i, &cameras[i].name) && !checked.contradictory.contains(&i)
-    };
-    let kept: Vec<usize> = (0..known.len()).filter(|&i| usable(i)).collect();
-    let training: Vec<PreparedPhoto> = known
+    let (kept, training): (Vec<usize>, Vec<PreparedPhoto>) = photos
         .into_iter()
         .enumerate()
-        .filter(|(i, _)| usable(*i))
-        .map(|p| p.1)
-        .collect();
+        .filter(|(i, _)| is_usable(*i))
+        .unzip();
     if training.len() < 2 {
         bail!(
             "{}: only {} photos are left for training; at least 2 are needed",
@@ -197,97 +412,7 @@ pub(crate) fn preprocess_locked(
             training.len()
         );
     }
-
-    let (mask_count, masks_per_photo) =
-        masks::segment(config, segmenter.as_ref(), &training, &folder, &cache, run)?;
-    drop(segmenter);
-    lap("masks");
-    let poses: Vec<Camera> = training.iter().map(|p| p.camera.clone()).collect();
-    let (keypoints, colors): (Vec<Keypoints>, Vec<_>) =
-        training.into_iter().map(|p| (p.points, p.colors)).unzip();
-    let matches = matches::consistent_matches(&kept, &matches, &poses, &keypoints);
-    if let Some(warning) = matches::warn_of_gaps(&poses, &matches) {
-        run.warn(&warning);
-        warnings.push(warning);
-        manifest.warnings.clone_from(&warnings);
-    }
-    let compared = brightness::compare(&colors, &matches);
-    let gains = poses
-        .iter()
-        .map(|c| c.name.clone())
-        .zip(compared.gains)
-        .collect();
-    let light = Brightness {
-        spread_stops: compared.spread_stops,
-        gains,
-    };
-
-    let matches = matches::guided(&matches, &poses, &keypoints);
-    let tracks = tracks::tracks(&poses, &keypoints, &matches, tracks::TOLERANCE);
-    // Given points are valid only for the given poses.
-    let poses_are_given = checked.moved.is_empty() && !adjusted.is_some_and(|a| a.used);
-    let mut points = if poses_are_given && dataset.points.len() > tracks.len() {
-        dataset.points.clone()
-    } else {
-        tracks::points(&tracks, &colors)
-    };
-    lap("tracks");
-    let work = run.work("depths", poses.len() as u64);
-    points.extend(sweep::points(
-        &poses,
-        &tracks,
-        |camera| Ok(folder.photo(&camera.name)?),
-        || work.advance(),
-    )?);
-    drop(work);
-    lap("depths");
-    folder.save_points(&points)?;
-    evidence::save_pairs(
-        &folder,
-        &matches::between_masks(&folder, &poses, &keypoints, &matches)?,
-    )?;
-    lap("points");
-    if let Some(encoder) = imported {
-        crate::masks::compute_descriptors(&folder, &poses, encoder.as_ref(), None, run)?;
-        lap("embeddings");
-    }
-    manifest.seconds = seconds.clone();
-    SceneNotes {
-        brightness: Some(light.clone()),
-        ..SceneNotes::default()
-    }
-    .store(&mut manifest)?;
-    // Training writes the object maps in place, so the manifest lists them now.
-    let maps = poses
-        .iter()
-        .map(|camera| SceneFolder::objects_name(&camera.name));
-    staged.publish(&scene, &REPLACED, maps, &manifest)?;
-    // Checkpoints of a training on other photos are invalid.
-    checkpoints::forget(&scene);
-    cache.tidy();
-    Ok(PreprocessReport {
-        scene: config.output.clone(),
-        photos: cameras.len(),
-        training_photos: poses.len(),
-        held_out: cameras.len() - poses.len(),
-        size: format!("{}x{}", cameras[0].width, cameras[0].height),
-        masks: mask_count,
-        masks_per_photo,
-        key_point_matches: matches.iter().map(|m| m.pairs.len()).sum(),
-        points: points.len(),
-        sift: keypoints::backend().to_owned(),
-        moved_cameras: checked.moved.len(),
-        adjusted,
-        warnings,
-        brightness_spread_stops: light.spread_stops,
-        cached: cache
-            .counts()
-            .into_iter()
-            .map(|(stage, counts)| (stage.to_owned(), counts))
-            .collect(),
-        seconds,
-        seconds_total: started.elapsed().as_secs_f64(),
-    })
+    Ok((kept, training))
 }
 
 /// Returns which views are held out: N for every N-th (0 for none), and names of views. Names come
