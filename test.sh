@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs missing dependencies and runs the tests on any Vulkan device, such as lavapipe on
 # machines without a GPU.
-# --all runs everything before a release: twenty kills, all rows of the quick benches, long fuzzing,
+# --all runs everything before a release: the benches, long fuzzing, the page on fox,
 # the packages, pip, and the originals of SAM and CLIP. It takes about an hour on two cores.
 set -euo pipefail
 cd "$(dirname "$0")"
@@ -35,7 +35,7 @@ lap "wasm and packages"
 tests/python.sh
 lap "Python"
 export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
-# The log shows the numbers of kills, damaged inputs and benches, and the slowest tests.
+# The log shows the numbers of damaged inputs, and the slowest tests.
 # shellcheck disable=SC2086
 python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output $ignored
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
