@@ -24,7 +24,7 @@ struct Tolerance {
 fn assert_helix(name: &str, tolerance: &Tolerance) {
     let (scene, warning) = splat_file::read(&fixture(name), &WorldFrame::default()).expect(name);
     assert_eq!(warning, None, "{name}");
-    // splat-transform converts the axes of PLY (y down) to those of SPZ and glTF (y up). Training
+    // splat-transform converts the axes of PLY (y down) to those of SPZ (y up). Training
     // compares both with the photos.
     let is_y_up = name.ends_with(".spz");
     let scene = if is_y_up {
