@@ -34,7 +34,6 @@ fn the_adapter_trains_a_scene() {
     let report = json(&[&train[..], &["--budget", "2000"]].concat());
     assert_eq!(report["device"]["device"], run::adapter());
     assert!(report["psnr_held_out"].as_f64() > Some(15.0), "{report}");
-    assert!(report["objects"].as_u64() > Some(3), "{report}");
 }
 
 #[test]
