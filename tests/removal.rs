@@ -181,7 +181,7 @@ fn a_thing_is_removed_and_what_lay_behind_it_is_there() {
         before[0], after[0], before[1], after[1]
     );
     assert!(
-        after[0] > before[0] + 4.0 && (after[1] - before[1]).abs() < 0.3,
+        after[0] > before[0] + 3.0 && (after[1] - before[1]).abs() < 0.3,
         "{before:?} {after:?}"
     );
 

@@ -691,7 +691,7 @@ fn examples_run() {
         (
             "query",
             vec![text(&room).to_owned(), "1".to_owned()],
-            "the answer",
+            "targets: [",
         ),
         (
             "name_photo",

@@ -14,7 +14,7 @@ pub mod ui;
 mod words;
 
 use anyhow::Context;
-use clap::{FromArgMatches, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 pub use outcome::Outcome;
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -194,7 +194,7 @@ fn run(command: Command, common: &ui::Common) -> anyhow::Result<Outcome> {
         }
         Command::Models(args) => commands::models::run(&args, common, run),
         Command::Info(args) => commands::info::run(&args, common),
-        Command::Completions(args) => commands::shell::completions(&args, program::command()),
-        Command::Man(args) => commands::shell::man(&args, program::command()),
+        Command::Completions(args) => commands::shell::completions(&args, Cli::command()),
+        Command::Man(args) => commands::shell::man(&args, Cli::command()),
     }
 }
