@@ -180,7 +180,7 @@ fn the_interface_answers_as_the_query_command_does() {
         ("/api/query", r#"{"point":[999,3]}"#, 400, "outside"),
         ("/api/query", r#"{"point":[[1,3],[999,3]]}"#, 400, "outside"),
         ("/api/query", r#"{"point":[]}"#, 422, "no pixel"),
-        ("/api/query", r#"{"image":"AAAA"}"#, 400, "picture"),
+        ("/api/query", r#"{"image":"AAAA"}"#, 400, "cannot be read"),
         ("/api/query", huge.as_str(), 413, "large"),
         ("/api/render", r#"{"what":"smell"}"#, 400, "smell"),
         (
