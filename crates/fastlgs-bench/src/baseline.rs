@@ -112,7 +112,7 @@ pub fn run(args: &Args, run: &Run) -> Result<Value> {
     Ok(value)
 }
 
-/// What a rendered vector stands for.
+/// Meaning of a rendered vector.
 enum Representation {
     /// An embedding.
     Embedding,

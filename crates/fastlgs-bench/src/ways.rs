@@ -29,7 +29,7 @@ pub enum How {
 }
 
 impl How {
-    /// Returns the command and its arguments. SCENE stands for the scene folder.
+    /// Returns the command and its arguments. SCENE is replaced by the scene folder.
     pub fn command(&self) -> Vec<&'static str> {
         const START: [&str; 3] = ["SCENE", "--init-ply", "SCENE/scene.ply"];
         match self {

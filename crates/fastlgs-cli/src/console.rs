@@ -149,8 +149,8 @@ impl Sink for Console {
 
 /// Returns whether another tenth of the stage is done since the last printed line. Always true if
 /// the total is unknown (0).
-fn is_tenth_more(told: u64, done: u64, total: u64) -> bool {
-    total == 0 || 10 * (done - told.min(done)) >= total
+fn is_tenth_more(last_done: u64, done: u64, total: u64) -> bool {
+    total == 0 || 10 * (done - last_done.min(done)) >= total
 }
 
 /// Formats a progress line: "train 400/2,000, loss 0.0410, 22.1 it/s, 62 s left".

@@ -71,7 +71,10 @@ impl Samples {
     /// other objects, in standard deviations of the latter.
     pub fn separation(&self) -> f32 {
         let [excess, variance] = [0, 1].map(|k| {
-            self.excesses.iter().map(|told| told[k]).sum::<f32>()
+            self.excesses
+                .iter()
+                .map(|name_excess| name_excess[k])
+                .sum::<f32>()
                 / self.excesses.len().max(1) as f32
         });
         excess / variance.sqrt()
@@ -210,8 +213,13 @@ impl Calibration {
     /// The best margins for absent names follow a Gumbel distribution.
     /// Returns `None` with fewer than two samples of a kind, or if names do not separate objects.
     pub fn measured(samples: &Samples, anything: f32) -> Option<Self> {
-        let [excess, variance] =
-            [0, 1].map(|k| samples.excesses.iter().map(|told| told[k]).sum::<f32>());
+        let [excess, variance] = [0, 1].map(|k| {
+            samples
+                .excesses
+                .iter()
+                .map(|name_excess| name_excess[k])
+                .sum::<f32>()
+        });
         let temperature = excess / variance;
         if samples.excesses.len().min(samples.absent.len()) < 2
             || !temperature.is_finite()

@@ -49,7 +49,7 @@ pub struct Chosen {
 }
 
 impl Chosen {
-    /// Returns for each id the objects that it stands for, smallest first.
+    /// Returns for each id the objects that it denotes, smallest first.
     pub fn lists(&self) -> Vec<Vec<u16>> {
         self.overlaps.lists(&self.parents)
     }

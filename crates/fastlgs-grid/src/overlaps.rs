@@ -1,11 +1,11 @@
 //! Ids for Gaussians that lie in several objects.
 //!
-//! Objects have the ids 1..=K in descending order of size. Id k stands for object k and all its
-//! ancestors. Ids above K stand for other combinations of objects, each by a list.
+//! Objects have the ids 1..=K in descending order of size. Id k denotes object k and all its
+//! ancestors. Ids above K denote other combinations of objects, each by a list.
 
 use std::collections::BTreeMap;
 
-/// Object lists that are no chain of parents. Id K + 1 + i stands for list i, in descending order
+/// Object lists that are no chain of parents. Id K + 1 + i denotes list i, in descending order
 /// of id: small objects come first.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Overlaps(pub Vec<Vec<u16>>);
@@ -94,7 +94,7 @@ impl Overlaps {
         sums
     }
 
-    /// Returns for each id, 0 included, the objects that it stands for, smallest first.
+    /// Returns for each id, 0 included, the objects that it denotes, smallest first.
     pub fn lists(&self, parents: &[u16]) -> Vec<Vec<u16>> {
         let objects = (0..=parents.len() as u16).map(|id| with_ancestors(id, parents));
         objects.chain(self.0.iter().cloned()).collect()

@@ -162,13 +162,13 @@ mod tests {
                     .map(|k| of(k, gain(k), whole[k]).powi(2))
                     .sum()
             };
-            for (i, told) in changes.scores.iter().enumerate() {
+            for (i, estimate) in changes.scores.iter().enumerate() {
                 let others: Vec<usize> = (0..scene.len()).filter(|k| *k != i).collect();
                 let without = rendered(&scene.select(&others));
                 let square = sum(&|k, gain, with| gain * (with - without[k]));
                 assert!(
-                    (told - square).abs() <= 1e-3 * square + 1e-4,
-                    "Gaussian {i}: score {told}, measured {square}"
+                    (estimate - square).abs() <= 1e-3 * square + 1e-4,
+                    "Gaussian {i}: score {estimate}, measured {square}"
                 );
             }
             let error = photo.map_or(0.0, |(image, exposure)| {

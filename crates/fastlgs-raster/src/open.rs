@@ -1,4 +1,4 @@
-//! Opens the engine that a device name stands for.
+//! Opens the engine that a device name selects.
 
 use crate::Result;
 use crate::engine::Engine;

@@ -67,8 +67,8 @@ pub fn compare(colors: &[Vec<[u8; 3]>], matches: &[PairMatches]) -> Brightness {
         all.iter()
             .flat_map(move |d| [d.0, d.1].map(|photo| 3 * photo + c))
     });
-    let told: BTreeSet<usize> = measured_indices.collect();
-    let [common, own] = told.iter().fold([0.0, 0.0], |[common, own], &k| {
+    let tied_channels: BTreeSet<usize> = measured_indices.collect();
+    let [common, own] = tied_channels.iter().fold([0.0, 0.0], |[common, own], &k| {
         [common + measured[k] * looks[k], own + looks[k] * looks[k]]
     });
     let stops = consistent(

@@ -239,7 +239,7 @@ impl ClipText {
         let mask = model.input(&["attention_mask"]).map(|s| s.name.clone());
         let configuration = settings(path, "config.json")?;
         let output = embedding_output(&model, &TEXT_OUTPUTS, &configuration)?;
-        let told = configuration["text_config"]["max_position_embeddings"]
+        let configured_context = configuration["text_config"]["max_position_embeddings"]
             .as_u64()
             .map(|longest| longest as usize);
         let tokens = if is_siglip(&configuration) {
@@ -248,7 +248,7 @@ impl ClipText {
             Tokens::beside(path)?
         };
         Ok(Self {
-            context: context.or(told).unwrap_or(tokens.context()),
+            context: context.or(configured_context).unwrap_or(tokens.context()),
             tokens,
             ids,
             mask,

@@ -28,7 +28,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 const VERSION: u32 = 2;
 /// Palette rows per row of the palette image.
 const PALETTE_COLUMNS: usize = 64;
-/// Fourth channel of a rotation whose omitted component is w; 253 to 255 stand for x, y and z.
+/// Fourth channel of a rotation whose omitted component is w; 253 to 255 denote x, y and z.
 const ROTATION_TAG_W: u8 = 252;
 
 #[derive(Serialize, Deserialize)]

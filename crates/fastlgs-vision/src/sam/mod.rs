@@ -169,7 +169,7 @@ impl Segmenter for Sam {
                 return Err(self.exports.refuse("it found no mask in any of the first photos; check that encoder and decoder belong to the same model"));
             }
         }
-        let told = |c: Candidate| {
+        let with_level = |c: Candidate| {
             let runs = c.mask.runs(width, height);
             Mask {
                 level: c.level,
@@ -182,7 +182,7 @@ impl Segmenter for Sam {
         Ok(MaskList {
             width,
             height,
-            masks: levels.into_iter().flatten().map(told).collect(),
+            masks: levels.into_iter().flatten().map(with_level).collect(),
         })
     }
 }

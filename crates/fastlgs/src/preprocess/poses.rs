@@ -218,10 +218,14 @@ pub(super) fn check(
         .iter()
         .map(|p| p.camera.shrunk_to(CHECK_SIDE))
         .collect();
-    let told = serde_json::to_vec(&given)?;
+    let given_json = serde_json::to_vec(&given)?;
     let mut inputs: Vec<&[u8]> = photos.iter().map(|p| p.key.as_slice()).collect();
     let seed = run.seed.to_le_bytes();
-    inputs.extend([told.as_slice(), &seed, keypoints::version().as_bytes()]);
+    inputs.extend([
+        given_json.as_slice(),
+        &seed,
+        keypoints::version().as_bytes(),
+    ]);
     let key = cache::key(&inputs);
     let detected = OnceCell::new();
     let points = || -> Result<&Vec<Keypoints>> {
