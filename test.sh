@@ -40,7 +40,7 @@ export FASTLGS_SNAKEMAKE=$PWD/target/snakemake/bin/snakemake
 python3 tests/slowest.py cargo test --release --locked --no-fail-fast $with -- --show-output $ignored
 if [ "${FASTLGS_TEST_ALL:-}" ]; then
     # Tests both kinds of key points against each other.
-    cargo test --release --locked -p fastlgs-vision --features opencv -- --show-output
+    cargo test --release --locked -p fastlgs-sfm --features opencv -- --show-output
     tests/reference.sh
 fi
 lap "tests"

@@ -29,7 +29,8 @@ const REACH: f32 = 5.0;
 impl Inpainter for Telea {
     fn fill(&self, colors: &mut [f32], hole: &[bool], width: u32) -> Result<()> {
         let mut picture = image_io::from_planar(colors, width, hole.len() as u32 / width);
-        crate::opencv::inpaint::telea(&mut picture, &mask(hole, width), REACH)?;
+        fastlgs_opencv::inpaint::telea(&mut picture, &mask(hole, width), REACH)
+            .map_err(|e| Error::Invalid(e.to_string()))?;
         replace(colors, &image_io::to_planar(&picture), hole);
         Ok(())
     }

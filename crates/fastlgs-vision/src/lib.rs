@@ -1,4 +1,4 @@
-//! Vision of FastLGS: segmenters, encoders (ONNX Runtime), key points (SIFT) and poses.
+//! Models of FastLGS: segmenters, encoders (ONNX Runtime), inpainting, and their downloads.
 //!
 //! To add a segmenter, implement [`Segmenter`] in a new file; to add an encoder, implement
 //! [`Encoder`].
@@ -6,47 +6,27 @@
 pub mod appearance;
 pub mod attributes;
 pub mod brighten;
-pub mod brightness;
-pub mod bundle;
 pub mod clip;
 pub mod clip_tokens;
 pub mod conse;
 pub mod crops;
 pub mod edges;
 pub mod encoder;
-pub mod frame;
 pub mod histogram;
 pub mod import;
 pub mod inpaint;
-pub mod keypoints;
 pub mod masks;
-pub mod matching;
 pub mod model_paths;
 pub mod models;
 pub mod names;
-#[cfg(feature = "opencv")]
-mod opencv;
-pub mod photo_quality;
-pub mod pose_check;
-pub mod pose_convention;
-mod process_output;
 pub mod pull;
 #[cfg(test)]
 mod reference;
 pub mod regions;
-pub mod resection;
-#[cfg(test)]
-mod ring;
 pub mod runtime;
 pub mod sam;
 pub mod segmenter;
-pub mod similarity;
-pub mod structure;
-pub mod sweep;
 pub mod text;
-pub mod tracks;
-pub mod triangulate;
-pub mod video;
 
 #[cfg(test)]
 #[path = "../../../tests/support/onnx.rs"]

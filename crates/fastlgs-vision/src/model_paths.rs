@@ -17,7 +17,7 @@ pub(crate) fn poses_venv() -> PathBuf {
 }
 
 /// Returns the Python interpreter of `poses_venv`.
-pub(crate) fn poses_python() -> PathBuf {
+pub fn poses_python() -> PathBuf {
     poses_venv().join(if cfg!(windows) {
         "Scripts/python.exe"
     } else {

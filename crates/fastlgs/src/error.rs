@@ -15,7 +15,10 @@ pub enum Error {
     /// Error of objects or queries.
     #[error(transparent)]
     Grid(#[from] fastlgs_grid::Error),
-    /// Error of segmenters, encoders or key points.
+    /// Error of structure from motion or a video.
+    #[error(transparent)]
+    Sfm(#[from] fastlgs_sfm::Error),
+    /// Error of segmenters, encoders or inpainting.
     #[error(transparent)]
     Vision(#[from] fastlgs_vision::Error),
     /// Error of the operating system.

@@ -12,7 +12,7 @@ use fastlgs_grid::support::support;
 use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
 use fastlgs_raster::density::State;
 use fastlgs_raster::{View, lift};
-use fastlgs_vision::photo_quality::{self, PhotoStats};
+use fastlgs_sfm::photo_quality::{self, PhotoStats};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;

@@ -4,7 +4,8 @@ use crate::outcome::Outcome;
 use crate::{report, ui, words};
 use anyhow::Result;
 use fastlgs_core::SceneFolder;
-use fastlgs_vision::{keypoints, models};
+use fastlgs_sfm::keypoints;
+use fastlgs_vision::models;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 

@@ -8,14 +8,23 @@ use crate::progress::Work;
 use crate::{Error, Result, Run};
 use fastlgs_core::dataset::{Dataset, PoseConvention, PosedPhoto};
 use fastlgs_core::{Camera, SceneFolder, camera, dataset, fs, image_io};
-use fastlgs_vision::keypoints::{self, Keypoints};
-use fastlgs_vision::pose_convention::{self, Verdict};
-use fastlgs_vision::structure::Tool;
-use fastlgs_vision::tracks::PairMatches;
-use fastlgs_vision::{bundle, frame, pose_check, resection, structure, tracks};
+use fastlgs_sfm::keypoints::{self, Keypoints};
+use fastlgs_sfm::pose_convention::{self, Verdict};
+use fastlgs_sfm::structure::Tool;
+use fastlgs_sfm::tracks::PairMatches;
+use fastlgs_sfm::{bundle, frame, pose_check, resection, structure, tracks};
+use fastlgs_vision::model_paths;
 use std::cell::OnceCell;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+
+/// Returns the installed program that computes poses.
+fn pose_tool(sfm: Sfm) -> Result<Tool> {
+    Ok(match sfm {
+        Sfm::Auto => Tool::find(model_paths::poses_python())?,
+        Sfm::Colmap => Tool::find_colmap()?,
+    })
+}
 
 /// Computes poses by structure from motion, and writes the COLMAP model to `sparse/0` of the scene
 /// folder. The result is cached by the names and contents of the photos.
@@ -46,7 +55,7 @@ pub(super) fn find(
     let key = cache::key(&inputs.iter().map(Vec::as_slice).collect::<Vec<_>>());
     let model = folder.root.join("sparse/0");
     let (upright, files) = cache.get("structure", &key, || {
-        let tool = Tool::find(sfm == Sfm::Colmap)?;
+        let tool = pose_tool(sfm)?;
         // `colmap` counts pixels as stored in the file; our key points are in the upright photo
         // (EXIF).
         Ok((
@@ -301,11 +310,8 @@ fn recompute_poses(
     folder: &SceneFolder,
     run: &Run,
 ) -> Result<Option<(Vec<Camera>, pose_check::PoseCheckReport)>> {
-    let Tool::Pycolmap(python) = Tool::find(false)? else {
-        let mend = "this needs pycolmap, but only the program 'colmap' is installed; run 'fastlgs models install-offline' to install pycolmap";
-        return Err(Error::Vision(fastlgs_vision::Error::Missing(
-            mend.to_owned(),
-        )));
+    let Tool::Pycolmap(python) = pose_tool(Sfm::Auto)? else {
+        return Err(Error::Sfm(fastlgs_sfm::Error::NoPycolmap));
     };
     let work = run.work("poses anew", 0);
     let files: Vec<PathBuf> = given.iter().map(|c| folder.photo_path(&c.name)).collect();

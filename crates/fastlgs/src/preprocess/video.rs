@@ -70,7 +70,7 @@ pub(super) fn photos(video: &Path, folder: &SceneFolder, run: &Run) -> Result<Pa
         work.set_activity(&format!("{seconds:.0} s, {chosen} photos"));
         work.check()
     };
-    let made = fastlgs_vision::video::photos(video, &partial.join("images"), looked);
+    let made = fastlgs_sfm::video::photos(video, &partial.join("images"), looked);
     let made = made.and_then(|_| {
         let names = partial
             .join("images")

@@ -1,16 +1,13 @@
-//! Compiles the C++ wrappers of OpenCV and links the system's OpenCV, with the feature `opencv`.
+//! Compiles the C++ wrappers and links the system's OpenCV.
 
 fn main() {
-    println!("cargo::rerun-if-changed=src/opencv");
-    if std::env::var_os("CARGO_FEATURE_OPENCV").is_none() {
-        return;
-    }
+    println!("cargo::rerun-if-changed=src");
     let mut build = cc::Build::new();
     build
         .cpp(true)
         .std("c++14")
         .warnings(false)
-        .files(["src/opencv/sift.cpp", "src/opencv/inpaint.cpp"]);
+        .files(["src/sift.cpp", "src/inpaint.cpp"]);
     // Debian's packages of single modules have no pkg-config file: use their usual header folder.
     match pkg_config::Config::new()
         .cargo_metadata(false)

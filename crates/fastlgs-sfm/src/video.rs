@@ -63,11 +63,10 @@ pub fn photos<E: From<Error>>(
 /// Writes the given frames of a video, and returns their number.
 fn write(video: &Path, frames: Vec<u32>, images: &Path) -> Result<usize> {
     if frames.len() < 3 {
-        return Err(Error::Invalid(format!(
-            "{}: only {} different views found, at least 3 are needed; move the camera around the scene for several seconds",
-            video.display(),
-            frames.len()
-        )));
+        return Err(Error::StillVideo {
+            video: video.to_owned(),
+            views: frames.len(),
+        });
     }
     let frames = thinned(frames, MAX_PHOTOS);
     std::fs::create_dir_all(images).map_err(fastlgs_core::Error::io(images))?;
@@ -207,13 +206,7 @@ impl<'a> Ffmpeg<'a> {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
-            .map_err(|_| {
-                let mend = "install it ('apt-get install ffmpeg'), or give a folder of photos";
-                Error::Missing(format!(
-                    "{}: reading videos needs ffmpeg, which cannot be started; {mend}",
-                    video.display()
-                ))
-            })?;
+            .map_err(|_| Error::NoFfmpeg(video.to_owned()))?;
         let errors = child.stderr.take();
         let complaint = std::thread::spawn(move || lines(errors?).last());
         Ok(Self {
@@ -235,10 +228,10 @@ impl<'a> Ffmpeg<'a> {
             .ok()
             .flatten()
             .unwrap_or_else(|| "it was stopped".to_owned());
-        Err(Error::Invalid(format!(
-            "{}: ffmpeg cannot read this video: {reason}",
-            self.video.display()
-        )))
+        Err(Error::UnreadableVideo {
+            video: self.video.to_owned(),
+            reason,
+        })
     }
 }
 

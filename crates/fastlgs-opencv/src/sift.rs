@@ -1,7 +1,6 @@
 //! SIFT key points by OpenCV (`sift.cpp`).
 
-use super::{checked, side};
-use crate::Result;
+use crate::{Result, checked, side};
 use glam::Vec2;
 use image::GrayImage;
 use std::ffi::{c_char, c_int};

@@ -1,6 +1,6 @@
 //! SIFT key points (Lowe 2004), and the epipolar check of their matches.
 
-use crate::Result;
+use crate::{Error, Result};
 use fastlgs_core::Camera;
 use glam::{Mat3, Vec2, Vec3};
 use image::GrayImage;
@@ -44,7 +44,8 @@ pub fn detect(photo: &GrayImage) -> Result<Keypoints> {
 
 #[cfg(feature = "opencv")]
 fn detect_with_opencv(photo: &GrayImage) -> Result<Keypoints> {
-    let (positions, descriptors) = crate::opencv::sift::detect(photo, MAX_KEYPOINTS)?;
+    let (positions, descriptors) = fastlgs_opencv::sift::detect(photo, MAX_KEYPOINTS)
+        .map_err(|e| Error::KeyPoints(e.to_string()))?;
     Ok(Keypoints {
         positions,
         descriptors,
@@ -90,8 +91,8 @@ fn detect_in_rust(photo: &GrayImage) -> Result<Keypoints> {
         .map(|row| std::array::from_fn(|k| row[k]))
         .collect::<Vec<[u8; 128]>>();
     if descriptors.len() != found.keypoints.len() {
-        return Err(crate::Error::Invalid(
-            "SIFT returned different numbers of key points and descriptors".to_owned(),
+        return Err(Error::KeyPoints(
+            "it returned different numbers of key points and descriptors".to_owned(),
         ));
     }
     // SIFT counts from the centre of the first pixel of a doubled picture, which lies 0.25 pixels

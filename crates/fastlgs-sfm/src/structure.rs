@@ -8,7 +8,7 @@ use crate::keypoints::{self, Keypoints};
 use crate::matching::matches;
 use crate::process_output::lines;
 use crate::tracks::PairMatches;
-use crate::{Error, Result, model_paths};
+use crate::{Error, Result};
 use fastlgs_core::dataset::{self, colmap, is_photo};
 use fastlgs_core::image_io::OrientationRule;
 use fastlgs_core::{Camera, fs, image_io};
@@ -48,32 +48,38 @@ pub enum Tool {
 }
 
 impl Tool {
-    /// Finds the tool: the pycolmap of the offline models, else a `python3` that can import it,
-    /// else `colmap` on the path. With `program`, only `colmap` is considered.
+    /// Finds a Python interpreter that can import pycolmap: `installed`, else the `python3` on the
+    /// path. Else returns [`Self::find_colmap`].
     ///
     /// # Errors
     /// No tool is installed; the message says how to install one.
-    pub fn find(program: bool) -> Result<Self> {
-        let folders: Vec<PathBuf> = std::env::var_os("PATH")
-            .map(|p| std::env::split_paths(&p).collect())
-            .unwrap_or_default();
-        let on_path = |name: &str| folders.iter().map(|f| f.join(name)).find(|p| p.is_file());
+    pub fn find(installed: PathBuf) -> Result<Self> {
         let imports = |python: &PathBuf| {
             Command::new(python)
                 .args(["-c", "import pycolmap"])
                 .output()
                 .is_ok_and(|o| o.status.success())
         };
-        let pythons = std::iter::once(model_paths::poses_python())
-            .chain(on_path("python3"))
-            .filter(|p| p.is_file() && !program);
-        let pycolmap = pythons.into_iter().find(imports).map(Self::Pycolmap);
-        pycolmap.or_else(|| on_path("colmap").map(Self::Colmap)).ok_or_else(|| {
-            let mend =
-                "run 'fastlgs models install-offline', which installs pycolmap, or install COLMAP ('apt-get install colmap'), or provide poses with the photos";
-            Error::Missing(format!("the photos have no poses, and no program that computes poses is installed: {mend}"))
-        })
+        let pythons = std::iter::once(installed).chain(on_path("python3"));
+        let pycolmap = pythons.filter(|p| p.is_file()).find(imports);
+        pycolmap.map_or_else(Self::find_colmap, |python| Ok(Self::Pycolmap(python)))
     }
+
+    /// Finds the program `colmap` on the path.
+    ///
+    /// # Errors
+    /// As [`Self::find`].
+    pub fn find_colmap() -> Result<Self> {
+        let program = on_path("colmap").map(Self::Colmap);
+        program.ok_or(Error::NoPoseProgram)
+    }
+}
+
+/// Returns the file of this name in the first folder of the path that has one.
+fn on_path(name: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    let mut files = std::env::split_paths(&path).map(|folder| folder.join(name));
+    files.find(|file| file.is_file())
 }
 
 /// Returns the photos in a folder, sorted by name.
@@ -96,16 +102,16 @@ pub fn photos_in(images: &Path) -> Result<Vec<PathBuf>> {
                 folders.join(", ")
             )
         });
-        let why: String = dataset::unreadable_images_warning(images)
+        let notes: String = dataset::unreadable_images_warning(images)
             .into_iter()
             .chain(below)
             .map(|reason| format!("; {reason}"))
             .collect();
-        return Err(Error::Invalid(format!(
-            "{}: {} photos found; computing poses needs at least 3{why}",
-            images.display(),
-            files.len()
-        )));
+        return Err(Error::TooFewPhotos {
+            folder: images.to_owned(),
+            found: files.len(),
+            notes,
+        });
     }
     Ok(files)
 }
@@ -138,10 +144,7 @@ pub fn reconstruct(
             by_script(python, work, &progress)?;
         }
     }
-    largest_model(&models).ok_or_else(|| {
-        let images = images.display();
-        Error::Invalid(format!("{images}: COLMAP could place no photo; check that the photos are sharp and that neighbouring photos overlap"))
-    })
+    largest_model(&models).ok_or_else(|| Error::NoPoses(images.to_owned()))
 }
 
 /// Runs pycolmap on the input files in the work folder.
@@ -348,9 +351,11 @@ pub fn reconstruct_with_lenses(
     if found.len() == cameras.len() {
         Ok(found)
     } else {
-        Err(Error::Invalid(
-            "structure from motion returned poses for another number of photos".to_owned(),
-        ))
+        Err(Error::PoseProgram {
+            program: "pycolmap".to_owned(),
+            stage: "structure from motion".to_owned(),
+            reason: "it returned poses for another number of photos".to_owned(),
+        })
     }
 }
 
@@ -416,13 +421,7 @@ fn largest_model(models: &Path) -> Option<PathBuf> {
 
 /// Returns an error if the callback cancelled the search for poses.
 fn check_cancelled(on: bool) -> Result<()> {
-    if on {
-        Ok(())
-    } else {
-        Err(Error::Invalid(
-            "the search for poses was cancelled".to_owned(),
-        ))
-    }
+    if on { Ok(()) } else { Err(Error::Cancelled) }
 }
 
 /// Longest time between two calls of `progress` while a tool prints nothing.
@@ -430,11 +429,11 @@ const SILENT: Duration = Duration::from_secs(1);
 
 /// Runs one stage and passes its output to `progress`.
 fn run(command: &mut Command, stage: &str, say: &impl Fn(&str, &str) -> bool) -> Result<()> {
-    let name = command.get_program().to_string_lossy().into_owned();
-    let failed = |reason: String| {
-        Error::Missing(format!(
-            "{name} failed while finding poses ({stage}): {reason}"
-        ))
+    let program = command.get_program().to_string_lossy().into_owned();
+    let failed = |reason| Error::PoseProgram {
+        program: program.clone(),
+        stage: stage.to_owned(),
+        reason,
     };
     check_cancelled(say(stage, ""))?;
     // Both streams are read, so that a full pipe does not block the tool.

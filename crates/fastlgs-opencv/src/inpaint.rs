@@ -1,7 +1,6 @@
 //! Inpainting by Telea's fast marching (`inpaint.cpp`).
 
-use super::{checked, side};
-use crate::Result;
+use crate::{Result, checked, side};
 use image::{GrayImage, RgbImage};
 use std::ffi::{c_char, c_int};
 
