@@ -15,7 +15,8 @@ use fastlgs_grid::Grid;
 use fastlgs_grid::field::Field;
 use fastlgs_grid::query::{self, QueryConfig};
 use fastlgs_grid::relevancy::TextQuery;
-use fastlgs_raster::lift;
+use fastlgs_raster::density::State;
+use fastlgs_raster::{CpuEngine, Engine};
 use fastlgs_vision::Encoder;
 use glam::Vec3;
 use ndarray::{Array2, Axis};
@@ -412,12 +413,10 @@ fn lifted(
 ) -> Result<Vectors> {
     let mut sums = Vectors::zeros((0, 0));
     let mut weights = vec![0.0f32; scene.gaussians().len()];
-    for (view, camera) in scene
-        .manifest()
-        .training(scene.cameras())
-        .iter()
-        .enumerate()
-    {
+    let training = scene.manifest().training(scene.cameras());
+    let mut engine = CpuEngine::new();
+    engine.set_state(&State::of(scene.gaussians()))?;
+    for (view, camera) in training.iter().enumerate() {
         let (map, vectors) = labelled_view(view, camera)?;
         let width = vectors.first().map_or(sums.ncols(), |v| v.1.len());
         if sums.is_empty() {
@@ -438,7 +437,7 @@ fn lifted(
                 *place = Some(k);
             }
         }
-        for vote in lift::votes(scene.gaussians(), &scene.view(camera), &map) {
+        for vote in engine.votes(scene.view(camera), &map)? {
             if let Some(k) = place[usize::from(vote.label)] {
                 let mut row = sums.row_mut(vote.gaussian as usize);
                 row.iter_mut()

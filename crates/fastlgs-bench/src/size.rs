@@ -7,7 +7,8 @@ use crate::trial::{self, Trial, text};
 use anyhow::Result;
 use fastlgs::Run;
 use fastlgs_core::{Gaussians, SceneFolder, ply};
-use fastlgs_raster::change::Changes;
+use fastlgs_raster::density::State;
+use fastlgs_raster::{CpuEngine, Engine};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -174,17 +175,14 @@ fn importance_order(folder: &SceneFolder, scene: &Gaussians) -> Result<Vec<usize
     let trained = fastlgs::SceneNotes::read(&manifest, &folder.root)?
         .train
         .unwrap_or_default();
-    let mut changes = Changes::of(scene);
-    manifest
-        .training(&folder.cameras()?)
-        .iter()
-        .for_each(|camera| changes.add_view(&trained.view(camera, scene), None));
+    let mut engine = CpuEngine::new();
+    engine.set_state(&State::of(scene))?;
+    let mut scores = vec![0.0; scene.len()];
+    for camera in manifest.training(&folder.cameras()?) {
+        engine.saliency(trained.view(&camera, scene), None, &mut scores)?;
+    }
     let mut order: Vec<usize> = (0..scene.len()).collect();
-    order.sort_by(|a, b| {
-        changes.scores[*b]
-            .total_cmp(&changes.scores[*a])
-            .then(a.cmp(b))
-    });
+    order.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]).then(a.cmp(b)));
     Ok(order)
 }
 

@@ -206,7 +206,7 @@ pub fn peak_process_bytes() -> Option<u64> {
 fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Result<Value> {
     let pixels = views[0].pixels();
     let zero = [0.0; BASE_CHANNELS + 1];
-    let degree = views[0].sh_degree;
+    let degree = views[0].sh_degree();
     let frozen = Step::new(1, 14..BASE_CHANNELS, &zero);
     let step = Step::new(1, 0..channels(degree), &zero);
     let options = |channels: Channels| StepOptions {
@@ -218,7 +218,7 @@ fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Resul
     // The step of `train --feature-mode train`.
     let full = options(Channels::Coupled);
     let target = TargetImage {
-        size: views[0].size,
+        size: views[0].size(),
         color: vec![pack([128; 3], true); pixels],
         feature: vec![pack([128; 3], true); pixels],
     };
@@ -286,7 +286,7 @@ fn measure_setting(engine: &mut dyn Engine, views: &[View], steps: u32) -> Resul
     let evaluated = splats_per_pixel * pixels as f64 / blend_seconds;
     Ok(json!({
         "gaussians": engine.len(),
-        "size": format!("{}x{}", views[0].size[0], views[0].size[1]),
+        "size": format!("{}x{}", views[0].size()[0], views[0].size()[1]),
         "pairs": pairs,
         "evaluated_per_pixel": splats_per_pixel,
         "evaluated_per_second": evaluated,

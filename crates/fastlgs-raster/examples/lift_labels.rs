@@ -9,7 +9,8 @@
 //! work if their numbers mean the same objects in all views.
 
 use fastlgs_core::{SceneFolder, ply};
-use fastlgs_raster::{View, lift};
+use fastlgs_raster::density::State;
+use fastlgs_raster::{View, open_engine};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -22,14 +23,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut gaussians = folder.gaussians()?;
     let cameras = folder.manifest()?.training(&folder.cameras()?);
 
+    let mut engine = open_engine("auto")?;
+    engine.set_state(&State::of(&gaussians))?;
     let mut weights: Vec<BTreeMap<u16, f32>> = vec![BTreeMap::new(); gaussians.len()];
     for camera in &cameras {
         // The weight that each Gaussian contributes to each label of the view.
-        for vote in lift::votes(
-            &gaussians,
-            &View::new(camera, gaussians.len(), 0),
-            &folder.objects(&camera.name)?,
-        ) {
+        let view = View::new(camera, gaussians.len(), 0);
+        for vote in engine.votes(view, &folder.objects(&camera.name)?)? {
             *weights[vote.gaussian as usize]
                 .entry(vote.label)
                 .or_default() += vote.weight;

@@ -2,7 +2,7 @@
 //!
 //! The scene first grows up to the limit. Then each Gaussian is scored by how much the training
 //! views would change without it alone, as in Optimal Brain Damage (LeCun et al. 1990); see
-//! `change.rs`. Gaussians are removed in ascending order of their scores, while the sum stays below
+//! [`Engine::saliency`](crate::Engine::saliency). Gaussians are removed in ascending order of their scores, while the sum stays below
 //! `MAX_REMOVED_SHARE` times the squared error of the views. Fewer are removed if the removal costs more
 //! than `MAX_REMOVAL_COST` dB.
 //!
@@ -88,8 +88,9 @@ fn remaining(changes: &[f32], affordable: f64) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::change::Changes;
+    use crate::density::State;
     use crate::view::View;
+    use crate::{CpuEngine, Engine};
     use fastlgs_core::{Camera, Gaussians};
     use glam::Vec3;
 
@@ -120,11 +121,13 @@ mod tests {
         scene.push_sphere(Vec3::Z * 0.3, 0.05, 0.99, [0.9; 3]);
         scene.push_sphere(Vec3::new(0.5, 0.5, 0.0), 0.05, 0.01, [0.5; 3]);
         let [camera, other] = [camera, other].map(|c| View::new(&c, scene.len(), 0));
-        let mut changes = Changes::of(&scene);
-        changes.add_view(&camera, None);
-        let one = changes.scores.clone();
-        changes.add_view(&other, None);
-        let both = changes.scores;
+        let mut engine = CpuEngine::new();
+        engine.set_state(&State::of(&scene)).unwrap();
+        let mut scores = vec![0.0; scene.len()];
+        engine.saliency(camera, None, &mut scores).unwrap();
+        let one = scores.clone();
+        engine.saliency(other, None, &mut scores).unwrap();
+        let both = scores;
         // The first view does not see the small Gaussian. Both views see the faint one, but hardly.
         assert!(
             one[3] < 1e-4 * one[0] && both[3] > 100.0 * one[3],

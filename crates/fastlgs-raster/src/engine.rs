@@ -3,9 +3,10 @@
 use crate::channels::Channels;
 use crate::cpu::ROWS_PER_INVOCATION;
 use crate::density::State;
+use crate::lift::Vote;
 use crate::view::{Plane, Step, View};
 use crate::{Error, Result};
-use fastlgs_core::IdWeights;
+use fastlgs_core::{IdWeights, LabelMap};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -231,6 +232,25 @@ pub trait Engine: Send {
     /// # Errors
     /// As [`Self::render`], and when the number of ids is wrong.
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<IdWeights>;
+    /// Returns the votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
+    /// `view.gaussians` must equal [`Self::len`].
+    ///
+    /// # Errors
+    /// As [`Self::render`], and when label map and view differ in size.
+    fn votes(&mut self, view: View, labels: &LabelMap) -> Result<Vec<Vote>>;
+    /// Adds to `scores`, one for each Gaussian, how much a view changes without it: the sum of
+    /// squared changes of colour (0 to 1). Returns the sum of squared differences between the view
+    /// and its photo. With a photo, only the pixels that count are used, and changes are scaled by
+    /// the gain of its exposure. Without one, all pixels are used as rendered, and the result is 0.
+    ///
+    /// # Errors
+    /// As [`Self::render`], and when photo and view differ in size.
+    fn saliency(
+        &mut self,
+        view: View,
+        photo: Option<&ExposedPhoto>,
+        scores: &mut [f32],
+    ) -> Result<f64>;
     /// Runs one training step towards target `id`: forward, loss, backward, Adam. With
     /// [`Channels::Feature`], geometry must not have changed since the last [`Self::set_state`].
     ///
@@ -252,6 +272,53 @@ pub trait Engine: Send {
     /// # Errors
     /// When the device failed.
     fn take_profile(&mut self) -> Result<BTreeMap<&'static str, f64>>;
+}
+
+/// A photo, and the exposure with which the scene shows it.
+#[derive(Clone, Copy, Debug)]
+pub struct ExposedPhoto<'a> {
+    /// The photo.
+    pub image: &'a TargetImage,
+    /// Its exposure.
+    pub exposure: Exposure,
+}
+
+impl ExposedPhoto<'_> {
+    /// Returns the factors on the changes of the colours of pixel `k`: the gains, or 0 if it does
+    /// not count.
+    pub(crate) fn factors(&self, k: usize) -> [f32; 3] {
+        let counts = f32::from(u8::from(self.image.color[k].to_le_bytes()[3] == 255));
+        self.exposure.gain.map(|gain| counts * gain)
+    }
+
+    /// Returns the squared difference of pixel `k` and the rendered colours.
+    pub(crate) fn squared_error(&self, k: usize, rendered: [f32; 3]) -> f64 {
+        let bytes = self.image.color[k].to_le_bytes();
+        let counts = f32::from(u8::from(bytes[3] == 255));
+        let Exposure { gain, offset } = self.exposure;
+        (0..3)
+            .map(|c| {
+                let missed = gain[c] * rendered[c] + offset[c] - f32::from(bytes[c]) / 255.0;
+                f64::from(counts * missed * missed)
+            })
+            .sum()
+    }
+}
+
+/// Checks that the photo and the scores of [`Engine::saliency`] fit the view.
+pub(crate) fn check_saliency(
+    view: &View,
+    photo: Option<&ExposedPhoto>,
+    scores: &[f32],
+) -> Result<()> {
+    if photo.is_some_and(|photo| photo.image.size != view.size)
+        || scores.len() != view.gaussians as usize
+    {
+        return Err(Error::Invalid(
+            "photo and scores must have the sizes of the view".to_owned(),
+        ));
+    }
+    Ok(())
 }
 
 /// Checks that view, engine and `ids` have the same number of Gaussians, and more than 0.

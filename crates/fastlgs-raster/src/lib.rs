@@ -6,14 +6,13 @@
 //! `project` -> radix sort of depths -> `gather_counts`, scan -> `emit` -> radix sort of tiles ->
 //! `tile_ranges` -> `tile_load`, radix sort of loads -> `blend` -> (training) `ssim_rows`,
 //! `ssim_columns`, `ssim_backward_rows`, `loss_gradient` -> `blend_backward` -> `fold_slots` ->
-//! `project_backward` -> `adam`.
+//! `project_backward` -> `adam`. `blend_ids`, `blend_votes` and `blend_saliency` use the same lists.
 //!
 //! [`Engine`] is the common interface of [`GpuEngine`] and of [`CpuEngine`], which runs vectorised
 //! Rust.
 
 pub mod align;
 pub mod budget;
-pub mod change;
 mod channels;
 pub mod checkpoint;
 pub mod cpu;
@@ -40,7 +39,9 @@ mod view;
 mod tests;
 
 pub use channels::Channels;
-pub use engine::{Engine, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, pack};
+pub use engine::{
+    Engine, ExposedPhoto, Exposure, Frame, Losses, Memory, StepOptions, TargetImage, pack,
+};
 pub use floaters::{FEW_VIEWS, FreeSpace};
 pub use gpu::{Gpu, adapters};
 pub use gpu_engine::GpuEngine;

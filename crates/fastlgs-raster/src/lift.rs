@@ -1,11 +1,11 @@
-//! Lifting: sums the blending weights of Gaussians by the labels of label maps.
+//! Lifting: sums the blending weights of Gaussians by the labels of label maps
+//! ([`Engine::votes`](crate::Engine::votes)).
 //!
 //! This takes one pass over the views instead of thousands of gradient steps.
 
-use crate::native::blend::{self, Job, Tile};
-use crate::native::{self, Lists};
 use crate::view::{TILE, View};
-use fastlgs_core::{Gaussians, LabelMap};
+use crate::{Error, Result};
+use fastlgs_core::LabelMap;
 use rayon::prelude::*;
 
 /// Contribution of one Gaussian to one label of one view: the sum of its blending weights
@@ -23,42 +23,60 @@ pub struct Vote {
 /// Votes with less weight are dropped to save memory.
 const MIN_WEIGHT: f32 = 0.02;
 
-/// Returns the votes of all Gaussians for the labels of a view, sorted by Gaussian and label.
-///
-/// # Panics
-/// If map and view differ in size.
-pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
-    assert_eq!(
-        view.size,
-        [labels.width, labels.height],
-        "the label map must have the view's size"
-    );
-    let view = View {
-        sh_degree: 0,
-        ..*view
-    };
-    let lists = lists_of(scene, &view);
-    let of_tile = |sums: &mut Vec<f32>, tile: usize| {
-        let job = Job::new(&view, tile, &lists);
-        let mut shown = blend::inside_image(&view, &job);
-        let (names, masks) = masks_of(labels, &job);
-        blend::by_mask(&job, &masks, &mut shown, sums);
-        let rows = job.gaussians().zip(sums.chunks_exact(names.len()));
-        let votes = rows.flat_map(|(gaussian, row)| {
-            names.iter().zip(row).map(move |(&label, &weight)| Vote {
-                gaussian,
-                label,
-                weight,
-            })
+/// Labels of the pixels of a tile.
+pub(crate) struct TileLabels {
+    /// The different labels, in the order of their first pixels.
+    pub labels: Vec<u16>,
+    /// For each pixel of the tile, row by row, the index of its label in `labels`. Padding pixels
+    /// repeat the border.
+    pub of_pixel: [u8; (TILE * TILE) as usize],
+}
+
+impl TileLabels {
+    /// Returns the labels of a tile of a view.
+    pub fn of(map: &LabelMap, view: &View, tile: usize) -> Self {
+        let (column, row) = (tile as u32 % view.tiles[0], tile as u32 / view.tiles[0]);
+        let mut labels: Vec<u16> = Vec::new();
+        let of_pixel = std::array::from_fn(|p| {
+            let x = (column * TILE + p as u32 % TILE).min(map.width - 1);
+            let y = (row * TILE + p as u32 / TILE).min(map.height - 1);
+            let label = map.at(x, y);
+            let known = labels.iter().position(|known| *known == label);
+            known.unwrap_or_else(|| {
+                labels.push(label);
+                labels.len() - 1
+            }) as u8
         });
-        votes.filter(|v| v.weight > 0.0).collect::<Vec<_>>()
-    };
-    let tiles: Vec<Vec<Vote>> = (0..view.tile_count() as usize)
-        .into_par_iter()
-        .map_init(Vec::new, of_tile)
-        .collect();
+        Self { labels, of_pixel }
+    }
+
+    /// Returns the votes of a Gaussian from its sum for each label.
+    pub fn votes(&self, gaussian: u32, sums: &[f32]) -> impl Iterator<Item = Vote> {
+        let pairs = self.labels.iter().zip(sums);
+        let votes = pairs.map(move |(&label, &weight)| Vote {
+            gaussian,
+            label,
+            weight,
+        });
+        votes.filter(|vote| vote.weight > 0.0)
+    }
+}
+
+/// Checks that label map and view have the same size.
+pub(crate) fn check_labels(view: &View, labels: &LabelMap) -> Result<()> {
+    if view.size == [labels.width, labels.height] {
+        return Ok(());
+    }
+    Err(Error::Invalid(format!(
+        "the label map has {}x{} pixels, but the view has {}x{}",
+        labels.width, labels.height, view.size[0], view.size[1]
+    )))
+}
+
+/// Sums the votes of the tiles by Gaussian and label. Tiles come in the order of their numbers, and
+/// the sort is stable, so that the sums are the same in every run.
+pub(crate) fn summed(tiles: &[Vec<Vote>]) -> Vec<Vote> {
     let mut all = tiles.concat();
-    // A stable sort keeps the order of the tiles, so the sums are the same in every run.
     all.par_sort_by_key(|v| (v.gaussian, v.label));
     all.dedup_by(|next, kept| {
         let same = (next.gaussian, next.label) == (kept.gaussian, kept.label);
@@ -69,35 +87,12 @@ pub fn votes(scene: &Gaussians, view: &View, labels: &LabelMap) -> Vec<Vote> {
     all
 }
 
-/// Returns the labels of a tile's pixels, and a mask of each (1 inside). Padding pixels repeat the
-/// border.
-fn masks_of(labels: &LabelMap, job: &Job) -> (Vec<u16>, Vec<Tile>) {
-    let (mut names, mut masks): (Vec<u16>, Vec<Tile>) = Default::default();
-    for p in 0..blend::EMPTY.len() {
-        let (x, y) = (
-            job.x as u32 + p as u32 % TILE,
-            job.y as u32 + p as u32 / TILE,
-        );
-        let label = labels.at(x.min(labels.width - 1), y.min(labels.height - 1));
-        let place = names.iter().position(|n| *n == label).unwrap_or_else(|| {
-            names.push(label);
-            masks.push(blend::EMPTY);
-            names.len() - 1
-        });
-        masks[place][p] = 1.0;
-    }
-    (names, masks)
-}
-
-/// Returns the tile lists of a view.
-fn lists_of(scene: &Gaussians, view: &View) -> Lists {
-    Lists::new(view, &native::transposed(&scene.to_channels(), scene.len()))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use fastlgs_core::Camera;
+    use crate::density::State;
+    use crate::{CpuEngine, Engine};
+    use fastlgs_core::{Camera, Gaussians};
     use glam::Vec3;
 
     #[test]
@@ -120,7 +115,9 @@ mod tests {
             .iter_mut()
             .enumerate()
             .for_each(|(p, l)| *l = if p % 64 < 32 { 1 } else { 2 });
-        let votes = votes(&scene, &View::new(&camera, 2, 0), &labels);
+        let mut engine = CpuEngine::new();
+        engine.set_state(&State::of(&scene)).unwrap();
+        let votes = engine.votes(View::new(&camera, 2, 0), &labels).unwrap();
         let of = |g: u32, l: u16| {
             votes
                 .iter()

@@ -17,53 +17,53 @@ const TRANSMITTANCE_TRAINED: f32 = 1.0 / 512.0;
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 pub struct View {
     /// World to camera, column-major.
-    pub world_to_camera: [f32; 16],
+    pub(crate) world_to_camera: [f32; 16],
     /// Focal lengths in pixels.
-    pub focal: [f32; 2],
+    pub(crate) focal: [f32; 2],
     /// Principal point in pixels.
-    pub centre: [f32; 2],
+    pub(crate) centre: [f32; 2],
     /// Image size in pixels.
-    pub size: [u32; 2],
+    pub(crate) size: [u32; 2],
     /// Image size in tiles.
-    pub tiles: [u32; 2],
+    pub(crate) tiles: [u32; 2],
     /// Background colour; the last entry is unused.
-    pub background_color: [f32; 4],
+    pub(crate) background_color: [f32; 4],
     /// Background feature; the last entry is unused.
-    pub background_feature: [f32; 4],
+    pub(crate) background_feature: [f32; 4],
     /// Position of the camera in the world; the last entry is unused.
-    pub camera: [f32; 4],
+    pub(crate) camera: [f32; 4],
     /// Number of Gaussians.
-    pub gaussians: u32,
+    pub(crate) gaussians: u32,
     /// Number of (tile, Gaussian) pairs, once they are counted.
-    pub pairs: u32,
+    pub(crate) pairs: u32,
     /// First Gaussian of the bound page.
-    pub first: u32,
+    pub(crate) first: u32,
     /// Number of Gaussians of the bound page.
-    pub page: u32,
+    pub(crate) page: u32,
     /// First pair of the bound window of gradient slots.
-    pub slot_first: u32,
+    pub(crate) slot_first: u32,
     /// Number of pairs whose Gaussians start in that window.
-    pub slot_count: u32,
+    pub(crate) slot_count: u32,
     /// SH degree of the colour in use.
-    pub sh_degree: u32,
+    pub(crate) sh_degree: u32,
     /// 1: opacity compensates for dilation (2-D Mip filter).
-    pub antialias: u32,
+    pub(crate) antialias: u32,
     /// 1: the first feature channel carries the depth.
-    pub depth_as_feature: u32,
+    pub(crate) depth_as_feature: u32,
     /// Transmittance below which a pixel ignores further Gaussians.
-    pub min_transmittance: f32,
+    pub(crate) min_transmittance: f32,
     /// A step drops each Gaussian with the probability `dropped` / 2^32.
-    pub dropped: u32,
+    pub(crate) dropped: u32,
     /// Seed that selects the dropped Gaussians.
-    pub draw: u32,
+    pub(crate) draw: u32,
     /// Length of the runs of pairs in which `fold_slots` sums a Gaussian's slots; 1 if it does not
     /// run.
-    pub fold_length: u32,
+    pub(crate) fold_length: u32,
     /// 1: Gaussians of transparent objects ([`fastlgs_core::gaussians::TRANSPARENT_LOGIT`]) are drawn as opaque
     /// ones, to show which objects are where.
-    pub solid: u32,
+    pub(crate) solid: u32,
     /// Padding to 16 bytes.
-    pub unused: [u32; 2],
+    pub(crate) unused: [u32; 2],
 }
 
 impl View {
@@ -97,6 +97,43 @@ impl View {
         }
     }
 
+    /// Returns the view with or without the 2-D Mip filter: opacity compensates for dilation.
+    #[must_use]
+    pub fn with_antialias(self, on: bool) -> Self {
+        Self {
+            antialias: u32::from(on),
+            ..self
+        }
+    }
+
+    /// Returns the view with the depth of each Gaussian as its first feature channel.
+    #[must_use]
+    pub fn with_depth_as_feature(self) -> Self {
+        Self {
+            depth_as_feature: 1,
+            ..self
+        }
+    }
+
+    /// Returns the view with the Gaussians of transparent objects
+    /// ([`fastlgs_core::gaussians::TRANSPARENT_LOGIT`]) drawn as opaque ones, or not drawn.
+    #[must_use]
+    pub fn with_transparent_as_solid(self, on: bool) -> Self {
+        Self {
+            solid: u32::from(on),
+            ..self
+        }
+    }
+
+    /// Returns the view on a background of this colour.
+    #[must_use]
+    pub fn with_background(self, [r, g, b]: [f32; 3]) -> Self {
+        Self {
+            background_color: [r, g, b, 0.0],
+            ..self
+        }
+    }
+
     /// Returns the view for a training step, which ignores the last half of a grey level.
     #[must_use]
     pub fn for_training(self) -> Self {
@@ -120,6 +157,16 @@ impl View {
     /// the largest alpha.
     pub(crate) fn kept_gain(&self) -> f32 {
         1.0 / (1.0 - self.dropped as f32 / 4_294_967_296.0)
+    }
+
+    /// Returns the image size in pixels.
+    pub fn size(&self) -> [u32; 2] {
+        self.size
+    }
+
+    /// Returns the SH degree of the colour in use.
+    pub fn sh_degree(&self) -> u32 {
+        self.sh_degree
     }
 
     /// Returns the number of pixels of the frame.

@@ -31,6 +31,7 @@ pub mod model_choice;
 pub mod names;
 pub mod objects;
 mod output;
+mod paper;
 pub mod preprocess;
 pub mod progress;
 pub mod query;

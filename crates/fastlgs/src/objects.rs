@@ -1,17 +1,16 @@
-//! Finds objects from masks for `train`: by Algorithm 1 before training, or by global mapping after
-//! it. Alternatively loads the objects of an earlier run.
+//! Finds objects from masks for `train`, by global mapping, or loads the objects of an earlier run.
 
 use crate::error::{Context, bail};
 use crate::{Result, Run, masks, model_choice};
 use fastlgs_core::mask_list::{AtomTable, Atoms};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs};
-use fastlgs_grid::mapping::{self, Mask, PaperConfig};
+use fastlgs_grid::mapping::Mask;
 use fastlgs_grid::objects::{self as chosen, Chosen};
 use fastlgs_grid::observations::{Observation, Observations};
 use fastlgs_grid::support::support;
-use fastlgs_grid::{Grid, codes, consensus, election, evidence, field, overlaps};
+use fastlgs_grid::{Grid, codes, consensus, election, field, overlaps};
 use fastlgs_raster::density::State;
-use fastlgs_raster::{View, lift};
+use fastlgs_raster::{Engine, View};
 use fastlgs_sfm::photo_quality::{self, PhotoStats};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -20,6 +19,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 /// Options of global mapping.
+#[derive(Clone)]
 pub struct MappingConfig {
     /// Conditions under which an elected set is an object.
     pub objects: chosen::SelectionConfig,
@@ -30,59 +30,6 @@ pub struct MappingConfig {
 /// Number of views in which an object is embedded: those that show most of it.
 const EMBEDDED_VIEWS: usize = 3;
 
-/// Finds objects by Algorithm 1 of the paper from the masks of preprocessing, and writes the object
-/// maps.
-pub fn by_algorithm_1(
-    folder: &SceneFolder,
-    training: &[Camera],
-    config: &PaperConfig,
-    run: &Run,
-) -> Result<Grid> {
-    let masks = masks::training_descriptors(folder, training, run)?;
-    let pairs = evidence::load_pairs(folder, &masks)?;
-    let manifest = folder.manifest()?;
-    // Embeddings are compared without their appearance part; with it, the masks of fox give twice
-    // as many objects.
-    let mut compared = masks.clone();
-    compared.iter_mut().for_each(|mask| {
-        mask.embedding = model_choice::for_texts(&manifest, std::mem::take(&mut mask.embedding))
-    });
-    let mapping::Mapped {
-        object_of,
-        count,
-        comparisons,
-    } = mapping::paper(&compared, &pairs, config)?;
-    tracing::debug!(masks = masks.len(), count, comparisons, "Algorithm 1");
-    mark_maps_unfinished(folder)?;
-    for (view, camera) in training.iter().enumerate() {
-        let labels = masks::whole_masks(folder, camera)?;
-        let mut table = vec![0u16; usize::from(labels.max()) + 1];
-        for (mask, object) in masks.iter().zip(&object_of).filter(|(m, _)| m.view == view) {
-            if let Some(entry) = table.get_mut(usize::from(mask.label)) {
-                *entry = *object;
-            }
-        }
-        let map = LabelMap {
-            labels: labels
-                .labels
-                .iter()
-                .map(|l| table[usize::from(*l)])
-                .collect(),
-            ..labels
-        };
-        map.save(&folder.objects_path(&camera.name))?;
-    }
-    let encoder = model_choice::identity_of(&manifest);
-    Ok(Grid {
-        encoder,
-        ..Grid::build(
-            &masks,
-            &object_of,
-            codes::lattice(usize::from(count), run.seed),
-        )
-    })
-}
-
 /// Returns the path of a marker file. It exists while the object maps do not belong to the saved
 /// object table.
 fn unfinished(folder: &SceneFolder) -> PathBuf {
@@ -90,7 +37,7 @@ fn unfinished(folder: &SceneFolder) -> PathBuf {
 }
 
 /// Creates the marker file, before the object maps are written.
-fn mark_maps_unfinished(folder: &SceneFolder) -> Result<()> {
+pub fn mark_maps_unfinished(folder: &SceneFolder) -> Result<()> {
     let why = "These object maps do not belong to grid.json; train the scene again.\n";
     Ok(fs::write_atomic(&unfinished(folder), |file| {
         std::io::Write::write_all(file, why.as_bytes())
@@ -150,62 +97,6 @@ pub fn load_kept(folder: &SceneFolder, training: &[Camera]) -> Result<Grid> {
     Ok(grid)
 }
 
-/// Returns the render settings of a camera without view-dependent colour (SH degree 0), with
-/// transparent objects drawn as solid.
-fn frame(scene: &Gaussians, camera: &Camera, antialias: bool) -> View {
-    View {
-        antialias: u32::from(antialias),
-        solid: 1,
-        ..View::new(camera, scene.len(), 0)
-    }
-}
-
-/// Assigns each Gaussian the objects that get more than half of its blending weight in the object
-/// maps of the views. Its feature is the code of the smallest of them.
-pub fn lift(
-    scene: &mut Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
-    grid: &Grid,
-    antialias: bool,
-) -> Result<()> {
-    let lists = grid.lists();
-    let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
-    for camera in training {
-        for vote in lift::votes(
-            scene,
-            &frame(scene, camera, antialias),
-            &folder.objects(&camera.name)?,
-        ) {
-            *weights[vote.gaussian as usize]
-                .entry(vote.label)
-                .or_default() += vote.weight;
-        }
-    }
-    let majority_objects = |found: &BTreeMap<u16, f32>| {
-        let mut sums: BTreeMap<Reverse<u16>, f32> = BTreeMap::new();
-        for (id, weight) in found {
-            lists[usize::from(*id)]
-                .iter()
-                .for_each(|object| *sums.entry(Reverse(*object)).or_default() += weight);
-        }
-        let all: f32 = found.values().sum();
-        let objects: Vec<u16> = sums
-            .into_iter()
-            .filter(|(_, sum)| 2.0 * sum > all)
-            .map(|(object, _)| object.0)
-            .collect();
-        overlaps::representative_id(
-            &objects,
-            found.iter().map(|(id, weight)| (*id, *weight)),
-            &lists,
-        )
-    };
-    scene.object_ids = weights.iter().map(majority_objects).collect();
-    grid.set_codes(scene);
-    Ok(())
-}
-
 /// Result of global mapping, before the objects are embedded.
 pub struct Mapped {
     /// The objects.
@@ -214,58 +105,172 @@ pub struct Mapped {
     pub summary: Summary,
 }
 
-/// Runs global mapping up to the objects. Masks propose sets of Gaussians and elect some of them.
-/// Those with enough support become objects, and the Gaussians get their ids. The folder needs
-/// masks and cameras.
-pub fn map(
-    scene: &mut Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
-    config: &MappingConfig,
-    run: &Run,
-) -> Result<Mapped> {
-    // Mean number of pixels of a view; photos may differ in size.
-    let pixels = training
-        .iter()
-        .map(|c| (c.width * c.height) as usize)
-        .sum::<usize>()
-        / training.len();
-    let clock = std::time::Instant::now();
-    let log_step = |what: &str, count: usize| {
-        tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}")
-    };
-    let (observations_by_view, tables) = sightings(scene, folder, training, config.antialias, run)?;
-    let masks = tables.iter().map(|t| t.areas.len()).sum();
-    let left_out: usize = tables.iter().map(|t| t.left_out).sum();
-    if left_out > 0 {
-        run.warn(&format!(
-            "{left_out} masks were ignored, because a view can have at most 65,535 masks and atoms"
-        ));
+/// Maps the masks of a scene folder onto Gaussians.
+pub struct Mapper<'a> {
+    /// Folder with the masks.
+    pub folder: &'a SceneFolder,
+    /// Cameras of the training views.
+    pub cameras: &'a [Camera],
+    /// Options.
+    pub config: MappingConfig,
+    /// The device. Its Gaussians are replaced.
+    pub engine: &'a mut dyn Engine,
+    /// Progress and warnings.
+    pub run: &'a Run<'a>,
+}
+
+impl Mapper<'_> {
+    /// Copies Gaussians to the device.
+    pub fn load(&mut self, scene: &Gaussians) -> Result<()> {
+        Ok(self.engine.set_state(&State::of(scene))?)
     }
-    let sightings = Observations::new(scene.len(), observations_by_view, &tables);
-    let megabytes = (sightings.bytes() >> 20) as u32;
-    log_step("observations", sightings.len());
-    let proposals = consensus::proposals(&sightings, config.objects.min_views);
-    log_step("proposals", proposals.len());
-    let elected = election::elected(proposals, config.objects.min_views);
-    log_step("elected", elected.len());
-    let support = support(&sightings, &elected);
-    log_step("support", support.len());
-    let sets = elected.len();
-    let chosen = chosen::choose(&sightings, elected, support, pixels, &config.objects);
-    log_step("objects", chosen.support.len());
-    scene.object_ids.clone_from(&chosen.ids);
-    let [few_views, unsupported, same] = chosen.dropped;
-    let summary = Summary {
-        masks,
-        megabytes,
-        sets,
-        overlaps: chosen.overlaps.0.len(),
-        few_views,
-        unsupported,
-        same,
-    };
-    Ok(Mapped { chosen, summary })
+
+    /// Returns the render settings of a camera for the loaded Gaussians, without view-dependent
+    /// colour. Transparent objects are drawn as solid.
+    fn view(&self, camera: &Camera) -> View {
+        View::new(camera, self.engine.len(), 0)
+            .with_antialias(self.config.antialias)
+            .with_transparent_as_solid(true)
+    }
+
+    /// Assigns each Gaussian the objects that get more than half of its blending weight in the object
+    /// maps of the views. Its feature is the code of the smallest of them.
+    pub fn lift(&mut self, scene: &mut Gaussians, grid: &Grid) -> Result<()> {
+        self.load(scene)?;
+        let lists = grid.lists();
+        let mut weights: Vec<BTreeMap<u16, f32>> = vec![Default::default(); scene.len()];
+        for camera in self.cameras {
+            let map = self.folder.objects(&camera.name)?;
+            for vote in self.engine.votes(self.view(camera), &map)? {
+                *weights[vote.gaussian as usize]
+                    .entry(vote.label)
+                    .or_default() += vote.weight;
+            }
+        }
+        let majority_objects = |found: &BTreeMap<u16, f32>| {
+            let mut sums: BTreeMap<Reverse<u16>, f32> = BTreeMap::new();
+            for (id, weight) in found {
+                lists[usize::from(*id)]
+                    .iter()
+                    .for_each(|object| *sums.entry(Reverse(*object)).or_default() += weight);
+            }
+            let all: f32 = found.values().sum();
+            let objects: Vec<u16> = sums
+                .into_iter()
+                .filter(|(_, sum)| 2.0 * sum > all)
+                .map(|(object, _)| object.0)
+                .collect();
+            overlaps::representative_id(
+                &objects,
+                found.iter().map(|(id, weight)| (*id, *weight)),
+                &lists,
+            )
+        };
+        scene.object_ids = weights.iter().map(majority_objects).collect();
+        grid.set_codes(scene);
+        Ok(())
+    }
+
+    /// Runs global mapping up to the objects. Masks propose sets of Gaussians and elect some of them.
+    /// Those with enough support become objects, and the Gaussians get their ids. The folder needs
+    /// masks and cameras.
+    pub fn map(&mut self, scene: &mut Gaussians) -> Result<Mapped> {
+        self.load(scene)?;
+        // Mean number of pixels of a view; photos may differ in size.
+        let pixels_of = |camera: &Camera| (camera.width * camera.height) as usize;
+        let pixels = self.cameras.iter().map(pixels_of).sum::<usize>() / self.cameras.len();
+        let clock = std::time::Instant::now();
+        let log_step = |what: &str, count: usize| {
+            tracing::debug!(seconds = clock.elapsed().as_secs_f64(), count, "{what}")
+        };
+        let (observations_by_view, tables) = self.observations()?;
+        let config = &self.config.objects;
+        let masks = tables.iter().map(|t| t.areas.len()).sum();
+        let left_out: usize = tables.iter().map(|t| t.left_out).sum();
+        if left_out > 0 {
+            self.run.warn(&format!(
+                "{left_out} masks were ignored, because a view can have at most 65,535 masks and atoms"
+            ));
+        }
+        let observations = Observations::new(scene.len(), observations_by_view, &tables);
+        let megabytes = (observations.bytes() >> 20) as u32;
+        log_step("observations", observations.len());
+        let proposals = consensus::proposals(&observations, config.min_views);
+        log_step("proposals", proposals.len());
+        let elected = election::elected(proposals, config.min_views);
+        log_step("elected", elected.len());
+        let support = support(&observations, &elected);
+        log_step("support", support.len());
+        let sets = elected.len();
+        let chosen = chosen::choose(&observations, elected, support, pixels, config);
+        log_step("objects", chosen.support.len());
+        scene.object_ids.clone_from(&chosen.ids);
+        let [few_views, unsupported, same] = chosen.dropped;
+        let summary = Summary {
+            masks,
+            megabytes,
+            sets,
+            overlaps: chosen.overlaps.0.len(),
+            few_views,
+            unsupported,
+            same,
+        };
+        Ok(Mapped { chosen, summary })
+    }
+
+    /// Writes the object map of each view, and passes it to `tell`.
+    pub fn write_maps(
+        &mut self,
+        scene: &Gaussians,
+        mapped: &Mapped,
+        mut tell: impl FnMut(&Camera, &LabelMap) -> Result<()>,
+    ) -> Result<()> {
+        let folder = self.folder;
+        mark_maps_unfinished(folder)?;
+        self.render_maps(scene, &mapped.chosen.lists(), |camera, map| {
+            map.save(&folder.objects_path(&camera.name))?;
+            tell(camera, &map)
+        })
+    }
+
+    /// Renders the object map of each view, and passes it to `take`. Each pixel has the id that
+    /// represents its objects; `lists` holds the objects of each id.
+    pub fn render_maps(
+        &mut self,
+        scene: &Gaussians,
+        lists: &[Vec<u16>],
+        mut take: impl FnMut(&Camera, LabelMap) -> Result<()>,
+    ) -> Result<()> {
+        self.load(scene)?;
+        let work = self.run.work("objects", self.cameras.len() as u64);
+        for camera in self.cameras {
+            let view = self.view(camera);
+            let shares = self.engine.render_ids(view, &scene.object_ids)?;
+            take(camera, field::ids(&shares, lists))?;
+            work.advance()?;
+        }
+        Ok(())
+    }
+
+    /// Returns the observations of each view, and the table of the masks of each atom.
+    fn observations(&mut self) -> Result<(Vec<Vec<Observation>>, Vec<AtomTable>)> {
+        let (mut seen, mut tables) = (Vec::new(), Vec::new());
+        let work = self.run.work("votes", self.cameras.len() as u64);
+        for camera in self.cameras {
+            let atoms = atoms(self.folder, camera)?;
+            let votes = self.engine.votes(self.view(camera), &atoms.map)?;
+            // A vector that is collected in place keeps the capacity of the unsummed votes.
+            let mut own: Vec<Observation> = votes
+                .into_iter()
+                .map(|vote| Observation::new(vote.gaussian, vote.label, vote.weight))
+                .collect();
+            own.shrink_to_fit();
+            seen.push(own);
+            tables.push(atoms.table);
+            work.advance()?;
+        }
+        Ok((seen, tables))
+    }
 }
 
 /// Completes global mapping: embeds the objects of [`map`] by the object maps that [`write_maps`]
@@ -306,51 +311,6 @@ pub fn embed_objects(
     );
     grid.set_codes(scene);
     Ok((grid, summary))
-}
-
-/// Writes the object map of each view, and passes it to `tell`.
-pub fn write_maps(
-    scene: &Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
-    mapped: &Mapped,
-    antialias: bool,
-    run: &Run,
-    mut tell: impl FnMut(&Camera, &LabelMap) -> Result<()>,
-) -> Result<()> {
-    mark_maps_unfinished(folder)?;
-    render_maps(
-        scene,
-        training,
-        &mapped.chosen.lists(),
-        antialias,
-        run,
-        |camera, map| {
-            map.save(&folder.objects_path(&camera.name))?;
-            tell(camera, &map)
-        },
-    )
-}
-
-/// Renders the object map of each view, and passes it to `take`. Each pixel has the id that
-/// represents its objects; `lists` holds the objects of each id.
-pub fn render_maps(
-    scene: &Gaussians,
-    training: &[Camera],
-    lists: &[Vec<u16>],
-    antialias: bool,
-    run: &Run,
-    mut take: impl FnMut(&Camera, LabelMap) -> Result<()>,
-) -> Result<()> {
-    let mut engine = fastlgs_raster::open_engine(run.device)?;
-    engine.set_state(&State::of(scene))?;
-    let work = run.work("objects", training.len() as u64);
-    for camera in training {
-        let shares = engine.render_ids(frame(scene, camera, antialias), &scene.object_ids)?;
-        take(camera, field::ids(&shares, lists))?;
-        work.advance()?;
-    }
-    Ok(())
 }
 
 /// Embeds every object in its best views (`embedding_views`). Returns the masks and their object ids. Objects
@@ -445,32 +405,6 @@ pub struct Summary {
 /// Returns the atoms of a view, with narrow gaps between masks closed.
 pub fn atoms(folder: &SceneFolder, camera: &Camera) -> Result<Atoms> {
     Ok(folder.masks(camera)?.atoms().without_gaps())
-}
-
-/// Returns the observations of each view, and the table of the masks of each atom.
-fn sightings(
-    scene: &Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
-    antialias: bool,
-    run: &Run,
-) -> Result<(Vec<Vec<Observation>>, Vec<AtomTable>)> {
-    let (mut seen, mut tables) = (Vec::new(), Vec::new());
-    let work = run.work("votes", training.len() as u64);
-    for camera in training {
-        let atoms = atoms(folder, camera)?;
-        let votes = lift::votes(scene, &frame(scene, camera, antialias), &atoms.map);
-        // A vector that is collected in place keeps the capacity of the unsummed votes.
-        let mut own: Vec<Observation> = votes
-            .into_iter()
-            .map(|vote| Observation::new(vote.gaussian, vote.label, vote.weight))
-            .collect();
-        own.shrink_to_fit();
-        seen.push(own);
-        tables.push(atoms.table);
-        work.advance()?;
-    }
-    Ok((seen, tables))
 }
 
 /// Returns for each object the views that show most of it, best first. `areas` holds the area and

@@ -222,13 +222,8 @@ impl Scene {
     /// Renders the expected depth of each pixel, in units of the scene: sum of w z / sum of w, with
     /// blending weights w. Pixels with a transmittance of 0.999 or more are infinite.
     pub fn render_depth(&mut self, camera: &Camera) -> Result<Vec<f32>> {
-        let frame = self.engine.render(
-            View {
-                depth_as_feature: 1,
-                ..self.view(camera)
-            },
-            Channels::Feature,
-        )?;
+        let view = self.view(camera).with_depth_as_feature();
+        let frame = self.engine.render(view, Channels::Feature)?;
         let solid = |(z, t): (&f32, &f32)| {
             if *t < 0.999 {
                 z / (1.0 - t)
@@ -267,14 +262,9 @@ impl Scene {
     }
 
     fn render_objects(&mut self, camera: &Camera, tau_ac: Option<f32>) -> Result<Field> {
-        let solid = u32::from(self.trained.clear > 0);
-        self.render_field(
-            View {
-                solid,
-                ..self.view(camera)
-            },
-            tau_ac,
-        )
+        let has_transparent = self.trained.clear > 0;
+        let view = self.view(camera).with_transparent_as_solid(has_transparent);
+        self.render_field(view, tau_ac)
     }
 
     /// Renders the object data of a view without transparent objects.
@@ -291,7 +281,7 @@ impl Scene {
         }
         let frame = self
             .engine
-            .render(View { solid: 0, ..view }, Channels::Feature)?;
+            .render(view.with_transparent_as_solid(false), Channels::Feature)?;
         let (width, height) = (frame.width, frame.height);
         // Trained codes compensate for the transmittance; lifted codes must be divided by the
         // coverage.

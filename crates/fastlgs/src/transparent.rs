@@ -1,11 +1,10 @@
 //! Finds transparent objects. Masks show where they are, and invisible Gaussians represent them.
 
-use crate::objects::{self, Mapped, MappingConfig};
-use crate::{Result, Run};
+use crate::Result;
+use crate::objects::{self, Mapped, Mapper};
 use fastlgs_core::gaussians::{TRANSPARENT_LOGIT, sigmoid};
 use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder};
 use fastlgs_grid::hull::{self, Hull, Outline};
-use fastlgs_raster::density::State;
 use fastlgs_raster::{Channels, Engine, View};
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -52,42 +51,22 @@ pub fn keep_owned(scene: &mut Gaussians) {
     });
 }
 
-/// Maps masks to objects as [`objects::map`] does, transparent objects included. Writes the object
+/// Maps masks to objects as [`Mapper::map`] does, transparent objects included. Writes the object
 /// maps.
-pub fn map(
-    scene: &mut Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
-    config: &MappingConfig,
-    run: &Run,
-) -> Result<Mapped> {
+pub fn map(mapper: &mut Mapper, scene: &mut Gaussians) -> Result<Mapped> {
     forget(scene);
-    let mapped = objects::map(scene, folder, training, config, run)?;
-    let (lists, mut left) = (mapped.chosen.lists(), Vec::with_capacity(training.len()));
-    objects::write_maps(
-        scene,
-        folder,
-        training,
-        &mapped,
-        config.antialias,
-        run,
-        |camera, shown| {
-            left.push(unexplained(folder, camera, shown, &lists, config)?);
-            Ok(())
-        },
-    )?;
-    let Some(with_clear) = add(scene, folder, training, left, config, run)? else {
+    let mapped = mapper.map(scene)?;
+    let lists = mapped.chosen.lists();
+    let mut left = Vec::with_capacity(mapper.cameras.len());
+    let (folder, min_support) = (mapper.folder, mapper.config.objects.min_support);
+    mapper.write_maps(scene, &mapped, |camera, shown| {
+        left.push(unexplained(folder, camera, shown, &lists, min_support)?);
+        Ok(())
+    })?;
+    let Some(with_clear) = add(mapper, scene, left)? else {
         return Ok(mapped);
     };
-    objects::write_maps(
-        scene,
-        folder,
-        training,
-        &with_clear,
-        config.antialias,
-        run,
-        |_, _| Ok(()),
-    )?;
+    mapper.write_maps(scene, &with_clear, |_, _| Ok(()))?;
     Ok(with_clear)
 }
 
@@ -101,21 +80,18 @@ fn forget(scene: &mut Gaussians) {
 /// Adds transparent Gaussians where `unexplained` masks of the views agree, and maps the objects
 /// again. Returns `None` if no transparent object is found.
 fn add(
+    mapper: &mut Mapper,
     scene: &mut Gaussians,
-    folder: &SceneFolder,
-    training: &[Camera],
     unexplained: Vec<Vec<bool>>,
-    config: &MappingConfig,
-    run: &Run,
 ) -> Result<Option<Mapped>> {
-    let hulls = hulls(scene, training, unexplained, config, run)?;
+    let hulls = hulls(mapper, scene, unexplained)?;
     if hulls.is_empty() {
         return Ok(None);
     }
     let (shown, before) = (scene.len(), scene.object_ids.clone());
     let mut places: Vec<Range<usize>> = hulls.iter().map(|hull| put(scene, hull)).collect();
     loop {
-        let mapped = objects::map(scene, folder, training, config, run)?;
+        let mapped = mapper.map(scene)?;
         let lists = mapped.chosen.lists();
         let lists: Vec<&[u16]> = scene
             .object_ids
@@ -158,14 +134,9 @@ fn unexplained(
     camera: &Camera,
     shown: &LabelMap,
     lists: &[Vec<u16>],
-    config: &MappingConfig,
+    min_support: f32,
 ) -> Result<Vec<bool>> {
-    let pixels = hull::unexplained(
-        &objects::atoms(folder, camera)?,
-        shown,
-        lists,
-        config.objects.min_support,
-    );
+    let pixels = hull::unexplained(&objects::atoms(folder, camera)?, shown, lists, min_support);
     let small = camera.shrunk_to(SEARCH_SIDE);
     let at = |k: u32, from: u32, to: u32| ((2 * k + 1) * from / (2 * to)) as usize;
     let columns = |x| at(x, camera.width, small.width);
@@ -178,26 +149,21 @@ fn unexplained(
 }
 
 /// Returns the visual hulls of unexplained masks; none if fewer than `min_views` views have any.
-fn hulls(
-    scene: &Gaussians,
-    training: &[Camera],
-    unexplained: Vec<Vec<bool>>,
-    config: &MappingConfig,
-    run: &Run,
-) -> Result<Vec<Hull>> {
+fn hulls(mapper: &mut Mapper, scene: &Gaussians, unexplained: Vec<Vec<bool>>) -> Result<Vec<Hull>> {
+    let min_views = mapper.config.objects.min_views;
     if unexplained
         .iter()
         .filter(|view| view.contains(&true))
         .count()
-        < config.objects.min_views
+        < min_views
     {
         return Ok(Vec::new());
     }
-    let mut engine = fastlgs_raster::open_engine(run.device)?;
-    engine.set_state(&State::of(scene))?;
+    mapper.load(scene)?;
+    let (training, antialias) = (mapper.cameras, mapper.config.antialias);
     let outline = |(camera, inside): (&Camera, Vec<bool>)| -> Result<Outline> {
         let camera = camera.shrunk_to(SEARCH_SIDE);
-        let depth = depth(engine.as_mut(), scene, &camera, config.antialias)?;
+        let depth = depth(mapper.engine, scene, &camera, antialias)?;
         Ok(Outline {
             camera,
             inside,
@@ -211,7 +177,7 @@ fn hulls(
         .step_by(every)
         .map(outline)
         .collect::<Result<Vec<_>>>()?;
-    Ok(hull::hulls(&views, config.objects.min_views))
+    Ok(hull::hulls(&views, min_views))
 }
 
 /// Renders the depth of each pixel; infinite where the pixel is empty.
@@ -221,11 +187,9 @@ fn depth(
     camera: &Camera,
     antialias: bool,
 ) -> Result<Vec<f32>> {
-    let view = View {
-        depth_as_feature: 1,
-        antialias: u32::from(antialias),
-        ..View::new(camera, scene.len(), 0)
-    };
+    let view = View::new(camera, scene.len(), 0)
+        .with_antialias(antialias)
+        .with_depth_as_feature();
     let frame = engine.render(view, Channels::Feature)?;
     let of_pixel = |(z, through): (&f32, &f32)| {
         if *through < EMPTY_TRANSMITTANCE {
@@ -281,7 +245,7 @@ fn gaussians_of_object(lists: &[&[u16]], places: Range<usize>) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Silent;
+    use crate::{Run, Silent};
     use fastlgs_core::mask_list::{Mask, RunLengths};
     use fastlgs_core::{Level, MaskList};
     use glam::{Vec2, Vec3};
@@ -332,19 +296,25 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let folder = SceneFolder::new(dir.path());
         let (mut scene, cameras) = scene(&folder);
-        let (wall, config) = (
-            scene.clone(),
-            MappingConfig {
-                objects: fastlgs_grid::objects::SelectionConfig::default(),
-                antialias: false,
-            },
-        );
+        let wall = scene.clone();
         let run = Run {
             seed: 0,
             device: "cpu",
             progress: &Silent,
         };
-        let mapped = objects::map(&mut scene, &folder, &cameras, &config, &run).unwrap();
+        let mut engine = fastlgs_raster::CpuEngine::new();
+        let mut mapper = Mapper {
+            folder: &folder,
+            cameras: &cameras,
+            config: objects::MappingConfig {
+                objects: fastlgs_grid::objects::SelectionConfig::default(),
+                antialias: false,
+            },
+            engine: &mut engine,
+            run: &run,
+        };
+        let mapped = mapper.map(&mut scene).unwrap();
+        let min_support = mapper.config.objects.min_support;
         assert!(
             mapped.chosen.support.is_empty(),
             "no part of the wall is in most of the masks"
@@ -355,14 +325,12 @@ mod tests {
                 camera,
                 &LabelMap::new(160, 120),
                 &mapped.chosen.lists(),
-                &config,
+                min_support,
             )
             .unwrap()
         };
         let left = cameras.iter().map(left).collect();
-        let mapped = add(&mut scene, &folder, &cameras, left, &config, &run)
-            .unwrap()
-            .expect("a pane");
+        let mapped = add(&mut mapper, &mut scene, left).unwrap().expect("a pane");
         let supports: Vec<f32> = mapped
             .chosen
             .support

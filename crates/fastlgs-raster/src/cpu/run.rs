@@ -71,6 +71,30 @@ pub(crate) fn run(name: &str, channels: Channels, uniform: &[u8], buffers: &mut 
                 shares,
             );
         }
+        ("blend_votes", [ranges, sorted, gaussians, splats, labels, tile_votes, votes]) => {
+            blend_votes(
+                &view(),
+                ranges,
+                sorted,
+                gaussians,
+                read(splats),
+                labels,
+                tile_votes,
+                write(votes),
+            );
+        }
+        ("blend_saliency", [ranges, sorted, gaussians, splats, frame, factors, saliency]) => {
+            blend_saliency(
+                &view(),
+                ranges,
+                sorted,
+                gaussians,
+                read(splats),
+                read(frame),
+                read(factors),
+                write(saliency),
+            );
+        }
         ("ssim_rows", [frame, targets, rows]) => {
             each_plane(&uniform_of(uniform), rows, &mut [], |plane, rows, _| {
                 ssim_rows(plane, read(frame), targets, write(rows))

@@ -58,6 +58,8 @@ pub struct Kernels {
     pub listing: Listing,
     pub training: Training,
     pub blend_ids: TypedPass<shaders::BlendIds>,
+    pub blend_votes: TypedPass<shaders::BlendVotes>,
+    pub blend_saliency: TypedPass<shaders::BlendSaliency>,
     blending: HashMap<Kind, Blending>,
 }
 
@@ -90,6 +92,8 @@ impl Kernels {
                 adam: pass!(),
             },
             blend_ids: pass!(),
+            blend_votes: pass!(),
+            blend_saliency: pass!(),
             blending: HashMap::new(),
         }
     }

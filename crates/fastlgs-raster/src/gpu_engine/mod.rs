@@ -6,18 +6,23 @@ mod lists;
 mod pages;
 mod picture;
 mod sorting;
+mod votes;
 
 use crate::channels::Channels;
 use crate::density::State;
-use crate::engine::{Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes};
+use crate::engine::{
+    Engine, ExposedPhoto, Frame, Losses, Memory, StepOptions, TargetImage, check_ids,
+    check_saliency, planes,
+};
+use crate::lift::{Vote, check_labels};
 use crate::pass::Recorder;
 use crate::profile::Profile;
 use crate::shader::shaders::{BlendBuffers, BlendIdsBuffers};
 use crate::view::{Step, View};
 use crate::{Error, Gpu, Result};
 use backward::{Slots, adam};
-use fastlgs_core::IdWeights;
 use fastlgs_core::id_weights::IDS_PER_PIXEL;
+use fastlgs_core::{IdWeights, LabelMap};
 use kernels::{Kernels, kind};
 use lists::{ListBuilder, Lists};
 use pages::Gaussians;
@@ -154,6 +159,17 @@ impl GpuEngine {
             .expect("made when the frame was prepared")
     }
 
+    /// Reads the channels of the frame that was blended last.
+    fn read_frame(&self, view: &View, channels: Channels) -> Result<Frame> {
+        let plane = view.padded_pixels();
+        self.gpu
+            .read_with(&self.picture().frame, 8 * plane, |planes: &[f32]| {
+                Frame::gathered(view, channels, |channel, y| {
+                    &planes[channel * plane + view.index_of(0, y)..]
+                })
+            })
+    }
+
     fn read_pages(&self, what: impl Fn(&pages::Page) -> &Buffer) -> Result<Vec<f32>> {
         self.gaussians
             .as_ref()
@@ -244,13 +260,7 @@ impl Engine for GpuEngine {
     fn render(&mut self, view: View, channels: Channels) -> Result<Frame> {
         let mut on_cpu = self.passes_on_cpu;
         let view = self.forward(view, channels, None, &mut on_cpu)?.view;
-        let plane = view.padded_pixels();
-        self.gpu
-            .read_with(&self.picture().frame, 8 * plane, |planes: &[f32]| {
-                Frame::gathered(&view, channels, |channel, y| {
-                    &planes[channel * plane + view.index_of(0, y)..]
-                })
-            })
+        self.read_frame(&view, channels)
     }
 
     fn render_ids(&mut self, view: View, ids: &[u16]) -> Result<IdWeights> {
@@ -297,6 +307,27 @@ impl Engine for GpuEngine {
             height,
             pixels: self.gpu.read_with(shares, IDS_PER_PIXEL * plane, gather)?,
         })
+    }
+
+    fn votes(&mut self, view: View, labels: &LabelMap) -> Result<Vec<Vote>> {
+        check_labels(&view, labels)?;
+        self.votes_on_device(
+            View {
+                sh_degree: 0,
+                ..view
+            },
+            labels,
+        )
+    }
+
+    fn saliency(
+        &mut self,
+        view: View,
+        photo: Option<&ExposedPhoto>,
+        scores: &mut [f32],
+    ) -> Result<f64> {
+        check_saliency(&view, photo, scores)?;
+        self.saliency_on_device(view, photo, scores)
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

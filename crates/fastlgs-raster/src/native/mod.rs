@@ -6,19 +6,22 @@ mod lists;
 mod loss;
 mod picture;
 mod simd;
+mod votes;
 
 use crate::channels::Channels;
 use crate::cpu;
 use crate::density::State;
 use crate::engine::{
-    Engine, Frame, Losses, Memory, StepOptions, TargetImage, check_ids, planes, rendered,
+    Engine, ExposedPhoto, Frame, Losses, Memory, StepOptions, TargetImage, check_ids,
+    check_saliency, planes, rendered,
 };
+use crate::lift::{Vote, check_labels};
 use crate::view::{Step, View};
 use crate::{Error, Result};
 use blend::{BackwardInput, Blended, EDGE, Job, Tile};
-use fastlgs_core::IdWeights;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 use fastlgs_core::id_weights::{IDS_PER_PIXEL, pack};
+use fastlgs_core::{IdWeights, LabelMap};
 pub(crate) use lists::Lists;
 use picture::TiledPlanes;
 use rayon::prelude::*;
@@ -433,6 +436,29 @@ impl Engine for CpuEngine {
             height,
             pixels,
         })
+    }
+
+    fn votes(&mut self, view: View, labels: &LabelMap) -> Result<Vec<Vote>> {
+        check_labels(&view, labels)?;
+        let view = View {
+            sh_degree: 0,
+            ..view
+        };
+        self.list(&view, None)?;
+        let lists = self.lists.as_ref().expect("made a line above");
+        Ok(votes::votes(&view, lists, labels))
+    }
+
+    fn saliency(
+        &mut self,
+        view: View,
+        photo: Option<&ExposedPhoto>,
+        scores: &mut [f32],
+    ) -> Result<f64> {
+        check_saliency(&view, photo, scores)?;
+        self.list(&view, None)?;
+        let lists = self.lists.as_ref().expect("made a line above");
+        Ok(votes::saliency(&view, lists, photo, scores))
     }
 
     fn step(&mut self, view: View, id: usize, options: &StepOptions, step: &Step) -> Result<()> {

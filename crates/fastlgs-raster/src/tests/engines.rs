@@ -3,8 +3,9 @@
 
 use super::{CHANNELS, assert_close, camera, cloud, gpu, gpu_in_each_shape, target};
 use crate::density::State;
-use crate::{Channels, CpuEngine, Engine, Exposure, GpuEngine, StepOptions};
+use crate::{Channels, CpuEngine, Engine, ExposedPhoto, Exposure, GpuEngine, StepOptions};
 use crate::{Step, View};
+use fastlgs_core::LabelMap;
 use fastlgs_core::gaussians::{BASE_CHANNELS, channels as channels_of};
 
 fn options(channels: Channels) -> StepOptions {
@@ -122,6 +123,51 @@ fn gpu_and_cpu_agree() {
             }
         }
     }
+}
+
+#[test]
+fn gpu_and_cpu_agree_on_votes_and_saliency() {
+    let Some(mut small) = gpu() else { return };
+    let (width, height) = (97, 61);
+    let scene = cloud(3000, 21, 1, true);
+    let view = View::new(&camera(width, height), scene.len(), 1);
+    // Enough for the histograms of the sort, but not for all votes at once.
+    small.max_binding = 1 << 18;
+    let mut labels = LabelMap::new(width, height);
+    for (p, label) in labels.labels.iter_mut().enumerate() {
+        *label = (p as u32 % width / 5) as u16;
+    }
+    let image = target(width, height);
+    let photo = ExposedPhoto {
+        image: &image,
+        exposure: options(Channels::Color).exposure,
+    };
+    let results = |engine: &mut dyn Engine| {
+        engine.set_state(&State::of(&scene)).unwrap();
+        let mut of_label = vec![0.0; scene.len() * 32];
+        for vote in engine.votes(view, &labels).unwrap() {
+            of_label[32 * vote.gaussian as usize + usize::from(vote.label)] = vote.weight;
+        }
+        let mut scores = vec![0.0; scene.len()];
+        let error = engine.saliency(view, Some(&photo), &mut scores).unwrap();
+        (of_label, scores, error)
+    };
+    let cpu = results(&mut CpuEngine::new());
+    assert!(cpu.0.iter().filter(|weight| **weight > 0.1).count() > 1000);
+    let mut mixed = GpuEngine::new(gpu().expect("opened above"));
+    mixed.passes_on_cpu = 1000;
+    for mut engine in [
+        GpuEngine::new(gpu().expect("opened above")),
+        GpuEngine::new(small),
+        mixed,
+    ] {
+        let device = results(&mut engine);
+        assert_close("votes", &device.0, &cpu.0, 0.01, 0.002);
+        assert_close("saliency", &device.1, &cpu.1, 0.01, 0.005);
+        assert!((device.2 - cpu.2).abs() < 1e-3 * cpu.2);
+    }
+    let wrong_size = CpuEngine::new().votes(view, &LabelMap::new(8, 8));
+    assert!(wrong_size.unwrap_err().to_string().contains("8x8"));
 }
 
 #[test]

@@ -759,6 +759,101 @@ fn blending_ids() {
 }
 
 #[test]
+fn blending_votes() {
+    let Some(gpu) = gpu() else { return };
+    for (n, w, h) in SIZES.into_iter().skip(1) {
+        let l = lists(n, w, h, 0, false);
+        let b = |name: &str| &l.buffers[name][..];
+        // Tiles have one to three labels. The window holds the second half of the sums.
+        let tile_count = l.view.tile_count();
+        let labels: Vec<u32> = (0..64 * tile_count)
+            .map(|p| p % 64 % (1 + p / 64 % 3))
+            .collect();
+        let mut sums = 0;
+        let mut tile_votes = Vec::new();
+        for (tile, range) in b("ranges").chunks_exact(2).enumerate() {
+            let count = 1 + tile as u32 % 3;
+            tile_votes.extend([sums, count]);
+            sums += count * (range[1] - range[0]);
+        }
+        let middle = tile_votes[2 * (tile_count as usize / 2)];
+        for (first, end) in [(0, sums), (middle, sums)] {
+            let view = View {
+                slot_first: first,
+                slot_count: end - first,
+                ..l.view
+            };
+            let buffers = [
+                b("ranges"),
+                b("sorted"),
+                b("gaussians"),
+                b("splats"),
+                &labels,
+                &tile_votes,
+                &zeros((end - first).max(1) as usize),
+            ];
+            let [device, twin] = on_device_and_twin(
+                &gpu,
+                shaders::BlendVotes::SHADER,
+                Channels::Both,
+                false,
+                &view,
+                &buffers,
+                tile_count.div_ceil(8),
+            );
+            assert!(floats(&twin[6]).iter().any(|sum| *sum > 0.1));
+            let what = format!("votes from {first} of {n}");
+            assert_close(&what, floats(&device[6]), floats(&twin[6]), 2e-3, 0.002);
+        }
+    }
+}
+
+#[test]
+fn blending_saliency() {
+    let Some(gpu) = gpu() else { return };
+    for (n, w, h) in SIZES.into_iter().skip(1) {
+        let l = lists(n, w, h, 0, false);
+        let b = |name: &str| &l.buffers[name][..];
+        let pixels = l.view.padded_pixels();
+        let listed = [b("ranges"), b("sorted"), b("gaussians"), b("splats")];
+        let mut blending = vec![
+            b("ranges").to_vec(),
+            b("tile_order").to_vec(),
+            b("sorted").to_vec(),
+            b("gaussians").to_vec(),
+            b("splats").to_vec(),
+            zeros(8 * pixels),
+        ];
+        cpu::run(
+            "blend",
+            Channels::Color,
+            bytemuck::bytes_of(&l.view),
+            &mut blending,
+        );
+        let mut rng = Rng::new(5, "factors");
+        let factors: Vec<u32> = (0..3 * pixels).map(|_| rng.uniform().to_bits()).collect();
+        let saliency = zeros(l.view.pairs as usize);
+        let [device, twin] = on_device_and_twin(
+            &gpu,
+            shaders::BlendSaliency::SHADER,
+            Channels::Both,
+            false,
+            &l.view,
+            &[&listed[..], &[&blending[5], &factors, &saliency]].concat(),
+            l.view.tile_count().div_ceil(8),
+        );
+        assert!(floats(&twin[6]).iter().any(|sum| *sum > 0.1));
+        assert_close(
+            &format!("saliency of {n}"),
+            floats(&device[6]),
+            floats(&twin[6]),
+            5e-3,
+            0.005,
+        );
+    }
+}
+
+#[test]
 fn loss() {
     let Some(gpu) = gpu() else { return };
     for (w, h) in [(17u32, 13u32), (64, 50), (131, 77), (1440, 1080)] {

@@ -122,7 +122,7 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
     let mut whole = start();
     let shaped = whole.run(Some(&checkpoint), |progress, trainer| {
         if progress.iteration == 100 {
-            trainer.couple(|scene, cameras| {
+            trainer.couple(|_, scene, cameras| {
                 assert_eq!(cameras.len(), 24);
                 scene.features.fill(Vec3::splat(0.5));
                 Ok::<_, crate::Error>(())
@@ -149,7 +149,7 @@ fn masks_shape_from_some_step_on_also_in_a_resumed_run() {
         whole.gaussians().unwrap().means != by_color.gaussians().unwrap().means,
         "masks change geometry"
     );
-    let refused = start().couple(|_, _| Err(crate::Error::Invalid("no objects".to_owned())));
+    let refused = start().couple(|_, _, _| Err(crate::Error::Invalid("no objects".to_owned())));
     assert!(refused.is_err());
 }
 

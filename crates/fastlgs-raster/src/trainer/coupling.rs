@@ -4,6 +4,7 @@
 
 use super::Trainer;
 use crate::channels::Channels;
+use crate::engine::Engine;
 use crate::{Error, Result};
 use fastlgs_core::gaussians::channel::FEATURE;
 use fastlgs_core::{Camera, Gaussians};
@@ -25,19 +26,22 @@ impl Trainer {
 
     /// Starts to train the feature, which then moves geometry too.
     ///
-    /// `features` gets the current Gaussians and the training cameras, and sets the initial
-    /// features. [`Trainer::set_codes`] sets the codes that views are trained towards.
+    /// `features` gets the engine, whose state it may replace, the current Gaussians and the
+    /// training cameras. It sets the initial features. [`Trainer::set_codes`] sets the codes that views are trained towards.
     ///
     /// # Errors
-    /// When the device fails, or `features` returns an error. Then nothing has changed.
+    /// When the device fails, or `features` returns an error. Then the Gaussians have not changed.
     pub fn couple<E: From<Error>>(
         &mut self,
-        features: impl FnOnce(&mut Gaussians, &[Camera]) -> Result<(), E>,
+        features: impl FnOnce(&mut dyn Engine, &mut Gaussians, &[Camera]) -> Result<(), E>,
     ) -> Result<(), E> {
         let mut state = self.engine.state()?;
         state.keep_finite();
         let mut scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
-        features(&mut scene, &self.targets.cameras)?;
+        if let Err(error) = features(&mut *self.engine, &mut scene, &self.targets.cameras) {
+            self.engine.set_state(&state)?;
+            return Err(error);
+        }
         let count = state.len();
         for (axis, channel) in FEATURE.enumerate() {
             let values = state.params[channel * count..][..count].iter_mut();

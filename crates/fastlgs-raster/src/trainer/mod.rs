@@ -157,6 +157,12 @@ impl Trainer {
         })
     }
 
+    /// Ends the run and returns the engine, without the images of the views.
+    pub fn into_engine(mut self) -> Box<dyn Engine> {
+        self.unload_targets();
+        self.engine
+    }
+
     /// Sets the free space for the current cameras. Density control removes Gaussians in it.
     pub fn set_free_space(&mut self, free: FreeSpace) {
         self.free_space = free;

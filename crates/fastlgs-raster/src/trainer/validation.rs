@@ -3,14 +3,12 @@
 //!
 //! Validation views are not trained on while the scene grows.
 
-use super::{Trainer, view_of};
+use super::Trainer;
 use crate::Result;
 use crate::budget::{self, Removal};
-use crate::change::Changes;
-use crate::density::State;
+use crate::engine::ExposedPhoto;
 use crate::schedule::Budget;
 use crate::target::Targets;
-use fastlgs_core::Gaussians;
 
 impl Trainer {
     /// Returns the validation views: training views that are held out while the scene grows.
@@ -52,7 +50,8 @@ impl Trainer {
     pub(super) fn prune(&mut self) -> Result<()> {
         let mut whole = self.engine.state()?;
         whole.keep_finite();
-        let changes = self.changes(&whole)?;
+        self.replace(&whole)?;
+        let (scores, squared_error) = self.saliency()?;
         let judges = self.cost_views();
         let psnr_before = self.quality(&judges, None)?;
         let mut removal = Removal {
@@ -62,7 +61,7 @@ impl Trainer {
             psnr_before,
             psnr_after: None,
         };
-        for places in budget::candidates(&changes.scores, changes.error) {
+        for places in budget::candidates(&scores, squared_error) {
             let mut state = whole.clone();
             state.keep(&places);
             self.replace(&state)?;
@@ -76,19 +75,21 @@ impl Trainer {
         Ok(())
     }
 
-    /// Scores the Gaussians on all training views.
-    fn changes(&self, state: &State) -> Result<Changes> {
-        let scene = Gaussians::from_channels(&state.params, state.sh_degree, None);
+    /// Returns how much the training views change without each Gaussian, and their squared error.
+    fn saliency(&mut self) -> Result<(Vec<f32>, f64)> {
         let degree = self.course.config.degree(self.course.iteration);
-        let mut changes = Changes::of(&scene);
+        let mut scores = vec![0.0; self.engine.len()];
+        let mut squared_error = 0.0;
         for id in 0..self.targets.len() {
             let target = self.targets.get(id)?;
-            changes.add_view(
-                &view_of(&self.course, scene.len(), &target.camera, degree),
-                Some((&target.image, self.exposure(id))),
-            );
+            let photo = ExposedPhoto {
+                image: &target.image,
+                exposure: self.exposure(id),
+            };
+            let view = self.view(&target.camera, degree);
+            squared_error += self.engine.saliency(view, Some(&photo), &mut scores)?;
         }
-        Ok(changes)
+        Ok((scores, squared_error))
     }
 
     /// Returns the views that measure the cost of a removal: the validation views, else every tenth
@@ -108,7 +109,7 @@ impl Trainer {
 mod tests {
     use super::*;
     use crate::{CpuEngine, Target, TargetImage, TrainerConfig, pack};
-    use fastlgs_core::Camera;
+    use fastlgs_core::{Camera, Gaussians};
     use glam::Vec3;
 
     #[test]

@@ -272,7 +272,7 @@ pub(super) fn check(
         match anew {
             Ok(anew) => (report, corrected_poses) = anew.unwrap_or((report, corrected_poses)),
             // Errors are not cached: the next run tries again, also after pycolmap is installed.
-            Err(Error::Vision(error)) => {
+            Err(Error::Sfm(error)) => {
                 let warning = format!(
                     "many poses contradict the photos, but computing all poses again failed: {error}; only single groups of cameras are corrected"
                 );

@@ -2,7 +2,6 @@
 
 use crate::{Result, Scene};
 use fastlgs_core::{Camera, LabelMap};
-use fastlgs_raster::lift;
 use glam::Vec3;
 
 /// Least number of views that must show a Gaussian outside of the hidden pixels.
@@ -16,9 +15,9 @@ const MIN_WEIGHT: f32 = 0.5;
 /// A Gaussian remains if two views show it outside of the hidden pixels. It also remains if no view
 /// shows it, or its centre, within them. All others belong to the object or lie inside or below it,
 /// where photos do not constrain training.
-pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
-    let mut view_counts = vec![0u8; session.gaussians().len()];
-    let mut within = vec![false; session.gaussians().len()];
+pub fn remaining_gaussians(scene: &mut Scene, views: &[(Camera, Vec<bool>)]) -> Result<Vec<bool>> {
+    let mut view_counts = vec![0u8; scene.gaussians().len()];
+    let mut within = vec![false; scene.gaussians().len()];
     for (camera, hidden) in views {
         let labels = hidden.iter().map(|hidden| u16::from(!hidden)).collect();
         let map = LabelMap {
@@ -26,7 +25,8 @@ pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Re
             height: camera.height,
             labels,
         };
-        for vote in lift::votes(session.gaussians(), &session.view(camera), &map) {
+        let view = scene.view(camera);
+        for vote in scene.engine().votes(view, &map)? {
             within[vote.gaussian as usize] |= vote.label == 0;
             if vote.label == 1 && vote.weight >= MIN_WEIGHT {
                 let count = &mut view_counts[vote.gaussian as usize];
@@ -47,7 +47,7 @@ pub fn remaining_gaussians(session: &Scene, views: &[(Camera, Vec<bool>)]) -> Re
     Ok(view_counts
         .into_iter()
         .zip(within)
-        .zip(&session.gaussians().means)
+        .zip(&scene.gaussians().means)
         .map(stays)
         .collect())
 }

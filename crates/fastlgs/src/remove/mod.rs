@@ -104,6 +104,67 @@ const EMPTY_TRANSMITTANCE: f32 = 0.5;
 /// A text or id without an object, an output folder that holds a scene, photos that are missing, or
 /// a device that fails.
 pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
+    check_folders(config)?;
+    let _lock = SceneLock::take(&config.output, "remove")?;
+    let inpainter: Box<dyn Inpainter> = if config.inpainter == "membrane" {
+        Box::new(Membrane)
+    } else {
+        inpaint::by_name(&config.inpainter).context("the inpainter cannot be opened")?
+    };
+    let mut scene = open_with_photos(config, run)?;
+    let grid = scene.grid()?;
+    let targets = targets(config, &mut scene, &grid)?;
+    let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
+    let hidden = HiddenPixels::of(&mut scene, &grid, &targets)?;
+    let left = remaining(&mut scene, &grid, &objects, &hidden)?;
+    if left.is_empty() {
+        bail!(
+            "{}: no Gaussians of the scene would remain; choose a smaller object",
+            config.scene.display()
+        );
+    }
+    let removed = scene.gaussians().len() - left.len();
+    let rest = scene.gaussians().select(&left);
+    scene.set_gaussians(rest)?;
+
+    let mut gaps = Vec::new();
+    for (camera, hidden) in &hidden.in_training {
+        gaps.push(gap(&mut scene, camera, hidden)?);
+    }
+    let gap_pixels: usize = gaps.iter().map(|gap| count_set(gap)).sum();
+    let hidden_pixels: usize = hidden.in_training.iter().map(|h| count_set(&h.1)).sum();
+    let filled = fill(
+        &mut scene,
+        &grid,
+        &hidden.in_training,
+        &gaps,
+        &*inpainter,
+        run,
+    )?;
+
+    let (left_over, ids) = grid.without(&objects);
+    let renumbered = |id: &u16| ids.get(usize::from(*id)).copied().unwrap_or(0);
+    let ids = scene.gaussians().object_ids.iter().map(renumbered);
+    let ids = ids.collect();
+    scene.set_object_ids(ids);
+    let what = config
+        .text
+        .clone()
+        .unwrap_or_else(|| format!("object {}", objects[0]));
+    folder::write(&config.output, &mut scene, &left_over, &hidden.all, &what)?;
+    Ok(RemoveReport {
+        scene: config.scene.clone(),
+        output: config.output.clone(),
+        objects,
+        removed,
+        filled,
+        seen: 1.0 - gap_pixels as f64 / (hidden_pixels as f64).max(1.0),
+        left: left_over.objects.len(),
+    })
+}
+
+/// Refuses an output folder that overlaps the scene, or holds one.
+fn check_folders(config: &RemoveConfig) -> Result<()> {
     let (output, scene) = (resolve_path(&config.output)?, resolve_path(&config.scene)?);
     if output.starts_with(&scene) || scene.starts_with(&output) {
         bail!(
@@ -118,115 +179,72 @@ pub fn remove(config: &RemoveConfig, run: &Run) -> Result<RemoveReport> {
             config.output.display()
         );
     }
-    let _lock = SceneLock::take(&config.output, "remove")?;
-    let inpainter: Box<dyn Inpainter> = if config.inpainter == "membrane" {
-        Box::new(Membrane)
-    } else {
-        inpaint::by_name(&config.inpainter).context("the inpainter cannot be opened")?
-    };
-    let mut session = Scene::open(&config.scene, run.device)?;
-    session.set_clip_text(config.clip_text.clone());
-    if session
-        .cameras()
-        .iter()
-        .any(|camera| !session.folder().photo_path(&camera.name).is_file())
-    {
+    Ok(())
+}
+
+/// Opens the scene, and checks that its prepared photos are there.
+fn open_with_photos(config: &RemoveConfig, run: &Run) -> Result<Scene> {
+    let mut scene = Scene::open(&config.scene, run.device)?;
+    scene.set_clip_text(config.clip_text.clone());
+    let has_photo = |camera: &Camera| scene.folder().photo_path(&camera.name).is_file();
+    if !scene.cameras().iter().all(has_photo) {
         bail!(
             "{}: its prepared photos are not there; remove the object from the trained scene, not from an export",
             config.scene.display()
         );
     }
-    let grid = session.grid()?;
-    let targets = targets(config, &mut session, &grid)?;
-    let views = session.manifest().training(session.cameras());
-    let trained_on = |camera: &Camera| views.iter().any(|v| v.name == camera.name);
-    let (mut hidden, mut hidden_in_training) = (Vec::new(), Vec::new());
-    for camera in session.cameras().to_vec() {
-        let widened = |field: &Field| {
-            metrics::dilate(
-                &field.mask(&grid, &targets),
-                camera.width,
-                camera.height,
-                MASK_DILATION,
-            )
-        };
-        let thing = widened(&*session.field(&camera, None)?);
-        if trained_on(&camera) {
-            // A transparent object does not hide the surface behind it.
-            hidden_in_training.push((
-                camera.clone(),
-                if session.trained().clear > 0 {
-                    widened(&session.field_without_transparent(&camera)?)
+    Ok(scene)
+}
+
+/// Pixels of the views that the removed objects cover, widened by `MASK_DILATION`.
+struct HiddenPixels {
+    /// All views.
+    all: Vec<(Camera, Vec<bool>)>,
+    /// The training views. A transparent object does not hide the surface behind it.
+    in_training: Vec<(Camera, Vec<bool>)>,
+}
+
+impl HiddenPixels {
+    fn of(scene: &mut Scene, grid: &Grid, targets: &[Hit]) -> Result<Self> {
+        let training = scene.manifest().training(scene.cameras());
+        let has_transparent = scene.trained().clear > 0;
+        let (mut all, mut in_training) = (Vec::new(), Vec::new());
+        for camera in scene.cameras().to_vec() {
+            let widened = |field: &Field| {
+                let mask = field.mask(grid, targets);
+                metrics::dilate(&mask, camera.width, camera.height, MASK_DILATION)
+            };
+            let hidden = widened(&*scene.field(&camera, None)?);
+            if training.iter().any(|view| view.name == camera.name) {
+                let opaque = if has_transparent {
+                    widened(&scene.field_without_transparent(&camera)?)
                 } else {
-                    thing.clone()
-                },
-            ));
+                    hidden.clone()
+                };
+                in_training.push((camera.clone(), opaque));
+            }
+            all.push((camera, hidden));
         }
-        hidden.push((camera, thing));
+        Ok(Self { all, in_training })
     }
-    let objects: Vec<u16> = targets.iter().map(|t| t.id).collect();
-    let mut remains = behind::remaining_gaussians(&session, &hidden_in_training)?;
-    // Photos do not show transparent Gaussians, so all of them remain, except those of the removed
-    // objects.
-    remains
-        .iter_mut()
-        .enumerate()
-        .for_each(|(i, stays)| *stays |= transparent::is_clear(session.gaussians(), i));
-    selection::gaussians(session.gaussians(), &grid, &objects)
-        .into_iter()
-        .for_each(|i| remains[i] = false);
-    let left: Vec<usize> = (0..remains.len()).filter(|i| remains[*i]).collect();
-    if left.is_empty() {
-        bail!(
-            "{}: no Gaussians of the scene would remain; choose a smaller object",
-            config.scene.display()
-        );
-    }
-    let removed = remains.len() - left.len();
-    let rest = session.gaussians().select(&left);
-    session.set_gaussians(rest)?;
+}
 
-    let mut gaps = Vec::new();
-    for (camera, hidden) in &hidden_in_training {
-        gaps.push(gap(&mut session, camera, hidden)?);
+/// Returns the indices of the Gaussians that remain. Photos do not show transparent Gaussians, so
+/// all of them remain, except those of the removed objects.
+fn remaining(
+    scene: &mut Scene,
+    grid: &Grid,
+    objects: &[u16],
+    hidden: &HiddenPixels,
+) -> Result<Vec<usize>> {
+    let mut remains = behind::remaining_gaussians(scene, &hidden.in_training)?;
+    for (i, remains) in remains.iter_mut().enumerate() {
+        *remains |= transparent::is_clear(scene.gaussians(), i);
     }
-    let count = |pixels: &mut dyn Iterator<Item = usize>| pixels.sum::<usize>() as f64;
-    let seen = 1.0
-        - count(&mut gaps.iter().map(|g| count_set(g)))
-            / count(&mut hidden_in_training.iter().map(|s| count_set(&s.1))).max(1.0);
-    let filled = fill(
-        &mut session,
-        &grid,
-        &hidden_in_training,
-        &gaps,
-        &*inpainter,
-        run,
-    )?;
-
-    let (left_over, ids) = grid.without(&objects);
-    let renumbered = |id: &u16| ids.get(usize::from(*id)).copied().unwrap_or(0);
-    session.set_object_ids(
-        session
-            .gaussians()
-            .object_ids
-            .iter()
-            .map(renumbered)
-            .collect(),
-    );
-    let what = config
-        .text
-        .clone()
-        .unwrap_or_else(|| format!("object {}", objects[0]));
-    folder::write(&config.output, &mut session, &left_over, &hidden, &what)?;
-    Ok(RemoveReport {
-        scene: config.scene.clone(),
-        output: config.output.clone(),
-        objects,
-        removed,
-        filled,
-        seen,
-        left: left_over.objects.len(),
-    })
+    for i in selection::gaussians(scene.gaussians(), grid, objects) {
+        remains[i] = false;
+    }
+    Ok((0..remains.len()).filter(|i| remains[*i]).collect())
 }
 
 fn count_set(pixels: &[bool]) -> usize {
@@ -237,7 +255,7 @@ fn count_set(pixels: &[bool]) -> usize {
 ///
 /// # Errors
 /// There is no such object.
-fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Vec<Hit>> {
+fn targets(config: &RemoveConfig, scene: &mut Scene, grid: &Grid) -> Result<Vec<Hit>> {
     let root = config.scene.display();
     if let Some(id) = config.object {
         if id == 0 || usize::from(id) > grid.objects.len() {
@@ -249,13 +267,13 @@ fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Ve
         return Ok(vec![Hit { id, score: 1.0 }]);
     }
     let text = config.text.clone().unwrap_or_default();
-    let camera = session
+    let camera = scene
         .cameras()
         .first()
         .cloned()
         .with_context(|| format!("{root}: the scene has no views"))?;
-    let field = session.field(&camera, None)?;
-    let found = ObjectQuery::Text(text.clone()).embed(session, &[])?.find(
+    let field = scene.field(&camera, None)?;
+    let found = ObjectQuery::Text(text.clone()).embed(scene, &[])?.find(
         grid,
         &field,
         &camera,
@@ -271,9 +289,9 @@ fn targets(config: &RemoveConfig, session: &mut Scene, grid: &Grid) -> Result<Ve
 
 /// Renders colours without the share of the background, `[3][h][w]`. At the border of a gap, this
 /// share is up to half of the light.
-fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
-    let frame = session.render(camera)?;
-    let behind = session.trained().background;
+fn solid_colors(scene: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
+    let frame = scene.render(camera)?;
+    let behind = scene.trained().background;
     let transmittance = frame.transmittance();
     let solid = |c: usize| {
         let channel = frame.channels(c, c + 1).iter().zip(transmittance);
@@ -289,8 +307,8 @@ fn solid_colors(session: &mut Scene, camera: &Camera) -> Result<Vec<f32>> {
 }
 
 /// Returns the hidden pixels of a view that are empty.
-fn gap(session: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
-    let frame = session.render(camera)?;
+fn gap(scene: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool>> {
+    let frame = scene.render(camera)?;
     Ok(hidden
         .iter()
         .zip(frame.transmittance())
@@ -300,54 +318,54 @@ fn gap(session: &mut Scene, camera: &Camera, hidden: &[bool]) -> Result<Vec<bool
 
 /// Fills the gaps of all views with Gaussians, and returns their number.
 fn fill(
-    session: &mut Scene,
+    scene: &mut Scene,
     grid: &Grid,
     views: &[(Camera, Vec<bool>)],
     gaps: &[Vec<bool>],
     inpainter: &dyn Inpainter,
     run: &Run,
 ) -> Result<usize> {
-    let before = session.gaussians().len();
+    let before = scene.gaussians().len();
     let mut order: Vec<usize> = (0..views.len()).collect();
     order.sort_by_key(|k| std::cmp::Reverse(count_set(&gaps[*k])));
     let work = run.work("gaps", order.len() as u64);
     for (camera, hidden) in order.into_iter().map(|k| &views[k]) {
         work.advance()?;
         // Other views may have filled a part of this gap.
-        let gap = gap(session, camera, hidden)?;
+        let gap = gap(scene, camera, hidden)?;
         let (n, width) = (gap.len(), camera.width as usize);
         if count_set(&gap) as f64 <= MIN_GAP_SHARE * n as f64 || count_set(&gap) == n {
             continue;
         }
-        let depth = session.render_depth(camera)?;
+        let depth = scene.render_depth(camera)?;
         let mut inverse: Vec<f32> = depth
             .iter()
             .map(|depth| if depth.is_finite() { 1.0 / depth } else { 0.0 })
             .collect();
         Membrane::fill_planes(&mut inverse, &gap, width);
-        let mut colors = solid_colors(session, camera)?;
+        let mut colors = solid_colors(scene, camera)?;
         inpainter.fill(&mut colors, &gap, camera.width)?;
         let ids = membrane::extend_labels(
-            &session.field_without_transparent(camera)?.ids(grid).labels,
+            &scene.field_without_transparent(camera)?.ids(grid).labels,
             &gap,
             width,
         );
         let to_world = camera.world_to_camera.inverse();
-        let mut scene = session.gaussians().clone();
+        let mut filled = scene.gaussians().clone();
         for p in (0..n).filter(|p| gap[*p] && inverse[*p] > 0.0) {
             let depth = 1.0 / inverse[p];
             let pixel = Vec2::new((p % width) as f32 + 0.5, (p / width) as f32 + 0.5);
             let place = to_world.transform_point3(camera.ray(pixel) * depth);
-            scene.push_sphere(
+            filled.push_sphere(
                 place,
                 FILL_RADIUS * depth / camera.fx,
                 FILL_OPACITY,
                 std::array::from_fn(|c| colors[c * n + p].clamp(0.0, 1.0)),
             );
-            let last = scene.len() - 1;
-            (scene.object_ids[last], scene.features[last]) = (ids[p], grid.code_of(ids[p]));
+            let last = filled.len() - 1;
+            (filled.object_ids[last], filled.features[last]) = (ids[p], grid.code_of(ids[p]));
         }
-        session.set_gaussians(scene)?;
+        scene.set_gaussians(filled)?;
     }
-    Ok(session.gaussians().len() - before)
+    Ok(scene.gaussians().len() - before)
 }

@@ -91,8 +91,8 @@ fn with_matching_axes(
         let mut sum = 0.0;
         for id in (0..views.len()).step_by(views.len().div_ceil(CHECKED_VIEWS).max(1)) {
             let Target { camera, image, .. } = views.get(id)?;
-            let mut view = View::new(&camera, scene.len(), scene.sh_degree);
-            view.background_color[..3].copy_from_slice(&background.color);
+            let view =
+                View::new(&camera, scene.len(), scene.sh_degree).with_background(background.color);
             let frame = engine.render(view, Channels::Color)?;
             let n = image.color.len();
             let pixels = image

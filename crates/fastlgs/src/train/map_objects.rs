@@ -2,10 +2,8 @@
 
 use super::Inputs;
 use super::run::Trained;
-use crate::{Result, Run, objects, transparent};
-use fastlgs_core::Gaussians;
+use crate::{Result, Run, objects, paper, transparent};
 use fastlgs_grid::Grid;
-use fastlgs_grid::codebook::Codebook;
 use std::time::Instant;
 
 /// The object table of a trained scene.
@@ -23,26 +21,34 @@ pub fn map_objects(inputs: &Inputs, trained: &mut Trained, run: &Run) -> Result<
         scene,
         training,
         kept_transparent,
+        engine,
         ..
     } = trained;
-    let (config, folder) = (&inputs.config, &inputs.folder);
+    let mut mapper = objects::Mapper {
+        folder: &inputs.folder,
+        cameras: training,
+        config: inputs.config.global(),
+        engine: &mut **engine,
+        run,
+    };
     let (grid, summary) = match inputs.prior_objects.clone() {
         Some(grid) if inputs.trains_features() => {
             if !grid.overlaps.0.is_empty() {
                 run.warn("a trained feature keeps only the smallest of overlapping objects and the objects that contain it; set feature_mode to lift to keep them all");
             }
-            nearest_codes(scene, &grid);
+            paper::assign_nearest_codes(scene, &grid);
             (grid, None)
         }
         Some(grid) => {
             scene.append(std::mem::take(kept_transparent).with_sh_degree(scene.sh_degree));
-            objects::lift(scene, folder, training, &grid, config.antialias)?;
+            mapper.lift(scene, &grid)?;
             transparent::keep_owned(scene);
             (grid, None)
         }
         None => {
-            let mapped = transparent::map(scene, folder, training, &config.global(), run)?;
-            let (grid, summary) = objects::embed_objects(scene, folder, training, mapped, run)?;
+            let mapped = transparent::map(&mut mapper, scene)?;
+            let (grid, summary) =
+                objects::embed_objects(scene, &inputs.folder, training, mapped, run)?;
             (grid, Some(summary))
         }
     };
@@ -51,15 +57,4 @@ pub fn map_objects(inputs: &Inputs, trained: &mut Trained, run: &Run) -> Result<
         summary,
         seconds: started.elapsed().as_secs_f64(),
     })
-}
-
-/// Assigns every Gaussian the object whose code is nearest to its trained feature. Gaussians nearer
-/// to the origin get none: pixels outside of all masks are trained towards the origin.
-fn nearest_codes(scene: &mut Gaussians, grid: &Grid) {
-    let codebook = Codebook::of(grid);
-    scene.object_ids = scene
-        .features
-        .iter()
-        .map(|feature| codebook.owner(*feature).0)
-        .collect();
 }

@@ -8,7 +8,7 @@
 use crate::error::Context;
 use crate::progress::{Message, Sink};
 use crate::{Result, Run, objects};
-use fastlgs_core::{Camera, Gaussians, LabelMap, SceneFolder, fs, image_io};
+use fastlgs_core::{Gaussians, LabelMap, SceneFolder, fs, image_io};
 use fastlgs_raster::{Trainer, pack};
 use glam::Vec3;
 use std::collections::BTreeMap;
@@ -33,14 +33,23 @@ fn target_path(folder: &SceneFolder, name: &str) -> PathBuf {
 pub fn begin(
     trainer: &mut Trainer,
     folder: &SceneFolder,
-    config: &objects::MappingConfig,
+    config: objects::MappingConfig,
     run: &Run,
 ) -> Result<()> {
     let run = Run {
         progress: &MutedSink(run.progress),
         ..*run
     };
-    trainer.couple(|scene, cameras| find(scene, folder, cameras, config, &run))?;
+    trainer.couple(|engine, scene, cameras| {
+        let mut mapper = objects::Mapper {
+            folder,
+            cameras,
+            config,
+            engine,
+            run: &run,
+        };
+        find(&mut mapper, scene)
+    })?;
     resume_targets(trainer, folder)
 }
 
@@ -94,29 +103,15 @@ fn of_view(folder: &SceneFolder, name: &str, codes: &[[u8; 3]]) -> Result<Vec<u3
 
 /// Finds the objects, writes the mask targets of all views, and sets the feature of every Gaussian
 /// to the code of its object.
-fn find(
-    scene: &mut Gaussians,
-    folder: &SceneFolder,
-    cameras: &[Camera],
-    config: &objects::MappingConfig,
-    run: &Run,
-) -> Result<()> {
-    let lists = objects::map(scene, folder, cameras, config, run)?
-        .chosen
-        .lists();
+fn find(mapper: &mut objects::Mapper, scene: &mut Gaussians) -> Result<()> {
+    let folder = mapper.folder;
+    let lists = mapper.map(scene)?.chosen.lists();
     let mut beside = Adjacency::default();
-    objects::render_maps(
-        scene,
-        cameras,
-        &lists,
-        config.antialias,
-        run,
-        |camera, shown| {
-            let map = objects_of_atoms(&shown, &objects::atoms(folder, camera)?.map);
-            beside.add(&map);
-            Ok(map.save(&target_path(folder, &format!("{}.png", camera.name)))?)
-        },
-    )?;
+    mapper.render_maps(scene, &lists, |camera, shown| {
+        let map = objects_of_atoms(&shown, &objects::atoms(folder, camera)?.map);
+        beside.add(&map);
+        Ok(map.save(&target_path(folder, &format!("{}.png", camera.name)))?)
+    })?;
     let codes = beside.codes(lists.len());
     fs::write_json(&target_path(folder, "codes.json"), &codes)
         .context("the object codes cannot be written")?;

@@ -108,7 +108,7 @@ impl Inputs {
         let prior_objects = match config.mapping {
             Mapping::Paper => {
                 let paper = config.paper(&manifest.encoder);
-                Some(objects::by_algorithm_1(&folder, &training, &paper, run)?)
+                Some(crate::paper::map(&folder, &training, &paper, run)?)
             }
             Mapping::Keep => Some(objects::load_kept(&folder, &training)?),
             Mapping::Global => None,

@@ -97,9 +97,8 @@ impl TrainReport {
 
     /// The same for `gaussians` Gaussians with colour of degree `sh_degree`.
     pub(crate) fn view_of(&self, camera: &Camera, gaussians: usize, sh_degree: u32) -> View {
-        let mut view = View::new(camera, gaussians, sh_degree);
-        view.antialias = u32::from(self.antialias);
-        view.background_color[..3].copy_from_slice(&self.background);
-        view
+        View::new(camera, gaussians, sh_degree)
+            .with_antialias(self.antialias)
+            .with_background(self.background)
     }
 }

@@ -5,12 +5,14 @@ use crate::progress::{Message, TrainStep};
 use crate::train::settings::settings;
 use crate::{Result, Run, checkpoints, objects, stop_point, transparent};
 use fastlgs_core::{Camera, Gaussians};
-use fastlgs_raster::{Choice, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
+use fastlgs_raster::{Choice, Engine, Progress, Targets, Trainer, TrainerConfig, TrainerReport};
 use std::time::Instant;
 
 /// Trained Gaussians, and what the report needs of their training.
 pub struct Trained {
     pub scene: Gaussians,
+    /// The device.
+    pub engine: Box<dyn Engine>,
     /// Cameras of all views; alignment may have moved those of the training views.
     pub cameras: Vec<Camera>,
     /// The training views among them.
@@ -29,12 +31,14 @@ pub struct Trained {
     pub result: TrainerReport,
 }
 
-/// Trains the Gaussians. The trainer is dropped at the end, so that mapping has its memory.
+/// Trains the Gaussians. Only the engine of the trainer remains, so that mapping has its memory.
 pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     let (config, folder) = (&inputs.config, &inputs.folder);
     let (targets, held_out) = (inputs.targets(), inputs.held_out());
     held_out.check()?;
-    let first = first_gaussians(inputs, &targets, run)?;
+    let device = fastlgs_raster::choice(run.device);
+    let mut engine = fastlgs_raster::open_engine(&device.device)?;
+    let first = first_gaussians(inputs, &targets, &mut *engine, run)?;
     let kept_transparent = match config.mapping {
         Mapping::Keep => transparent::take(&mut folder.gaussians()?),
         Mapping::Paper | Mapping::Global => Gaussians::default(),
@@ -48,8 +52,6 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
         &brightness,
         run.seed,
     );
-    let device = fastlgs_raster::choice(run.device);
-    let engine = fastlgs_raster::open_engine(&device.device)?;
     let free = init::free_space(config, folder, &inputs.training, &first)?;
     let work = run.work("train", u64::from(settings.iterations));
     let mut trainer = Trainer::new(engine, &first, targets, settings.clone())?;
@@ -89,6 +91,7 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
     run.progress.on_message(Message::TrainingEnds(&scene));
     Ok(Trained {
         scene,
+        engine: trainer.into_engine(),
         aligned: cameras != inputs.initial_cameras,
         cameras,
         training,
@@ -103,7 +106,12 @@ pub fn train(inputs: &Inputs, run: &Run) -> Result<Trained> {
 }
 
 /// Returns the Gaussians that training starts from, with their features.
-fn first_gaussians(inputs: &Inputs, targets: &Targets, run: &Run) -> Result<Gaussians> {
+fn first_gaussians(
+    inputs: &Inputs,
+    targets: &Targets,
+    engine: &mut dyn Engine,
+    run: &Run,
+) -> Result<Gaussians> {
     let config = &inputs.config;
     let mut first = init::gaussians(config, &inputs.folder, targets, run)?;
     // Gaussians of transparent objects have no colour to train.
@@ -116,13 +124,14 @@ fn first_gaussians(inputs: &Inputs, targets: &Targets, run: &Run) -> Result<Gaus
     {
         // Start from the objects on which most views agree. From elsewhere, descent ends between
         // the codes of views that disagree.
-        objects::lift(
-            &mut first,
-            &inputs.folder,
-            &inputs.training,
-            objects,
-            config.antialias,
-        )?;
+        let mut mapper = objects::Mapper {
+            folder: &inputs.folder,
+            cameras: &inputs.training,
+            config: config.global(),
+            engine,
+            run,
+        };
+        mapper.lift(&mut first, objects)?;
     }
     Ok(first)
 }
@@ -165,7 +174,7 @@ impl Watch<'_> {
         if self.settings.couples_at == Some(iteration) {
             let started = Instant::now();
             let config = self.inputs.config.global();
-            mask_supervision::begin(trainer, &self.inputs.folder, &config, self.run)?;
+            mask_supervision::begin(trainer, &self.inputs.folder, config, self.run)?;
             self.supervision_seconds += started.elapsed().as_secs_f64();
         }
         stop_point::reach("train", u64::from(iteration));
